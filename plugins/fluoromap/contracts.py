@@ -1,0 +1,582 @@
+"""What travels between stages, and the four stage protocols.
+
+Everything here is a frozen dataclass, validated once when built: whoever holds one holds a whole one. Frames are counted
+from 0 inside the project (from 1 in files and in the API). Pixels are (u, v) = (column, row), (0, 0) the centre of the
+top-left pixel. World points are millimetres along DICOM patient axes (LPS) from the isocentre unless a name says
+``relative``: then the mean of the reference catheter's electrodes in the same frames has been subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel
+
+from fluoromap.catheters import Catalogue
+from fluoromap.geometry import Camera
+from fluoromap.reasons import Reason
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+View = Literal["a", "b"]
+
+CHI2_95_3D = 7.814727903251179
+"""95th percentile of the chi-squared distribution with 3 degrees of freedom: a 95 % ellipsoid's squared radius."""
+
+
+class StageStopped(Exception):
+    """Raised by :meth:`Context.check` when the job was cancelled or taken over; a stage lets it pass."""
+
+
+class Refusal(Exception):
+    """A stage's whole answer is that the data cannot support one. ``reason`` is its code, the message says what to do."""
+
+    def __init__(self, reason: Reason, message: str | None = None) -> None:
+        super().__init__(message or reason.sentence)
+        self.reason = reason
+
+
+class Context(Protocol):
+    """The one line a running stage has to the outside."""
+
+    def progress(self, fraction: float) -> None:
+        """Tell how much is done, 0 to 1. Cheap: call it as often as you like."""
+
+    def check(self) -> None:
+        """Raise :class:`StageStopped` when the work is no longer wanted."""
+
+
+class Silent:
+    """A :class:`Context` for notebooks and tests: tells nobody, never stops."""
+
+    def progress(self, fraction: float) -> None:
+        pass
+
+    def check(self) -> None:
+        pass
+
+
+class Grade(StrEnum):
+    """Trust in a position by the largest semi-axis of its 95 % ellipsoid."""
+
+    A = "A"
+    B = "B"
+    C = "C"
+    REJECTED = "rejected"
+
+
+def grade_of(covariance_mm2: ArrayLike) -> Grade:
+    """Grade of a 3x3 position covariance: A up to 2 mm, B up to 4 mm, C beyond (largest 95 % semi-axis)."""
+    largest = float(np.linalg.eigvalsh(np.asarray(covariance_mm2, dtype=np.float64))[-1])
+    semi_axis_mm = float(np.sqrt(CHI2_95_3D * max(largest, 0.0)))
+    return Grade.A if semi_axis_mm <= 2.0 else Grade.B if semi_axis_mm <= 4.0 else Grade.C
+
+
+def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: type = np.float64) -> NDArray[Any]:
+    """A read-only copy of ``value`` after checking its shape (None: any length) and that it is finite.
+
+    Raises
+    ------
+    ValueError
+        Naming the field, when shape or numbers are wrong.
+    """
+    array: NDArray[Any] = np.array(value, dtype=dtype)
+    if array.ndim != len(shape) or any(
+        want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
+    ):
+        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite")
+    array.setflags(write=False)
+    return array
+
+
+# --- what a segmenter gets and gives ---------------------------------------------------------------------------------
+
+
+class FrameSource(Protocol):
+    """The frames of one run, decoded one at a time; can be indexed and iterated again and again."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> NDArray[np.generic]:
+        """Stored pixels of frame ``index`` (from 0), shape (rows, columns), an unsigned integer type."""
+
+    def __iter__(self) -> Iterator[NDArray[np.generic]]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """The part of the image that was exposed, as shutter or collimator attributes tell; pixels (u, v).
+
+    rectangle : (left, right, upper, lower) edges; circle : (centre_u, centre_v, radius); polygon : vertices (u, v).
+    The field is what lies inside all that are given.
+    """
+
+    rectangle: tuple[float, float, float, float] | None = None
+    circle: tuple[float, float, float] | None = None
+    polygon: tuple[tuple[float, float], ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFacts:
+    """What the stored numbers mean.
+
+    logarithmic : the logarithm was taken already (PixelIntensityRelationship LOG or DISP).
+    bits_stored : significant bits. monochrome1 : high values are displayed dark, to be inverted first.
+    """
+
+    logarithmic: bool
+    bits_stored: int
+    monochrome1: bool
+    shutter: Shutter | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One cine as a segmenter sees it.
+
+    frames : decoded one at a time. frame_times_ms : (n,), from the first frame on.
+    px_per_mm : at the isocentre. r_wave_frames : frames of R waves where the file tells them.
+    """
+
+    frames: FrameSource
+    frame_times_ms: Array
+    px_per_mm: float
+    pixels: PixelFacts
+    r_wave_frames: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (len(self.frames),), "frame_times_ms"))
+        if not self.px_per_mm > 0:
+            raise ValueError("px_per_mm must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """The electrodes of one catheter in one image.
+
+    electrodes : their numbers, 1 = tip, ascending; a chain set by hand may hold only some.
+    pixels_uv : (m, 2). covariance_px2 : (m, 2, 2). scores : (m,), contrast over noise.
+    kinds : catheter name -> probability that this is it (sums to at most 1); look-alikes share theirs.
+    track : chains of one run with the same track number are the same catheter in other frames; -1 where unlinked.
+    manual : set by hand (then ``kinds`` holds one name with probability 1).
+    """
+
+    electrodes: tuple[int, ...]
+    pixels_uv: Array
+    covariance_px2: Array
+    scores: Array
+    kinds: tuple[tuple[str, float], ...]
+    track: int = -1
+    manual: bool = False
+
+    def __post_init__(self) -> None:
+        m = len(self.electrodes)
+        if m < 1 or list(self.electrodes) != sorted(set(self.electrodes)) or self.electrodes[0] < 1:
+            raise ValueError("electrodes must be different numbers from 1 on, ascending")
+        object.__setattr__(self, "pixels_uv", frozen(self.pixels_uv, (m, 2), "pixels_uv"))
+        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (m, 2, 2), "covariance_px2"))
+        object.__setattr__(self, "scores", frozen(self.scores, (m,), "scores"))
+        if sum(probability for _, probability in self.kinds) > 1 + 1e-6:
+            raise ValueError("probabilities of kinds add up to more than 1")
+
+    def probability(self, catheter: str) -> float:
+        return dict(self.kinds).get(catheter, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameChains:
+    """All chains of one image. ``manual_needed`` tells why there are none, or why they are not to be trusted."""
+
+    frame: int
+    chains: tuple[Chain, ...]
+    manual_needed: Reason | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What a segmenter found in one run.
+
+    frames : one entry per frame of the run, in order.
+    diastole : chains in the mean of the quiet frames round diastole; its ``frame`` is the middle one of them.
+        None where no quiet stretch exists (then single frames stand for themselves).
+    diastole_frames : the frames that were averaged, ascending.
+    motion : (n,) how much the image changed from the frame before, low-passed, arbitrary unit; the first repeats the second.
+    frame_times_ms, r_wave_frames : the run's, carried along for phase matching.
+    """
+
+    frames: tuple[FrameChains, ...]
+    diastole: FrameChains | None
+    diastole_frames: tuple[int, ...]
+    motion: Array
+    frame_times_ms: Array
+    r_wave_frames: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.frames)
+        if [entry.frame for entry in self.frames] != list(range(n)):
+            raise ValueError("frames must hold every frame of the run in order")
+        object.__setattr__(self, "motion", frozen(self.motion, (n,), "motion"))
+        object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (n,), "frame_times_ms"))
+
+
+Marks = Mapping[int, tuple[Chain, ...]]
+"""Chains set by hand: frame -> the chains that stand in it."""
+
+
+# --- what matching makes of it ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class NamedChain:
+    """The electrodes of a named catheter in one image; fields as in :class:`Chain`."""
+
+    catheter: str
+    electrodes: tuple[int, ...]
+    pixels_uv: Array
+    covariance_px2: Array
+
+    def __post_init__(self) -> None:
+        m = len(self.electrodes)
+        object.__setattr__(self, "pixels_uv", frozen(self.pixels_uv, (m, 2), "pixels_uv"))
+        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (m, 2, 2), "covariance_px2"))
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What one view shows at one moment: a frame, its cardiac phase (0..1 from one R wave, or one start of systole, to the
+    next; None where no cycle is known) and the named catheters in it."""
+
+    frame: int
+    phase: float | None
+    chains: tuple[NamedChain, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PhasePair:
+    """The same cardiac phase in both views, usually of different beats."""
+
+    phase: float | None
+    a: Observation
+    b: Observation
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedSite:
+    """One site with its catheters named in both views.
+
+    diastole : the pair that locates the site. cycle : pairs over the cardiac cycle by rising phase; empty where unknown.
+    track_a, track_b : every frame of each run, for following the single view.
+    notes : (catheter, reason) of catheters that are missing or doubtful here.
+    """
+
+    site: str
+    camera_a: Camera
+    camera_b: Camera
+    diastole: PhasePair
+    cycle: tuple[PhasePair, ...]
+    track_a: tuple[Observation, ...]
+    track_b: tuple[Observation, ...]
+    frame_times_a_ms: Array
+    frame_times_b_ms: Array
+    notes: tuple[tuple[str, Reason], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RejectedSite:
+    """A site that could not be located, and why."""
+
+    site: str
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Matching:
+    """All sites of a study, named and paired, and those that could not be."""
+
+    sites: tuple[MatchedSite, ...]
+    rejected: tuple[RejectedSite, ...]
+
+
+# --- what a triangulator gives ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ElectrodePoint:
+    """One electrode in 3D at diastole.
+
+    position_mm : (3,), covariance_mm2 : (3, 3), from the isocentre.
+    relative_mm, relative_covariance_mm2 : the same from the reference catheter's mean; None where that was not located.
+    residual_px : reprojection residual in view a, b. reasons : what speaks against trusting it fully.
+    """
+
+    catheter: str
+    electrode: int
+    position_mm: Array
+    covariance_mm2: Array
+    relative_mm: Array | None
+    relative_covariance_mm2: Array | None
+    residual_px: tuple[float, float]
+    ray_angle_deg: float
+    reasons: tuple[Reason, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position_mm", frozen(self.position_mm, (3,), "position_mm"))
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3, 3), "covariance_mm2"))
+        if (self.relative_mm is None) != (self.relative_covariance_mm2 is None):
+            raise ValueError("a relative position needs its covariance")
+        if self.relative_mm is not None:
+            object.__setattr__(self, "relative_mm", frozen(self.relative_mm, (3,), "relative_mm"))
+            covariance = frozen(self.relative_covariance_mm2, (3, 3), "relative_covariance_mm2")  # type: ignore[arg-type]
+            object.__setattr__(self, "relative_covariance_mm2", covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class SiteCycle:
+    """A site's electrodes in 3D over one cardiac cycle.
+
+    phases : (p,), rising within 0..1. labels : (catheter, electrode) of each of the m electrodes.
+    positions_mm : (p, m, 3). covariance_mm2 : (p, m, 3, 3).
+    """
+
+    phases: Array
+    labels: tuple[tuple[str, int], ...]
+    positions_mm: Array
+    covariance_mm2: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "phases", frozen(self.phases, (None,), "phases"))
+        p, m = len(self.phases), len(self.labels)
+        object.__setattr__(self, "positions_mm", frozen(self.positions_mm, (p, m, 3), "positions_mm"))
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (p, m, 3, 3), "covariance_mm2"))
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedSite:
+    """A site in 3D: its points at diastole, its cycle, and the cameras it ended with (self-calibrated or not).
+
+    frame_a, frame_b : the diastolic frames. reference_mm : (3,) the reference catheter's mean, None where not located.
+    """
+
+    site: str
+    camera_a: Camera
+    camera_b: Camera
+    frame_a: int
+    frame_b: int
+    points: tuple[ElectrodePoint, ...]
+    reference_mm: Array | None
+    cycle: SiteCycle | None
+    reasons: tuple[Reason, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.reference_mm is not None:
+            object.__setattr__(self, "reference_mm", frozen(self.reference_mm, (3,), "reference_mm"))
+
+    def point(self, catheter: str, electrode: int) -> ElectrodePoint | None:
+        for point in self.points:
+            if point.catheter == catheter and point.electrode == electrode:
+                return point
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Triangulation:
+    """All sites of a study in 3D, and those that could not be located. ``notes``: sentences for the report."""
+
+    sites: tuple[LocatedSite, ...]
+    rejected: tuple[RejectedSite, ...]
+    notes: tuple[str, ...] = ()
+
+
+# --- what a monoplane solver gets and gives --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class MonoplaneView:
+    """One view of one site, to be followed in 3D.
+
+    frame_times_ms : (n,). observations : one per frame, in order. a_priori : points known from two views, valid in
+    ``a_priori_frame``. cycle : the site's own biplane cycle or None. others : cycles of other sites, empty when ``cycle`` is valid.
+    """
+
+    site: str
+    view: View
+    camera: Camera
+    catalogue: Catalogue
+    frame_times_ms: Array
+    observations: tuple[Observation, ...]
+    a_priori: tuple[ElectrodePoint, ...]
+    a_priori_frame: int
+    cycle: SiteCycle | None
+    others: tuple[SiteCycle, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.observations)
+        object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (n,), "frame_times_ms"))
+        if not 0 <= self.a_priori_frame < n:
+            raise ValueError("a_priori_frame must be a frame of the run")
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Electrodes in 3D in every frame of one view.
+
+    labels : (catheter, electrode) of each of the m electrodes. located : (n, m), False where there is no position; the
+    arrays hold 0 there. positions_mm, baseline_mm : (n, m, 3), the baseline being the plain back-projection at the
+    prior's depth. covariance_mm2 : (n, m, 3, 3). pixels_uv : (n, m, 2) as seen. reasons : one tuple an electrode.
+    """
+
+    labels: tuple[tuple[str, int], ...]
+    located: BoolArray
+    positions_mm: Array
+    baseline_mm: Array
+    covariance_mm2: Array
+    pixels_uv: Array
+    reasons: tuple[tuple[Reason, ...], ...]
+
+    def __post_init__(self) -> None:
+        m = len(self.labels)
+        object.__setattr__(self, "located", frozen(self.located, (None, m), "located", dtype=np.bool_))
+        n = self.located.shape[0]
+        object.__setattr__(self, "positions_mm", frozen(self.positions_mm, (n, m, 3), "positions_mm"))
+        object.__setattr__(self, "baseline_mm", frozen(self.baseline_mm, (n, m, 3), "baseline_mm"))
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (n, m, 3, 3), "covariance_mm2"))
+        object.__setattr__(self, "pixels_uv", frozen(self.pixels_uv, (n, m, 2), "pixels_uv"))
+        if len(self.reasons) != m:
+            raise ValueError("reasons need one tuple an electrode")
+
+
+# --- what a fuser gets and gives -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSite:
+    """A located site with its activation time, as a fuser gets it.
+
+    tip_mm, covariance_mm2 : the mapping tip relative to the reference catheter. axis : (3,) unit vector along the
+    catheter from electrode 2 to the tip. tip_length_mm : of the tip electrode. lat_ms, lat_sd_ms : activation time.
+    """
+
+    site: str
+    tip_mm: Array
+    covariance_mm2: Array
+    axis: Array
+    tip_length_mm: float
+    lat_ms: float
+    lat_sd_ms: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, (3,), "tip_mm"))
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3, 3), "covariance_mm2"))
+        object.__setattr__(self, "axis", frozen(self.axis, (3,), "axis"))
+        if not (np.isfinite(self.lat_ms) and np.isfinite(self.lat_sd_ms) and self.lat_sd_ms >= 0):
+            raise ValueError("lat_ms must be finite and lat_sd_ms finite and not negative")
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSite:
+    """A site on the map: where it lies (position_mm), where on the surface it counts (surface_mm), how far that is."""
+
+    site: str
+    position_mm: Array
+    surface_mm: Array
+    distance_mm: float
+    lat_ms: float
+    leave_one_out_error_ms: float | None
+    reasons: tuple[Reason, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position_mm", frozen(self.position_mm, (3,), "position_mm"))
+        object.__setattr__(self, "surface_mm", frozen(self.surface_mm, (3,), "surface_mm"))
+
+
+@dataclass(frozen=True, eq=False)
+class ChamberMap:
+    """The chamber's surface with activation times, relative to the reference catheter.
+
+    vertices_mm : (n, 3). faces : (f, 3), outward by the right-hand rule, watertight. lat_ms, lat_sd_ms : (n,), where
+    ``covered`` (n,); elsewhere no site is near enough and the numbers are 0. earliest : (site, probability), most probable
+    first. coverage : covered share of the area, 0..1.
+    """
+
+    vertices_mm: Array
+    faces: IntArray
+    lat_ms: Array
+    lat_sd_ms: Array
+    covered: BoolArray
+    sites: tuple[SurfaceSite, ...]
+    earliest: tuple[tuple[str, float], ...]
+    total_activation_time_ms: float
+    leave_one_out_rms_ms: float | None
+    volume_ml: float
+    area_cm2: float
+    coverage: float
+    warnings: tuple[Reason, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices_mm", frozen(self.vertices_mm, (None, 3), "vertices_mm"))
+        n = len(self.vertices_mm)
+        object.__setattr__(self, "faces", frozen(self.faces, (None, 3), "faces", dtype=np.int64))
+        if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < n):
+            raise ValueError("faces must name vertices")
+        object.__setattr__(self, "lat_ms", frozen(self.lat_ms, (n,), "lat_ms"))
+        object.__setattr__(self, "lat_sd_ms", frozen(self.lat_sd_ms, (n,), "lat_sd_ms"))
+        object.__setattr__(self, "covered", frozen(self.covered, (n,), "covered", dtype=np.bool_))
+
+
+# --- the four kinds of stage -----------------------------------------------------------------------------------------
+
+
+class NoParams(BaseModel, extra="forbid"):
+    """The ``Params`` of a stage that has none."""
+
+
+class Stage(Protocol):
+    """What every plugin class has. It is built as ``PluginClass(params)`` and used for one subject at a time.
+
+    name : as clients write it. version : raise it whenever the answer to the same input changes; results are kept by it.
+    Params : a pydantic model with ``extra="forbid"``, a default and a description for each field.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[str]
+    Params: ClassVar[type[BaseModel]]
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Finds the catheters' electrodes in the frames of one run; does not name look-alikes."""
+
+    def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation: ...
+
+
+@runtime_checkable
+class Triangulator(Protocol):
+    """Locates the named electrodes of all sites of a study in 3D."""
+
+    def triangulate(self, sites: tuple[MatchedSite, ...], catalogue: Catalogue, context: Context) -> Triangulation: ...
+
+
+@runtime_checkable
+class MonoplaneSolver(Protocol):
+    """Follows the electrodes in 3D through one view; raises :class:`Refusal` where the view cannot tell."""
+
+    def follow(self, view: MonoplaneView, context: Context) -> Track: ...
+
+
+@runtime_checkable
+class Fuser(Protocol):
+    """Makes surface and map of the located sites; raises :class:`Refusal` where there are too few."""
+
+    def fuse(self, sites: tuple[MappedSite, ...], context: Context) -> ChamberMap: ...

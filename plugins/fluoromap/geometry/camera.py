@@ -1,0 +1,143 @@
+"""A C-arm view as a 3x4 projection matrix, and the paper's three camera models.
+
+World: DICOM patient axes (+X left, +Y back, +Z head), millimetres, origin at the isocentre.
+Pixel (u, v): column and row index; (0, 0) is the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A perspective camera ``w (u, v, 1)' = M (X, Y, Z, 1)'`` with ``w`` the depth in mm.
+
+    The 12 numbers of ``matrix`` row by row are m1..m12 of the paper's equation (8).
+
+    Parameters
+    ----------
+    matrix : array_like, shape (3, 4)
+        Scaled at construction so that its third row's first three numbers have length 1: then ``w`` is the depth
+        along the central ray, in mm, and positive in front of the source. A C-arm view seen from the detector has a
+        left-handed rotation block (determinant -1); either handedness is legal.
+    rows, columns : int
+        Size of the stored image, for drawing and for the limits of the field.
+
+    Raises
+    ------
+    ValueError
+        When the matrix has not the shape, is not finite or has no centre of projection.
+    """
+
+    matrix: Array
+    rows: int
+    columns: int
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.matrix, dtype=np.float64)
+        if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
+            raise ValueError("a camera is a finite 3x4 matrix")
+        if abs(np.linalg.det(matrix[:, :3])) < 1e-12:
+            raise ValueError("the camera matrix has no centre of projection")
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError("a camera needs an image of at least one pixel")
+        matrix /= np.linalg.norm(matrix[2, :3])
+        matrix.setflags(write=False)
+        object.__setattr__(self, "matrix", matrix)
+
+    @property
+    def source_world_mm(self) -> Array:
+        """Centre of projection (the X-ray source), shape (3,)."""
+        source: Array = np.linalg.solve(self.matrix[:, :3], -self.matrix[:, 3])
+        return source
+
+    @property
+    def axis_world(self) -> Array:
+        """Unit vector of the central ray, from the source to the detector, shape (3,)."""
+        return self.matrix[2, :3].copy()
+
+    @property
+    def px_per_mm(self) -> float:
+        """Pixels per millimetre at the isocentre, mean of the two image directions."""
+        jacobian = self.jacobian(np.zeros(3))
+        return float(np.sqrt(np.linalg.norm(jacobian[0]) * np.linalg.norm(jacobian[1])))
+
+    def depth_mm(self, points_world_mm: ArrayLike) -> Array:
+        """Depth of points ``(..., 3)`` along the central ray from the source, shape (...)."""
+        points = np.asarray(points_world_mm, dtype=np.float64)
+        depth: Array = points @ self.matrix[2, :3] + self.matrix[2, 3]
+        return depth
+
+    def project(self, points_world_mm: ArrayLike) -> Array:
+        """Full perspective projection, the paper's equation (1): points ``(..., 3)`` to pixels ``(..., 2)``."""
+        points = np.asarray(points_world_mm, dtype=np.float64)
+        homogeneous = points @ self.matrix[:, :3].T + self.matrix[:, 3]
+        pixels: Array = homogeneous[..., :2] / homogeneous[..., 2:]
+        return pixels
+
+    def project_parallel(self, points_world_mm: ArrayLike) -> Array:
+        """Parallel projection, the paper's equation (2): the scale of the isocentre for every point, no depth."""
+        return self._project_at_depth(points_world_mm, self.matrix[2, 3])
+
+    def project_weak(self, points_world_mm: ArrayLike) -> Array:
+        """Weak perspective, the paper's equation (3): the depth of the cloud's centroid for every point."""
+        points = np.asarray(points_world_mm, dtype=np.float64)
+        return self._project_at_depth(points, float(self.depth_mm(points.reshape(-1, 3).mean(axis=0))))
+
+    def _project_at_depth(self, points_world_mm: ArrayLike, depth_mm: float) -> Array:
+        points = np.asarray(points_world_mm, dtype=np.float64)
+        principal = self.principal_point_uv
+        # The two image rows without their share of the depth: lengths across the central ray, times focal length.
+        across = self.matrix[:2] - principal[:, None] * self.matrix[2]
+        pixels: Array = (points @ across[:, :3].T + across[:, 3]) / depth_mm + principal
+        return pixels
+
+    @property
+    def principal_point_uv(self) -> Array:
+        """Pixel of the central ray, shape (2,)."""
+        axis = self.matrix[2, :3]
+        principal: Array = self.matrix[:2, :3] @ axis
+        return principal
+
+    def jacobian(self, points_world_mm: ArrayLike) -> Array:
+        """d(u, v)/d(X, Y, Z) in px/mm at points ``(..., 3)``, shape (..., 2, 3)."""
+        points = np.asarray(points_world_mm, dtype=np.float64)
+        pixels = self.project(points)
+        depth = self.depth_mm(points)
+        rows = self.matrix[:2, :3] - pixels[..., :, None] * self.matrix[2, :3]
+        scaled: Array = rows / depth[..., None, None]
+        return scaled
+
+    def rays(self, pixels_uv: ArrayLike) -> Array:
+        """Unit directions in the world from the source through pixels ``(..., 2)``, shape (..., 3)."""
+        pixels = np.asarray(pixels_uv, dtype=np.float64)
+        homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
+        directions = homogeneous @ np.linalg.inv(self.matrix[:, :3]).T
+        unit: Array = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        return unit
+
+    def back_project(self, pixels_uv: ArrayLike, depth_mm: ArrayLike) -> Array:
+        """Points on the rays of pixels ``(..., 2)`` at depths ``(...)`` in mm along the central ray, shape (..., 3)."""
+        directions = self.rays(pixels_uv)
+        along = directions @ self.matrix[2, :3]
+        points: Array = self.source_world_mm + directions * (np.asarray(depth_mm, dtype=np.float64) / along)[..., None]
+        return points
+
+    def translated(self, shift_world_mm: ArrayLike) -> Camera:
+        """The camera for coordinates whose origin lies at ``shift_world_mm`` in this camera's world."""
+        shift = np.asarray(shift_world_mm, dtype=np.float64)
+        matrix = self.matrix.copy()
+        matrix[:, 3] += matrix[:, :3] @ shift
+        return Camera(matrix, self.rows, self.columns)
+
+
+def ray_angle_deg(first: Camera, second: Camera) -> float:
+    """Angle between two views' central rays, folded to 0..90 degrees."""
+    cosine = abs(float(first.axis_world @ second.axis_world))
+    return float(np.degrees(np.arccos(min(cosine, 1.0))))

@@ -1,0 +1,94 @@
+"""The C-arm's gantry and the camera that belongs to it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.geometry.camera import Array, Camera
+
+ImageAxes = tuple[tuple[int, int], tuple[int, int]]
+UPRIGHT: ImageAxes = ((1, 0), (0, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Gantry:
+    """Where source and detector stood for a run.
+
+    Parameters
+    ----------
+    primary_deg : float
+        PositionerPrimaryAngle (0018,1510): LAO positive, RAO negative.
+    secondary_deg : float
+        PositionerSecondaryAngle (0018,1511): cranial positive, caudal negative.
+    source_detector_mm : float
+        DistanceSourceToDetector (0018,1110), SID.
+    source_isocentre_mm : float
+        DistanceSourceToPatient (0018,1111), SOD: source to isocentre.
+    pixel_spacing_mm : tuple of float
+        ImagerPixelSpacing (0018,1164): row spacing, column spacing, at the DETECTOR.
+    rows, columns : int
+        Size of the stored image.
+    image_axes : tuple
+        Integer matrix that takes (u, v) offsets of the upright image, seen from the detector, to offsets of the stored
+        image; what FieldOfViewRotation, FieldOfViewHorizontalFlip or PatientOrientation tell. The identity by default.
+
+    Raises
+    ------
+    ValueError
+        When a number is outside what a C-arm can do.
+    """
+
+    primary_deg: float
+    secondary_deg: float
+    source_detector_mm: float
+    source_isocentre_mm: float
+    pixel_spacing_mm: tuple[float, float]
+    rows: int
+    columns: int
+    image_axes: ImageAxes = UPRIGHT
+
+    def __post_init__(self) -> None:
+        numbers = (
+            self.primary_deg, self.secondary_deg, self.source_detector_mm, self.source_isocentre_mm,
+            *self.pixel_spacing_mm,
+        )  # fmt: skip
+        if not all(math.isfinite(number) for number in numbers):
+            raise ValueError("gantry values must be finite numbers")
+        if abs(self.primary_deg) > 180 or abs(self.secondary_deg) > 90:
+            raise ValueError("PositionerPrimaryAngle lies within 180 degrees, PositionerSecondaryAngle within 90")
+        if not 100 <= self.source_isocentre_mm < self.source_detector_mm <= 3000:
+            raise ValueError("the source lies 100 mm or more from the isocentre, and the detector behind it")
+        if not all(0.01 <= spacing <= 5 for spacing in self.pixel_spacing_mm):
+            raise ValueError("ImagerPixelSpacing must be between 0.01 and 5 mm")
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError("an image has at least one row and one column")
+        if abs(round(float(np.linalg.det(np.array(self.image_axes))))) != 1:
+            raise ValueError("image_axes must be a flip, a quarter turn or both")
+
+
+def camera_from_gantry(gantry: Gantry) -> Camera:
+    """Perspective camera of a gantry position, for stored pixels.
+
+    The displayed image looks at the patient from the detector: a frontal view shows the patient's left on the image's
+    right. With a the primary and b the secondary angle, n = (sin a cos b, -cos a cos b, sin b) points from the
+    isocentre to the detector, e_u = (cos a, sin a, 0), e_v = (sin a sin b, -cos a sin b, -cos b); (e_u, e_v, n) is
+    left-handed. DICOM PS3.3 C.8.7.5.1.2; the isocentre projects to the middle of the field, PS3.17 FFF.2.1.5.2.
+    """
+    a, b = math.radians(gantry.primary_deg), math.radians(gantry.secondary_deg)
+    e_u = np.array([math.cos(a), math.sin(a), 0.0])
+    e_v = np.array([math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b)])
+    n = np.array([math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)])
+    # Lengths across the ray come out on the detector in mm, are turned as the image was, then counted in stored pixels.
+    across: Array = np.array(gantry.image_axes, dtype=np.float64) @ np.stack([e_u, e_v])
+    row_spacing, column_spacing = gantry.pixel_spacing_mm
+    focal = gantry.source_detector_mm / np.array([column_spacing, row_spacing])
+    centre = np.array([(gantry.columns - 1) / 2, (gantry.rows - 1) / 2])
+    matrix = np.empty((3, 4))
+    matrix[2] = [*n, gantry.source_isocentre_mm]
+    matrix[:2, :3] = focal[:, None] * across
+    matrix[:2, 3] = 0.0
+    matrix[:2] += centre[:, None] * matrix[2]
+    return Camera(matrix, gantry.rows, gantry.columns)

@@ -1,0 +1,63 @@
+"""Why an answer is graded down or refused: the closed list of reason codes, each with its sentence."""
+
+from enum import StrEnum
+
+
+class Reason(StrEnum):
+    """A reason code as it appears in points, tracks and maps.
+
+    ``Reason.sentence`` tells an electrophysiologist what happened and what to do about it.
+    """
+
+    NO_ELECTRODES = "no_electrodes"
+    MANUAL_NEEDED = "manual_needed"
+    CATHETER_NOT_FOUND = "catheter_not_found"
+    IDENTITY_BY_MOTION = "identity_by_motion"
+    IDENTITY_UNCERTAIN = "identity_uncertain"
+    NO_REFERENCE = "no_reference"
+    NO_ACTIVATION_TIME = "no_activation_time"
+    ONE_VIEW_ONLY = "one_view_only"
+    VIEWS_PARALLEL = "views_parallel"
+    NO_GEOMETRY = "no_geometry"
+    NO_A_PRIORI = "no_a_priori"
+    PAIRING_FAILED = "pairing_failed"
+    SPACING_MISMATCH = "spacing_mismatch"
+    TABLE_MOVED = "table_moved"
+    DEPTH_UNOBSERVABLE = "depth_unobservable"
+    DEPTH_ASSUMED = "depth_assumed"
+    TRACK_INTERRUPTED = "track_interrupted"
+    PHASE_UNKNOWN = "phase_unknown"
+    LAT_OUTLIER = "lat_outlier"
+    TOO_FEW_SITES = "too_few_sites"
+    SITES_COPLANAR = "sites_coplanar"
+    PLUGIN_FAILED = "plugin_failed"
+
+    @property
+    def sentence(self) -> str:
+        return _SENTENCES[self]
+
+
+_SENTENCES: dict[Reason, str] = {
+    Reason.NO_ELECTRODES: "No electrodes were found in this run; mark them by hand on one frame or check the contrast.",
+    Reason.MANUAL_NEEDED: "The electrodes could not be told from the background; mark them by hand on one frame.",
+    Reason.CATHETER_NOT_FOUND: "This catheter was not found in one of the views; mark it by hand on one frame.",
+    Reason.IDENTITY_BY_MOTION: "The reference catheter was told from look-alikes by moving least between the sites.",
+    Reason.IDENTITY_UNCERTAIN: "Two catheters could be exchanged; name one of them by hand on one frame.",
+    Reason.NO_REFERENCE: "The reference catheter was not located here; its mean position over the other sites was used.",
+    Reason.NO_ACTIVATION_TIME: "This site has no activation time; send one with the activation-time table.",
+    Reason.ONE_VIEW_ONLY: "This site has only one run; a second view at least 30 degrees away is needed.",
+    Reason.VIEWS_PARALLEL: "The two views are less than 20 degrees apart; depth cannot be had from them.",
+    Reason.NO_GEOMETRY: "The gantry geometry is incomplete; complete the instance's missing values.",
+    Reason.NO_A_PRIORI: "No biplane position is known here; a single view alone cannot tell depth.",
+    Reason.PAIRING_FAILED: "The catheters of the two views do not belong together; check the binding of runs to the site.",
+    Reason.SPACING_MISMATCH: "The electrode spacing found differs from the catalogue's; check the catheter's description.",
+    Reason.TABLE_MOVED: "The table moved between the two views; repeat one of them.",
+    Reason.DEPTH_UNOBSERVABLE: "One view cannot tell the depth of this catheter to a useful accuracy.",
+    Reason.DEPTH_ASSUMED: "The depth along the ray comes from the solver's start value, not from the image.",
+    Reason.TRACK_INTERRUPTED: "The catheter was not seen in this frame.",
+    Reason.PHASE_UNKNOWN: "No cardiac cycle could be recognised in this run; the quietest frames were used.",
+    Reason.LAT_OUTLIER: "The activation time does not agree with its neighbours; check the annotation.",
+    Reason.TOO_FEW_SITES: "Fewer than four sites could be located; a chamber surface needs at least four.",
+    Reason.SITES_COPLANAR: "All located sites lie in one plane; a chamber surface needs sites on several walls.",
+    Reason.PLUGIN_FAILED: "The plugin for this stage failed; its message stands with the job's stage.",
+}
