@@ -1,0 +1,107 @@
+"""Step 4 of the four-step filter: grey-level morphology with disks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fluoromap.contracts import IntArray
+from fluoromap.segmenter.log_image import Image
+
+_NOTHING = np.finfo(np.float32).min
+"""Below every grey level; an infinity would not be safe under fast arithmetic."""
+
+
+def disk_morphology(x: Image, background_px: int = 14, opening_px: int = 2) -> Image:
+    """Dark things that a disk of ``background_px`` does not fit into and one of ``opening_px`` does, as bright ones.
+
+    Closing by the large disk minus the image (black top-hat), then opening by the small one. Radii are in pixels at the
+    heart: the large one must exceed half an electrode's length, the small one stay within half a ring's.
+    """
+    hat = closing(x, background_px) - x
+    return opening(hat, opening_px)
+
+
+def disk(radius: int) -> NDArray[np.bool_]:
+    """Pixels whose centres lie within ``radius`` of the middle one, shape (2 radius + 1, 2 radius + 1)."""
+    v, u = np.ogrid[-radius : radius + 1, -radius : radius + 1]
+    inside: NDArray[np.bool_] = u * u + v * v <= radius * radius
+    return inside
+
+
+def closing(x: Image, radius: int) -> Image:
+    return erode(dilate(x, radius), radius)
+
+
+def opening(x: Image, radius: int) -> Image:
+    return dilate(erode(x, radius), radius)
+
+
+def dilate(x: Image, radius: int) -> Image:
+    """Largest value under an exact disk; what lies outside the image does not count."""
+    if radius < 1:
+        return x.copy()
+    out = np.full((x.shape[0] + 2 * radius, x.shape[1]), _NOTHING, np.float32)
+    _dilate(np.pad(x, ((0, 0), (radius, radius)), constant_values=_NOTHING), _half_widths(radius), out)
+    return out[radius:-radius]
+
+
+def erode(x: Image, radius: int) -> Image:
+    """Smallest value under an exact disk; what lies outside the image does not count."""
+    return -dilate(-x, radius)
+
+
+def _half_widths(radius: int) -> IntArray:
+    """Half width of the disk's row at distance 0, 1, ... radius from its middle."""
+    return np.array([math.isqrt(radius**2 - k**2) for k in range(radius + 1)], dtype=np.int64)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _larger(out, first, second):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for u in range(out.size):
+        out[u] = max(first[u], second[u])
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _raise(out, other):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for u in range(out.size):
+        out[u] = max(out[u], other[u])
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _dilate(padded, half_widths, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Each row is widened to every width of the disk, by windows of 1, 2, 4, ... pixels overlapped in pairs, and raises the
+    rows above and below that the disk reaches with that width. ``out`` has ``radius`` spare rows at both ends."""
+    rows, width = padded.shape
+    radius = half_widths.size - 1
+    columns = width - 2 * radius
+    levels = 1
+    while (1 << levels) <= 2 * radius + 1:
+        levels += 1
+    windows = np.empty((levels, width), np.float32)
+    wide = np.empty(columns, np.float32)
+    for v in range(rows):
+        windows[0] = padded[v]
+        for level in range(1, levels):
+            shift = 1 << (level - 1)
+            source = windows[level - 1]
+            _larger(windows[level][: width - shift], source[: width - shift], source[shift:])
+        done = -1
+        for k in range(radius, -1, -1):
+            half = half_widths[k]
+            if half != done:
+                span = 2 * half + 1
+                level = 0
+                while (2 << level) <= span:
+                    level += 1
+                source = windows[level]
+                first = radius - half
+                second = radius + half + 1 - (1 << level)
+                _larger(wide, source[first : first + columns], source[second : second + columns])
+                done = half
+            _raise(out[v + radius - k], wide)
+            if k > 0:
+                _raise(out[v + radius + k], wide)

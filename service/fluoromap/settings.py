@@ -1,0 +1,58 @@
+"""All settings, each a ``FLUOROMAP_*`` environment variable."""
+
+from __future__ import annotations
+
+import functools
+import os
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Settings of one process; the field ``data_dir`` is read from ``FLUOROMAP_DATA_DIR``, and so on."""
+
+    model_config = SettingsConfigDict(env_prefix="FLUOROMAP_", frozen=True)
+
+    data_dir: Path = Field(
+        Path.home() / ".fluoromap", description="Folder of the files, and of the embedded database and broker."
+    )
+    database_url: str = Field("", description="SQLAlchemy URL; empty: SQLite in the data folder.")
+    broker_url: str = Field(
+        "", description="Celery broker URL; empty: files in the data folder; 'eager': jobs run at once."
+    )
+    host: str = Field("127.0.0.1", description="Address the API listens on.")
+    port: int = Field(8000, ge=0, le=65535, description="Port the API listens on.")
+    max_upload_bytes: int = Field(4 * 2**30, gt=0, description="Largest request body accepted, in bytes.")
+    workers: int = Field(max(os.cpu_count() or 1, 1), ge=1, description="Stages that one worker runs at the same time.")
+    worker_memory_mib: int = Field(8192, ge=512, description="Address space one running stage may take, in MiB.")
+    stage_seconds: int = Field(
+        1800, gt=0, description="Longest time one stage may run before it is stopped, in seconds."
+    )
+    lease_seconds: float = Field(30.0, gt=0, description="Silence after which a worker counts as dead, in seconds.")
+    heartbeat_seconds: float = Field(
+        10.0, gt=0, description="Time between a running stage's signs of life, in seconds."
+    )
+    republish_seconds: float = Field(
+        5.0, gt=0, description="Time after which an unclaimed stage is announced again, in seconds."
+    )
+    max_attempts: int = Field(3, ge=1, description="How often a stage is tried when its worker dies.")
+
+    @property
+    def effective_database_url(self) -> str:
+        return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'fluoromap.sqlite'}"
+
+    @property
+    def eager(self) -> bool:
+        return self.broker_url == "eager"
+
+    @property
+    def files_dir(self) -> Path:
+        return self.data_dir / "files"
+
+
+@functools.cache
+def settings() -> Settings:
+    """The process's settings, read once from the environment."""
+    return Settings()

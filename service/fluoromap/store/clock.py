@@ -1,0 +1,27 @@
+"""The database's clock: hosts may disagree about the time, the database does not with itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Float
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.expression import FunctionElement
+
+
+class db_now(FunctionElement[float]):  # noqa: N801 - reads as the SQL function it is
+    """Seconds since 1970-01-01 UTC by the database's clock."""
+
+    type = Float()
+    inherit_cache = True
+
+
+@compiles(db_now, "sqlite")
+def _sqlite(element: db_now, compiler: Any, **options: Any) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
+@compiles(db_now, "postgresql")
+def _postgresql(element: db_now, compiler: Any, **options: Any) -> str:
+    # now() would be the transaction's start; a transaction that waited for a lock must not read an old time.
+    return "EXTRACT(EPOCH FROM clock_timestamp())::double precision"
