@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from fluoromap.contracts import IntArray
 from fluoromap.segmenter.log_image import Image
 
-_NOTHING = np.finfo(np.float32).min
-"""Below every grey level; an infinity would not be safe under fast arithmetic."""
+Levels = NDArray[np.uint16]
+
+_LEVELS = 65536
 
 
 def disk_morphology(x: Image, background_px: int = 14, opening_px: int = 2) -> Image:
@@ -20,9 +21,14 @@ def disk_morphology(x: Image, background_px: int = 14, opening_px: int = 2) -> I
 
     Closing by the large disk minus the image (black top-hat), then opening by the small one. Radii are in pixels at the
     heart: the large one must exceed half an electrode's length, the small one stay within half a ring's.
+
+    Worked out on 65536 grey levels between the extremes of ``x``: rank filters are several times faster on short integers.
     """
-    hat = closing(x, background_px) - x
-    return opening(hat, opening_px)
+    low, high = float(x.min()), float(x.max())
+    scale = (_LEVELS - 1) / (high - low) if high > low else 1.0
+    levels = ((x - np.float32(low)) * np.float32(scale)).astype(np.uint16)
+    hat = closing(levels, background_px) - levels
+    return opening(hat, opening_px).astype(np.float32) * np.float32(1.0 / scale)
 
 
 def disk(radius: int) -> NDArray[np.bool_]:
@@ -32,26 +38,26 @@ def disk(radius: int) -> NDArray[np.bool_]:
     return inside
 
 
-def closing(x: Image, radius: int) -> Image:
+def closing(x: Levels, radius: int) -> Levels:
     return erode(dilate(x, radius), radius)
 
 
-def opening(x: Image, radius: int) -> Image:
+def opening(x: Levels, radius: int) -> Levels:
     return dilate(erode(x, radius), radius)
 
 
-def dilate(x: Image, radius: int) -> Image:
+def dilate(x: Levels, radius: int) -> Levels:
     """Largest value under an exact disk; what lies outside the image does not count."""
     if radius < 1:
         return x.copy()
-    out = np.full((x.shape[0] + 2 * radius, x.shape[1]), _NOTHING, np.float32)
-    _dilate(np.pad(x, ((0, 0), (radius, radius)), constant_values=_NOTHING), _half_widths(radius), out)
+    out = np.zeros((x.shape[0] + 2 * radius, x.shape[1]), np.uint16)
+    _dilate(np.pad(x, ((0, 0), (radius, radius))), _half_widths(radius), out)
     return out[radius:-radius]
 
 
-def erode(x: Image, radius: int) -> Image:
+def erode(x: Levels, radius: int) -> Levels:
     """Smallest value under an exact disk; what lies outside the image does not count."""
-    return -dilate(-x, radius)
+    return ~dilate(~x, radius)
 
 
 def _half_widths(radius: int) -> IntArray:
@@ -81,8 +87,8 @@ def _dilate(padded, half_widths, out):  # type: ignore[no-untyped-def]  # pragma
     levels = 1
     while (1 << levels) <= 2 * radius + 1:
         levels += 1
-    windows = np.empty((levels, width), np.float32)
-    wide = np.empty(columns, np.float32)
+    windows = np.empty((levels, width), np.uint16)
+    wide = np.empty(columns, np.uint16)
     for v in range(rows):
         windows[0] = padded[v]
         for level in range(1, levels):

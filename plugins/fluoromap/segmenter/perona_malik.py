@@ -21,14 +21,15 @@ def edge_scale(x: Image, inside: BoolArray, factor: float = 2.0) -> float | None
     On coarsely quantised frames the median is 0; then, and where it is smaller, a thousandth of the spread of x takes its
     place. None for a flat frame, which has nothing to diffuse.
     """
-    values = x[::4, :][inside[::4, :]]
+    values = x[::4, ::4][inside[::4, ::4]]
     if values.size < 2:
         return None
-    spread = float(np.percentile(values[::4], 99.5) - np.percentile(values[::4], 0.5))
+    low, high = np.percentile(values, [0.5, 99.5])
+    spread = float(high - low)
     if not spread > 0:
         return None
-    both = inside[::4, 1:] & inside[::4, :-1]
-    differences = np.abs(x[::4, 1:] - x[::4, :-1])[both]
+    rows = x[::8]
+    differences = np.abs(rows[:, 1:] - rows[:, :-1])[inside[::8, 1:] & inside[::8, :-1]]
     median = float(np.median(differences)) if differences.size else 0.0
     return max(factor * _GAUSSIAN_SD * median, _FLOOR * spread)
 
@@ -71,19 +72,17 @@ def _conduction(square):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _diffuse_row(row, right, below, north, flow, flow_east, flow_west, south, inverse, step):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """One sweep over one row; ``north`` holds the flux from above and leaves with the flux below.
-
-    ``flow`` has one entry a vertical pixel face; ``right``, ``flow_east`` and ``flow_west`` are shifted views.
-    """
+def _diffuse_row(row, right, below, north, west, east, south, inverse, step):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """One sweep over one row; ``north`` holds the flux from above and leaves with the flux below. ``west`` and ``east`` are
+    views of one array, the fluxes through the vertical pixel faces; ``right`` is the row shifted by a pixel."""
     for u in range(right.size):
         d = right[u] - row[u]
-        flow[u + 1] = d * _conduction(d * d * inverse)
+        east[u] = d * _conduction(d * d * inverse)
     for u in range(row.size):
         d = below[u] - row[u]
         south[u] = d * _conduction(d * d * inverse)
     for u in range(row.size):
-        row[u] += step * (south[u] - north[u] + flow_east[u] - flow_west[u])
+        row[u] += step * (south[u] - north[u] + east[u] - west[u])
     for u in range(row.size):
         north[u] = south[u]
 
@@ -99,4 +98,4 @@ def _diffuse(x, sweeps, inverse, step):  # type: ignore[no-untyped-def]  # pragm
             v = front - sweep
             row = x[v]
             below = x[min(v + 1, rows - 1)]
-            _diffuse_row(row, row[1:], below, north[sweep], flow, flow[1:], flow[:-1], south, inverse, step)
+            _diffuse_row(row, row[1:], below, north[sweep], flow[:-1], flow[1:], south, inverse, step)

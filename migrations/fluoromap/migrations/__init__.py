@@ -1,0 +1,1 @@
+"""The database's schema, step by step. Apply with ``fluoromap db upgrade``; a new step: see CONTRIBUTING.md."""

@@ -1,0 +1,118 @@
+"""Text and colour bar of the pictures."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+
+from PIL import Image, ImageDraw, ImageFont
+
+from fluoromap.fuser.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale, milliseconds
+
+Box = tuple[float, float, float, float]
+RGB = tuple[int, int, int]
+WHITE: RGB = (255, 255, 255)
+BLACK: RGB = (0, 0, 0)
+BAR_SHARE = 0.42
+"""Height of the colour bar's bands over the height of the picture."""
+
+
+@functools.cache
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Pillow's own typeface, so that pictures are the same on every machine."""
+    return ImageFont.load_default(size=size)
+
+
+def text_size(text: str, size: int) -> tuple[int, int]:
+    left, top, right, bottom = font(size).getbbox(text)
+    return round(right - left), round(bottom - top)
+
+
+def halo_text(draw: ImageDraw.ImageDraw, middle: tuple[float, float], text: str, size: int, ink: RGB, halo: RGB) -> None:
+    """Text round a point with a rim that keeps it legible on any background."""
+    stroke = max(1, size // 9)
+    draw.text(middle, text, fill=ink, font=font(size), anchor="mm", stroke_width=stroke, stroke_fill=halo)
+
+
+class Labels:
+    """Places labels beside their points without covering one another where that can be had."""
+
+    def __init__(self, width: int, height: int, taken: Iterable[Box] = ()) -> None:
+        self._field = (0.0, 0.0, float(width), float(height))
+        self._taken = list(taken)
+
+    def place(self, point: tuple[float, float], text: str, size: int, distance: float) -> tuple[float, float]:
+        """Middle of the label, in the direction where it overlaps least."""
+        width, height = text_size(text, size)
+        width, height = width + size // 3, height + size // 3
+        best, cost_of_best, box_of_best = point, float("inf"), (0.0, 0.0, 0.0, 0.0)
+        side, up = distance + width / 2, distance + height / 2
+        offsets = ((side, 0), (-side, 0), (0, -up), (0, up), (side * 0.8, -up * 0.8), (side * 0.8, up * 0.8),
+                   (-side * 0.8, -up * 0.8), (-side * 0.8, up * 0.8))  # fmt: skip
+        for rank, (right, down) in enumerate(offsets):
+            middle = (point[0] + right, point[1] + down)
+            box = (middle[0] - width / 2, middle[1] - height / 2, middle[0] + width / 2, middle[1] + height / 2)
+            outside = width * height - _overlap(box, self._field)
+            cost = rank + 2 * outside + sum(_overlap(box, other) for other in self._taken)
+            if cost < cost_of_best:
+                best, cost_of_best, box_of_best = middle, cost, box
+        self._taken.append(box_of_best)
+        return best
+
+
+def _overlap(a: Box, b: Box) -> float:
+    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    return max(width, 0.0) * max(height, 0.0)
+
+
+def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:
+    """Where :func:`draw_colour_bar` draws in a picture (width, height): its panel at the right edge."""
+    width, height = picture
+    widest = max(text_size(milliseconds(edge), size)[0] for edge in scale.edges_ms)
+    panel_width = max(1.1 * size + 0.6 * size + widest + size, text_size("no data", size)[0] + size)
+    panel_height = BAR_SHARE * height + 5.6 * size
+    top = (height - panel_height) / 2
+    return (width - panel_width - 0.5 * size, top, width - 0.5 * size, top + panel_height)
+
+
+def draw_colour_bar(
+    image: Image.Image, scale: Scale, size: int, *, dark: bool, mark_ms: float | None = None
+) -> None:
+    """Bands with their times in ms, earliest on top, and the hatch that means "no data"; optionally a mark at a time."""
+    ink, ground = (WHITE, (0, 0, 0, 150)) if dark else ((40, 40, 40), (255, 255, 255, 255))
+    left, top, right, bottom = bar_box(scale, image.size, size)
+    panel = Image.new("RGBA", (round(right - left), round(bottom - top)), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(panel)
+    draw.rounded_rectangle((0, 0, panel.width - 1, panel.height - 1), radius=size // 2, fill=ground)
+    bar_left, bar_right = 0.5 * size, 1.6 * size
+    bar_top = 1.9 * size
+    bar_height = BAR_SHARE * image.height
+    draw.text((panel.width / 2, 0.9 * size), "ms", fill=ink, font=font(size), anchor="mm")
+
+    def level(lat_ms: float) -> float:
+        share = (lat_ms - scale.start_ms) / (scale.stop_ms - scale.start_ms)
+        return bar_top + min(max(share, 0.0), 1.0) * bar_height
+
+    edges = scale.edges_ms.tolist()
+    for colour, early, late in zip(scale.band_colours().tolist(), edges, edges[1:], strict=False):
+        draw.rectangle((bar_left, level(early), bar_right, level(late)), fill=tuple(colour))
+    every = max(1, -(-int(1.3 * size * scale.bands) // int(bar_height)), -(-scale.bands // 8))
+    for index, edge in enumerate(edges):
+        draw.line((bar_right, level(edge), bar_right + 0.3 * size, level(edge)), fill=ink)
+        if index % every == 0:
+            place = (bar_right + 0.6 * size, level(edge))
+            draw.text(place, milliseconds(edge), fill=ink, font=font(size), anchor="lm")
+    draw.rectangle((bar_left, bar_top, bar_right, bar_top + bar_height), outline=ink)
+    if mark_ms is not None:
+        y, reach = level(mark_ms), 0.45 * size
+        draw.polygon((bar_left - 1, y - reach, bar_left + 0.6 * size, y, bar_left - 1, y + reach), fill=WHITE, outline=BLACK)
+
+    swatch_top = bar_top + bar_height + 0.9 * size
+    swatch = (round(bar_left), round(swatch_top), round(panel.width - bar_left), round(swatch_top + size))
+    draw.rectangle(swatch, fill=NO_DATA_RGB)
+    for x in range(swatch[0] - size, swatch[2], max(3, size // 3)):
+        clipped = [(x + step, swatch[3] - step) for step in range(size) if swatch[0] <= x + step <= swatch[2]]
+        draw.line(clipped, fill=NO_DATA_HATCH_RGB)
+    draw.rectangle(swatch, outline=ink)
+    draw.text((panel.width / 2, swatch_top + 1.7 * size), "no data", fill=ink, font=font(round(0.85 * size)), anchor="mm")
+    image.paste(panel, (round(left), round(top)), panel)

@@ -1,0 +1,205 @@
+"""Closed triangle surfaces: hull, refinement, nearest points, distances along the surface, area and volume.
+
+A surface is ``vertices_mm`` (n, 3) and ``faces`` (f, 3), outward by the right-hand rule; any frame of reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import ConvexHull
+
+from fluoromap.contracts import Array, BoolArray, IntArray
+
+MOST_FACES = 40_000
+"""More than a chamber ever needs at 1 mm; coordinates that are far off must not eat the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points on a surface: positions_mm (k, 3), in faces (k,) with barycentric weights (k, 3), distance_mm (k,) from
+    the points they were projected from."""
+
+    positions_mm: Array
+    faces: IntArray
+    weights: Array
+    distance_mm: Array
+
+    def rows(self, faces: IntArray, vertices: int) -> csr_array:
+        """Sparse (k, n) matrix that interpolates vertex values at the points."""
+        k = len(self.faces)
+        where = (np.repeat(np.arange(k), 3), faces[self.faces].ravel())
+        return coo_array((self.weights.ravel(), where), shape=(k, vertices)).tocsr()
+
+
+def hull_surface(points_mm: Array) -> tuple[Array, IntArray]:
+    """Convex hull of points (k, 3), k >= 4 and not coplanar, as a closed outward surface of its extreme points only."""
+    hull = ConvexHull(points_mm)
+    if not is_watertight(np.asarray(hull.simplices, dtype=np.int64)):
+        # Qhull's triangulation of facets with many coplanar points can leave holes; jogging the input never does.
+        hull = ConvexHull(points_mm, qhull_options="QJ")
+    faces: IntArray = np.array(hull.simplices, dtype=np.int64)
+    corners = points_mm[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = (normals * hull.equations[:, :3]).sum(axis=1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return points_mm[used], renumbered.reshape(-1, 3).astype(np.int64)
+
+
+def is_watertight(faces: IntArray) -> bool:
+    """Whether every edge belongs to exactly two faces."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    return bool((counts == 2).all())
+
+
+def face_normals(vertices_mm: Array, faces: IntArray) -> Array:
+    """Outward normals (f, 3), each as long as twice its face's area in mm²."""
+    corners = vertices_mm[faces]
+    normals: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals
+
+
+def face_areas_mm2(vertices_mm: Array, faces: IntArray) -> Array:
+    areas: Array = np.linalg.norm(face_normals(vertices_mm, faces), axis=1) / 2
+    return areas
+
+
+def volume_mm3(vertices_mm: Array, faces: IntArray) -> float:
+    """Enclosed volume by the divergence theorem; positive where faces are outward."""
+    corners = vertices_mm[faces] - vertices_mm.mean(axis=0)
+    return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
+
+
+def refine(vertices_mm: Array, faces: IntArray, edge_mm: float) -> tuple[Array, IntArray]:
+    """Split edges until none is longer than ``edge_mm``; the shape, closedness and given vertices stay.
+
+    Longest edges go first, so that triangles do not become needles. Where that would give more than ``MOST_FACES``,
+    the edges stay longer.
+    """
+    area = float(face_areas_mm2(vertices_mm, faces).sum())
+    # Halved edges end between 1/2 and 1 of the target: a triangle then measures about a fifth of its square.
+    target = max(edge_mm, float(np.sqrt(area / (0.2 * MOST_FACES))))
+    while len(faces) < MOST_FACES:
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        unique, of_edge = np.unique(edges, axis=0, return_inverse=True)
+        lengths = np.linalg.norm(vertices_mm[unique[:, 0]] - vertices_mm[unique[:, 1]], axis=1)
+        longest = float(lengths.max())
+        if longest <= target:
+            break
+        split = lengths > max(target, 0.7 * longest)
+        middle = np.full(len(unique), -1)
+        middle[split] = len(vertices_mm) + np.arange(int(split.sum()))
+        vertices_mm = np.concatenate([vertices_mm, vertices_mm[unique[split]].mean(axis=1)])
+        faces = _split_faces(vertices_mm, faces, middle[of_edge.ravel()].reshape(-1, 3))
+    return vertices_mm, faces
+
+
+def _split_faces(vertices_mm: Array, faces: IntArray, middles: IntArray) -> IntArray:
+    """Replace faces by 1 to 4, given the new vertex on each edge (01, 12, 20), -1 where the edge is whole."""
+    count = (middles >= 0).sum(axis=1)
+    parts = [faces[count == 0]]
+
+    # One split edge: turned to be edge 01.
+    a, b, c, m, _, _ = _turned(faces, middles, count == 1, np.argmax(middles >= 0, axis=1))
+    parts += [np.stack([a, m, c], 1), np.stack([m, b, c], 1)]
+
+    # Two: turned so that the whole edge is 20; of the quadrilateral's diagonals the shorter one.
+    a, b, c, m, k, _ = _turned(faces, middles, count == 2, (np.argmin(middles, axis=1) + 1) % 3)
+    parts.append(np.stack([m, b, k], 1))
+    first = np.linalg.norm(vertices_mm[a] - vertices_mm[k], axis=1)
+    second = np.linalg.norm(vertices_mm[m] - vertices_mm[c], axis=1)
+    near = (first < second)[:, None]
+    parts.append(np.where(near, np.stack([a, m, k], 1), np.stack([a, m, c], 1)))
+    parts.append(np.where(near, np.stack([a, k, c], 1), np.stack([m, k, c], 1)))
+
+    a, b, c, m, k, j = _turned(faces, middles, count == 3, np.zeros(len(faces), dtype=np.int64))
+    parts += [np.stack(corner, 1) for corner in ((a, m, j), (m, b, k), (j, k, c), (m, k, j))]
+    return np.concatenate(parts).astype(np.int64)
+
+
+def _turned(faces: IntArray, middles: IntArray, which: BoolArray, turn: IntArray) -> tuple[IntArray, ...]:
+    order = (turn[which][:, None] + np.arange(3)) % 3
+    corners = np.take_along_axis(faces[which], order, axis=1)
+    halves = np.take_along_axis(middles[which], order, axis=1)
+    return (*corners.T, *halves.T)
+
+
+def nearest_on_surface(vertices_mm: Array, faces: IntArray, points_mm: Array) -> SurfacePoints:
+    """Nearest surface point of each of the points (k, 3)."""
+    corners = vertices_mm[faces]
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    bc = corners[:, 2] - corners[:, 1]
+    aa, bb, cc = (np.maximum((edge**2).sum(axis=1), 1e-12) for edge in (ab, ac, bc))
+    cross = (ab * ac).sum(axis=1)
+    determinant = np.maximum(aa * bb - cross**2, 1e-12 * aa * bb)
+    chosen, weights = [], []
+    for point in points_mm:
+        offset = point - a
+        along_ab, along_ac = (offset * ab).sum(axis=1), (offset * ac).sum(axis=1)
+        v = (bb * along_ab - cross * along_ac) / determinant
+        w = (aa * along_ac - cross * along_ab) / determinant
+        t_ab, t_ac = np.clip(along_ab / aa, 0, 1), np.clip(along_ac / bb, 0, 1)
+        t_bc = np.clip(((point - corners[:, 1]) * bc).sum(axis=1) / cc, 0, 1)
+        zero = np.zeros_like(v)
+        # The foot of the perpendicular where it lies inside the face, else the nearest point of the three edges.
+        outside = (v < 0) | (w < 0) | (v + w > 1)
+        inner = np.where(outside[:, None], [1.0, 0.0, 0.0], np.stack([1 - v - w, v, w], 1))
+        candidates = np.stack([
+            np.stack([1 - t_ab, t_ab, zero], 1), np.stack([1 - t_ac, zero, t_ac], 1),
+            np.stack([zero, 1 - t_bc, t_bc], 1), inner,
+        ])  # fmt: skip
+        distances = np.linalg.norm(np.einsum("cfk,fkx->cfx", candidates, corners) - point, axis=2)
+        which, face = np.unravel_index(int(np.argmin(distances)), distances.shape)
+        chosen.append(int(face))
+        weights.append(candidates[which, face])
+    index, weight = np.array(chosen, dtype=np.int64), np.array(weights).reshape(-1, 3)
+    positions = np.einsum("kc,kcx->kx", weight, vertices_mm[faces[index]])
+    return SurfacePoints(positions, index, weight, np.linalg.norm(positions - points_mm, axis=1))
+
+
+def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfacePoints, limit_mm: float) -> Array:
+    """Distance (n,) along the surface from each vertex to the nearest of the points, infinite beyond ``limit_mm``.
+
+    Dijkstra's shortest paths over the mesh edges and, across each edge, the straight line between its two opposite
+    vertices with both faces laid flat: a few per cent longer than the true geodesic, never shorter.
+    """
+    n, k = len(vertices_mm), len(points.faces)
+    edges, lengths = _edges_and_shortcuts(vertices_mm, faces)
+    to_corner = np.linalg.norm(vertices_mm[faces[points.faces]] - points.positions_mm[:, None], axis=2)
+    row = np.concatenate([edges[:, 0], n + np.repeat(np.arange(k), 3)])
+    column = np.concatenate([edges[:, 1], faces[points.faces].ravel()])
+    # A point that is a vertex has distance 0, which a sparse graph would take for no connection.
+    weight = np.maximum(np.concatenate([lengths, to_corner.ravel()]), 1e-9)
+    graph = coo_array((weight, (row, column)), shape=(n + k, n + k)).tocsr()
+    distance: Array = dijkstra(graph, directed=False, indices=n + np.arange(k), limit=limit_mm, min_only=True)
+    return distance[:n]
+
+
+def _edges_and_shortcuts(vertices_mm: Array, faces: IntArray) -> tuple[IntArray, Array]:
+    """Each edge once with its length, and each straight line across an edge that stays within its two faces."""
+    half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    opposite = faces[:, [2, 0, 1]].ravel()
+    order = np.lexsort((np.sort(half, axis=1)[:, 1], np.sort(half, axis=1)[:, 0]))
+    first, second = order[0::2], order[1::2]
+    edge = half[first]
+    start, direction = vertices_mm[edge[:, 0]], vertices_mm[edge[:, 1]] - vertices_mm[edge[:, 0]]
+    length = np.linalg.norm(direction, axis=1)
+    unit = direction / np.maximum(length, 1e-12)[:, None]
+
+    def flat(vertex: IntArray) -> tuple[Array, Array]:
+        offset = vertices_mm[vertex] - start
+        along = (offset * unit).sum(axis=1)
+        return along, np.linalg.norm(offset - along[:, None] * unit, axis=1)
+
+    p, q = opposite[first], opposite[second]
+    (along_p, height_p), (along_q, height_q) = flat(p), flat(q)
+    crossing = (along_p * height_q + along_q * height_p) / np.maximum(height_p + height_q, 1e-12)
+    inside = (crossing > 0) & (crossing < length)
+    across = np.hypot(along_p - along_q, height_p + height_q)
+    shortcuts = np.stack([p, q], 1)[inside]
+    return np.concatenate([edge, shortcuts]), np.concatenate([length, across[inside]])

@@ -1,0 +1,194 @@
+"""The chains of one run gathered into catheters, not yet named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from fluoromap.contracts import Array, Chain, Segmentation
+
+LINK_GATE_MM = 3.0
+"""A chain without a track number continues the catheter that was this near in a neighbouring frame (at the isocentre)."""
+LINK_MEMORY_FRAMES = 10
+"""How many frames back a catheter's last place is still a guide."""
+SEEN_AT_LEAST = 0.2
+"""A track in fewer of the run's frames, absent from the diastolic mean and not set by hand, is taken for a false one."""
+_NEVER = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class RunCatheter:
+    """One catheter through one run.
+
+    chains : frame -> chain. diastole : the chain that stands for diastole, valid in ``diastole_frame``.
+    votes : catheter name -> mean probability over the frames. manual_name : as set by hand, else None.
+    """
+
+    chains: dict[int, Chain]
+    diastole: Chain
+    diastole_frame: int
+    votes: dict[str, float]
+    manual_name: str | None
+
+    def centroids_uv(self) -> tuple[Array, Array]:
+        """Frames (k,) and the mean pixel (k, 2) of the electrodes that are common to all its chains."""
+        common = set.intersection(*(set(chain.electrodes) for chain in self.chains.values())) if self.chains else set()
+        frames = sorted(self.chains) if common else []
+        centroids = [
+            self.chains[f].pixels_uv[[e in common for e in self.chains[f].electrodes]].mean(axis=0) for f in frames
+        ]
+        return np.array(frames, dtype=np.float64), np.array(centroids).reshape(-1, 2)
+
+    @property
+    def motion_px(self) -> float:
+        """How far it moves through the run: RMS distance of its centroid from its mean place."""
+        _, centroids = self.centroids_uv()
+        return float(np.sqrt(centroids.var(axis=0).sum())) if len(centroids) else np.inf
+
+
+def common_electrodes(first: Chain, second: Chain) -> tuple[list[int], list[int]]:
+    """Places in each chain of the electrodes that both hold."""
+    both = [number for number in first.electrodes if number in second.electrodes]
+    return [first.electrodes.index(number) for number in both], [second.electrodes.index(number) for number in both]
+
+
+def _distance_px(first: Chain, second: Chain) -> float:
+    i, j = common_electrodes(first, second)
+    if not i:
+        return _NEVER
+    return float(np.linalg.norm(first.pixels_uv[i] - second.pixels_uv[j], axis=1).mean())
+
+
+def _assign(last: list[Chain], chains: list[Chain], gate_px: float) -> dict[int, int]:
+    """Chain index -> catheter index of those that lie within the gate, at least total distance."""
+    if not last or not chains:
+        return {}
+    cost = np.array([[_distance_px(known, chain) for chain in chains] for known in last])
+    rows, columns = linear_sum_assignment(np.minimum(cost, _NEVER))
+    return {int(c): int(r) for r, c in zip(rows, columns, strict=True) if cost[r, c] <= gate_px}
+
+
+def gather(segmentation: Segmentation, phases: Array | None, px_per_mm: float) -> tuple[RunCatheter, ...]:
+    """Gather a run's chains into catheters, by track number and, where that is missing, by nearness in time and place.
+
+    Parameters
+    ----------
+    segmentation : Segmentation
+        Of one run.
+    phases : ndarray or None
+        (n,) cardiac phase of each frame, where known: a catheter missing at diastole is taken from another beat's.
+    px_per_mm : float
+        At the isocentre.
+    """
+    centre = _diastolic_frame(segmentation)
+    groups = link_chains(segmentation, px_per_mm)
+    diastole = segmentation.diastole.chains if segmentation.diastole else ()
+    quiet: dict[int, Chain] = {}
+    keys = list(groups)
+    unlinked = []
+    for chain in diastole:
+        if chain.track >= 0:
+            quiet[chain.track] = chain
+            groups.setdefault(chain.track, {})
+        else:
+            unlinked.append(chain)
+    free = [key for key in keys if key not in quiet and groups[key]]
+    places = [groups[key][min(groups[key], key=lambda frame: abs(frame - centre))] for key in free]
+    found = _assign(places, unlinked, LINK_GATE_MM * px_per_mm)
+    for index, chain in enumerate(unlinked):
+        key = free[found[index]] if index in found else max(groups, default=-1) + 1
+        groups.setdefault(key, {})
+        quiet[key] = chain
+    averaged = set(segmentation.diastole_frames) or {centre}
+    catheters = [
+        _catheter(chains, quiet.get(key), centre, averaged, segmentation, phases)
+        for key, chains in groups.items()
+        if key in quiet
+        or len(chains) >= SEEN_AT_LEAST * len(segmentation.frames)
+        or any(chain.manual for chain in chains.values())
+    ]
+    return tuple(catheters)
+
+
+def _diastolic_frame(segmentation: Segmentation) -> int:
+    if segmentation.diastole is not None:
+        return segmentation.diastole.frame
+    # Where nothing was averaged, the quietest of the frames that show most stands for diastole.
+    seen = np.array([len(entry.chains) for entry in segmentation.frames])
+    return int(np.lexsort((segmentation.motion, -seen))[0])
+
+
+def _catheter(
+    chains: dict[int, Chain],
+    mean_chain: Chain | None,
+    centre: int,
+    averaged: set[int],
+    segmentation: Segmentation,
+    phases: Array | None,
+) -> RunCatheter:
+    frames = sorted(chains)
+    marked = [frame for frame in frames if chains[frame].manual]
+    at_hand = [frame for frame in marked if frame in averaged]
+    if at_hand:
+        frame = min(at_hand, key=lambda f: abs(f - centre))
+        chosen = chains[frame]
+    elif mean_chain is not None:
+        frame, chosen = centre, mean_chain
+    else:
+        frame = min(marked or frames, key=lambda f: (*_from_diastole(f, centre, averaged, phases), segmentation.motion[f]))
+        chosen = chains[frame]
+    weighted = [(chain, 1.0) for chain in chains.values()]
+    if mean_chain is not None:
+        weighted.append((mean_chain, float(max(1, len(segmentation.diastole_frames)))))
+    total = sum(weight for _, weight in weighted)
+    votes: dict[str, float] = {}
+    for chain, weight in weighted:
+        for name, probability in chain.kinds:
+            votes[name] = votes.get(name, 0.0) + probability * weight / total
+    names = [chain.kinds[0][0] for chain, _ in weighted if chain.manual and chain.kinds]
+    manual_name = max(sorted(set(names)), key=names.count) if names else None
+    return RunCatheter(chains, chosen, frame, votes, manual_name)
+
+
+def _from_diastole(frame: int, centre: int, averaged: set[int], phases: Array | None) -> tuple[float, float]:
+    """How far a frame is from diastole: first by phase, then by time; the averaged frames come first."""
+    if frame in averaged:
+        return 0.0, abs(frame - centre)
+    if phases is None:
+        return 1.0, abs(frame - centre)
+    apart = abs(phases[frame] - phases[centre]) % 1.0
+    return float(round(min(apart, 1 - apart), 2)), abs(frame - centre)
+
+
+def link_chains(segmentation: Segmentation, px_per_mm: float) -> dict[int, dict[int, Chain]]:
+    """Key -> frame -> chain: track numbers as the segmenter gave them, chains without one joined to the nearest.
+
+    Runs from the diastolic frame outwards, so that a catheter is met first where it moves least.
+    """
+    groups: dict[int, dict[int, Chain]] = {}
+    for entry in segmentation.frames:
+        for chain in entry.chains:
+            if chain.track >= 0:
+                groups.setdefault(chain.track, {})[entry.frame] = chain
+    gate_px = LINK_GATE_MM * px_per_mm
+    centre = _diastolic_frame(segmentation)
+    order = [*range(centre, len(segmentation.frames)), *range(centre - 1, -1, -1)]
+    for frame in order:
+        loose = [chain for chain in segmentation.frames[frame].chains if chain.track < 0]
+        if not loose:
+            continue
+        near: dict[int, Chain] = {}
+        for key, chains in groups.items():
+            if frame in chains:
+                continue
+            closest = min(chains, key=lambda known: abs(known - frame))
+            if abs(closest - frame) <= LINK_MEMORY_FRAMES:
+                near[key] = chains[closest]
+        keys = list(near)
+        found = _assign(list(near.values()), loose, gate_px)
+        for index, chain in enumerate(loose):
+            key = keys[found[index]] if index in found else max(groups, default=-1) + 1
+            groups.setdefault(key, {})[frame] = chain
+    return groups

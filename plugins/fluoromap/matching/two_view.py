@@ -1,0 +1,77 @@
+"""Geometry of two views: the epipolar constraint and the paper's four projection equations."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fluoromap.contracts import Array
+from fluoromap.geometry import Camera
+
+PARALLEL_BELOW_DEG = 20.0
+"""Views whose central rays are closer than this cannot tell depth."""
+
+
+def fundamental_matrix(camera_a: Camera, camera_b: Camera) -> Array:
+    """The 3x3 matrix F with ``(u_b, v_b, 1) F (u_a, v_a, 1)' = 0`` for the same point in both views.
+
+    References
+    ----------
+    Hartley & Zisserman, Multiple View Geometry, 2nd ed., eq. (9.1): ``F = [e_b]x M_b M_a^+``.
+    """
+    e1, e2, e3 = camera_b.matrix @ np.append(camera_a.source_world_mm, 1.0)
+    cross = np.array([[0.0, -e3, e2], [e3, 0.0, -e1], [-e2, e1, 0.0]])
+    fundamental: Array = cross @ camera_b.matrix @ np.linalg.pinv(camera_a.matrix)
+    return fundamental
+
+
+def signed_epipolar_px(camera_a: Camera, camera_b: Camera, pixels_a: ArrayLike, pixels_b: ArrayLike) -> Array:
+    """Signed distance in view b of each point from the epipolar line of its partner in view a.
+
+    Parameters
+    ----------
+    pixels_a, pixels_b : array_like, shape (..., 2)
+        The same electrodes (u, v) in the two views.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Pixels of view b; the sign is the same for the same direction across the lines.
+    """
+    fundamental = fundamental_matrix(camera_a, camera_b)
+    a, b = np.asarray(pixels_a, dtype=np.float64), np.asarray(pixels_b, dtype=np.float64)
+    lines = a @ fundamental[:, :2].T + fundamental[:, 2]
+    distances: Array = ((lines[..., :2] * b).sum(axis=-1) + lines[..., 2]) / np.hypot(lines[..., 0], lines[..., 1])
+    return distances
+
+
+def triangulate_linear(camera_a: Camera, camera_b: Camera, pixels_a: ArrayLike, pixels_b: ArrayLike) -> Array:
+    """Points from the paper's four projection equations (8) of two views, by linear least squares.
+
+    Each view gives ``(u m_3 - m_1) X = m_14 - u m_34`` and the same for v: four equations, three unknowns.
+
+    Parameters
+    ----------
+    pixels_a, pixels_b : array_like, shape (N, 2)
+        The same N electrodes (u, v) in the two views.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        World, mm.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        When the views coincide.
+    """
+    rows = []
+    for camera, pixels in ((camera_a, pixels_a), (camera_b, pixels_b)):
+        uv = np.asarray(pixels, dtype=np.float64)
+        rows.append(uv[:, :, None] * camera.matrix[2] - camera.matrix[:2])
+    equations = np.concatenate(rows, axis=1)
+    unknowns, known = equations[..., :3], -equations[..., 3:]
+    # QR keeps the condition number of the equations; normal equations would square it at small angles.
+    q, r = np.linalg.qr(unknowns)
+    points: Array = np.linalg.solve(r, q.swapaxes(1, 2) @ known)[..., 0]
+    return points

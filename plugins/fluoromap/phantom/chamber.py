@@ -1,0 +1,125 @@
+"""The left ventricle at diastole: an ellipsoid, the focus on its wall and how activation spreads along the wall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_LEVELS = 6
+_SWEEPS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Chamber:
+    """Endocardial wall of the ventricle at diastole, between breaths; millimetres along LPS axes from the isocentre.
+
+    Parameters
+    ----------
+    centre_mm : ndarray, shape (3,)
+    axes : ndarray, shape (3, 3)
+        Rows are unit vectors: two across the ventricle (the first towards the right ventricle), the third from base to apex.
+    semi_axes_mm : ndarray, shape (3,)
+        Lengths along the rows of ``axes``.
+    focus_mm : ndarray, shape (3,)
+        Where activation starts, on the wall.
+    conduction_mm_per_ms : float
+        Speed along the wall, the same everywhere; 1 mm/ms is 1 m/s.
+    reference_ms : float
+        When the reference catheter is activated, after the focus: the zero of activation times.
+    """
+
+    centre_mm: Array
+    axes: Array
+    semi_axes_mm: Array
+    focus_mm: Array
+    conduction_mm_per_ms: float
+    reference_ms: float
+
+    @property
+    def volume_ml(self) -> float:
+        return float(4 / 3 * np.pi * np.prod(self.semi_axes_mm) / 1000)
+
+    def level(self, points_mm: ArrayLike) -> Array:
+        """1 on the wall, less inside, for points ``(..., 3)``; shape (...)."""
+        unit = self._to_sphere(points_mm)
+        return np.asarray(np.linalg.norm(unit, axis=-1))
+
+    def on_wall(self, points_mm: ArrayLike) -> Array:
+        """Points ``(..., 3)`` moved along the line through the chamber's centre onto the wall."""
+        unit = self._to_sphere(points_mm)
+        return self._from_sphere(unit / np.linalg.norm(unit, axis=-1, keepdims=True))
+
+    def inward(self, points_mm: ArrayLike) -> Array:
+        """Unit normals of the wall at points ``(..., 3)`` on it, into the blood."""
+        normal = -(self._to_sphere(points_mm) / self.semi_axes_mm) @ self.axes
+        unit: Array = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        return unit
+
+    def wall_distance_mm(self, points_mm: ArrayLike) -> Array:
+        """Length of the shortest way along the wall from the focus to points ``(..., 3)`` on the wall, shape (...).
+
+        The way starts as the arc of a great circle and is pulled tight: every point moves to the middle of its
+        neighbours and back to the wall, on ever finer polylines.
+        """
+        ends = self._to_sphere(points_mm)
+        ends = ends / np.linalg.norm(ends, axis=-1, keepdims=True)
+        start = np.broadcast_to(self._to_sphere(self.focus_mm), ends.shape)
+        way = np.stack([start, ends])
+        for _ in range(_LEVELS):
+            finer = np.empty((2 * len(way) - 1, *way.shape[1:]))
+            # A point exactly opposite the focus has no middle; any direction will do.
+            finer[::2], finer[1::2] = way, _unit(way[1:] + way[:-1] + 1e-9)
+            way = finer
+            for _ in range(_SWEEPS):
+                for first in (1, 2):
+                    way[first:-1:2] = self._pulled(way[first - 1 : -2 : 2], way[first:-1:2], way[first + 1 :: 2])
+        steps = np.diff(way * self.semi_axes_mm, axis=0)
+        length: Array = np.linalg.norm(steps, axis=-1).sum(axis=0)
+        return length
+
+    def activation_ms(self, points_mm: ArrayLike) -> Array:
+        """Activation time of wall points ``(..., 3)`` relative to the reference catheter, without noise; may be negative."""
+        times: Array = self.wall_distance_mm(points_mm) / self.conduction_mm_per_ms - self.reference_ms
+        return times
+
+    def _pulled(self, before: Array, points: Array, after: Array) -> Array:
+        """Points of the unit sphere that stands for the wall, moved along the wall to the middle of their neighbours."""
+        pull = ((before + after) / 2 - points) * self.semi_axes_mm
+        normal = _unit(points / self.semi_axes_mm)
+        pull -= (pull * normal).sum(axis=-1, keepdims=True) * normal
+        return _unit(points + pull / self.semi_axes_mm)
+
+    def _to_sphere(self, points_mm: ArrayLike) -> Array:
+        points = np.asarray(points_mm, dtype=np.float64)
+        local: Array = ((points - self.centre_mm) @ self.axes.T) / self.semi_axes_mm
+        return local
+
+    def _from_sphere(self, unit: Array) -> Array:
+        points: Array = (unit * self.semi_axes_mm) @ self.axes + self.centre_mm
+        return points
+
+
+def _unit(vectors: Array) -> Array:
+    unit: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit
+
+
+def spread_over_wall(chamber: Chamber, count: int, rng: np.random.Generator) -> Array:
+    """``count`` wall points far from each other, apex and basal ring included, in random order; shape (count, 3).
+
+    The valve plane leaves the basal quarter of the ellipsoid without wall. Each next point is the one of 1500 random
+    candidates that lies farthest from those chosen.
+    """
+    candidates = chamber._from_sphere(_unit(rng.normal(size=(6000, 3))))
+    height = (candidates - chamber.centre_mm) @ chamber.axes[2] / chamber.semi_axes_mm[2]
+    candidates = candidates[(height > -0.55) & (height < 0.97)][:1500]
+    chosen = [int(rng.integers(len(candidates)))]
+    nearest = np.linalg.norm(candidates - candidates[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(candidates - candidates[chosen[-1]], axis=1))
+    return np.asarray(candidates[rng.permutation(chosen)])

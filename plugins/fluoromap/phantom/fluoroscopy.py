@@ -1,0 +1,140 @@
+"""The imaging chain: from centre lines of catheters and a torso to stored pixels."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.geometry import Camera
+from fluoromap.phantom import kernels
+from fluoromap.phantom.appearance import Appearance
+from fluoromap.phantom.shaft import Shaft, arc_lengths_mm
+from fluoromap.phantom.torso import Torso
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+BITS_STORED = 12
+MEAN_GREY = 1400.0
+DETECTOR_BLUR_PX = 0.75
+ELECTRONIC_NOISE = 1.5
+# Where the shaft points nearly along the ray its line integral is cut: no real catheter runs straight at the detector.
+_LEAST_SIN2 = 0.12
+
+
+class RenderedFrames:
+    """Frames of one run, rendered when asked for; frame ``i`` is the same in whatever order frames are asked for.
+
+    Holds a way to make images and nothing about what is in them.
+    """
+
+    def __init__(self, shape: tuple[int, int], count: int, render: Callable[[int], NDArray[np.uint16]]) -> None:
+        self._shape = shape
+        self._count = count
+        self._render = render
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self._shape
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> NDArray[np.uint16]:
+        """Stored pixels of frame ``index`` (from 0; negative from the end), shape (rows, columns), 12 bits in 16.
+
+        Raises
+        ------
+        IndexError
+            When the run has no such frame.
+        """
+        if not -self._count <= index < self._count:
+            raise IndexError(f"the run has {self._count} frames, not a frame {index}")
+        return self._render(index % self._count)
+
+    def __iter__(self) -> Iterator[NDArray[np.uint16]]:
+        for index in range(self._count):
+            yield self._render(index)
+
+
+def transmission(
+    camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Array], appearance: Appearance
+) -> Image:
+    """Share of primary photons the catheters let through, shape (rows, columns).
+
+    Parameters
+    ----------
+    camera : Camera
+        The view as it truly is.
+    shafts : sequence of Shaft
+    lines_mm : sequence of ndarray, shape (t, k, 3)
+        Each catheter's centre line at the ``t`` instants of one exposure, which are averaged.
+    appearance : Appearance
+    """
+    ss = kernels.SUPERSAMPLING
+    rows, columns = camera.rows, camera.columns
+    thickness = np.zeros((rows * ss, columns * ss), np.float32)
+    touched = np.zeros((rows, columns), np.uint8)
+    absorbed = np.zeros((rows, columns), np.float32)
+    instants = len(lines_mm[0])
+    drawn = [_drawn(camera, lines) for lines in lines_mm]
+    for instant in range(instants):
+        for shaft, lines in zip(shafts, drawn, strict=True):
+            kernels.add_tube(
+                thickness,
+                touched,
+                lines[instant],
+                shaft.bands_mm.astype(np.float32),
+                shaft.radius_mm,
+                shaft.solid_tip,
+                np.float32(appearance.platinum_per_mm),
+                appearance.shaft,
+            )
+        kernels.absorb(thickness, touched, absorbed, 1 / instants)
+    return 1 - absorbed
+
+
+def _drawn(camera: Camera, lines_mm: Array) -> Image:
+    """Centre lines (t, k, 3) as the kernel takes them: u, v, arc length, px per mm, 1/sin and cot to the ray; (t, k, 6)."""
+    pixels = camera.project(lines_mm)
+    depth = camera.depth_mm(lines_mm)
+    px_per_mm = camera.px_per_mm * float(camera.depth_mm(np.zeros(3))) / depth
+    tangents = np.gradient(lines_mm, axis=1)
+    rays = lines_mm - camera.source_world_mm
+    cosine = (tangents * rays).sum(axis=2) / (np.linalg.norm(tangents, axis=2) * np.linalg.norm(rays, axis=2))
+    sin2 = np.maximum(1 - cosine**2, _LEAST_SIN2)
+    aslant = np.sqrt((1 - sin2) / sin2)
+    parts = [pixels[..., 0], pixels[..., 1], arc_lengths_mm(lines_mm), px_per_mm, 1 / np.sqrt(sin2), aslant]
+    return np.stack(parts, axis=2).astype(np.float32)
+
+
+def expected_photons(torso: Torso, passed: Image, appearance: Appearance, dose: float) -> Image:
+    """Mean photon count of each pixel, shape (rows, columns), for the share ``passed`` the catheters let through."""
+    photons: Image = (torso.primary * passed + torso.scatter) * np.float32(appearance.photons * dose)
+    return photons
+
+
+def detect(expected: Image, photons_at_mean: float, key: int) -> NDArray[np.uint16]:
+    """The stored image of an exposure: photons are counted, blurred by the detector, read out with noise and rounded.
+
+    The gain brings ``photons_at_mean`` to the same grey level at any dose, as a system's exposure control does.
+    ``key`` : 64 bits that name the exposure; the same key gives the same noise.
+    """
+    photons, electronic = np.empty_like(expected), np.empty_like(expected)
+    kernels.count_photons(expected, np.uint64(key), ELECTRONIC_NOISE, photons, electronic)
+    image = np.empty(expected.shape, np.uint16)
+    gain = MEAN_GREY / photons_at_mean
+    kernels.read_out(photons, electronic, _blur_taps(), gain, (1 << BITS_STORED) - 1, image)
+    return image
+
+
+@functools.cache
+def _blur_taps() -> Image:
+    offsets = np.arange(4)
+    taps = np.exp(-0.5 * (offsets / DETECTOR_BLUR_PX) ** 2)
+    taps /= taps[0] + 2 * taps[1:].sum()
+    return taps.astype(np.float32)

@@ -1,0 +1,202 @@
+"""Compiled inner loops: the shadow of a catheter, photon counting and the detector's blur."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+
+SUPERSAMPLING = 2
+WALL = 0.86
+"""Inner over outer radius of a platinum ring: a wall of 14 %."""
+SOLID_TIP = 0.9
+"""Share of metal in an ablation tip."""
+_BRAID = 2.0
+_EXACT_BELOW = 30.0
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def add_tube(
+    thickness: Image,
+    touched: NDArray[np.uint8],
+    line: Image,
+    bands: Image,
+    radius_mm: float,
+    solid_tip: bool,
+    platinum_per_mm: float,
+    shaft: float,
+) -> None:
+    """Add a catheter's attenuation to ``thickness`` (rows x columns, each pixel SUPERSAMPLING squared samples).
+
+    ``line`` : (k, 6) points of the centre line from the tip on: u, v (pixels), arc length (mm), pixels per mm, 1/sin and
+    cot of the angle between shaft and ray. ``bands`` : (electrodes, 2) arc lengths. ``touched`` (rows, columns) is set
+    where something was added. Between two points the line owns the samples ahead of the bisector at the one and behind
+    the bisector at the other, so that none is counted twice in a bend.
+    """
+    rows, columns = touched.shape
+    ss = SUPERSAMPLING
+    step = np.float32(1.0 / ss)
+    count = line.shape[0]
+    outer2 = np.float32(radius_mm * radius_mm)
+    radius = np.float32(radius_mm)
+    wall2 = np.float32(WALL * WALL)
+    solid_shaft = np.float32(shaft / (1.0 + _BRAID * (1.0 - WALL)) / (2.0 * radius_mm))
+    for k in range(count - 1):
+        u0, v0, u1, v1 = line[k, 0], line[k, 1], line[k + 1, 0], line[k + 1, 1]
+        reach = radius * line[k, 3] + np.float32(1.0)
+        left, right = min(u0, u1) - reach, max(u0, u1) + reach
+        upper, lower = min(v0, v1) - reach, max(v0, v1) + reach
+        if right < -0.5 or lower < -0.5 or left > columns - 0.5 or upper > rows - 0.5:
+            continue
+        before, beyond = max(k - 1, 0), min(k + 2, count - 1)
+        du0, dv0 = u1 - line[before, 0], v1 - line[before, 1]
+        du1, dv1 = line[beyond, 0] - u0, line[beyond, 1] - v0
+        px_per_mm, s0, s1 = line[k, 3], line[k, 2], line[k + 1, 2]
+        inv_sin, cot = line[k, 4], line[k, 5]
+        i_from, i_to = max(int(math.floor(upper)), 0), min(int(math.ceil(lower)), rows - 1)
+        j_from, j_to = max(int(math.floor(left)), 0), min(int(math.ceil(right)), columns - 1)
+        for i in range(i_from * ss, (i_to + 1) * ss):
+            v = (np.float32(i) + np.float32(0.5)) * step - np.float32(0.5)
+            for j in range(j_from * ss, (j_to + 1) * ss):
+                u = (np.float32(j) + np.float32(0.5)) * step - np.float32(0.5)
+                ahead = (u - u0) * du0 + (v - v0) * dv0
+                behind = (u - u1) * du1 + (v - v1) * dv1
+                if ahead < 0 or behind >= 0:
+                    continue
+                part = ahead / (ahead - behind)
+                qu, qv = u - (u0 + part * (u1 - u0)), v - (v0 + part * (v1 - v0))
+                off2 = (qu * qu + qv * qv) / (px_per_mm * px_per_mm)
+                along = s0 + part * (s1 - s0)
+                edge2 = outer2
+                if along < radius:
+                    edge2 = outer2 - (radius - along) * (radius - along)
+                if off2 >= edge2:
+                    continue
+                half = math.sqrt(edge2 - off2)
+                hollow = math.sqrt(max(wall2 * edge2 - off2, np.float32(0.0)))
+                chord = 2 * half * inv_sin
+                shell = 2 * (half - hollow) * inv_sin
+                # A ray that meets the shaft aslant leaves its front wall nearer the tip than it enters the back one.
+                front, back = along - half * cot, along + half * cot
+                ring = np.float32(0.0)
+                for e in range(bands.shape[0]):
+                    if e == 0 and solid_tip:
+                        inside = min(back, bands[0, 1]) - max(front, bands[0, 0])
+                        if inside >= 0:
+                            whole = max(back - front, np.float32(1e-6))
+                            share = min(max(inside, np.float32(1e-6)) / whole, np.float32(1.0))
+                            ring += share * chord * SOLID_TIP / max(shell, np.float32(1e-6))
+                        continue
+                    if bands[e, 0] <= front < bands[e, 1]:
+                        ring += np.float32(0.5)
+                    if bands[e, 0] <= back < bands[e, 1]:
+                        ring += np.float32(0.5)
+                bare = max(np.float32(0.0), np.float32(1.0) - ring)
+                thickness[i, j] += (
+                    platinum_per_mm * shell * ring + bare * solid_shaft * (chord + np.float32(_BRAID) * shell)
+                )
+                touched[i // ss, j // ss] = 1
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def absorb(thickness: Image, touched: NDArray[np.uint8], absorbed: Image, weight: float) -> None:
+    """Add ``weight`` times the absorbed share of each touched pixel to ``absorbed``; clear ``thickness`` and ``touched``."""
+    rows, columns = touched.shape
+    ss = SUPERSAMPLING
+    share = np.float32(1.0 / (ss * ss))
+    w = np.float32(weight)
+    for i in range(rows):
+        for j in range(columns):
+            if touched[i, j] == 0:
+                continue
+            touched[i, j] = 0
+            passed = np.float32(0.0)
+            for a in range(i * ss, (i + 1) * ss):
+                for b in range(j * ss, (j + 1) * ss):
+                    passed += math.exp(-thickness[a, b])
+                    thickness[a, b] = 0
+            absorbed[i, j] += w * (np.float32(1.0) - passed * share)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mixed(state: np.uint64) -> np.uint64:
+    """64 random bits from a counter (SplitMix64, Steele, Lea and Flood 2014)."""
+    z = state * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def count_photons(expected: Image, key: np.uint64, noise: float, photons: Image, electronic: Image) -> None:
+    """Poisson counts of mean ``expected`` and normal noise of standard deviation ``noise``, pixel by pixel.
+
+    Below a mean of 30 by inversion, exactly; above by the Cornish-Fisher expansion of the Poisson quantile, which has
+    its mean, variance and skewness. A pixel's numbers depend on ``key`` and its place alone.
+    """
+    rows, columns = expected.shape
+    to_unit = np.float32(2.0**-24)
+    for i in range(rows):
+        for j in range(columns):
+            bits = _mixed(key + np.uint64(2 * (i * columns + j)))
+            first = (np.float32(bits >> np.uint64(40)) + np.float32(0.5)) * to_unit
+            second = np.float32((bits >> np.uint64(16)) & np.uint64(0xFFFFFF)) * to_unit
+            size = math.sqrt(np.float32(-2.0) * math.log(first))
+            angle = np.float32(2 * math.pi) * second
+            electronic[i, j] = np.float32(noise) * size * math.sin(angle)
+            mean = expected[i, j]
+            if mean < np.float32(_EXACT_BELOW):
+                left = np.float64(_mixed(key + np.uint64(2 * (i * columns + j) + 1)) >> np.uint64(11)) * 2.0**-53
+                probability = math.exp(-np.float64(mean))
+                n = 0
+                while left > probability and n < 200:
+                    left -= probability
+                    n += 1
+                    probability *= np.float64(mean) / n
+                photons[i, j] = np.float32(n)
+            else:
+                z = size * math.cos(angle)
+                # Rounding adds 1/12 to the variance.
+                spread = math.sqrt(mean - np.float32(1.0 / 12.0))
+                value = mean + spread * z + (z * z - 1) / 6 + (z - z * z * z) / (72 * spread)
+                photons[i, j] = math.floor(value + np.float32(0.5))
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def read_out(
+    photons: Image, electronic: Image, taps: Image, gain: float, top: int, image: NDArray[np.uint16]
+) -> None:
+    """Blur ``photons`` by ``taps`` (centre first) in both directions, edges reflected, add ``electronic``, scale, round."""
+    rows, columns = photons.shape
+    reach = taps.shape[0] - 1
+    across = np.empty((rows, columns), np.float32)
+    padded = np.empty(columns + 2 * reach, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            padded[reach + j] = photons[i, j]
+        for k in range(reach):
+            padded[reach - 1 - k] = photons[i, k]
+            padded[reach + columns + k] = photons[i, columns - 1 - k]
+        for j in range(columns):
+            total = taps[0] * padded[reach + j]
+            for k in range(1, reach + 1):
+                total += taps[k] * (padded[reach + j - k] + padded[reach + j + k])
+            across[i, j] = total
+    factor = np.float32(gain)
+    limit = np.float32(top)
+    total_row = np.empty(columns, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            total_row[j] = taps[0] * across[i, j] + electronic[i, j]
+        for k in range(1, reach + 1):
+            above, below = i - k, i + k
+            above = above if above >= 0 else -1 - above
+            below = below if below < rows else 2 * rows - 1 - below
+            for j in range(columns):
+                total_row[j] += taps[k] * (across[above, j] + across[below, j])
+        for j in range(columns):
+            image[i, j] = np.uint16(min(max(total_row[j] * factor + np.float32(0.5), np.float32(0.0)), limit))

@@ -1,0 +1,197 @@
+"""What the service keeps of one DICOM instance: a run's geometry, timing and pixels, nothing of the patient."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, Literal
+
+from fluoromap.contracts import PixelFacts, Shutter
+from fluoromap.geometry.gantry import ImageAxes
+
+Plane = Literal["single", "A", "B"]
+Pair = tuple[float, float]
+
+_UID = re.compile(r"[0-9]+(\.[0-9]+)*")
+
+
+class HeaderWarning(StrEnum):
+    """What in a header is odd but can be lived with. ``sentence`` tells it to a PACS engineer."""
+
+    FRAME_TIME_ASSUMED = "frame_time_assumed"
+    PIXEL_SPACING_FROM_FIELD_OF_VIEW = "pixel_spacing_from_field_of_view"
+    PIXEL_SPACING_FROM_INTENSIFIER = "pixel_spacing_from_intensifier"
+    SOURCE_ISOCENTRE_FROM_MAGNIFICATION = "source_isocentre_from_magnification"
+    GEOMETRY_IMPLAUSIBLE = "geometry_implausible"
+    ORIENTATION_CONFLICT = "orientation_conflict"
+    ORIENTATION_UNUSABLE = "orientation_unusable"
+    POSITIONER_MOVED = "positioner_moved"
+    TABLE_MOVED = "table_moved"
+    PIXEL_INTENSITY_UNKNOWN = "pixel_intensity_unknown"
+    BITS_STORED_EXCEEDED = "bits_stored_exceeded"
+    PIXEL_DATA_LONGER = "pixel_data_longer"
+    SHUTTER_IGNORED = "shutter_ignored"
+    R_WAVES_IGNORED = "r_waves_ignored"
+
+    @property
+    def sentence(self) -> str:
+        return _SENTENCES[self]
+
+
+_SENTENCES: dict[HeaderWarning, str] = {
+    HeaderWarning.FRAME_TIME_ASSUMED: "The header tells no frame rate; 15 frames a second are assumed.",
+    HeaderWarning.PIXEL_SPACING_FROM_FIELD_OF_VIEW: (
+        "ImagerPixelSpacing is missing; FieldOfViewDimensions divided by the matrix size is used."
+    ),
+    HeaderWarning.PIXEL_SPACING_FROM_INTENSIFIER: (
+        "ImagerPixelSpacing is missing; IntensifierSize divided by the matrix size is used."
+    ),
+    HeaderWarning.SOURCE_ISOCENTRE_FROM_MAGNIFICATION: (
+        "DistanceSourceToPatient is missing; it was computed from EstimatedRadiographicMagnificationFactor."
+    ),
+    HeaderWarning.GEOMETRY_IMPLAUSIBLE: "A geometry attribute holds what no C-arm can do; it counts as missing.",
+    HeaderWarning.ORIENTATION_CONFLICT: (
+        "PatientOrientation contradicts FieldOfViewRotation or FieldOfViewHorizontalFlip; the field of view is believed."
+    ),
+    HeaderWarning.ORIENTATION_UNUSABLE: (
+        "PatientOrientation or the field of view's rotation does not fit the gantry angles; an upright image is assumed."
+    ),
+    HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; only its first position is used.",
+    HeaderWarning.TABLE_MOVED: "The table moved during this run.",
+    HeaderWarning.PIXEL_INTENSITY_UNKNOWN: (
+        "PixelIntensityRelationship is missing; the pixels are taken as prepared for display."
+    ),
+    HeaderWarning.BITS_STORED_EXCEEDED: "The pixels use more bits than BitsStored tells; the larger number is used.",
+    HeaderWarning.PIXEL_DATA_LONGER: "There is more pixel data than NumberOfFrames tells; the rest is ignored.",
+    HeaderWarning.SHUTTER_IGNORED: "A shutter or collimator attribute makes no sense and is ignored.",
+    HeaderWarning.R_WAVES_IGNORED: "RWavePointer names frames that do not exist; those are ignored.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class InstanceFacts:
+    """One run as its file describes it.
+
+    Parameters
+    ----------
+    sop_class_uid, sop_instance_uid, study_instance_uid, series_instance_uid : str
+    series_number : int or None
+    frames, rows, columns : int
+    transfer_syntax : str
+        UID of the pixel data's encoding.
+    frame_times_ms : tuple of float
+        Time of each frame from the first on, never falling.
+    frame_time_ms : float
+        Mean interval; 0 for a single frame.
+    acquired : datetime or None
+        Start of the run, UTC. A clock time without zone in the file is taken as UTC: it orders runs, no more.
+    plane : {"single", "A", "B"}
+        Plane of a biplane system.
+    primary_deg, secondary_deg, source_detector_mm, source_isocentre_mm, pixel_spacing_mm
+        Gantry values as in :class:`fluoromap.geometry.Gantry`; None where the header does not tell.
+    image_axes : ImageAxes
+        Upright to stored offsets, as in :class:`fluoromap.geometry.Gantry`.
+    patient_orientation : tuple of str or None
+        PatientOrientation's row and column direction, for :func:`image_axes_from_orientation` once angles are known.
+    table_mm : tuple of float or None
+        Table top (lateral, longitudinal, vertical) in the machine's own frame: only differences between runs mean anything.
+    pixels : PixelFacts
+    window : tuple of float or None
+        The file's display window (centre, width) in stored values.
+    r_wave_frames : tuple of int
+        Frames of R waves, from 0.
+    missing : tuple of str
+        DICOM keywords of gantry values that neither the header nor a substitute told.
+    warnings : tuple of HeaderWarning
+
+    Raises
+    ------
+    ValueError
+        When the numbers contradict each other.
+    """
+
+    sop_class_uid: str
+    sop_instance_uid: str
+    study_instance_uid: str
+    series_instance_uid: str
+    series_number: int | None
+    frames: int
+    rows: int
+    columns: int
+    transfer_syntax: str
+    frame_times_ms: tuple[float, ...]
+    frame_time_ms: float
+    acquired: datetime | None
+    plane: Plane
+    primary_deg: float | None
+    secondary_deg: float | None
+    source_detector_mm: float | None
+    source_isocentre_mm: float | None
+    pixel_spacing_mm: Pair | None
+    image_axes: ImageAxes
+    patient_orientation: tuple[str, str] | None
+    table_mm: tuple[float, float, float] | None
+    pixels: PixelFacts
+    window: Pair | None
+    r_wave_frames: tuple[int, ...]
+    missing: tuple[str, ...]
+    warnings: tuple[HeaderWarning, ...]
+
+    def __post_init__(self) -> None:
+        uids = (self.sop_class_uid, self.sop_instance_uid, self.study_instance_uid, self.series_instance_uid)
+        if not all(is_uid(uid) for uid in uids):
+            raise ValueError("an instance needs valid UIDs")
+        if min(self.frames, self.rows, self.columns) < 1:
+            raise ValueError("a run has at least one frame of at least one pixel")
+        times = self.frame_times_ms
+        if len(times) != self.frames or any(later < earlier for earlier, later in zip(times, times[1:], strict=False)):
+            raise ValueError("frame_times_ms needs one time a frame, never falling")
+        if self.acquired is not None and self.acquired.utcoffset() is None:
+            raise ValueError("acquired needs a time zone")
+        if not all(0 <= frame < self.frames for frame in self.r_wave_frames):
+            raise ValueError("r_wave_frames must be frames of the run")
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields as JSON types; :meth:`from_json` takes it back."""
+        value = dataclasses.asdict(self)
+        value["acquired"] = self.acquired.isoformat() if self.acquired else None
+        value["warnings"] = [str(warning) for warning in self.warnings]
+        listed: dict[str, Any] = _lists(value)
+        return listed
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> InstanceFacts:
+        """The instance that :meth:`to_json` wrote."""
+        fields: dict[str, Any] = {key: _tuples(item) for key, item in value.items()}
+        pixels = dict(fields["pixels"])
+        shutter = pixels["shutter"]
+        pixels["shutter"] = Shutter(**shutter) if shutter else None
+        acquired = fields["acquired"]
+        return cls(
+            **fields
+            | {
+                "pixels": PixelFacts(**pixels),
+                "acquired": datetime.fromisoformat(acquired) if acquired else None,
+                "warnings": tuple(HeaderWarning(code) for code in fields["warnings"]),
+            }
+        )
+
+
+def is_uid(value: str) -> bool:
+    """Whether ``value`` is a UID of PS3.5 section 9.1 (leading zeros are let pass: real systems write them)."""
+    return len(value) <= 64 and _UID.fullmatch(value) is not None
+
+
+def _lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _lists(item) for key, item in value.items()}
+    return [_lists(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value

@@ -1,0 +1,119 @@
+"""How the stored image lies: flips and quarter turns, from the header and into it.
+
+An image is upright when a frontal view shows the patient's left on its right and the head on top (SCIENCE: e_u, e_v);
+``image_axes`` takes offsets (u, v) of that image to offsets of the stored one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
+
+Array = NDArray[np.float64]
+
+_LETTERS = {"L": (0, 1), "R": (0, -1), "P": (1, 1), "A": (1, -1), "H": (2, 1), "F": (2, -1)}
+# A direction is named by its main letter and those of further axes it leans to by more than about 12 degrees.
+_LEAN = 0.2
+# PatientOrientation names directions to within about 30 degrees in each axis.
+_AGREEMENT = 0.6
+
+_TURN: Array = np.array([[0, -1], [1, 0]], dtype=np.float64)
+_FLIP: Array = np.array([[-1, 0], [0, 1]], dtype=np.float64)
+
+
+def upright_axes_world(primary_deg: float, secondary_deg: float) -> Array:
+    """Directions of +u and +v of the upright image in the world (LPS), shape (2, 3)."""
+    a, b = math.radians(primary_deg), math.radians(secondary_deg)
+    return np.array(
+        [
+            [math.cos(a), math.sin(a), 0.0],
+            [math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b)],
+        ]
+    )
+
+
+def image_axes_from_field_of_view(rotation_deg: float, flipped: bool) -> ImageAxes | None:
+    """FieldOfViewRotation (0018,7032), clockwise, then FieldOfViewHorizontalFlip (0018,7034).
+
+    PS3.3 C.8.11.4. None when the rotation is no quarter turn: such an image has no pixel axes of its own.
+    """
+    turns = rotation_deg / 90
+    if turns != round(turns):
+        return None
+    axes = np.linalg.matrix_power(_TURN, round(turns) % 4)
+    return _as_axes(_FLIP @ axes if flipped else axes)
+
+
+def field_of_view_of(image_axes: ImageAxes) -> tuple[int, bool]:
+    """(FieldOfViewRotation, FieldOfViewHorizontalFlip) that mean ``image_axes``."""
+    for turns, flipped in itertools.product(range(4), (False, True)):
+        if image_axes_from_field_of_view(90.0 * turns, flipped) == image_axes:
+            return 90 * turns, flipped
+    raise ValueError("image_axes must be a flip, a quarter turn or both")
+
+
+def image_axes_from_orientation(
+    orientation: Sequence[str], primary_deg: float, secondary_deg: float
+) -> ImageAxes | None:
+    """The flip or turn under which the upright image's directions agree best with PatientOrientation (0020,0020).
+
+    Parameters
+    ----------
+    orientation : two str
+        Direction of the rows (+u) and of the columns (+v) in letters of L, R, P, A, H, F, the main one first.
+
+    Returns
+    -------
+    ImageAxes or None
+        None when the letters fit no flip or turn of these gantry angles.
+    """
+    named = [_direction(letters) for letters in orientation]
+    if len(named) != 2 or named[0] is None or named[1] is None:
+        return None
+    told = np.stack([named[0], named[1]])
+    upright = upright_axes_world(primary_deg, secondary_deg)
+    candidates = [
+        np.linalg.matrix_power(_TURN, turns) if not flip else _FLIP @ np.linalg.matrix_power(_TURN, turns)
+        for flip in (False, True)
+        for turns in range(4)
+    ]
+    agreements = [np.sum(told * (axes @ upright), axis=1) for axes in candidates]
+    best = max(range(len(candidates)), key=lambda index: float(agreements[index].sum()))
+    return _as_axes(candidates[best]) if agreements[best].min() >= _AGREEMENT else None
+
+
+def patient_orientation(primary_deg: float, secondary_deg: float, image_axes: ImageAxes = UPRIGHT) -> tuple[str, str]:
+    """PatientOrientation (0020,0020) of a stored image."""
+    rows, columns = np.array(image_axes, dtype=np.float64) @ upright_axes_world(primary_deg, secondary_deg)
+    return _letters(rows), _letters(columns)
+
+
+def _letters(direction: Array) -> str:
+    order = sorted(range(3), key=lambda axis: -abs(float(direction[axis])))
+    return "".join(
+        "LPH"[axis] if direction[axis] > 0 else "RAF"[axis] for axis in order if abs(float(direction[axis])) > _LEAN
+    )
+
+
+def _direction(letters: str) -> Array | None:
+    direction = np.zeros(3)
+    for position, letter in enumerate(letters.strip().upper()):
+        if letter not in _LETTERS or position > 2:
+            return None
+        axis, sign = _LETTERS[letter]
+        if direction[axis]:
+            return None
+        direction[axis] = sign * 0.5**position
+    length = float(np.linalg.norm(direction))
+    return direction / length if length else None
+
+
+def _as_axes(matrix: Array) -> ImageAxes:
+    rounded = np.rint(matrix).astype(int).tolist()
+    return ((rounded[0][0], rounded[0][1]), (rounded[1][0], rounded[1][1]))

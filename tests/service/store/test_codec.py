@@ -1,0 +1,53 @@
+"""The stored form of the contracts: exact, and equal for equal values."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fluoromap.contracts import Chain, FrameChains, Segmentation
+from fluoromap.geometry import Camera, Gantry, camera_from_gantry
+from fluoromap.reasons import Reason
+from fluoromap.store.codec import decode, encode
+
+
+def _segmentation() -> Segmentation:
+    chain = Chain(
+        electrodes=(1, 3),
+        pixels_uv=np.array([[0.1, 1 / 3], [np.pi, 1e-17]]),
+        covariance_px2=np.stack([np.eye(2), np.eye(2) / 7]),
+        scores=np.array([1.0, 2.5]),
+        kinds=(("mapping", 0.9),),
+        track=2,
+    )
+    frames = (FrameChains(0, (chain,)), FrameChains(1, (), Reason.MANUAL_NEEDED))
+    return Segmentation(frames, frames[0], (0,), np.array([0.5, 0.5]), np.array([0.0, 66.7]), (1,))
+
+
+def test_a_segmentation_comes_back_bit_for_bit() -> None:
+    before = _segmentation()
+    after = decode(Segmentation, encode(before))
+    assert encode(after) == encode(before)
+    assert after.frames[1].manual_needed is Reason.MANUAL_NEEDED
+    assert after.diastole is not None
+    np.testing.assert_array_equal(after.diastole.chains[0].pixels_uv, before.frames[0].chains[0].pixels_uv)
+    assert isinstance(after.frames, tuple)
+    assert after.frames[0].chains[0].kinds == (("mapping", 0.9),)
+
+
+def test_a_camera_comes_back_bit_for_bit() -> None:
+    camera = camera_from_gantry(Gantry(31.7, -12.3, 1011.0, 723.0, (0.3, 0.31), 512, 640))
+    after = decode(Camera, encode(camera))
+    np.testing.assert_allclose(after.matrix, camera.matrix, rtol=1e-15)
+
+
+def test_empty_arrays_and_missing_values_keep_their_shape() -> None:
+    before = dataclasses.replace(_segmentation(), diastole=None, r_wave_frames=())
+    after = decode(Segmentation, encode(before))
+    assert after.diastole is None
+    assert after.r_wave_frames == ()
+
+
+def test_what_is_not_a_number_is_refused() -> None:
+    with pytest.raises(ValueError):
+        encode((float("nan"),))

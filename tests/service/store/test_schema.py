@@ -1,0 +1,76 @@
+"""The migrations make the tables that the models describe, however many processes ask at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import inspect, text
+
+from fluoromap.settings import settings
+from fluoromap.store import engine as store_engine
+from fluoromap.store import schema
+from fluoromap.store.engine import engine, reading, writing
+from fluoromap.store.models import Base, Study, StudyInstance
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    url = request.getfixturevalue("postgres_url") if request.param == "postgresql" else ""
+    monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setenv("FLUOROMAP_DATABASE_URL", url)
+    settings.cache_clear()
+    yield request.param
+    engine().dispose()
+    store_engine._engine.cache_clear()
+    settings.cache_clear()
+
+
+@pytest.mark.usefixtures("database")
+def test_migrated_schema_equals_the_models() -> None:
+    schema.upgrade()
+    with engine().connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True, "compare_server_default": True})
+        assert compare_metadata(context, Base.metadata) == []
+
+
+@pytest.mark.usefixtures("database")
+def test_upgrading_again_changes_nothing_and_keeps_the_rows() -> None:
+    schema.upgrade()
+    with writing() as session:
+        session.add(
+            Study(
+                id="s1", label="x", catheters=[], reference="reference", mapping="mapping", frame_of_reference_uid="1.2"
+            )
+        )
+    schema.upgrade()
+    with reading() as session:
+        assert session.get_one(Study, "s1").label == "x"
+
+
+def test_sqlite_still_holds_foreign_keys_after_an_upgrade(database: str) -> None:
+    schema.upgrade()
+    if database == "sqlite":
+        with engine().connect() as connection:
+            assert connection.execute(text("PRAGMA foreign_keys")).scalar() == 1
+    with pytest.raises(Exception, match=r"(?i)foreign key"), writing() as session:
+        session.add(StudyInstance(study_id="none", sop_instance_uid="1.2", gantry={}))
+
+
+@pytest.mark.usefixtures("database")
+def test_processes_that_migrate_at_once_all_succeed() -> None:
+    program = "from fluoromap.store.schema import upgrade; upgrade()"
+    started = [subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.PIPE) for _ in range(3)]
+    errors = [process.communicate()[1].decode() for process in started]
+    assert [process.returncode for process in started] == [0, 0, 0], errors
+    assert set(inspect(engine()).get_table_names()) == {*Base.metadata.tables, "alembic_version"}
+
+
+def test_history_is_one_line() -> None:
+    assert len(ScriptDirectory.from_config(schema.configuration()).get_heads()) == 1

@@ -1,0 +1,226 @@
+"""Hands stored inputs to a stage and makes stored bytes of what it returns; stages themselves read no store.
+
+A result is kept under the hash of plugin, version, parameters and exactly what the stage reads, so that a correction
+redoes only what hangs on it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import (
+    Chain,
+    Context,
+    LocatedSite,
+    MatchedSite,
+    Matching,
+    MonoplaneView,
+    Refusal,
+    Run,
+    Segmentation,
+    Triangulation,
+    View,
+)
+from fluoromap.dicom import InstanceFacts, open_frames
+from fluoromap.fuser.mapped_sites import map_origin, mapped_sites
+from fluoromap.matching import SiteRuns, match_study
+from fluoromap.reasons import Reason
+from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
+from fluoromap.store import files
+from fluoromap.store.codec import decode, encode
+from fluoromap.store.jobs import Claim
+from fluoromap.store.manifest import Manifest, MarkPlan, PluginPlan
+from fluoromap.store.models import Base, StageRow, StageState
+from fluoromap.store.results import FollowedSite, FollowedView, MapOutcome
+from fluoromap.workers.points import point_rows
+
+MATCH_VERSION = "1"
+
+
+def _no_rows(content: bytes) -> Iterable[Base]:
+    return ()
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """A stage ready to run: the key of its result, how to compute its bytes, and the rows that belong to them."""
+
+    key: str
+    compute: Callable[[Context], bytes]
+    rows: Callable[[bytes], Iterable[Base]] = _no_rows
+
+
+def prepare(session: Session, held: Claim, manifest: Manifest) -> Work:
+    """Gather the inputs of a claimed stage."""
+    if held.name == "segment":
+        return _segment(manifest, held.subject)
+    if held.name == "match":
+        return _match(session, held.job_id, manifest)
+    matching = _result(session, held.job_id, "match", None, Matching)
+    assert matching is not None, "a stage runs only after the stages it depends on are done"
+    if held.name == "triangulate":
+        return _triangulate(held.job_id, manifest, matching)
+    triangulation = _result(session, held.job_id, "triangulate", None, Triangulation)
+    assert triangulation is not None, "a stage runs only after the stages it depends on are done"
+    if held.name == "fuse":
+        return _fuse(manifest, triangulation)
+    return _monoplane(manifest, held.subject, matching, triangulation)
+
+
+def _segment(manifest: Manifest, uid: str) -> Work:
+    plan, catalogue = manifest.runs[uid], manifest.catalogue()
+    facts = InstanceFacts.from_json(plan.facts)
+    px_per_mm = plan.gantry.camera().px_per_mm
+    marks = {frame - 1: _chains(electrodes) for frame, electrodes in plan.marks.items()}
+    key = _key(
+        "segment", manifest.segmenter, plan.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames,
+        px_per_mm, asdict(catalogue), {frame: [mark.model_dump() for mark in plan.marks[frame]] for frame in plan.marks},
+    )  # fmt: skip
+
+    def compute(context: Context) -> bytes:
+        frames = open_frames(files.path_of(plan.sha256), facts)
+        run = Run(frames, facts.frame_times_ms, px_per_mm, facts.pixels, facts.r_wave_frames)
+        segmenter = build_segmenter(manifest.segmenter.name, manifest.segmenter.params)
+        return encode(segmenter.segment(run, catalogue, marks, context))
+
+    return Work(key, compute)
+
+
+def _chains(marks: tuple[MarkPlan, ...]) -> tuple[Chain, ...]:
+    chains = []
+    for catheter in sorted({mark.catheter for mark in marks}):
+        own = sorted((mark for mark in marks if mark.catheter == catheter), key=lambda mark: mark.electrode)
+        chains.append(
+            Chain(
+                electrodes=tuple(mark.electrode for mark in own),
+                pixels_uv=[[mark.u_px, mark.v_px] for mark in own],  # type: ignore[arg-type]
+                covariance_px2=[[[mark.sd_px**2, 0.0], [0.0, mark.sd_px**2]] for mark in own],  # type: ignore[arg-type]
+                scores=[0.0] * len(own),  # type: ignore[arg-type]
+                kinds=((catheter, 1.0),),
+                manual=True,
+            )
+        )
+    return tuple(chains)
+
+
+def _match(session: Session, job_id: str, manifest: Manifest) -> Work:
+    catalogue = manifest.catalogue()
+    sites = tuple(
+        SiteRuns(
+            site.site,
+            manifest.runs[site.view_a].gantry.camera(),
+            manifest.runs[site.view_b].gantry.camera(),
+            _result(session, job_id, "segment", site.view_a, Segmentation),
+            _result(session, job_id, "segment", site.view_b, Segmentation),
+        )
+        for site in manifest.sites
+    )
+    own = PluginPlan(name="fluoromap", version=MATCH_VERSION, params={})
+    key = _key("match", own, asdict(catalogue), *(encode(site) for site in sites))
+    return Work(key, lambda context: encode(match_study(sites, catalogue, context)))
+
+
+def _triangulate(job_id: str, manifest: Manifest, matching: Matching) -> Work:
+    catalogue = manifest.catalogue()
+
+    def compute(context: Context) -> bytes:
+        triangulator = build_triangulator(manifest.triangulator.name, manifest.triangulator.params)
+        located = triangulator.triangulate(matching.sites, catalogue, context)
+        return encode(Triangulation(located.sites, (*matching.rejected, *located.rejected), located.notes))
+
+    def rows(content: bytes) -> Iterable[Base]:
+        return point_rows(job_id, manifest, matching, decode(Triangulation, content))
+
+    return Work(_key("triangulate", manifest.triangulator, asdict(catalogue), encode(matching)), compute, rows)
+
+
+def _fuse(manifest: Manifest, triangulation: Triangulation) -> Work:
+    catalogue = manifest.catalogue()
+    times = {site.site: (site.lat_ms, site.lat_sd_ms) for site in manifest.sites}
+    sites = mapped_sites(triangulation, catalogue, times)
+    origin = map_origin(triangulation)
+
+    def compute(context: Context) -> bytes:
+        fuser = build_fuser(manifest.fuser.name, manifest.fuser.params)
+        try:
+            return encode(MapOutcome(fuser.fuse(sites, context), None, "", origin))
+        except Refusal as refusal:
+            return encode(MapOutcome(None, refusal.reason, str(refusal), origin))
+
+    return Work(_key("fuse", manifest.fuser, list(origin or ()), *(encode(site) for site in sites)), compute)
+
+
+def _monoplane(manifest: Manifest, name: str, matching: Matching, triangulation: Triangulation) -> Work:
+    catalogue = manifest.catalogue()
+    matched = next((site for site in matching.sites if site.site == name), None)
+    located = next((site for site in triangulation.sites if site.site == name), None)
+    views: list[tuple[View, MonoplaneView]] = []
+    if matched is not None and located is not None:
+        others = () if located.cycle else tuple(site.cycle for site in triangulation.sites if site.cycle)
+        views = [(view, _monoplane_view(view, matched, located, catalogue, others)) for view in manifest.views]
+    refused = [] if views else [_rejected_view(view, name, triangulation) for view in manifest.views]
+    key = _key("monoplane", manifest.monoplane, name, encode(refused), *(encode(view) for _, view in views))
+
+    def compute(context: Context) -> bytes:
+        followed = list(refused)
+        for view, seen in views:
+            solver = build_monoplane(manifest.monoplane.name, manifest.monoplane.params)
+            try:
+                followed.append(FollowedView(view, solver.follow(seen, context), None, ""))
+            except Refusal as refusal:
+                followed.append(FollowedView(view, None, refusal.reason, str(refusal)))
+        return encode(FollowedSite(name, tuple(followed)))
+
+    return Work(key, compute)
+
+
+def _monoplane_view(
+    view: View, matched: MatchedSite, located: LocatedSite, catalogue: Catalogue, others: tuple[Any, ...]
+) -> MonoplaneView:
+    first = view == "a"
+    return MonoplaneView(
+        site=matched.site,
+        view=view,
+        camera=located.camera_a if first else located.camera_b,
+        catalogue=catalogue,
+        frame_times_ms=matched.frame_times_a_ms if first else matched.frame_times_b_ms,
+        observations=matched.track_a if first else matched.track_b,
+        a_priori=located.points,
+        a_priori_frame=located.frame_a if first else located.frame_b,
+        cycle=located.cycle,
+        others=others,
+    )
+
+
+def _rejected_view(view: View, name: str, triangulation: Triangulation) -> FollowedView:
+    reasons = next((site.reasons for site in triangulation.rejected if site.site == name), ())
+    sentences = " ".join(reason.sentence for reason in reasons)
+    return FollowedView(view, None, Reason.NO_A_PRIORI, f"{Reason.NO_A_PRIORI.sentence} {sentences}".strip())
+
+
+def _result(session: Session, job_id: str, name: str, subject: str | None, kind: type[Any]) -> Any:
+    """The decoded result of another stage of the job; None when that stage failed."""
+    query = select(StageRow.result).where(
+        StageRow.job_id == job_id, StageRow.name == name, StageRow.state == StageState.DONE
+    )
+    if subject is not None:
+        query = query.where(StageRow.subject == subject)
+    sha256 = session.scalar(query)
+    return None if sha256 is None else decode(kind, files.path_of(sha256).read_bytes())
+
+
+def _key(stage: str, plan: PluginPlan, *inputs: Any) -> str:
+    digest = hashlib.sha256()
+    for item in (stage, plan.name, plan.version, plan.params, *inputs):
+        content = item if isinstance(item, bytes) else json.dumps(item, sort_keys=True, allow_nan=False).encode()
+        digest.update(len(content).to_bytes(8, "big"))
+        digest.update(content)
+    return digest.hexdigest()

@@ -1,0 +1,64 @@
+"""What Celery registers: one task, and what a worker does besides."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from typing import Any
+
+import structlog
+from celery import bootsteps
+from celery.signals import worker_process_init
+from sqlalchemy.exc import OperationalError
+
+from fluoromap import queue
+from fluoromap.store import jobs
+from fluoromap.store.engine import forget_connections, writing
+from fluoromap.workers.process import limit_memory, warm_up
+from fluoromap.workers.runner import run
+
+SWEEP_SECONDS = 1.0
+
+log = structlog.get_logger(__name__)
+
+
+@queue.app.task(name=queue.RUN_STAGE)
+def run_stage(stage_id: int) -> None:
+    """Run the stage of that row, if it is still to be had."""
+    run(stage_id, worker=f"{socket.gethostname()}:{os.getpid()}")
+    queue.publish_due()
+
+
+@worker_process_init.connect
+def prepare_child(**_: Any) -> None:
+    """Make a pool child ready: own connections, bounded memory, plugins loaded and kernels compiled."""
+    forget_connections()
+    limit_memory()
+    warm_up()
+
+
+class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
+    """Sweeps every second from the worker's own timer, and tells that the worker lives."""
+
+    requires = frozenset({"celery.worker.components:Timer"})
+
+    def __init__(self, parent: Any, **options: Any) -> None:
+        self.entry: Any = None
+
+    def start(self, parent: Any) -> None:
+        self.entry = parent.timer.call_repeatedly(SWEEP_SECONDS, self.sweep, (parent.hostname,))
+
+    def stop(self, parent: Any) -> None:
+        if self.entry is not None:
+            self.entry.cancel()
+
+    def sweep(self, name: str) -> None:
+        # A database that is away for a moment must not end the worker: the next sweep finds it again.
+        with contextlib.suppress(OperationalError):
+            with writing() as session:
+                jobs.worker_seen(session, name)
+            queue.sweep()
+
+
+queue.app.steps["worker"].add(Sweeper)
