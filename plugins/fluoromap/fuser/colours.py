@@ -47,8 +47,7 @@ class Scale:
     @property
     def edges_ms(self) -> Array:
         """Times between and around the bands, (bands + 1,)."""
-        edges: Array = self.start_ms + self.step_ms * np.arange(self.bands + 1)
-        return edges
+        return self.start_ms + self.step_ms * np.arange(self.bands + 1, dtype=np.float64)
 
     def band(self, lat_ms: Array) -> NDArray[np.int64]:
         """Band of each time; times outside the scale count to the first or last one."""
@@ -94,6 +93,5 @@ def vertex_colours(chamber: ChamberMap) -> Colours:
 
 
 def milliseconds(lat_ms: float) -> str:
-    """A time as it is written beside a site: whole milliseconds with a true minus sign."""
-    whole = round(lat_ms)
-    return f"−{-whole}" if whole < 0 else f"{whole}"
+    """A time as it is written beside a site: whole milliseconds. (Pillow's typeface has no true minus sign.)"""
+    return str(round(lat_ms))

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
+from scipy.spatial import cKDTree
 from scipy.special import log_ndtr
 
 from fluoromap.contracts import Array, BoolArray, ChamberMap, Context, MappedSite, Refusal, SurfaceSite
@@ -27,12 +28,18 @@ LEAST_THICKNESS_MM = 0.5
 LEAST_SITES_TO_JUDGE = 8
 """With fewer other sites no activation time can be called an outlier."""
 
+SLOWEST_MM_PER_MS = 0.5
+"""A time that a wave as slow as this explains from the nearest other site may be a focus; it is no outlier."""
+
 
 class ConvexHullParams(BaseModel, extra="forbid"):
     """Parameters of :class:`ConvexHull`."""
 
     fill_mm: float = Field(
-        15.0, ge=1.0, le=60.0, description="Colour the surface up to this distance from a site, along the surface, in mm."
+        15.0,
+        ge=1.0,
+        le=60.0,
+        description="Colour the surface up to this distance from a site, along the surface, in mm.",
     )
     tip_point: Literal["centre", "end"] = Field(
         "centre",
@@ -43,7 +50,8 @@ class ConvexHullParams(BaseModel, extra="forbid"):
         5.0,
         ge=3.0,
         le=20.0,
-        description="An activation time this many standard deviations from what the other sites predict is kept out.",
+        description="An activation time this many standard deviations from what the other sites predict is kept out, "
+        "where conduction at 0.5 m/s from the nearest of them cannot explain it either.",
     )
 
 
@@ -143,7 +151,9 @@ class ConvexHull:
             if used.sum() <= LEAST_SITES_TO_JUDGE:
                 break
             others = field.leave_one_out(_chosen(points, used), lat[used], sd[used])
-            deviation = np.abs(lat[used] - others.predicted_ms) / others.sd_ms
+            error = np.abs(lat[used] - others.predicted_ms)
+            explained = error <= _nearest_other_mm(points.positions_mm[used]) / SLOWEST_MM_PER_MS
+            deviation = np.where(explained, 0.0, error / others.sd_ms)
             if deviation.max() <= self._params.outlier_sigma:
                 break
             used[np.flatnonzero(used)[int(np.argmax(deviation))]] = False
@@ -170,6 +180,13 @@ def _chosen(points: SurfacePoints, which: BoolArray) -> SurfacePoints:
     return SurfacePoints(
         points.positions_mm[which], points.faces[which], points.weights[which], points.distance_mm[which]
     )
+
+
+def _nearest_other_mm(points_mm: Array) -> Array:
+    """Straight distance (k,) of each point to the nearest other one."""
+    distances = np.asarray(cKDTree(points_mm).query(points_mm, k=2)[0])
+    nearest: Array = distances[:, 1]
+    return nearest
 
 
 def _thickness_mm(points_mm: Array) -> float:

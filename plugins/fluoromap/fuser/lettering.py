@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from fluoromap.fuser.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale, milliseconds
 
+Point = tuple[float, float]
 Box = tuple[float, float, float, float]
 RGB = tuple[int, int, int]
 WHITE: RGB = (255, 255, 255)
@@ -28,29 +29,31 @@ def text_size(text: str, size: int) -> tuple[int, int]:
     return round(right - left), round(bottom - top)
 
 
-def halo_text(draw: ImageDraw.ImageDraw, middle: tuple[float, float], text: str, size: int, ink: RGB, halo: RGB) -> None:
+def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, ink: RGB, halo: RGB) -> None:
     """Text round a point with a rim that keeps it legible on any background."""
     stroke = max(1, size // 9)
     draw.text(middle, text, fill=ink, font=font(size), anchor="mm", stroke_width=stroke, stroke_fill=halo)
 
 
+_NEAR = ((1, 0), (-1, 0), (0, -1), (0, 1), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (-0.8, 0.8))
+_DIRECTIONS = (*_NEAR, *((1.7 * right, 1.7 * down) for right, down in _NEAR))
+
+
 class Labels:
-    """Places labels beside their points without covering one another where that can be had."""
+    """Places labels beside their points, close where there is room, without covering one another where that can be had."""
 
     def __init__(self, width: int, height: int, taken: Iterable[Box] = ()) -> None:
         self._field = (0.0, 0.0, float(width), float(height))
         self._taken = list(taken)
 
-    def place(self, point: tuple[float, float], text: str, size: int, distance: float) -> tuple[float, float]:
+    def place(self, point: Point, text: str, size: int, distance: float) -> Point:
         """Middle of the label, in the direction where it overlaps least."""
         width, height = text_size(text, size)
         width, height = width + size // 3, height + size // 3
         best, cost_of_best, box_of_best = point, float("inf"), (0.0, 0.0, 0.0, 0.0)
         side, up = distance + width / 2, distance + height / 2
-        offsets = ((side, 0), (-side, 0), (0, -up), (0, up), (side * 0.8, -up * 0.8), (side * 0.8, up * 0.8),
-                   (-side * 0.8, -up * 0.8), (-side * 0.8, up * 0.8))  # fmt: skip
-        for rank, (right, down) in enumerate(offsets):
-            middle = (point[0] + right, point[1] + down)
+        for rank, (right, down) in enumerate(_DIRECTIONS):
+            middle = (point[0] + right * side, point[1] + down * up)
             box = (middle[0] - width / 2, middle[1] - height / 2, middle[0] + width / 2, middle[1] + height / 2)
             outside = width * height - _overlap(box, self._field)
             cost = rank + 2 * outside + sum(_overlap(box, other) for other in self._taken)
@@ -75,9 +78,7 @@ def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:
     return (width - panel_width - 0.5 * size, top, width - 0.5 * size, top + panel_height)
 
 
-def draw_colour_bar(
-    image: Image.Image, scale: Scale, size: int, *, dark: bool, mark_ms: float | None = None
-) -> None:
+def draw_colour_bar(image: Image.Image, scale: Scale, size: int, *, dark: bool, mark_ms: float | None = None) -> None:
     """Bands with their times in ms, earliest on top, and the hatch that means "no data"; optionally a mark at a time."""
     ink, ground = (WHITE, (0, 0, 0, 150)) if dark else ((40, 40, 40), (255, 255, 255, 255))
     left, top, right, bottom = bar_box(scale, image.size, size)
@@ -105,7 +106,9 @@ def draw_colour_bar(
     draw.rectangle((bar_left, bar_top, bar_right, bar_top + bar_height), outline=ink)
     if mark_ms is not None:
         y, reach = level(mark_ms), 0.45 * size
-        draw.polygon((bar_left - 1, y - reach, bar_left + 0.6 * size, y, bar_left - 1, y + reach), fill=WHITE, outline=BLACK)
+        draw.polygon(
+            (bar_left - 1, y - reach, bar_left + 0.6 * size, y, bar_left - 1, y + reach), fill=WHITE, outline=BLACK
+        )
 
     swatch_top = bar_top + bar_height + 0.9 * size
     swatch = (round(bar_left), round(swatch_top), round(panel.width - bar_left), round(swatch_top + size))
@@ -114,5 +117,7 @@ def draw_colour_bar(
         clipped = [(x + step, swatch[3] - step) for step in range(size) if swatch[0] <= x + step <= swatch[2]]
         draw.line(clipped, fill=NO_DATA_HATCH_RGB)
     draw.rectangle(swatch, outline=ink)
-    draw.text((panel.width / 2, swatch_top + 1.7 * size), "no data", fill=ink, font=font(round(0.85 * size)), anchor="mm")
+    draw.text(
+        (panel.width / 2, swatch_top + 1.7 * size), "no data", fill=ink, font=font(round(0.85 * size)), anchor="mm"
+    )
     image.paste(panel, (round(left), round(top)), panel)

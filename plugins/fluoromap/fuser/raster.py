@@ -78,6 +78,7 @@ def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, sh
     in_field = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) <= [columns - 1, rows - 1]).all(axis=1)
     painted = np.flatnonzero(facing & in_field)
     order = painted[np.argsort(nearness[faces[painted]].mean(axis=1), kind="stable")]
-    for face, triangle in zip(order.tolist(), corners[order].reshape(-1, 6).tolist(), strict=True):
+    # Pillow cuts coordinates to whole numbers; half a pixel more rounds them.
+    for face, triangle in zip(order.tolist(), (corners[order] + 0.5).reshape(-1, 6).tolist(), strict=True):
         draw.polygon(triangle, fill=face)
     return Raster(np.array(picture, dtype=np.int32), uv, faces, nearness)

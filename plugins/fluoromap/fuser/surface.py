@@ -166,7 +166,8 @@ def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfaceP
     """Distance (n,) along the surface from each vertex to the nearest of the points, infinite beyond ``limit_mm``.
 
     Dijkstra's shortest paths over the mesh edges and, across each edge, the straight line between its two opposite
-    vertices with both faces laid flat: a few per cent longer than the true geodesic, never shorter.
+    vertices with both faces laid flat: never shorter than the true geodesic, 2 to 3 % longer on average and up to a
+    fifth where triangles are needles, so colour ends a little early rather than late.
     """
     n, k = len(vertices_mm), len(points.faces)
     edges, lengths = _edges_and_shortcuts(vertices_mm, faces)

@@ -21,6 +21,7 @@ SHIFT_LIMIT_MM = 20.0
 _NEVER = 1e6
 _SPACING_WEIGHT_PX_PER_MM = 3.0
 _OFFSET_WEIGHT = 0.5
+_COMMON_WEIGHT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +63,8 @@ def pair_chains(
 
     A pair costs ``mean|d - mean d| + 0.5 |mean d - o| + 3 x spacing misfit`` (pixels, mm), d the signed epipolar
     distance of each electrode. ``o`` is the offset that all catheters of the site share because the heart was breathed
-    elsewhere, or the table stood elsewhere, when the second run was taken; it is searched for, costs ``0.5 |o|`` once,
-    and with one pair the whole is the plain cost. Chains set by hand under different names are never paired.
+    elsewhere, or the table stood elsewhere, when the second run was taken. It is searched for, up to 20 mm, and costs
+    ``0.1 |o|`` once: a deep breath must not cost a site. Chains set by hand under different names are never paired.
 
     Returns
     -------
@@ -99,4 +100,4 @@ def _pairs_at(own: Array, offsets: Array, common: float, limit: float) -> tuple[
     kept = tuple(
         Pair(int(r), int(c), float(cost[r, c])) for r, c in zip(rows, columns, strict=True) if cost[r, c] <= limit
     )
-    return float(cost[rows, columns].sum()) + _OFFSET_WEIGHT * abs(common), kept
+    return float(cost[rows, columns].sum()) + _COMMON_WEIGHT * abs(common), kept

@@ -137,7 +137,9 @@ def _catheter(
     elif mean_chain is not None:
         frame, chosen = centre, mean_chain
     else:
-        frame = min(marked or frames, key=lambda f: (*_from_diastole(f, centre, averaged, phases), segmentation.motion[f]))
+        frame = min(
+            marked or frames, key=lambda f: (*_from_diastole(f, centre, averaged, phases), segmentation.motion[f])
+        )
         chosen = chains[frame]
     weighted = [(chain, 1.0) for chain in chains.values()]
     if mean_chain is not None:

@@ -116,7 +116,7 @@ def spread_over_wall(chamber: Chamber, count: int, rng: np.random.Generator) -> 
     """
     candidates = chamber._from_sphere(_unit(rng.normal(size=(6000, 3))))
     height = (candidates - chamber.centre_mm) @ chamber.axes[2] / chamber.semi_axes_mm[2]
-    candidates = candidates[(height > -0.55) & (height < 0.97)][:1500]
+    candidates = candidates[(height > -0.5) & (height < 0.95)][:1500]
     chosen = [int(rng.integers(len(candidates)))]
     nearest = np.linalg.norm(candidates - candidates[chosen[0]], axis=1)
     while len(chosen) < count:

@@ -23,6 +23,8 @@ DETECTOR_BLUR_PX = 0.75
 ELECTRONIC_NOISE = 1.5
 # Where the shaft points nearly along the ray its line integral is cut: no real catheter runs straight at the detector.
 _LEAST_SIN2 = 0.12
+# Of the points that keep arc lengths exact, every second is enough to draw.
+_EVERY = 2
 
 
 class RenderedFrames:
@@ -61,9 +63,7 @@ class RenderedFrames:
             yield self._render(index)
 
 
-def transmission(
-    camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Array], appearance: Appearance
-) -> Image:
+def transmission(camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Array], appearance: Appearance) -> Image:
     """Share of primary photons the catheters let through, shape (rows, columns).
 
     Parameters
@@ -91,7 +91,7 @@ def transmission(
                 shaft.bands_mm.astype(np.float32),
                 shaft.radius_mm,
                 shaft.solid_tip,
-                np.float32(appearance.platinum_per_mm),
+                appearance.platinum_per_mm,
                 appearance.shaft,
             )
         kernels.absorb(thickness, touched, absorbed, 1 / instants)
@@ -99,7 +99,9 @@ def transmission(
 
 
 def _drawn(camera: Camera, lines_mm: Array) -> Image:
-    """Centre lines (t, k, 3) as the kernel takes them: u, v, arc length, px per mm, 1/sin and cot to the ray; (t, k, 6)."""
+    """Centre lines (t, k, 3) as the kernel takes them: u, v, arc length, px per mm, 1/sin to the ray; (t, k, 5)."""
+    along = arc_lengths_mm(lines_mm)[:, ::_EVERY]
+    lines_mm = lines_mm[:, ::_EVERY]
     pixels = camera.project(lines_mm)
     depth = camera.depth_mm(lines_mm)
     px_per_mm = camera.px_per_mm * float(camera.depth_mm(np.zeros(3))) / depth
@@ -107,8 +109,7 @@ def _drawn(camera: Camera, lines_mm: Array) -> Image:
     rays = lines_mm - camera.source_world_mm
     cosine = (tangents * rays).sum(axis=2) / (np.linalg.norm(tangents, axis=2) * np.linalg.norm(rays, axis=2))
     sin2 = np.maximum(1 - cosine**2, _LEAST_SIN2)
-    aslant = np.sqrt((1 - sin2) / sin2)
-    parts = [pixels[..., 0], pixels[..., 1], arc_lengths_mm(lines_mm), px_per_mm, 1 / np.sqrt(sin2), aslant]
+    parts = [pixels[..., 0], pixels[..., 1], along, px_per_mm, 1 / np.sqrt(sin2)]
     return np.stack(parts, axis=2).astype(np.float32)
 
 
@@ -125,11 +126,17 @@ def detect(expected: Image, photons_at_mean: float, key: int) -> NDArray[np.uint
     ``key`` : 64 bits that name the exposure; the same key gives the same noise.
     """
     photons, electronic = np.empty_like(expected), np.empty_like(expected)
-    kernels.count_photons(expected, np.uint64(key), ELECTRONIC_NOISE, photons, electronic)
+    middle, tail = _normal_quantiles()
+    kernels.count_photons(expected, np.uint64(key), ELECTRONIC_NOISE, middle, tail, photons, electronic)
     image = np.empty(expected.shape, np.uint16)
     gain = MEAN_GREY / photons_at_mean
     kernels.read_out(photons, electronic, _blur_taps(), gain, (1 << BITS_STORED) - 1, image)
     return image
+
+
+@functools.cache
+def _normal_quantiles() -> tuple[Image, Image]:
+    return kernels.normal_quantiles()
 
 
 @functools.cache

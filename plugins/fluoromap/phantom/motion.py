@@ -23,9 +23,10 @@ DIASTOLIC_PHASE = 0.8
 
 # Phase of the peak and width (standard deviation) of each pulse, in parts of the cycle: contraction with twist,
 # shortening a little later, and an early and a late one for what is not the ventricle's common motion.
-_PEAK = np.array([0.30, 0.33, 0.22, 0.40])
-_WIDTH = np.array([0.11, 0.11, 0.10, 0.10])
+_PEAK = np.array([0.30, 0.32, 0.24, 0.38])
+_WIDTH = np.array([0.11, 0.11, 0.11, 0.11])
 MODES = len(_PEAK)
+_SLOW_PERIOD_S = 1 / 1.6
 
 SHORTENING = 0.14
 THICKENING = 0.18
@@ -61,7 +62,8 @@ def non_affine_vectors(rng: np.random.Generator) -> Array:
     """A random motion of its own for one catheter, 0.6 mm standard deviation an axis over the cycle; shape (MODES, 3)."""
     vectors = np.zeros((MODES, 3))
     vectors[2:] = rng.normal(size=(2, 3))
-    return vectors * (NON_AFFINE_MM / (_cycle_pulses() @ vectors).std(axis=0))
+    scaled: Array = vectors * (NON_AFFINE_MM / (_cycle_pulses() @ vectors).std(axis=0))
+    return scaled
 
 
 def _cycle_pulses(steps: int = 120) -> Array:
@@ -90,8 +92,8 @@ class Beats:
         count = int(np.ceil(duration_s / period)) + 5
         return cls(
             period,
-            period * (np.arange(count) - 2 - rng.uniform()),
-            1 + BEAT_AMPLITUDE * rng.normal(size=count),
+            np.asarray(period * (np.arange(count) - 2 - rng.uniform()), dtype=np.float64),
+            1 + BEAT_AMPLITUDE * np.clip(rng.normal(size=count), -2, 2),
             BEAT_TIMING_CYCLE * rng.normal(size=count),
             BEAT_POSITION_MM * rng.normal(size=(count, catheters, 3)),
         )
@@ -102,12 +104,20 @@ class Beats:
         period = 1 / rate_hz
         count = int(np.ceil(duration_s / period)) + 5
         zeros = np.zeros(count)
-        return cls(period, period * (np.arange(count) - 2.0), zeros + 1, zeros, np.zeros((count, catheters, 3)))
+        return cls(
+            period,
+            np.asarray(period * (np.arange(count) - 2.0), dtype=np.float64),
+            zeros + 1,
+            zeros,
+            np.zeros((count, catheters, 3)),
+        )
 
     def pulses(self, times_s: Array) -> Array:
         """Strength of each pulse at times ``(t,)``, shape (t, MODES)."""
         phase = (times_s[:, None] - self.r_waves_s) / self.period_s - self.delay
-        shape = np.exp(-0.5 * ((phase[..., None] - _PEAK) / _WIDTH) ** 2)
+        # At high rates diastole shortens more than systole.
+        width = _WIDTH * max(1.0, float(np.sqrt(_SLOW_PERIOD_S / self.period_s)))
+        shape = np.exp(-0.5 * ((phase[..., None] - _PEAK) / width) ** 2)
         strength: Array = np.einsum("tbm,b->tm", shape, self.amplitude)
         return strength
 
@@ -117,7 +127,7 @@ class Beats:
         It changes from one beat's to the next's during systole, so that diastole stays quiet.
         """
         phase = (times_s[:, None] - self.r_waves_s) / self.period_s - self.delay
-        reached = 1 / (1 + np.exp(-np.clip((phase - _PEAK[0]) / 0.04, -40, 40)))
+        reached = 1 / (1 + np.exp(-np.clip((phase - _PEAK[0]) / 0.06, -40, 40)))
         steps = np.diff(self.offsets_mm, axis=0, prepend=0)
         shift: Array = np.einsum("tb,bcd->tcd", reached, steps)
         return shift

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from dataclasses import dataclass
 from datetime import datetime
@@ -147,7 +148,7 @@ class InstanceFacts:
         if min(self.frames, self.rows, self.columns) < 1:
             raise ValueError("a run has at least one frame of at least one pixel")
         times = self.frame_times_ms
-        if len(times) != self.frames or any(later < earlier for earlier, later in zip(times, times[1:], strict=False)):
+        if len(times) != self.frames or any(later < earlier for earlier, later in itertools.pairwise(times)):
             raise ValueError("frame_times_ms needs one time a frame, never falling")
         if self.acquired is not None and self.acquired.utcoffset() is None:
             raise ValueError("acquired needs a time zone")

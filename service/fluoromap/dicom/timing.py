@@ -13,9 +13,7 @@ from fluoromap.dicom.header import Header
 _LONGEST_INTERVAL_MS = 10_000.0
 _ASSUMED_INTERVAL_MS = 1000.0 / 15
 _FRAME_TIME = 0x00181063
-_CLOCK = re.compile(
-    r"(\d{4})\.?(\d\d)\.?(\d\d)(\d\d)?:?(\d\d)?:?(\d\d)?(?:\.(\d{1,6})\d*)?([+-]\d{4})?"
-)
+_CLOCK = re.compile(r"(\d{4})\.?(\d\d)\.?(\d\d)(\d\d)?:?(\d\d)?:?(\d\d)?(?:\.(\d{1,6})\d*)?([+-]\d{4})?")
 
 
 def frame_times_ms(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[float, ...]:
@@ -29,10 +27,10 @@ def frame_times_ms(header: Header, frames: int, warnings: list[HeaderWarning]) -
     constant, vector = _frame_time(header, frames), _frame_time_vector(header, frames)
     first, second = (constant, vector) if _FRAME_TIME in header.tags("FrameIncrementPointer") else (vector, constant)
     times = first or second or _frame_clocks(header, frames) or _frame_rate(header, frames)
-    if times is None:
-        warnings.append(HeaderWarning.FRAME_TIME_ASSUMED)
-        times = _evenly(_ASSUMED_INTERVAL_MS, frames)
-    return times
+    if times is not None:
+        return times
+    warnings.append(HeaderWarning.FRAME_TIME_ASSUMED)
+    return tuple(_ASSUMED_INTERVAL_MS * frame for frame in range(frames))
 
 
 def _evenly(interval_ms: float | None, frames: int) -> tuple[float, ...] | None:
@@ -55,10 +53,13 @@ def _frame_time_vector(header: Header, frames: int) -> tuple[float, ...] | None:
 
 
 def _frame_clocks(header: Header, frames: int) -> tuple[float, ...] | None:
-    clocks = [_clock(values[0], UTC) if values else None for values in header.texts_per_frame("FrameAcquisitionDateTime")]
+    clocks = [
+        _clock(values[0], UTC) if values else None for values in header.texts_per_frame("FrameAcquisitionDateTime")
+    ]
     known = [clock for clock in clocks if clock is not None]
     if len(known) != frames or not all(
-        0 < (later - earlier).total_seconds() * 1000 <= _LONGEST_INTERVAL_MS for earlier, later in itertools.pairwise(known)
+        0 < (later - earlier).total_seconds() * 1000 <= _LONGEST_INTERVAL_MS
+        for earlier, later in itertools.pairwise(known)
     ):
         return None
     return tuple((clock - known[0]).total_seconds() * 1000 for clock in known)

@@ -48,9 +48,12 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def keep(session: Session, path: Path, media_type: str) -> str:
-    """Move an incoming file to its content address and add its row to the session. Returns the hash."""
-    sha256 = sha256_of(path)
+def keep(session: Session, path: Path, media_type: str, sha256: str | None = None) -> str:
+    """Move an incoming file to its content address and add its row to the session. Returns the hash.
+
+    A caller that knows the file's hash already gives it, so that a long file is not read again inside the transaction.
+    """
+    sha256 = sha256 or sha256_of(path)
     target = path_of(sha256)
     size = path.stat().st_size
     if not target.exists():

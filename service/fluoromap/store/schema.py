@@ -27,7 +27,7 @@ def configuration() -> Config:
         raise RuntimeError(f"the package {MIGRATIONS} is not installed; install fluoromap again")
     config = Config()
     # A percent sign in the path would be read as interpolation.
-    config.set_main_option("script_location", list(spec.submodule_search_locations)[0].replace("%", "%%"))
+    config.set_main_option("script_location", next(iter(spec.submodule_search_locations)).replace("%", "%%"))
     return config
 
 

@@ -27,10 +27,12 @@ def _manifest(study: str, sites: int = 2) -> Manifest:
     plan = PluginPlan(name="p", version="1", params={})
     run = RunPlan(sha256="0" * 64, facts={}, gantry=GANTRY, marks={})
     catheters = tuple(
-        CatheterPlan(name=name, electrodes=4, spacing_mm=(3.5, 6, 3), tip_mm=2, ring_mm=1) for name in ("reference", "mapping")
+        CatheterPlan(name=name, electrodes=4, spacing_mm=(3.5, 6, 3), tip_mm=2, ring_mm=1)
+        for name in ("reference", "mapping")
     )
     plans = tuple(
-        SitePlan(site=f"S{i:02}", lat_ms=1.0 * i, lat_sd_ms=1.0, view_a=f"1.{i}.1", view_b=f"1.{i}.2") for i in range(1, sites + 1)
+        SitePlan(site=f"S{i:02}", lat_ms=1.0 * i, lat_sd_ms=1.0, view_a=f"1.{i}.1", view_b=f"1.{i}.2")
+        for i in range(1, sites + 1)
     )
     runs = {uid: run for plan_ in plans for uid in (plan_.view_a, plan_.view_b)}
     return Manifest(
@@ -50,7 +52,9 @@ def job(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Monk
     Base.metadata.create_all(engine())
     with writing() as session:
         session.add(
-            Study(id="s", label="x", catheters=[], reference="reference", mapping="mapping", frame_of_reference_uid="1.2")
+            Study(
+                id="s", label="x", catheters=[], reference="reference", mapping="mapping", frame_of_reference_uid="1.2"
+            )
         )
         session.flush()
         created = jobs.create(session, "s", _manifest("s"))

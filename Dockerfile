@@ -1,0 +1,27 @@
+# One image for the API, the worker and every other command of the program.
+FROM python:3.12-slim-bookworm AS build
+WORKDIR /src
+RUN python -m venv /opt/fluoromap
+COPY requirements.lock ./
+RUN /opt/fluoromap/bin/pip install --no-cache-dir --require-hashes -r requirements.lock
+COPY pyproject.toml README.md LICENSE ./
+COPY plugins plugins
+COPY service service
+COPY workers workers
+COPY migrations migrations
+RUN /opt/fluoromap/bin/pip install --no-cache-dir --no-deps .
+
+FROM python:3.12-slim-bookworm
+RUN useradd --uid 10001 --user-group --no-create-home --home-dir /var/lib/fluoromap --shell /usr/sbin/nologin fluoromap \
+    && install -d -o fluoromap -g fluoromap -m 0750 /var/lib/fluoromap
+COPY --from=build /opt/fluoromap /opt/fluoromap
+ENV PATH=/opt/fluoromap/bin:/usr/local/bin:/usr/bin:/bin \
+    PYTHONUNBUFFERED=1 \
+    FLUOROMAP_DATA_DIR=/var/lib/fluoromap \
+    FLUOROMAP_HOST=0.0.0.0 \
+    FLUOROMAP_PORT=8000
+USER fluoromap
+VOLUME /var/lib/fluoromap
+EXPOSE 8000
+ENTRYPOINT ["fluoromap"]
+CMD ["api"]

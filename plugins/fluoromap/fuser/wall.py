@@ -1,0 +1,54 @@
+"""What the pictures share of the chamber's wall: its colours in a raster, its outline, the lit parts of a line."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.contracts import Array, BoolArray, ChamberMap, IntArray
+from fluoromap.fuser.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale
+from fluoromap.fuser.raster import Raster
+
+
+def pixel_colours(
+    raster: Raster, chamber: ChamberMap, times: Scale, unit: float
+) -> tuple[NDArray[np.float32], BoolArray, BoolArray]:
+    """Of the p pixels that show the wall, in row-major order: RGB (p, 3), covered (p,), on the "no data" hatch (p,).
+
+    ``unit`` is the size of the picture's details, 1 for a picture of 512 pixels.
+    """
+    covered = raster.sample(chamber.covered.astype(np.float64)) > 0.5
+    bands = times.band(raster.sample(_times_past_rim(chamber)))
+    colours = times.band_colours()[bands].astype(np.float32)
+    v, u = np.nonzero(raster.shown())
+    hatched = ~covered & ((u + v) % max(4, round(7 * unit)) < max(1, round(unit)))
+    colours[~covered] = NO_DATA_RGB
+    colours[hatched] = NO_DATA_HATCH_RGB
+    return colours, covered, hatched
+
+
+def _times_past_rim(chamber: ChamberMap) -> Array:
+    """Times at the vertices, those just past the covered part taking the mean of their covered neighbours: else a face on
+    the rim would run through all bands down to 0."""
+    lat, faces = chamber.lat_ms.copy(), chamber.faces
+    known = chamber.covered[faces].astype(np.float64)
+    total = np.bincount(faces.ravel(), np.repeat((known * lat[faces]).sum(axis=1), 3), minlength=len(lat))
+    count = np.bincount(faces.ravel(), np.repeat(known.sum(axis=1), 3), minlength=len(lat))
+    rim = ~chamber.covered & (count > 0)
+    lat[rim] = total[rim] / count[rim]
+    return lat
+
+
+def outline_edges(faces: IntArray, facing: BoolArray) -> IntArray:
+    """Edges (e, 2) between a face that faces the viewer and one that does not."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, of_edge = np.unique(edges, axis=0, return_inverse=True)
+    count = np.bincount(of_edge.ravel(), np.repeat(facing, 3), minlength=len(unique))
+    rim: IntArray = unique[count == 1]
+    return rim
+
+
+def runs(flags: BoolArray) -> list[slice]:
+    """Slices of a line's points, one for each run of segments whose flag is set."""
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [slice(int(start), int(stop) + 1) for start, stop in changes.reshape(-1, 2)]

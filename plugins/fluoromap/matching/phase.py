@@ -1,0 +1,145 @@
+"""Cardiac phase of the frames of a run: from R waves where told, else from the catheters' own periodic motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from fluoromap.contracts import Array, Segmentation
+from fluoromap.matching.run_catheters import RunCatheter
+
+SHORTEST_CYCLE_MS = 300.0
+LONGEST_CYCLE_MS = 1600.0
+MUST_SHOW = 0.7
+"""A catheter serves as a clock when it is seen in this share of the frames."""
+PERIODIC_BELOW = 0.5
+"""Mean squared change over one cycle, as a share of that over any time: above it, nothing repeats."""
+_BINS = 60
+
+
+def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter]) -> Array | None:
+    """Phase of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next; None where unknown.
+
+    With R waves told the time between two of them is one cycle; before the first and after the last the neighbouring
+    cycle's length goes on. Without, the length of the cycle is the time after which the catheters are back where they
+    were, and systole begins where the longest quiet stretch of the cycle ends.
+
+    Returns
+    -------
+    ndarray, shape (n,), or None
+    """
+    times = segmentation.frame_times_ms
+    beats = times[np.array(sorted(set(segmentation.r_wave_frames)), dtype=np.intp)]
+    if len(beats) >= 2:
+        return _phases_from_beats(times, beats)
+    if len(times) < 8 or np.any(np.diff(times) <= 0):
+        return None
+    step_ms = float(np.median(np.diff(times)))
+    grid = np.arange(times[0], times[-1] + step_ms / 2, step_ms)
+    places = _places(segmentation, catheters, grid)
+    signal = places if places is not None else np.interp(grid, times, segmentation.motion)[:, None]
+    cycle_ms = cycle_length_ms(signal, step_ms)
+    if cycle_ms is None:
+        return None
+    if len(beats) == 1:
+        return np.asarray(((times - beats[0]) / cycle_ms) % 1.0)
+    if places is not None:
+        smooth = gaussian_filter1d(places, max(25.0 / step_ms, 0.5), axis=0)
+        speed = np.linalg.norm(np.gradient(smooth, axis=0), axis=1)
+    else:
+        speed = signal[:, 0]
+    start = start_of_systole(((grid - grid[0]) / cycle_ms) % 1.0, speed)
+    return np.asarray(((times - grid[0]) / cycle_ms - start) % 1.0)
+
+
+def _phases_from_beats(times: Array, beats: Array) -> Array:
+    first, last = beats[1] - beats[0], beats[-1] - beats[-2]
+    before = int(np.ceil(max(beats[0] - times[0], 0.0) / first)) + 1
+    after = int(np.ceil(max(times[-1] - beats[-1], 0.0) / last)) + 1
+    marks = np.concatenate(
+        [beats[0] - first * np.arange(before, 0, -1), beats, beats[-1] + last * np.arange(1, after + 1)]
+    )
+    phases: Array = np.interp(times, marks, np.arange(len(marks), dtype=np.float64)) % 1.0
+    return phases
+
+
+def _places(segmentation: Segmentation, catheters: Sequence[RunCatheter], grid_ms: Array) -> Array | None:
+    """Centroids of the catheters that are seen nearly throughout, on an even time grid, shape (g, 2 k); drift removed."""
+    columns: list[Array] = []
+    for catheter in catheters:
+        frames, centroids = catheter.centroids_uv()
+        if len(frames) < MUST_SHOW * len(segmentation.frames):
+            continue
+        at = segmentation.frame_times_ms[frames.astype(np.intp)]
+        columns.extend(np.interp(grid_ms, at, centroids[:, axis]) for axis in (0, 1))
+    if not columns:
+        return None
+    signal = np.stack(columns, axis=1)
+    # Breathing within a run is slow: a straight line takes most of it.
+    ramp = np.stack([np.ones(len(signal)), np.linspace(-1, 1, len(signal))], axis=1)
+    places: Array = signal - ramp @ np.linalg.lstsq(ramp, signal, rcond=None)[0]
+    return places
+
+
+def cycle_length_ms(signal: Array, step_ms: float) -> float | None:
+    """Length of the cycle of a signal (g, k) on an even time grid; None where it does not repeat.
+
+    The first lag at which the signal comes back to itself nearly as well as it ever does, between 300 and 1600 ms and
+    at most 0.7 of the run.
+    """
+    n = len(signal)
+    spread = 2.0 * float(signal.var(axis=0).sum())
+    lags = np.arange(max(2, int(SHORTEST_CYCLE_MS / step_ms)), int(min(LONGEST_CYCLE_MS / step_ms, 0.7 * n)) + 1)
+    if spread <= 0 or len(lags) < 3:
+        return None
+    change = np.array([float(((signal[lag:] - signal[:-lag]) ** 2).sum(axis=1).mean()) for lag in lags]) / spread
+    inner = np.flatnonzero((change[1:-1] <= change[:-2]) & (change[1:-1] <= change[2:])) + 1
+    if not len(inner):
+        return None
+    best = float(change[inner].min())
+    if best > PERIODIC_BELOW:
+        return None
+    found = int(inner[change[inner] <= best + 0.1][0])
+    left, middle, right = change[found - 1 : found + 2]
+    bend = left - 2 * middle + right
+    shift = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    return float((lags[found] + shift) * step_ms)
+
+
+def start_of_systole(phases: Array, speed: Array) -> float:
+    """Phase at which the longest quiet stretch of the cycle ends.
+
+    End-systole stands still too, but for a shorter time than diastole.
+
+    Parameters
+    ----------
+    phases, speed : ndarray, shape (g,)
+        Phase from any origin, and how fast the heart moves (any unit).
+    """
+    weights = np.bincount((phases * _BINS).astype(np.intp) % _BINS, minlength=_BINS).astype(np.float64)
+    sums = np.bincount((phases * _BINS).astype(np.intp) % _BINS, weights=speed, minlength=_BINS)
+    known = np.flatnonzero(weights)
+    folded = np.interp(np.arange(_BINS), known, sums[known] / weights[known], period=_BINS)
+    folded = gaussian_filter1d(folded, 1.0, mode="wrap")
+    threshold = folded.min() + 0.3 * (folded.max() - folded.min())
+    # Starting at the fastest moment, no quiet stretch is cut in two.
+    origin = int(np.argmax(folded))
+    quiet = np.append(np.roll(folded, -origin) < threshold, False)
+    best_length, best_end, length = 0, 0, 0
+    for index, still in enumerate(quiet):
+        if still:
+            length += 1
+            continue
+        if length > best_length:
+            best_length, best_end = length, index
+        length = 0
+    return float((origin + best_end) % _BINS) / _BINS
+
+
+def phase_distance(first: Array, second: Array) -> Array:
+    """Distance between phases round the cycle, 0 to 0.5."""
+    apart = np.abs(np.asarray(first) - np.asarray(second)) % 1.0
+    distance: Array = np.minimum(apart, 1.0 - apart)
+    return distance

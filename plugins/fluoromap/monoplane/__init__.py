@@ -1,0 +1,1 @@
+"""Electrodes in 3D through one view."""

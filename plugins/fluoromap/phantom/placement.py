@@ -1,0 +1,150 @@
+"""Where heart and catheters lie in the chest, and how strongly this heart moves them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.phantom.chamber import Chamber, spread_over_wall
+from fluoromap.phantom.motion import (
+    HEART_RATE_HZ,
+    ROCKING_MM,
+    Beats,
+    HeartKind,
+    non_affine_vectors,
+    wall_vectors,
+)
+from fluoromap.phantom.shaft import Shaft
+
+Array = NDArray[np.float64]
+
+SEMI_AXES_MM = (22.0, 22.0, 40.0)
+RADIUS_6F_MM, RADIUS_7F_MM = 1.0, 1.17
+_SEPTUM_MM_PER_MS = 0.6
+# What the tips' mean excursion along an axis is brought to, unless that is too fast for the heart's rate.
+_EXCURSION_MM = (4.4, 5.6)
+# Across the ray of a lateral or frontal view; leaves room below 9 px between frames at 60/s for beats that differ.
+_FASTEST_MM_PER_S = 88.0
+
+
+@dataclass(frozen=True, eq=False)
+class Resident:
+    """A catheter in place: its shaft and the displacement of its tip by each pulse of the beat, (MODES, 3) mm."""
+
+    shaft: Shaft
+    vectors_mm: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """One heart with its catheters.
+
+    right : reference and pacing catheter in the right ventricle, which stay. left : the mapping catheter, site by site.
+    contacts_mm : (sites, 3) where its tip's end touches the wall at diastole.
+    """
+
+    chamber: Chamber
+    rate_hz: float
+    right: tuple[Resident, ...]
+    left: tuple[Resident, ...]
+    contacts_mm: Array
+
+    def residents(self, site: int) -> tuple[Resident, ...]:
+        """Reference, pacing and mapping catheter at a site."""
+        return (*self.right, self.left[site])
+
+
+def draw_anatomy(heart: HeartKind, sites: int, rng: np.random.Generator) -> Anatomy:
+    """A heart at random: pose, rate, focus, conduction and motion differ from one to the next."""
+    rate = float(rng.uniform(*HEART_RATE_HZ[heart]))
+    chamber, reference, pacing = _ventricles(rng)
+    contacts = spread_over_wall(chamber, sites, rng)
+    mapping = [_mapping_shaft(chamber, contact, rng) for contact in contacts]
+
+    rocking = rng.normal(size=3)
+    rocking *= ROCKING_MM / np.linalg.norm(rocking)
+    tips = np.stack([reference.rest_mm[0], pacing.rest_mm[0], *contacts])
+    # The right ventricle's catheters lie on trabeculae and follow the wall less.
+    follow = np.array([0.5, 0.7, *np.ones(sites)])[:, None, None]
+    common = follow * wall_vectors(chamber, tips, rocking)
+    own = follow * np.stack([non_affine_vectors(rng) for _ in tips])
+    vectors = _strength(common, own, rate, float(rng.uniform(*_EXCURSION_MM))) * common + own
+    placed = [Resident(shaft, v) for shaft, v in zip([reference, pacing, *mapping], vectors, strict=True)]
+    return Anatomy(chamber, rate, tuple(placed[:2]), tuple(placed[2:]), contacts)
+
+
+def _ventricles(rng: np.random.Generator) -> tuple[Chamber, Shaft, Shaft]:
+    """The left ventricle, apex to the patient's left, front and feet, and the two catheters in the right one."""
+    apex = np.array([0.55, -0.55, -0.63]) + rng.normal(0, 0.08, 3)
+    apex /= np.linalg.norm(apex)
+    to_right = np.array([-0.9, -0.4, -0.1]) + rng.normal(0, 0.08, 3)
+    to_right -= (to_right @ apex) * apex
+    to_right /= np.linalg.norm(to_right)
+    axes = np.stack([to_right, np.cross(apex, to_right), apex])
+    centre = np.array([3.0, 4.0, 2.0]) + rng.normal(0, 2, 3)
+
+    def in_heart(right: float, across: float, along: float) -> Array:
+        return np.asarray(centre + np.array([right, across, along]) @ axes + rng.normal(0, 1.5, 3))
+
+    entry = np.array([-18.0, 8.0, 95.0]) + rng.normal(0, 4, 3)
+    atrium = np.array([-26.0, 4.0, 34.0]) + rng.normal(0, 4, 3)
+    shafts = []
+    places = (
+        ("reference", in_heart(27, -5, 20), np.array([0.42, -0.48, -0.78])),
+        ("pacing", in_heart(29, 8, 2), np.array([0.52, -0.40, -0.72])),
+    )
+    for name, tip, heading in places:
+        heading = heading + rng.normal(0, 0.13, 3)
+        behind = tip - 24 * heading / np.linalg.norm(heading)
+        bow = atrium + rng.normal(0, 4, 3)
+        shafts.append(Shaft.through(DEFAULT_CATALOGUE[name], RADIUS_6F_MM, False, tip, behind, bow, entry))
+
+    undecided = Chamber(centre, axes, np.array(SEMI_AXES_MM), centre, 1.0, 0.0)
+    focus = spread_over_wall(undecided, 1, rng)[0]
+    speed = float(rng.uniform(0.6, 1.0))
+    from_focus = Chamber(centre, axes, np.array(SEMI_AXES_MM), focus, speed, 0.0)
+    reference_tip = shafts[0].rest_mm[0]
+    septum = from_focus.on_wall(reference_tip)
+    delay = float(from_focus.activation_ms(septum)) + float(np.linalg.norm(reference_tip - septum)) / _SEPTUM_MM_PER_MS
+    return Chamber(centre, axes, np.array(SEMI_AXES_MM), focus, speed, delay), shafts[0], shafts[1]
+
+
+def _mapping_shaft(chamber: Chamber, contact_mm: Array, rng: np.random.Generator) -> Shaft:
+    """The mapping catheter, come down the aorta through the valve, its tip's end on the wall."""
+    inward = chamber.inward(contact_mm)
+    valve = chamber.centre_mm - 34 * chamber.axes[2] + rng.normal(0, 2, 3)
+    to_valve = valve - contact_mm
+    leaving = 0.4 * inward + to_valve / np.linalg.norm(to_valve) + rng.normal(0, 0.2, 3)
+    leaving /= np.linalg.norm(leaving)
+    # However the hand turns it, the tip meets the wall rather than lying along it.
+    leaving += max(0.0, 0.25 - float(leaving @ inward)) * inward
+    leaving /= np.linalg.norm(leaving)
+    bow = valve + 18 * np.array([-0.2, 0.2, 1.0]) + rng.normal(0, 3, 3)
+    entry = np.array([-8.0, 10.0, 95.0]) + rng.normal(0, 4, 3)
+    mapping = DEFAULT_CATALOGUE[DEFAULT_CATALOGUE.mapping]
+    return Shaft.through(mapping, RADIUS_7F_MM, True, contact_mm, contact_mm + 22 * leaving, bow, entry)
+
+
+def _strength(common: Array, own: Array, rate_hz: float, excursion_mm: float) -> float:
+    """How strongly this heart beats: mapping tips move ``excursion_mm`` an axis on average, no tip faster than the limit."""
+    steps = 60
+    times = np.arange(steps) / steps
+    pulses = Beats.even(rate_hz, 1 / rate_hz).pulses(times / rate_hz)
+    strength = 1.0
+    for _ in range(8):
+        paths = np.einsum("tm,nmd->tnd", pulses, strength * common + own)
+        excursion = np.ptp(paths, axis=0)[2:].mean()
+        velocity = (np.roll(paths, -1, axis=0) - paths) * steps * rate_hz
+        speed = max(np.linalg.norm(velocity[..., 1:], axis=2).max(), np.linalg.norm(velocity[..., ::2], axis=2).max())
+        strength *= min(excursion_mm / excursion, _FASTEST_MM_PER_S / speed)
+    return strength
+
+
+def electrodes_over_cycle_mm(residents: Sequence[Resident], steps: int) -> Array:
+    """All electrodes at ``steps`` phases of an average beat, shape (steps, electrodes, 3)."""
+    pulses = Beats.even(1.0, 1.0).pulses(np.arange(steps) / steps)
+    return np.concatenate([r.shaft.electrodes_mm(r.shaft.moved(pulses @ r.vectors_mm)) for r in residents], axis=1)

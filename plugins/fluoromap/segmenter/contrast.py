@@ -1,0 +1,134 @@
+"""How much darker than its surroundings a place is: the evidence that linking weighs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy import ndimage
+
+from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.homomorphic import gaussian, reduce_by
+from fluoromap.segmenter.log_image import Image
+
+_CORE_MM = 0.55
+_RING_MM = (1.5, 2.0)
+_GRID = 24
+_SIDE_MM = 1.75
+_PEAK_MM = (0.35, 0.7)
+_MOST_PEAKS = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contrast:
+    """Contrast measured on one frame.
+
+    image : (rows, columns) float32 log units. smooth : the same after diffusion, on which shafts stand out.
+    noise : robust standard deviation of :meth:`of` over the field: photon noise and anatomy together.
+    line_scale : what counts as a clear shaft on ``smooth``. px_per_mm : at the isocentre.
+    """
+
+    image: Image
+    smooth: Image
+    noise: float
+    line_scale: float
+    px_per_mm: float
+
+    @classmethod
+    def of_frame(
+        cls, image: Image, smooth: Image, inside: BoolArray, line_scale: float, px_per_mm: float
+    ) -> Contrast:
+        rows, columns = image.shape
+        v, u = np.meshgrid(
+            np.linspace(0, rows - 1, _GRID).round(), np.linspace(0, columns - 1, _GRID).round(), indexing="ij"
+        )
+        places = np.stack([u.ravel(), v.ravel()], axis=1)
+        places = places[inside[places[:, 1].astype(int), places[:, 0].astype(int)]]
+        values = _centre_surround(image, places, *_radii(px_per_mm)) if len(places) else np.zeros(1)
+        noise = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+        return cls(image, smooth, max(noise, 1e-6), line_scale, px_per_mm)
+
+    def of(self, points_uv: Array) -> Array:
+        """Contrast over noise at each point, (n,): surroundings minus centre, positive where dark."""
+        return _centre_surround(self.image, points_uv, *_radii(self.px_per_mm)) / self.noise  # type: ignore[no-any-return]
+
+    def peaks(self, candidates: BoolArray, threshold: float = 8.0) -> Array:
+        """Places that are darker than all round them by ``threshold`` times the noise, strongest first, (n, 2) pixels.
+
+        Maxima of a difference of Gaussians of ring size on the half-size image.
+        """
+        half = reduce_by(self.image, 2)
+        narrow, wide = (max(0.5, 0.5 * size * self.px_per_mm) for size in _PEAK_MM)
+        response = gaussian(half, wide) - gaussian(half, narrow)
+        highest = (response == ndimage.maximum_filter(response, size=5)) & (response > 0)
+        v, u = np.nonzero(highest)
+        order = np.argsort(-response[v, u])[:_MOST_PEAKS]
+        places = np.stack([2.0 * u[order] + 0.5, 2.0 * v[order] + 0.5], axis=1)
+        rows, columns = self.image.shape
+        allowed = candidates[
+            np.minimum(places[:, 1].astype(int), rows - 1), np.minimum(places[:, 0].astype(int), columns - 1)
+        ]
+        places = places[allowed]
+        clear: Array = places[self.of(places) >= threshold]
+        return clear
+
+    def shaft(self, start_uv: Array, end_uv: Array) -> float:
+        """How clearly the straight piece from start to end is a dark tube: -1 (bright) to 1."""
+        depth = _dark_line(
+            self.smooth, start_uv[0], start_uv[1], end_uv[0], end_uv[1], max(2.0, _SIDE_MM * self.px_per_mm)
+        )
+        return float(np.clip(depth / self.line_scale, -1.0, 1.0))
+
+
+def _radii(px_per_mm: float) -> tuple[float, float, float]:
+    return max(1.0, _CORE_MM * px_per_mm), max(3.0, _RING_MM[0] * px_per_mm), max(4.5, _RING_MM[1] * px_per_mm)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _centre_surround(x, points, core, near, far):  # type: ignore[no-untyped-def]  # pragma: no cover
+    rows, columns = x.shape
+    reach = int(far) + 1
+    out = np.zeros(points.shape[0], np.float64)
+    for i in range(points.shape[0]):
+        cu, cv = points[i, 0], points[i, 1]
+        inner = outer = 0.0
+        n_inner = n_outer = 0
+        for v in range(max(int(cv) - reach, 0), min(int(cv) + reach + 2, rows)):
+            for u in range(max(int(cu) - reach, 0), min(int(cu) + reach + 2, columns)):
+                square = (u - cu) ** 2 + (v - cv) ** 2
+                if square <= core * core:
+                    inner += x[v, u]
+                    n_inner += 1
+                elif near * near <= square <= far * far:
+                    outer += x[v, u]
+                    n_outer += 1
+        if n_inner > 0 and n_outer > 0:
+            out[i] = outer / n_outer - inner / n_inner
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _dark_line(x, u0, v0, u1, v1, side):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Mean over the piece of (darker of the two sides - middle); what leaves the image does not count."""
+    rows, columns = x.shape
+    du, dv = u1 - u0, v1 - v0
+    length = np.sqrt(du * du + dv * dv) + 1e-9
+    across_u, across_v = -dv / length * side, du / length * side
+    steps = max(3, int(length / 2))
+    total = 0.0
+    count = 0
+    for i in range(steps):
+        t = (i + 0.5) / steps
+        cu, cv = u0 + t * du, v0 + t * dv
+        if (
+            min(cu - abs(across_u), cv - abs(across_v)) < 0
+            or cu + abs(across_u) > columns - 1
+            or cv + abs(across_v) > rows - 1
+        ):
+            continue
+        one = x[int(cv + across_v + 0.5), int(cu + across_u + 0.5)]
+        other = x[int(cv - across_v + 0.5), int(cu - across_u + 0.5)]
+        total += min(one, other) - x[int(cv + 0.5), int(cu + 0.5)]
+        count += 1
+    return total / count if count > 0 else 0.0

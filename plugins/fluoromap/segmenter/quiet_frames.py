@@ -1,0 +1,121 @@
+"""How much each frame moves, and which frames round diastole stand still enough to be averaged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.homomorphic import gaussian, reduce_by
+from fluoromap.segmenter.log_image import Image
+
+MOST_AVERAGED = 7
+
+_SIGMA_PX = 3.0
+_REDUCTION = 4
+_LIVELY = 0.05
+_QUIET = 0.07
+_UNSURE = 0.25
+_LATE_PHASE = 0.55
+_USUAL_CYCLE_MS = 800.0
+
+
+class MotionMeter:
+    """RMS difference of each log image to the one before, after a Gaussian of sigma 3 px, where the run moves at all.
+
+    The paper's criterion for the diastolic frame; unsmoothed, and over the whole image, photon noise would decide. The
+    liveliest twentieth of the field is found beforehand from at most 15 evenly spaced log images. Keeps one reduced image.
+    """
+
+    def __init__(self, samples: Iterable[Image], inside: BoolArray) -> None:
+        small = [_reduced(x) for x in samples]
+        field = reduce_by(inside.astype(np.float32), _REDUCTION) > 0.5
+        if not field.any():
+            field[:] = True
+        changing = np.std(small, axis=0)
+        self._weights = field & (changing >= np.quantile(changing[field], 1.0 - _LIVELY))
+        self._before: Image | None = None
+
+    def __call__(self, x: Image) -> float:
+        """Motion of the next frame; 0 for the first."""
+        small = _reduced(x)
+        before, self._before = self._before, small
+        if before is None:
+            return 0.0
+        return float(np.sqrt(np.mean((small - before)[self._weights] ** 2, dtype=np.float64)))
+
+
+def _reduced(x: Image) -> Image:
+    variance = (_SIGMA_PX**2 - (_REDUCTION**2 - 1) / 12.0) / _REDUCTION**2
+    return gaussian(reduce_by(x, _REDUCTION), float(np.sqrt(variance)))
+
+
+def is_quiet(motion: Array) -> BoolArray:
+    """Frames that differ from the frame before by little more than noise, (n,).
+
+    Motion and noise add in squares. The noise is what the quietest fifth shows; quiet is a fifteenth of the liveliest motion,
+    or what the noise could be alone.
+    """
+    if len(motion) < 3:
+        return np.ones(len(motion), dtype=np.bool_)
+    smooth = ndimage.median_filter(motion, 3, mode="nearest") if len(motion) >= 30 else motion
+    noise = float(np.percentile(smooth, 20))
+    moved = np.sqrt(np.maximum(smooth**2 - noise**2, 0.0))
+    quiet: BoolArray = moved <= max(_QUIET * float(np.percentile(moved, 95)), _UNSURE * noise)
+    return quiet
+
+
+def quiet_stretches(motion: Array) -> tuple[tuple[int, int], ...]:
+    """(first, last) frames between which nothing moves, in order. A stretch begins one frame before its first quiet
+    difference: both frames of a small difference show the same place."""
+    quiet = is_quiet(motion)
+    stretches = []
+    start: int | None = None
+    for frame in range(1, len(motion) + 1):
+        if frame < len(motion) and quiet[frame]:
+            start = frame - 1 if start is None else start
+        elif start is not None:
+            stretches.append((start, frame - 1))
+            start = None
+    return tuple(stretches)
+
+
+def diastolic_frames(motion: Array, frame_times_ms: Array, r_wave_frames: Sequence[int] = ()) -> tuple[int, ...]:
+    """Frames round diastole that may be averaged, ascending; at most 7.
+
+    Without R waves they are the middle of the longest quiet stretch: end-systole stands still too, but shorter. With R
+    waves (RWavePointer, DICOM 0028,6040) they are the middle of the longest quiet stretch within the last 45 % before one.
+    Where nothing stands still, the single quietest frame.
+    """
+    n = len(motion)
+    if n < 3:
+        return (n - 1,)
+    late = _late_in_cycle(frame_times_ms, [frame for frame in r_wave_frames if 0 <= frame < n])
+    stretches: list[list[int]] = []
+    for first, last in quiet_stretches(motion):
+        frames = [frame for frame in range(first, last + 1) if late[frame]]
+        if len(frames) >= 2:
+            stretches.append(frames)
+    if not stretches:
+        allowed = np.flatnonzero(late[1:]) + 1
+        if not allowed.size:
+            allowed = np.arange(1, n)
+        return (int(allowed[np.argmin(motion[allowed])]),)
+    longest = max(stretches, key=len)
+    count = min(MOST_AVERAGED, len(longest))
+    start = (len(longest) - count) // 2
+    return tuple(longest[start : start + count])
+
+
+def _late_in_cycle(frame_times_ms: Array, r_waves: Sequence[int]) -> BoolArray:
+    if not r_waves:
+        return np.ones(len(frame_times_ms), dtype=np.bool_)
+    beats = frame_times_ms[sorted(set(r_waves))]
+    cycle = float(np.median(np.diff(beats))) if len(beats) > 1 else _USUAL_CYCLE_MS
+    edges = np.concatenate([[beats[0] - cycle], beats, [beats[-1] + cycle]])
+    beat = np.clip(np.searchsorted(edges, frame_times_ms, side="right") - 1, 0, len(edges) - 2)
+    phase = (frame_times_ms - edges[beat]) / np.maximum(edges[beat + 1] - edges[beat], 1e-9)
+    late: BoolArray = (phase >= _LATE_PHASE) & (phase < 1.0)
+    return late

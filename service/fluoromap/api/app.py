@@ -1,0 +1,126 @@
+"""The service as an ASGI application."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
+
+from fluoromap import queue
+from fluoromap.api import (
+    activation_times,
+    archive,
+    drawing,
+    electrodes,
+    electrograms,
+    events,
+    frames,
+    health,
+    instances,
+    jobs,
+    maps,
+    overlays,
+    plugins,
+    points,
+    problems,
+    sites,
+    studies,
+    tracks,
+)
+from fluoromap.api.body import BodyLimit, TooLarge
+from fluoromap.api.problems import Problem
+from fluoromap.api.security import Doorkeeper, Reader
+from fluoromap.settings import settings
+from fluoromap.store.refused import Refused
+
+SWEEP_SECONDS = 1.0
+
+ROUTERS = (
+    studies.router,
+    instances.router,
+    frames.router,
+    electrodes.router,
+    activation_times.router,
+    electrograms.router,
+    sites.router,
+    jobs.router,
+    events.router,
+    points.router,
+    tracks.router,
+    maps.router,
+    overlays.router,
+    archive.router,
+    plugins.router,
+    health.router,
+)
+
+log = structlog.get_logger(__name__)
+
+
+def create_app() -> FastAPI:
+    """The application for the process's settings."""
+    # The usual documentation pages fetch their scripts from elsewhere; hospital networks are closed.
+    app = FastAPI(
+        title="fluoromap",
+        summary="Activation maps of a heart chamber from ordinary C-arm fluoroscopy",
+        version="1",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=None,
+        lifespan=_lifespan,
+    )
+    problems.install(app)
+    _install_refusals(app)
+    for router in ROUTERS:
+        app.include_router(router)
+
+    @app.get("/v1/openapi.json", include_in_schema=False)
+    def openapi(caller: Reader) -> JSONResponse:
+        return JSONResponse(app.openapi())
+
+    app.add_middleware(BodyLimit)
+    app.add_middleware(Doorkeeper)
+    return app
+
+
+def _install_refusals(app: FastAPI) -> None:
+    @app.exception_handler(Refused)
+    async def refused(request: Request, error: Refused) -> JSONResponse:
+        return Problem(error.status, error.code, error.detail, error.errors, extra=error.extra).response()
+
+    @app.exception_handler(TooLarge)
+    async def too_large(request: Request, error: TooLarge) -> JSONResponse:
+        return error.problem.response()
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    sweeper = None if settings().eager else asyncio.create_task(_sweep())
+    try:
+        yield
+    finally:
+        if sweeper is not None:
+            sweeper.cancel()
+            with suppress(asyncio.CancelledError):
+                await sweeper
+        drawing.close()
+
+
+async def _sweep() -> None:
+    """Free dead workers' stages and announce what is due, for as long as the service runs."""
+    failing = False
+    while True:
+        try:
+            await run_in_threadpool(queue.sweep)
+            failing = False
+        except Exception as error:
+            # The database may come back; one line when it goes is enough.
+            if not failing:
+                log.warning("sweep_failed", error=type(error).__name__)
+            failing = True
+        await asyncio.sleep(SWEEP_SECONDS)

@@ -1,0 +1,159 @@
+"""The electrodes of one frame: found automatically, or set by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Body, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from fluoromap.api.frames import FrameNumber
+from fluoromap.api.instances import InstanceUid
+from fluoromap.api.problems import Problem, not_found, responses
+from fluoromap.api.security import Reader, Writer
+from fluoromap.api.studies import StudyId
+from fluoromap.contracts import Segmentation
+from fluoromap.store import instances, marks, studies
+from fluoromap.store.engine import reading, writing
+from fluoromap.store.instances import StudyRun
+from fluoromap.store.manifest import MarkPlan
+from fluoromap.store.models import Job, Mark, StageRow, StageState, Study
+from fluoromap.store.outcomes import load
+
+router = APIRouter(prefix="/v1/studies/{study_id}/instances/{uid}/frames/{n}/electrodes", tags=["electrodes"])
+
+
+class ElectrodeIn(BaseModel):
+    """An electrode set by hand."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"catheter": "mapping", "electrode": 1, "u_px": 251.5, "v_px": 233.0}]},
+    )
+    catheter: str = Field(max_length=64)
+    electrode: int = Field(ge=1, le=64, description="1 is the tip.")
+    u_px: float = Field(allow_inf_nan=False, description="Column; 0 is the centre of the leftmost stored pixel.")
+    v_px: float = Field(allow_inf_nan=False, description="Row; 0 is the centre of the topmost stored pixel.")
+    sd_px: float = Field(1.0, gt=0, le=50, allow_inf_nan=False, description="Standard deviation of each coordinate.")
+
+
+class ElectrodeOut(BaseModel):
+    """One electrode in one frame."""
+
+    catheter: str | None = Field(description="Null where no catheter of the study fits.", examples=["mapping"])
+    electrode: int = Field(examples=[1])
+    u_px: float = Field(examples=[251.5])
+    v_px: float = Field(examples=[233.0])
+    sd_px: float = Field(examples=[0.6])
+    source: Literal["manual", "automatic"]
+
+
+@router.get("", responses=responses(401, 403, 404, 422))
+def get_electrodes(
+    study_id: StudyId, uid: InstanceUid, n: FrameNumber, response: Response, caller: Reader
+) -> list[ElectrodeOut]:
+    """Electrodes set by hand where there are any, else those the newest job found."""
+    with reading() as session:
+        _run_with_frame(session, study_id, uid, n)
+        mark = marks.newest(session, study_id, uid, n)
+        return _answer(session, study_id, uid, n, mark, response)
+
+
+@router.put("", responses=responses(400, 401, 403, 404, 422))
+def put_electrodes(
+    study_id: StudyId,
+    uid: InstanceUid,
+    n: FrameNumber,
+    body: Annotated[list[ElectrodeIn], Body(max_length=512)],
+    response: Response,
+    caller: Writer,
+) -> list[ElectrodeOut]:
+    """Set this frame's electrodes by hand; the next job tracks the run anew from here."""
+    with writing() as session:
+        study = studies.lock(session, study_id)
+        run = _run_with_frame(session, study_id, uid, n)
+        _check(study, run, body)
+        mark = marks.put(session, study_id, uid, n, tuple(MarkPlan(**item.model_dump()) for item in body), caller)
+        return _answer(session, study_id, uid, n, mark, response)
+
+
+@router.delete("", responses=responses(401, 403, 404, 422))
+def delete_electrodes(
+    study_id: StudyId, uid: InstanceUid, n: FrameNumber, response: Response, caller: Writer
+) -> list[ElectrodeOut]:
+    """Return this frame to automatic detection; answers what that found last."""
+    with writing() as session:
+        studies.lock(session, study_id)
+        _run_with_frame(session, study_id, uid, n)
+        mark = marks.newest(session, study_id, uid, n)
+        if mark is not None and mark.electrodes is not None:
+            mark = marks.put(session, study_id, uid, n, None, caller)
+        return _answer(session, study_id, uid, n, mark, response)
+
+
+def _run_with_frame(session: Session, study_id: str, uid: str, n: int) -> StudyRun:
+    run = instances.run_of(session, study_id, uid)
+    if n > run.facts.frames:
+        raise not_found("frame")
+    return run
+
+
+def _answer(
+    session: Session, study_id: str, uid: str, n: int, mark: Mark | None, response: Response
+) -> list[ElectrodeOut]:
+    response.headers["ETag"] = f'"{mark.version if mark else 0}"'
+    if mark is not None and mark.electrodes is not None:
+        return [ElectrodeOut(**electrode, source="manual") for electrode in mark.electrodes]
+    return _detected(session, study_id, uid, n - 1)
+
+
+def _detected(session: Session, study_id: str, uid: str, frame: int) -> list[ElectrodeOut]:
+    """What the newest job that segmented this run found in ``frame`` (from 0)."""
+    stage = session.scalar(
+        select(StageRow)
+        .join(Job, Job.id == StageRow.job_id)
+        .where(
+            Job.study_id == study_id,
+            StageRow.name == "segment",
+            StageRow.subject == uid,
+            StageRow.state == StageState.DONE,
+        )
+        .order_by(Job.created.desc(), Job.id)
+        .limit(1)
+    )
+    if stage is None:
+        return []
+    found: list[ElectrodeOut] = []
+    for chain in load(Segmentation, stage).frames[frame].chains:
+        kind: dict[str, Any] = {
+            "catheter": max(chain.kinds, key=lambda item: item[1])[0] if chain.kinds else None,
+            "source": "manual" if chain.manual else "automatic",
+        }
+        for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
+            sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
+            found.append(ElectrodeOut(electrode=electrode, u_px=float(u), v_px=float(v), sd_px=sd, **kind))
+    return found
+
+
+def _check(study: Study, run: StudyRun, body: list[ElectrodeIn]) -> None:
+    catalogue = studies.catalogue_of(study)
+    errors: list[tuple[str, str]] = []
+    seen: set[tuple[str, int]] = set()
+    for index, item in enumerate(body):
+        where = f"body.{index}"
+        if item.catheter not in catalogue.names:
+            errors.append((f"{where}.catheter", f"the study's catheters are {', '.join(catalogue.names)}"))
+        elif item.electrode > catalogue[item.catheter].electrodes:
+            count = catalogue[item.catheter].electrodes
+            errors.append((f"{where}.electrode", f"this catheter has {count} electrodes"))
+        if (item.catheter, item.electrode) in seen:
+            errors.append((f"{where}.electrode", "this electrode is set twice"))
+        seen.add((item.catheter, item.electrode))
+        for name, value, size in (("u_px", item.u_px, run.facts.columns), ("v_px", item.v_px, run.facts.rows)):
+            if not -0.5 <= value <= size - 0.5:
+                errors.append((f"{where}.{name}", f"lies outside the image of {size} pixels"))
+    if errors:
+        raise Problem(422, "invalid_electrodes", "Some electrodes cannot be where they were set.", errors)

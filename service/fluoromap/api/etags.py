@@ -1,0 +1,35 @@
+"""Entity tags: answers that did not change are not sent again (RFC 9110 section 13.1.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastapi import Request, Response
+from fastapi.responses import FileResponse
+
+
+def known(request: Request, etag: str) -> bool:
+    """Whether the client holds that version already; compared weakly, as If-None-Match demands."""
+    header = request.headers.get("if-none-match")
+    if header is None:
+        return False
+    sent = {tag.strip().removeprefix("W/") for tag in header.split(",")}
+    return "*" in sent or etag.removeprefix("W/") in sent
+
+
+def not_modified(etag: str) -> Response:
+    return Response(status_code=304, headers={"ETag": etag})
+
+
+def file_response(
+    request: Request, path: Path, sha256: str, media_type: str, file_name: str, *, inline: bool = False
+) -> Response:
+    """A stored file with its hash as the tag, or 304."""
+    etag = f'"{sha256}"'
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
+    if known(request, etag):
+        return Response(status_code=304, headers=headers)
+    disposition = "inline" if inline else "attachment"
+    return FileResponse(
+        path, media_type=media_type, filename=file_name, headers=headers, content_disposition_type=disposition
+    )

@@ -1,0 +1,105 @@
+"""Samples of a site followed in one view: positions from the chosen origin, with what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Array, BoolArray, Grade, LocatedSite, Track, View, grade_of
+from fluoromap.geometry import Camera
+from fluoromap.reasons import Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One electrode in one frame (counted from 1).
+
+    position_mm, baseline_mm, covariance_mm2 : (3,), (3,), (3, 3); None where there is no position.
+    along_ray_sd_mm : standard deviation along the ray of this view; lateral_sd_mm : across it, root mean square of the
+    two directions. pixel_uv : where the electrode was seen; None in frames without it.
+    """
+
+    frame: int
+    position_mm: Array | None
+    baseline_mm: Array | None
+    covariance_mm2: Array | None
+    along_ray_sd_mm: float | None
+    lateral_sd_mm: float | None
+    pixel_uv: Array | None
+    grade: Grade
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameOrigins:
+    """What is subtracted in each frame: positions_mm (n, 3) from the isocentre; known (n,), False where there is none;
+    borrowed (n,), True where it is the mean over the other sites."""
+
+    positions_mm: Array
+    known: BoolArray
+    borrowed: BoolArray
+
+
+def isocentre(frames: int) -> FrameOrigins:
+    """The isocentre in every frame."""
+    return FrameOrigins(np.zeros((frames, 3)), np.ones(frames, dtype=np.bool_), np.zeros(frames, dtype=np.bool_))
+
+
+def reference(track: Track, catheter: str, own_mm: Array | None, others_mm: Array | None) -> FrameOrigins:
+    """Mean of the reference catheter's located electrodes in each frame.
+
+    Frames in which none is located take the site's own diastolic reference ``own_mm``, or where the site has none the
+    mean over the other sites ``others_mm``.
+    """
+    electrodes = [index for index, (name, _) in enumerate(track.labels) if name == catheter]
+    located = track.located[:, electrodes]
+    count = located.sum(axis=1)
+    total = np.where(located[..., None], track.positions_mm[:, electrodes], 0.0).sum(axis=1)
+    mean: Array = total / np.maximum(count, 1)[:, None]
+    seen: BoolArray = count > 0
+    fallback = own_mm if own_mm is not None else others_mm
+    if fallback is None:
+        return FrameOrigins(mean, seen, np.zeros_like(seen))
+    mean[~seen] = fallback
+    return FrameOrigins(mean, np.ones_like(seen), ~seen if own_mm is None else np.zeros_like(seen))
+
+
+def camera_of(site: LocatedSite, view: View) -> Camera:
+    """The camera a view ended with, self-calibrated or not."""
+    return site.camera_a if view == "a" else site.camera_b
+
+
+def samples(track: Track, index: int, camera: Camera, origins: FrameOrigins) -> Iterator[Sample]:
+    """The samples of the electrode that stands at ``index`` in ``track.labels``, one a frame."""
+    doubts = track.reasons[index]
+    source = camera.source_world_mm
+    for frame, located in enumerate(track.located[:, index]):
+        if not located:
+            yield _without_position(frame, None, (*doubts, Reason.TRACK_INTERRUPTED))
+            continue
+        pixel = track.pixels_uv[frame, index]
+        if not origins.known[frame]:
+            yield _without_position(frame, pixel, (*doubts, Reason.NO_REFERENCE))
+            continue
+        reasons = (*doubts, Reason.NO_REFERENCE) if origins.borrowed[frame] else doubts
+        position, covariance = track.positions_mm[frame, index], track.covariance_mm2[frame, index]
+        along, lateral = split_along_ray(covariance, position - source)
+        origin = origins.positions_mm[frame]
+        yield Sample(
+            frame + 1, position - origin, track.baseline_mm[frame, index] - origin, covariance, along, lateral, pixel,
+            grade_of(covariance), tuple(dict.fromkeys(reasons)),
+        )  # fmt: skip
+
+
+def _without_position(frame: int, pixel: Array | None, reasons: tuple[Reason, ...]) -> Sample:
+    return Sample(frame + 1, None, None, None, None, None, pixel, Grade.REJECTED, tuple(dict.fromkeys(reasons)))
+
+
+def split_along_ray(covariance_mm2: Array, ray: Array) -> tuple[float, float]:
+    """Standard deviation along a ray, and across it (root mean square of the two directions), in mm."""
+    direction = ray / np.linalg.norm(ray)
+    along = float(direction @ covariance_mm2 @ direction)
+    across = (float(np.trace(covariance_mm2)) - along) / 2
+    return float(np.sqrt(max(along, 0.0))), float(np.sqrt(max(across, 0.0)))

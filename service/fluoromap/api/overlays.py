@@ -1,0 +1,281 @@
+"""The activation map fused on fluoroscopy frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal
+from urllib.parse import quote
+
+import numpy as np
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+
+from fluoromap.api.drawing import drawn
+from fluoromap.api.etags import file_response
+from fluoromap.api.file_names import plain
+from fluoromap.api.followed import camera_of
+from fluoromap.api.maps import chamber_of
+from fluoromap.api.problems import Problem, not_found, responses
+from fluoromap.api.readiness import done_stage, job_of, manifest_of, map_of
+from fluoromap.api.security import Reader
+from fluoromap.contracts import Array, ChamberMap, LocatedSite, Matching, Triangulation, View
+from fluoromap.dicom import InstanceFacts, frame_to_8bit, open_frames
+from fluoromap.fuser.overlay import draw_overlay, encode_png
+from fluoromap.geometry import Camera
+from fluoromap.store import files
+from fluoromap.store.engine import reading
+from fluoromap.store.manifest import Manifest
+from fluoromap.store.models import Job, StageState
+from fluoromap.store.outcomes import load, stage_of
+from fluoromap.store.renderings import Rendered, rendered
+from fluoromap.store.results import FollowedSite, MapOutcome
+
+router = APIRouter(tags=["results"])
+
+VIEWS: tuple[View, ...] = ("a", "b")
+
+JobId = Annotated[str, Path(description="The job's id.")]
+
+
+class Overlay(BaseModel):
+    """A picture that can be had; by default of the frame that located the site."""
+
+    sop_instance_uid: str
+    site: str
+    view: Literal["a", "b"]
+    frame: int = Field(description="The diastolic frame, counted from 1.")
+    href: str
+
+
+class Overlays(BaseModel):
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "overlays": [
+                        {
+                            "sop_instance_uid": "1.2.826.0.1.3680043.8.498.1", "site": "S03", "view": "a", "frame": 37,
+                            "href": "/v1/jobs/7f0c.../overlays/1.2.826.0.1.3680043.8.498.1.png",
+                        }
+                    ]
+                }
+            ]
+        }
+    )  # fmt: skip
+
+    overlays: list[Overlay]
+
+
+@dataclass(frozen=True, eq=False)
+class Fusion:
+    """Everything that one overlay is drawn of; ``frame`` counts from 0, ``shift_mm`` (3,) takes the map to the world."""
+
+    uid: str
+    sha256: str
+    facts: InstanceFacts
+    frame: int
+    camera: Camera
+    map_sha256: str
+    chamber: ChamberMap
+    shift_mm: Array
+    site: str
+    tip_uv: Array | None
+
+    def asked(self, scale: int) -> dict[str, Any]:
+        """What the picture depends on, as JSON values."""
+        return {
+            "overlay": self.uid,
+            "file": self.sha256,
+            "frame": self.frame,
+            "camera": self.camera.matrix.ravel().tolist(),
+            "map": self.map_sha256,
+            "shift_mm": self.shift_mm.tolist(),
+            "tip_uv": None if self.tip_uv is None else self.tip_uv.tolist(),
+            "scale": scale,
+        }
+
+
+def overlays_of(session: Session, job: Job) -> list[Overlay]:
+    """An overlay for each view of each located site; 409 while there is no map."""
+    map_of(session, job)
+    manifest = manifest_of(job)
+    listed = []
+    for located in load(Triangulation, done_stage(session, job, "triangulate")).sites:
+        for view in VIEWS:
+            uid = manifest.site(located.site).run(view)
+            href = f"/v1/jobs/{job.id}/overlays/{quote(uid)}.png"
+            frame = _diastolic_frame(located, view) + 1
+            listed.append(Overlay(sop_instance_uid=uid, site=located.site, view=view, frame=frame, href=href))
+    return listed
+
+
+def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion:
+    """What the overlay of a run is drawn of.
+
+    Parameters
+    ----------
+    frame : int or None
+        Counted from 1; None takes the diastolic frame.
+
+    Raises
+    ------
+    Problem
+        404 for a run that is not a view of a located site, 422 for a frame the run does not have, 409 without a map.
+    """
+    outcome, fuse = map_of(session, job)
+    manifest = manifest_of(job)
+    located, view = _view_of(load(Triangulation, done_stage(session, job, "triangulate")), manifest, uid)
+    plan = manifest.runs[uid]
+    facts = InstanceFacts.from_json(plan.facts)
+    index = _diastolic_frame(located, view) if frame is None else frame - 1
+    if not 0 <= index < facts.frames:
+        raise Problem(
+            422, "no_such_frame", f"This run has the frames 1 to {facts.frames}.", [("frame", "out of range")]
+        )
+    camera = camera_of(located, view)
+    shift = _shift(session, job, manifest, outcome, located, view, index)
+    return Fusion(
+        uid=uid,
+        sha256=plan.sha256,
+        facts=facts,
+        frame=index,
+        camera=camera,
+        map_sha256=str(fuse.result),
+        chamber=chamber_of(outcome),
+        shift_mm=shift,
+        site=located.site,
+        tip_uv=_tip(session, job, manifest, located, view, index, shift),
+    )
+
+
+def picture_of(job_id: str, fusion: Fusion, scale: int) -> Rendered:
+    """The kept PNG of an overlay."""
+
+    def make() -> bytes:
+        path = files.path_of(fusion.sha256)
+        if not path.exists():
+            raise Problem(409, "run_deleted", "This run was deleted; its overlay can no longer be drawn.")
+        return drawn(draw, path, fusion, scale)
+
+    return rendered(job_id, fusion.asked(scale), "image/png", make)
+
+
+def draw(path: FilePath, fusion: Fusion, scale: int) -> bytes:
+    """PNG of an overlay from the run's file; called in a process of its own."""
+    shown = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
+    picture = draw_overlay(
+        shown, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv, scale
+    )  # fmt: skip
+    return encode_png(picture)
+
+
+def _view_of(triangulation: Triangulation, manifest: Manifest, uid: str) -> tuple[LocatedSite, View]:
+    for located in triangulation.sites:
+        for view in VIEWS:
+            if manifest.site(located.site).run(view) == uid:
+                return located, view
+    raise not_found("overlay: the run is no view of a located site")
+
+
+def _diastolic_frame(located: LocatedSite, view: View) -> int:
+    return located.frame_a if view == "a" else located.frame_b
+
+
+def _shift(
+    session: Session, job: Job, manifest: Manifest, outcome: MapOutcome, located: LocatedSite, view: View, frame: int
+) -> Array:
+    """Where the reference catheter stood in this frame: the map hangs on it.
+
+    In the diastolic frame as two views located it; in others as the view was followed; where neither tells, the site's
+    diastolic position, and last the mean over the sites.
+    """
+    if frame != _diastolic_frame(located, view):
+        stage = stage_of(session, job.id, "monoplane", located.site)
+        if stage is not None and stage.state == StageState.DONE:
+            followed = _followed_reference(load(FollowedSite, stage), view, frame, manifest.reference)
+            if followed is not None:
+                return followed
+    if located.reference_mm is not None:
+        return located.reference_mm
+    return np.array(outcome.reference_mm or (0.0, 0.0, 0.0))
+
+
+def _followed_reference(site: FollowedSite, view: View, frame: int, catheter: str) -> Array | None:
+    track = next((followed.track for followed in site.views if followed.view == view), None)
+    if track is None or frame >= len(track.located):
+        return None
+    seen = [
+        index for index, (name, _) in enumerate(track.labels) if name == catheter and track.located[frame, index]
+    ]  # fmt: skip
+    if not seen:
+        return None
+    mean: Array = track.positions_mm[frame, seen].mean(axis=0)
+    return mean
+
+
+def _tip(
+    session: Session, job: Job, manifest: Manifest, located: LocatedSite, view: View, frame: int, shift: Array
+) -> Array | None:
+    """The mapping tip as seen in this frame, else its diastolic position projected."""
+    matching = load(Matching, done_stage(session, job, "match"))
+    matched = next((site for site in matching.sites if site.site == located.site), None)
+    if matched is not None:
+        diastole = matched.diastole.a if view == "a" else matched.diastole.b
+        track = matched.track_a if view == "a" else matched.track_b
+        for observation in (diastole, *track):
+            if observation.frame != frame:
+                continue
+            for chain in observation.chains:
+                if chain.catheter == manifest.mapping and 1 in chain.electrodes:
+                    seen: Array = chain.pixels_uv[chain.electrodes.index(1)]
+                    return seen
+    tip = located.point(manifest.mapping, 1)
+    if tip is None:
+        return None
+    if tip.relative_mm is None:
+        return camera_of(located, view).project(tip.position_mm)
+    return camera_of(located, view).project(tip.relative_mm + shift)
+
+
+@router.get(
+    "/v1/jobs/{job_id}/overlays",
+    summary="Pictures of the map on fluoroscopy",
+    response_model=Overlays,
+    responses=responses(401, 403, 404, 409),
+)
+def list_overlays(job_id: JobId, token: Reader) -> Overlays:
+    """One entry for each view of each located site; 409 `not_ready` before the map is made, `no_map` where there is none."""
+    with reading() as session:
+        return Overlays(overlays=overlays_of(session, job_of(session, job_id)))
+
+
+@router.get(
+    "/v1/jobs/{job_id}/overlays/{uid}.png",
+    summary="The map on one fluoroscopy frame",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "The picture.",
+        },
+        304: {"description": "Unchanged since the ETag sent."},
+        **responses(401, 403, 404, 409, 422, 429),
+    },
+)
+def get_overlay(
+    job_id: JobId,
+    uid: Annotated[str, Path(description="SOPInstanceUID of the run.")],
+    request: Request,
+    token: Reader,
+    frame: Annotated[int | None, Query(ge=1, description="Counted from 1; by default the diastolic frame.")] = None,
+    scale: Annotated[Literal["1", "2"], Query(description="Pixels of the picture per stored pixel.")] = "1",
+) -> Response:
+    """Isochrones, hull outline, sites with their times in ms, a star at the tip and a colour bar, in stored pixels."""
+    with reading() as session:
+        job = job_of(session, job_id)
+        fusion = fusion_of(session, job, uid, frame)
+    picture = picture_of(job_id, fusion, int(scale))
+    name = f"overlay-{plain(fusion.site)}-{fusion.frame + 1}.png"
+    return file_response(request, picture.path, picture.sha256, "image/png", name, inline=True)

@@ -1,0 +1,26 @@
+"""Maps that several tests look at, made once a process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from sys import path
+
+import pytest
+
+path.insert(0, str(Path(__file__).parent))  # chambers.py stands beside this file
+
+from chambers import fused, sphere
+
+from fluoromap.contracts import ChamberMap
+
+
+@pytest.fixture(scope="session")
+def ball() -> ChamberMap:
+    """40 sites on a sphere of 25 mm about (10, -20, 5), a plane wave of 1 ms/mm along X, -25 to 25 ms."""
+    return fused(sphere(40))
+
+
+@pytest.fixture(scope="session")
+def sparse_ball() -> ChamberMap:
+    """10 sites on the same sphere: part of it is not covered."""
+    return fused(sphere(10), fill_mm=10.0)

@@ -1,0 +1,215 @@
+"""Overlays, views, isochrones and colours: what is drawn stands where geometry puts it."""
+
+import io
+
+import numpy as np
+import pytest
+from chambers import fused, sites_at, sphere
+from PIL import Image
+
+from fluoromap.fuser.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
+from fluoromap.fuser.isochrones import isochrones
+from fluoromap.fuser.lettering import bar_box
+from fluoromap.fuser.map_picture import draw_map_views
+from fluoromap.fuser.overlay import draw_overlay, encode_png
+from fluoromap.fuser.raster import rasterise
+from fluoromap.geometry import Camera, Gantry, camera_from_gantry
+
+SHIFT = np.array([-10.0, 20.0, -5.0])
+
+
+def camera(primary: float = 90.0, secondary: float = 0.0, rows: int = 512, columns: int = 512) -> Camera:
+    spacing = 178 * 2 / 512
+    return camera_from_gantry(Gantry(primary, secondary, 1000.0, 500.0, (spacing, spacing), rows, columns))
+
+
+def grey(view: Camera) -> np.ndarray:
+    return np.full((view.rows, view.columns), 120, dtype=np.uint8)
+
+
+class TestIsochrones:
+    def test_points_lie_on_their_level(self, ball):
+        lines = isochrones(ball, np.arange(-20.0, 25.0, 5.0))
+        assert {line.lat_ms for line in lines} == set(np.arange(-20.0, 25.0, 5.0))
+        for line in lines:
+            assert len(line.faces) == len(line.points_mm) - 1
+            # The field is linear in X to within the map's error.
+            assert np.abs(line.points_mm[:, 0] - 10 - line.lat_ms).max() < 2.5
+
+    def test_lines_on_a_closed_covered_surface_are_closed(self, ball):
+        for line in isochrones(ball, np.arange(-20.0, 25.0, 5.0)):
+            np.testing.assert_array_equal(line.points_mm[0], line.points_mm[-1])
+
+    def test_a_level_through_a_vertex_breaks_nothing(self, ball):
+        (level,) = ball.lat_ms[[17]]
+        lines = isochrones(ball, np.array([level]))
+        assert all((line.points_mm[0] == line.points_mm[-1]).all() for line in lines)
+
+    def test_nothing_runs_through_what_is_not_covered(self, sparse_ball):
+        for line in isochrones(sparse_ball, np.arange(-20.0, 25.0, 5.0)):
+            assert sparse_ball.covered[sparse_ball.faces[line.faces]].all()
+
+
+class TestColours:
+    @pytest.mark.parametrize(("spread", "step"), [(2, 5), (48, 5), (90, 10), (110, 10), (220, 20)])
+    def test_step_follows_the_range(self, spread, step):
+        sites = sphere(20, slope_ms_per_mm=spread / 50)
+        scale = scale_of(fused(sites, edge_mm=7))
+        assert scale.step_ms == step
+        assert scale.start_ms % step == 0
+        assert all(scale.start_ms <= site.lat_ms <= scale.stop_ms for site in sites)
+
+    def test_order_survives_without_hue(self):
+        colours = colour_map(np.linspace(0, 1, 30)).astype(float)
+        linear = np.where(colours / 255 <= 0.04045, colours / 255 / 12.92, ((colours / 255 + 0.055) / 1.055) ** 2.4)
+        assert (np.diff(linear @ [0.2126, 0.7152, 0.0722]) < 0).all()
+        # Machado, Oliveira & Fernandes (2009), complete deuteranopia: what such a reader sees is in the same order.
+        deuteranope = linear @ np.array([[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+                                         [-0.011820, 0.042940, 0.968881]]).T  # fmt: skip
+        assert (np.diff(deuteranope @ [0.2126, 0.7152, 0.0722]) < 0).all()
+
+    def test_no_data_is_grey_and_no_band_is(self, sparse_ball):
+        colours = vertex_colours(sparse_ball).astype(int)
+        assert (np.ptp(colours[~sparse_ball.covered], axis=1) == 0).all()
+        assert np.ptp(scale_of(sparse_ball).band_colours().astype(int), axis=1).min() > 60
+
+    def test_bands(self):
+        scale = Scale(-10.0, 5.0, 4)
+        assert scale.band(np.array([-99, -10, -5.01, -5, 9.9, 99])).tolist() == [0, 0, 0, 1, 3, 3]
+        assert [milliseconds(value) for value in (-0.4, -12.6, 41.2)] == ["0", "-13", "41"]
+
+
+def test_raster_shows_the_nearest_face_with_linear_values():
+    uv = np.array([[0, 0], [40, 0], [0, 40], [0, 0], [40, 0], [0, 40]], dtype=float)
+    nearness = np.array([1.0, 1, 1, 5, 5, 5])
+    faces = np.array([[0, 1, 2], [3, 4, 5]])
+    for order in (faces, faces[::-1]):
+        raster = rasterise(uv, nearness, order, np.ones(2, dtype=bool), (50, 50))
+        assert (order[raster.face[raster.shown()]] == [3, 4, 5]).all()
+        v, u = np.nonzero(raster.shown())
+        np.testing.assert_allclose(raster.sample(2 * uv[:, 0] - uv[:, 1]), 2.0 * u - v, atol=1.5)
+    assert raster.visible(np.array([[5.0, 5.0], [5.0, 5.0], [45.0, 45.0]]), np.array([5.0, 1.0, 1.0])).tolist() == [
+        True,
+        False,
+        True,
+    ]
+
+
+class TestOverlay:
+    @pytest.mark.parametrize("scale", [1, 2])
+    def test_size_and_kind(self, ball, scale):
+        view = camera(rows=400, columns=512)
+        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, scale)
+        assert picture.shape == (400 * scale, 512 * scale, 3)
+        assert picture.dtype == np.uint8
+
+    @pytest.mark.parametrize("scale", [1, 2])
+    @pytest.mark.parametrize(("primary", "secondary"), [(90, 0), (0, 0), (-30, 20)])
+    def test_star_stands_at_the_projected_tip(self, ball, primary, secondary, scale):
+        view = camera(primary, secondary)
+        site = next(site for site in ball.sites if site.site == "S05")
+        tip = (view.project(site.position_mm + SHIFT) + 0.5) * scale - 0.5
+        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, scale)
+        white = (picture == 255).all(axis=2)
+        v, u = np.nonzero(white)
+        pixels = np.stack([u, v], axis=1)
+        star = pixels[np.linalg.norm(pixels - tip, axis=1) < 5 * scale]
+        assert len(star) > 20 * scale
+        assert np.linalg.norm(star.mean(axis=0) - tip) <= scale
+
+    def test_star_takes_the_tip_that_was_seen(self, ball):
+        view = camera()
+        tip = np.array([60.0, 380.0])
+        with_star = draw_overlay(grey(view), view, ball, SHIFT, "S05", tip)
+        white = (with_star == 255).all(axis=2)
+        v, u = np.nonzero(white)
+        pixels = np.stack([u, v], axis=1)
+        star = pixels[np.linalg.norm(pixels - tip, axis=1) < 9]
+        assert np.linalg.norm(star.mean(axis=0) - tip) <= 1
+
+    @pytest.mark.parametrize("primary", [0, 90, 45])
+    def test_each_dot_stands_where_its_site_projects(self, primary):
+        tips = np.array([[0.0, 0, 0], [30, 5, 0], [0, 30, 8], [4, 3, 30], [-20, -15, 10]])
+        view = camera(primary)
+        times = np.array([0.0, 20, 40, 60, 80])
+        chamber = fused(sites_at(tips, times), edge_mm=5)
+        first = draw_overlay(grey(view), view, chamber, [0, 0, 0], "none", None)
+        scale = scale_of(chamber)
+        for index, tip in enumerate(tips):
+            uv = view.project(tip)
+            own = scale.band_colours()[scale.band(times[index])].astype(int)
+            v, u = np.nonzero(np.abs(first.astype(int) - own).max(axis=2) < 30)
+            pixels = np.stack([u, v], axis=1)
+            dot = pixels[np.linalg.norm(pixels - uv, axis=1) < 5]
+            assert len(dot) >= 4
+            assert np.linalg.norm(dot.mean(axis=0) - uv) <= 1
+
+    def test_front_wall_is_the_one_towards_the_detector(self):
+        # Early on the patient's left (+X), late on the right; a left lateral C-arm looks from the left.
+        chamber = fused(sphere(60, slope_ms_per_mm=-1.0), edge_mm=5)
+        scale = scale_of(chamber)
+        for primary, expected in ((90, scale.band_colours()[1]), (-90, scale.band_colours()[-2])):
+            view = camera(primary)
+            picture = draw_overlay(np.zeros((512, 512), np.uint8), view, chamber, SHIFT, "none", None).astype(float)
+            u, v = np.rint(view.project(np.array([10.0, -20.0, 5.0]) + SHIFT)).astype(int)
+            patch = np.median(picture[v - 12 : v + 13, u - 12 : u + 13].reshape(-1, 3), axis=0)
+            direction = patch / np.linalg.norm(patch)
+            wanted = expected / np.linalg.norm(expected.astype(float))
+            assert direction @ wanted > 0.97
+
+    def test_colour_bar_shows_every_band_in_order(self, ball):
+        view = camera()
+        picture = draw_overlay(grey(view), view, ball, SHIFT, "none", None)
+        scale = scale_of(ball)
+        left, top, right, bottom = bar_box(scale, (512, 512), 12)
+        panel = picture[int(top) : int(bottom), int(left) : int(right)].astype(int)
+        rows = [
+            np.nonzero((np.abs(panel - colour).max(axis=2) == 0).sum(axis=1) > 5)[0] for colour in scale.band_colours()
+        ]
+        middles = [row.mean() for row in rows]
+        assert (np.diff(middles) > 5).all()
+
+    def test_electrodes_stay_legible_and_the_rest_stays_as_it_was(self, ball):
+        view = camera()
+        bright = draw_overlay(np.full((512, 512), 160, np.uint8), view, ball, SHIFT, "none", None).astype(int)
+        dark = draw_overlay(np.full((512, 512), 60, np.uint8), view, ball, SHIFT, "none", None).astype(int)
+        contrast = (bright - dark).mean(axis=2)
+        u, v = np.rint(view.project(np.array([10.0, -20.0, 5.0]) + SHIFT)).astype(int)
+        assert np.median(contrast[v - 40 : v + 41, u - 40 : u + 41]) > 0.6 * 100
+        assert (bright[:40, :300] == 160).all()
+
+    def test_what_is_not_covered_gets_no_colour_but_a_hatch(self, sparse_ball):
+        view = camera()
+        picture = draw_overlay(grey(view), view, sparse_ball, SHIFT, "none", None).astype(int)
+        assert not (np.ptp(picture, axis=2) > 0).all()
+        hatch = (np.ptp(picture, axis=2) == 0) & (picture[..., 0] > 130) & (picture[..., 0] < 190)
+        u, v = np.rint(view.project(np.array([10.0, -20.0, 5.0]) + SHIFT)).astype(int)
+        assert hatch[v - 130 : v + 131, u - 130 : u + 131].sum() > 100
+
+    def test_unknown_site_far_map_and_wrong_frame(self, ball):
+        view = camera()
+        assert draw_overlay(grey(view), view, ball, [5000.0, 0, 0], "S99", None).shape == (512, 512, 3)
+        assert draw_overlay(grey(view), view, ball, [-600.0, 0, 0], "S05", None).shape == (512, 512, 3)
+        with pytest.raises(ValueError, match="frame"):
+            draw_overlay(np.zeros((10, 10), np.uint8), view, ball, SHIFT, "S05", None)
+        with pytest.raises(ValueError, match="scale"):
+            draw_overlay(grey(view), view, ball, SHIFT, "S05", None, 0)
+
+    def test_png_is_the_picture_and_always_the_same(self, ball):
+        view = camera()
+        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None)
+        again = draw_overlay(grey(view), view, ball, SHIFT, "S05", None)
+        assert encode_png(picture) == encode_png(again)
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(encode_png(picture)))), picture)
+
+
+def test_views_show_each_side_in_its_colours():
+    chamber = fused(sphere(60, slope_ms_per_mm=-1.0), edge_mm=5)
+    picture = draw_map_views(chamber)
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    bands = scale_of(chamber).band_colours().astype(float)
+    # Third panel of the first row: from the patient's left, where it is early.
+    patch = np.median(picture[160:180, 840:860].reshape(-1, 3).astype(float), axis=0)
+    nearest = np.linalg.norm(bands / np.linalg.norm(bands, axis=1)[:, None] - patch / np.linalg.norm(patch), axis=1)
+    assert nearest.argmin() <= 1

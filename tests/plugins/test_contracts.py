@@ -1,0 +1,93 @@
+"""No half-valid objects travel between stages."""
+
+import numpy as np
+import pytest
+
+from fluoromap.contracts import (
+    CHI2_95_3D,
+    Chain,
+    ElectrodePoint,
+    FrameChains,
+    Grade,
+    Refusal,
+    Segmentation,
+    SiteCycle,
+    Track,
+    frozen,
+    grade_of,
+)
+from fluoromap.reasons import Reason
+
+
+def chain(electrodes: tuple[int, ...] = (1, 2), **changes: object) -> Chain:
+    m = len(electrodes)
+    values: dict[str, object] = {
+        "electrodes": electrodes, "pixels_uv": np.zeros((m, 2)), "covariance_px2": np.zeros((m, 2, 2)),
+        "scores": np.ones(m), "kinds": (("mapping", 1.0),),
+    }  # fmt: skip
+    return Chain(**{**values, **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("semi_axis_mm", "grade"), [(1.99, Grade.A), (2.01, Grade.B), (3.99, Grade.B), (4.01, Grade.C)])
+def test_grade_is_by_the_largest_semi_axis_whatever_its_direction(semi_axis_mm: float, grade: Grade) -> None:
+    rotation, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
+    covariance = rotation @ np.diag([semi_axis_mm**2, 0.01, 0.01]) @ rotation.T / CHI2_95_3D
+    assert grade_of(covariance) is grade
+
+
+def test_chi_squared_radius_holds_ninety_five_percent() -> None:
+    squared = (np.random.default_rng(2).normal(size=(200_000, 3)) ** 2).sum(axis=1)
+    assert (squared <= CHI2_95_3D).mean() == pytest.approx(0.95, abs=0.002)
+
+
+def test_frozen_arrays_are_copies_that_cannot_be_changed() -> None:
+    mine = np.zeros(3)
+    kept = frozen(mine, (3,), "mine")
+    mine[0] = 1
+    assert kept[0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        kept[0] = 1
+
+
+@pytest.mark.parametrize("value", [np.zeros(2), np.zeros((3, 1)), [0.0, np.nan, 0.0]])
+def test_wrong_shapes_and_numbers_name_the_field(value: object) -> None:
+    with pytest.raises(ValueError, match="tip"):
+        frozen(value, (3,), "tip")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("electrodes", [(), (2, 1), (1, 1), (0, 1)])
+def test_electrodes_of_a_chain_are_ascending_numbers_from_one(electrodes: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError):
+        chain(electrodes)
+
+
+def test_kinds_of_a_chain_are_probabilities() -> None:
+    assert chain().probability("mapping") == 1
+    assert chain().probability("pacing") == 0
+    with pytest.raises(ValueError, match="probabilities"):
+        chain(kinds=(("mapping", 0.8), ("pacing", 0.4)))
+
+
+def test_a_segmentation_holds_every_frame_in_order() -> None:
+    frames = (FrameChains(1, ()), FrameChains(0, ()))
+    with pytest.raises(ValueError, match="order"):
+        Segmentation(frames, None, (), np.zeros(2), np.arange(2.0))
+
+
+def test_a_relative_position_needs_its_covariance() -> None:
+    with pytest.raises(ValueError, match="relative"):
+        ElectrodePoint("mapping", 1, np.zeros(3), np.eye(3), np.zeros(3), None, (0.1, 0.1), 90.0)
+
+
+def test_cycles_and_tracks_agree_with_their_labels() -> None:
+    with pytest.raises(ValueError, match="positions_mm"):
+        SiteCycle(np.array([0.1]), (("mapping", 1),), np.zeros((1, 2, 3)), np.zeros((1, 2, 3, 3)))
+    n, labels = 2, (("mapping", 1),)
+    arrays = (np.zeros((n, 1, 3)), np.zeros((n, 1, 3)), np.zeros((n, 1, 3, 3)), np.zeros((n, 1, 2)))
+    with pytest.raises(ValueError, match="reasons"):
+        Track(labels, np.ones((n, 1), dtype=bool), *arrays, reasons=())
+
+
+def test_a_refusal_says_its_reason_s_sentence_unless_told_better() -> None:
+    assert str(Refusal(Reason.NO_A_PRIORI)) == Reason.NO_A_PRIORI.sentence
+    assert str(Refusal(Reason.DEPTH_UNOBSERVABLE, "17 mm")) == "17 mm"

@@ -1,0 +1,43 @@
+"""Fixtures for the output half of the API."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from fastapi import FastAPI  # noqa: E402
+from fastapi.testclient import TestClient  # noqa: E402
+from finished_study import FinishedStudy, make_study  # noqa: E402
+
+from fluoromap.api import drawing  # noqa: E402
+from fluoromap.api.app import create_app  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def application() -> FastAPI:
+    """The whole application; it asks for its settings at each request."""
+    return create_app()
+
+
+@pytest.fixture
+def client(application: FastAPI, data_dir: Path) -> TestClient:
+    """A client from the same machine, on an empty database."""
+    return TestClient(application, base_url="http://127.0.0.1")
+
+
+@pytest.fixture
+def study(client: TestClient) -> FinishedStudy:
+    """A job none of whose stages has begun."""
+    return make_study()
+
+
+@pytest.fixture(scope="session")
+def drawing_processes() -> Iterator[None]:
+    """Ends the drawing processes with the session."""
+    yield
+    drawing.close()

@@ -1,0 +1,302 @@
+"""A small study whose stages end one by one, with results written down by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from fluoromap.contracts import (
+    ChamberMap,
+    ElectrodePoint,
+    LocatedSite,
+    MatchedSite,
+    Matching,
+    NamedChain,
+    Observation,
+    PhasePair,
+    RejectedSite,
+    SurfaceSite,
+    Track,
+    Triangulation,
+)
+from fluoromap.dicom import deterministic_uid, read_instance, write_cine
+from fluoromap.geometry import Gantry
+from fluoromap.reasons import Reason
+from fluoromap.store import files, jobs
+from fluoromap.store.codec import encode
+from fluoromap.store.engine import reading, writing
+from fluoromap.store.manifest import CatheterPlan, GantryPlan, Manifest, PluginPlan, RejectedPlan, RunPlan, SitePlan
+from fluoromap.store.models import Base, Instance, Point, StageRow, Study
+from fluoromap.store.results import FollowedSite, FollowedView, MapOutcome
+
+SIZE = 96
+FRAMES = 3
+GANTRIES = {
+    "a": Gantry(90.0, 0.0, 1000.0, 700.0, (1.2, 1.2), SIZE, SIZE),
+    "b": Gantry(0.0, 0.0, 1000.0, 700.0, (1.2, 1.2), SIZE, SIZE),
+}
+REFERENCE_MM = np.array([5.0, -4.0, 3.0])
+STEP_MM = np.array([1.0, 0.0, 0.0])
+TIP_MM = np.array([12.0, 6.0, 9.0])
+DIASTOLE = 1
+"""Index of the diastolic frame in every run."""
+TIP_PIXEL = {"a": (70.0, 20.0), "b": (25.0, 30.0)}
+COVARIANCE_A = np.diag([4.0, 0.01, 0.01])
+"""Of view a's track: the ray of a lateral view is the patient's left-right axis."""
+
+
+@dataclass
+class FinishedStudy:
+    """``S01`` is located and followed, ``S02`` could not be located, ``S03`` was not ready when the job was made."""
+
+    study_id: str
+    job_id: str
+    uids: dict[tuple[str, str], str]
+
+    def stage(self, name: str, subject: str | None = None) -> int:
+        with reading() as session:
+            query = select(StageRow.id).where(StageRow.job_id == self.job_id, StageRow.name == name)
+            stage_id = session.scalar(query if subject is None else query.where(StageRow.subject == subject))
+        assert stage_id is not None
+        return stage_id
+
+    @contextmanager
+    def claimed(self, name: str, subject: str | None = None) -> Iterator[tuple[Session, jobs.Claim]]:
+        stage_id = self.stage(name, subject)
+        with writing() as session:
+            held = jobs.claim(session, stage_id, "tester")
+            assert held is not None
+            yield session, held
+
+    def end(self, name: str, subject: str | None, result: Any, rows: list[Base] | None = None) -> None:
+        with self.claimed(name, subject) as (session, held):
+            sha256 = files.keep_bytes(session, encode(result), "application/json")
+            assert jobs.finish(session, held, sha256, reused=False, rows=rows or ())
+
+    def fail(self, name: str, subject: str | None = None) -> None:
+        error = {"code": "plugin_failed", "detail": f"The stage {name!r} failed: it broke."}
+        with self.claimed(name, subject) as (session, held):
+            assert jobs.fail(session, held, error)
+
+    def segmented(self) -> None:
+        for uid in self.uids.values():
+            self.end("segment", uid, {"of": uid})
+
+    def matched(self) -> None:
+        self.segmented()
+        self.end("match", None, matching())
+
+    def triangulated(self) -> None:
+        self.matched()
+        self.end("triangulate", None, triangulation(), self._points())
+
+    def mapped(self, outcome: MapOutcome | None = None) -> None:
+        self.triangulated()
+        self.end("fuse", None, outcome or map_outcome())
+
+    def followed(self) -> None:
+        self.end("monoplane", "S01", followed_site())
+        refused = FollowedView("a", None, Reason.NO_A_PRIORI, Reason.NO_A_PRIORI.sentence)
+        self.end("monoplane", "S02", FollowedSite("S02", (refused,)))
+
+    def finish(self, outcome: MapOutcome | None = None) -> None:
+        """End all stages."""
+        self.mapped(outcome)
+        self.followed()
+
+    def _points(self) -> list[Base]:
+        located = Point(
+            job_id=self.job_id,
+            site="S01",
+            catheter="mapping",
+            electrode=1,
+            position_mm=TIP_MM.tolist(),
+            covariance_mm2=[2.0, 0.0, 0.0, 2.0, 0.0, 2.0],
+            relative_mm=(TIP_MM - REFERENCE_MM).tolist(),
+            relative_covariance_mm2=[0.1, 0.01, 0.0, 0.1, 0.0, 0.1],
+            view_a=self.uids["S01", "a"],
+            view_b=self.uids["S01", "b"],
+            frame_a=DIASTOLE + 1,
+            frame_b=DIASTOLE + 1,
+            residual_a_px=0.25,
+            residual_b_px=0.5,
+            ray_angle_deg=90.0,
+            lat_ms=41.0,
+            grade="C",
+            relative_grade="A",
+            reasons=["identity_by_motion"],
+        )
+        rejected = Point(
+            job_id=self.job_id, site="S03", catheter="mapping", electrode=1, lat_ms=None, grade="rejected",
+            relative_grade="rejected", reasons=["one_view_only", "no_activation_time"],
+        )  # fmt: skip
+        return [located, rejected]
+
+
+def make_study() -> FinishedStudy:
+    """Store two sites' runs as DICOM files and a job whose first stages are ready."""
+    uids = {(site, view): deterministic_uid("output", site, view) for site in ("S01", "S02") for view in ("a", "b")}
+    with writing() as session:
+        study = Study(
+            id="0" * 32, label="rhythm", catheters=[], reference="reference", mapping="mapping",
+            frame_of_reference_uid=deterministic_uid("frame"),
+        )  # fmt: skip
+        session.add(study)
+        session.flush()
+        runs = {uid: _stored_run(session, uid, view) for (_, view), uid in uids.items()}
+        plugin = PluginPlan(name="by-hand", version="1", params={})
+        manifest = Manifest(
+            study=study.id,
+            catheters=tuple(
+                CatheterPlan(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
+                for name in ("reference", "mapping")
+            ),
+            reference="reference",
+            mapping="mapping",
+            segmenter=plugin,
+            triangulator=plugin,
+            monoplane=plugin,
+            fuser=plugin,
+            view="a",
+            runs=runs,
+            sites=tuple(
+                SitePlan(site=site, lat_ms=41.0, lat_sd_ms=2.0, view_a=uids[site, "a"], view_b=uids[site, "b"])
+                for site in ("S01", "S02")
+            ),
+            rejected=(
+                RejectedPlan(
+                    site="S03", lat_ms=None, view_a=None, view_b=None,
+                    reasons=(Reason.ONE_VIEW_ONLY, Reason.NO_ACTIVATION_TIME),
+                ),
+            ),
+        )  # fmt: skip
+        job = jobs.create(session, study.id, manifest)
+        return FinishedStudy(study.id, job.id, uids)
+
+
+def _stored_run(session: Session, uid: str, view: str) -> RunPlan:
+    gantry = GANTRIES[view]
+    ramp = np.tile(np.linspace(200, 3000, SIZE, dtype=np.uint16), (SIZE, 1))
+    with files.incoming() as path:
+        write_cine(
+            path,
+            [ramp + 10 * frame for frame in range(FRAMES)],
+            frame_count=FRAMES,
+            gantry=gantry,
+            frame_time_ms=16.7,
+            acquired=datetime(2026, 3, 1, 9, 30, tzinfo=UTC),
+            study_instance_uid=deterministic_uid("study"),
+            series_number=1,
+            sop_instance_uid=uid,
+        )
+        facts = read_instance(path)
+        sha256 = files.keep(session, path, "application/dicom")
+    session.add(
+        Instance(
+            sop_instance_uid=uid, sha256=sha256, study_instance_uid=facts.study_instance_uid,
+            series_instance_uid=facts.series_instance_uid, series_number=1, acquired=None, facts=facts.to_json(),
+        )
+    )  # fmt: skip
+    plan = GantryPlan(
+        primary_deg=gantry.primary_deg, secondary_deg=gantry.secondary_deg, source_detector_mm=1000.0,
+        source_isocentre_mm=700.0, pixel_spacing_mm=gantry.pixel_spacing_mm, rows=SIZE, columns=SIZE,
+        image_axes=gantry.image_axes,
+    )  # fmt: skip
+    return RunPlan(sha256=sha256, facts=facts.to_json(), gantry=plan, marks={})
+
+
+def camera(view: str) -> Any:
+    from fluoromap.geometry import camera_from_gantry
+
+    return camera_from_gantry(GANTRIES[view])
+
+
+def _observation(view: str, frame: int) -> Observation:
+    chains: tuple[NamedChain, ...] = ()
+    if frame != 2:
+        chains = (NamedChain("mapping", (1,), np.array([TIP_PIXEL[view]]), np.eye(2)[None]),)
+    return Observation(frame, None, chains)
+
+
+def matching() -> Matching:
+    times = np.arange(FRAMES) * 16.7
+    site = MatchedSite(
+        site="S01",
+        camera_a=camera("a"),
+        camera_b=camera("b"),
+        diastole=PhasePair(None, _observation("a", DIASTOLE), _observation("b", DIASTOLE)),
+        cycle=(),
+        track_a=tuple(_observation("a", frame) for frame in range(FRAMES)),
+        track_b=tuple(_observation("b", frame) for frame in range(FRAMES)),
+        frame_times_a_ms=times,
+        frame_times_b_ms=times,
+    )
+    return Matching((site,), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
+
+
+def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
+    relative = None if reference_mm is None else TIP_MM - reference_mm
+    tip = ElectrodePoint(
+        "mapping", 1, TIP_MM, 0.1 * np.eye(3), relative, None if relative is None else 0.1 * np.eye(3), (0.2, 0.3), 90.0
+    )  # fmt: skip
+    site = LocatedSite("S01", camera("a"), camera("b"), DIASTOLE, DIASTOLE, (tip,), reference_mm, None)
+    return Triangulation((site,), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
+
+
+def followed_site() -> FollowedSite:
+    """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
+    is not seen in frame 2."""
+    labels = (("reference", 1), ("reference", 2), ("mapping", 1))
+    half = np.array([0.0, 0.0, 2.0])
+    positions = np.zeros((FRAMES, 3, 3))
+    for frame in range(FRAMES):
+        moved = REFERENCE_MM + (STEP_MM if frame == 0 else 0.0)
+        positions[frame] = [moved - half, moved + half, TIP_MM + 0.5 * frame * STEP_MM]
+    located = np.ones((FRAMES, 3), dtype=bool)
+    located[2, :2] = False
+    located[1, 2] = False
+    track = Track(
+        labels=labels,
+        located=located,
+        positions_mm=positions * located[..., None],
+        baseline_mm=(positions + 0.25) * located[..., None],
+        covariance_mm2=np.tile(COVARIANCE_A, (FRAMES, 3, 1, 1)),
+        pixels_uv=np.full((FRAMES, 3, 2), 40.0),
+        reasons=((), (), (Reason.DEPTH_ASSUMED,)),
+    )
+    return FollowedSite("S01", (FollowedView("a", track, None, ""),))
+
+
+def map_outcome() -> MapOutcome:
+    """An octahedron of 10 mm about the reference, one vertex without a time."""
+    vertices = 10.0 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    covered = np.array([True, True, True, True, True, False])
+    tip = TIP_MM - REFERENCE_MM
+    chamber = ChamberMap(
+        vertices_mm=vertices,
+        faces=faces,
+        lat_ms=np.array([10.0, 20.0, 30.0, 40.0, 50.0, 0.0]),
+        lat_sd_ms=np.where(covered, 2.0, 0.0),
+        covered=covered,
+        sites=(SurfaceSite("S01", tip, tip - 0.5, 0.9, 41.0, None),),
+        earliest=(("S01", 1.0),),
+        total_activation_time_ms=40.0,
+        leave_one_out_rms_ms=None,
+        volume_ml=1.33,
+        area_cm2=6.9,
+        coverage=0.8,
+    )
+    x, y, z = REFERENCE_MM.tolist()
+    return MapOutcome(chamber, None, "", (x, y, z))
+
+
+def no_map() -> MapOutcome:
+    return MapOutcome(None, Reason.TOO_FEW_SITES, Reason.TOO_FEW_SITES.sentence, None)

@@ -1,0 +1,143 @@
+"""Overlays and the archive: what is drawn, of which frame, and that it is drawn once."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from finished_study import DIASTOLE, REFERENCE_MM, SIZE, STEP_MM, TIP_MM, TIP_PIXEL, FinishedStudy, camera, no_map
+from PIL import Image
+from sqlalchemy import select
+
+from fluoromap.api import overlays as overlay_routes
+from fluoromap.api.overlays import fusion_of
+from fluoromap.store import files
+from fluoromap.store.engine import reading
+from fluoromap.store.models import Job, Rendering
+
+pytestmark = pytest.mark.usefixtures("drawing_processes")
+
+
+def _fusion(study: FinishedStudy, view: str, frame: int | None) -> overlay_routes.Fusion:
+    with reading() as session:
+        return fusion_of(session, session.get_one(Job, study.job_id), study.uids["S01", view], frame)
+
+
+def test_each_view_of_each_located_site_is_listed(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    listed = client.get(f"/v1/jobs/{study.job_id}/overlays").json()["overlays"]
+    assert [(entry["site"], entry["view"], entry["frame"]) for entry in listed] == [
+        ("S01", "a", DIASTOLE + 1),
+        ("S01", "b", DIASTOLE + 1),
+    ]
+    assert [entry["sop_instance_uid"] for entry in listed] == [study.uids["S01", "a"], study.uids["S01", "b"]]
+    assert client.get(listed[0]["href"]).headers["content-type"] == "image/png"
+
+
+def test_size_and_cache(client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    first = client.get(path)
+    assert first.status_code == 200, first.text
+    picture = Image.open(io.BytesIO(first.content))
+    assert (picture.size, picture.mode) == ((SIZE, SIZE), "RGB")
+    assert Image.open(io.BytesIO(client.get(f"{path}?scale=2").content)).size == (2 * SIZE, 2 * SIZE)
+
+    def never(*_: object) -> bytes:
+        raise AssertionError("drawn again")
+
+    monkeypatch.setattr(overlay_routes, "drawn", never)
+    assert client.get(path).content == first.content
+    assert client.get(f"{path}?frame={DIASTOLE + 1}").content == first.content
+    assert client.get(path, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
+    with reading() as session:
+        assert len(session.scalars(select(Rendering)).all()) == 2
+
+
+def test_the_file_name_tells_site_and_frame_only(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png?frame=1")
+    assert answer.headers["content-disposition"] == 'inline; filename="overlay-S01-1.png"'
+
+
+@pytest.mark.parametrize("query", ["frame=0", "frame=4", "scale=3", "frame=x"])
+def test_wrong_frames_and_scales(client: TestClient, study: FinishedStudy, query: str) -> None:
+    study.mapped()
+    answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png?{query}")
+    assert answer.status_code == 422
+
+
+def test_runs_without_overlay(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    for uid in (study.uids["S02", "a"], "1.2.3"):
+        assert client.get(f"/v1/jobs/{study.job_id}/overlays/{uid}.png").status_code == 404
+
+
+def test_the_map_hangs_on_the_reference_of_the_frame(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    np.testing.assert_allclose(_fusion(study, "a", 1).shift_mm, REFERENCE_MM)
+    study.followed()
+    np.testing.assert_allclose(_fusion(study, "a", 1).shift_mm, REFERENCE_MM + STEP_MM)
+    np.testing.assert_allclose(_fusion(study, "a", None).shift_mm, REFERENCE_MM)
+    np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
+    np.testing.assert_allclose(_fusion(study, "b", 1).shift_mm, REFERENCE_MM)
+
+
+def test_the_star_stands_where_the_tip_was_seen(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    np.testing.assert_array_equal(_fusion(study, "a", 1).tip_uv, TIP_PIXEL["a"])
+    np.testing.assert_array_equal(_fusion(study, "b", None).tip_uv, TIP_PIXEL["b"])
+    np.testing.assert_allclose(_fusion(study, "a", 3).tip_uv, camera("a").project(TIP_MM))
+
+
+def test_a_deleted_runs_overlay_stays_when_it_was_drawn(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    kept = client.get(path).content
+    files.path_of(_fusion(study, "a", None).sha256).unlink()
+    assert client.get(path).content == kept
+    answer = client.get(f"{path}?frame=1")
+    assert (answer.status_code, answer.json()["code"]) == (409, "run_deleted")
+
+
+def test_a_run_that_does_not_decode(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    files.path_of(_fusion(study, "b", None).sha256).write_bytes(b"\0" * 128 + b"DICM")
+    answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png")
+    assert 400 <= answer.status_code < 500
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_the_archive_holds_everything(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    path = f"/v1/jobs/{study.job_id}/archive.zip"
+    answer = client.get(path)
+    assert answer.headers["content-type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        assert set(archive.namelist()) == {
+            "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "mesh/chamber.ply",
+            "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "overlays/S01-a.png", "overlays/S01-b.png",
+        }  # fmt: skip
+        assert json.loads(archive.read("job.json"))["state"] == "succeeded"
+        assert json.loads(archive.read("parameters.json"))["segmenter"]["name"] == "by-hand"
+        assert archive.read("points.csv").decode() == client.get(f"/v1/jobs/{study.job_id}/points.csv").text
+        assert json.loads(archive.read("map.json")) == client.get(f"/v1/jobs/{study.job_id}/map").json()
+    assert client.get(path).content == answer.content
+
+
+def test_the_archive_without_a_map(client: TestClient, study: FinishedStudy) -> None:
+    study.finish(no_map())
+    content = client.get(f"/v1/jobs/{study.job_id}/archive.zip").content
+    names = set(zipfile.ZipFile(io.BytesIO(content)).namelist())
+    assert names == {"job.json", "parameters.json", "points.csv", "tracks.csv"}
+
+
+def test_the_archive_waits_for_the_end(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    answer = client.get(f"/v1/jobs/{study.job_id}/archive.zip")
+    assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")

@@ -1,0 +1,160 @@
+"""Timing, intensities, shutters and display as headers tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fluoromap.dicom import HeaderWarning, InstanceFacts, frame_to_8bit, open_frames, read_instance
+
+MakeXa = Callable[..., Path]
+FRAMES = np.arange(4 * 8 * 16, dtype=np.uint16).reshape(4, 8, 16)
+
+
+def facts(make_xa: MakeXa, **attributes: Any) -> InstanceFacts:
+    return read_instance(make_xa(FRAMES, **attributes))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "times"),
+    [
+        ({"FrameTime": 40}, (0, 40, 80, 120)),
+        ({"FrameTime": None, "FrameTimeVector": [0, 10, 20, 30]}, (0, 10, 30, 60)),
+        ({"FrameTime": None, "FrameTimeVector": [10, 20, 30]}, (0, 10, 30, 60)),
+        ({"FrameTime": 40, "FrameTimeVector": [0, 10, 20, 30], "FrameIncrementPointer": 0x00181063}, (0, 40, 80, 120)),
+        ({"FrameTime": 40, "FrameTimeVector": [0, 10, 20, 30], "FrameIncrementPointer": 0x00181065}, (0, 10, 30, 60)),
+        ({"FrameTime": 40, "FrameTimeVector": [0, 10], "FrameIncrementPointer": 0x00181065}, (0, 40, 80, 120)),
+        ({"FrameTime": 0, "CineRate": 50}, (0, 20, 40, 60)),
+        ({"FrameTime": -3, "RecommendedDisplayFrameRate": 10}, (0, 100, 200, 300)),
+    ],
+)
+def test_frame_times(make_xa: MakeXa, attributes: dict[str, Any], times: tuple[float, ...]) -> None:
+    found = facts(make_xa, **attributes)
+    assert found.frame_times_ms == pytest.approx(times)
+    assert found.frame_time_ms == pytest.approx(times[-1] / 3)
+    assert found.warnings == ()
+
+
+def test_no_frame_rate_at_all(make_xa: MakeXa) -> None:
+    assert facts(make_xa, FrameTime=None).warnings == (HeaderWarning.FRAME_TIME_ASSUMED,)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "acquired"),
+    [
+        ({}, None),
+        ({"AcquisitionDateTime": "20240102030405.5+0200"}, datetime(2024, 1, 2, 1, 4, 5, 500000, UTC)),
+        ({"AcquisitionDate": "20240102", "AcquisitionTime": "030405"}, datetime(2024, 1, 2, 3, 4, 5, 0, UTC)),
+        (
+            {"ContentDate": "20240102", "ContentTime": "030405.25", "TimezoneOffsetFromUTC": "-0400"},
+            datetime(2024, 1, 2, 7, 4, 5, 250000, UTC),
+        ),
+        ({"SeriesDate": "20240102", "SeriesTime": "03"}, datetime(2024, 1, 2, 3, 0, 0, 0, UTC)),
+        ({"StudyDate": "20240102", "StudyTime": "030405"}, None),
+        ({"AcquisitionDate": "20240102", "SeriesDate": "20240103", "SeriesTime": "1000"}, datetime(2024, 1, 3, 10, tzinfo=UTC)),
+    ],
+)  # fmt: skip
+def test_acquired(make_xa: MakeXa, attributes: dict[str, str], acquired: datetime | None) -> None:
+    assert facts(make_xa, **attributes).acquired == acquired
+
+
+def test_impossible_date(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES, AcquisitionDateTime="20240102030405")
+    path.write_bytes(path.read_bytes().replace(b"20240102030405", b"20241399030405"))
+    assert read_instance(path).acquired is None
+
+
+def test_unreadable_number_is_an_absent_number(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES, PositionerPrimaryAngle="12.5", SeriesNumber=4321)
+    path.write_bytes(path.read_bytes().replace(b"12.5", b"12,5").replace(b"4321", b"43x1"))
+    found = read_instance(path)
+    assert (found.primary_deg, found.series_number) == (None, None)
+
+
+def test_r_waves(make_xa: MakeXa) -> None:
+    found = facts(make_xa, RWavePointer=[1, 3, 9])
+    assert found.r_wave_frames == (0, 2)
+    assert found.warnings == (HeaderWarning.R_WAVES_IGNORED,)
+
+
+@pytest.mark.parametrize(("relationship", "logarithmic"), [("LIN", False), ("LOG", True), ("DISP", True)])
+def test_intensities(make_xa: MakeXa, relationship: str, logarithmic: bool) -> None:
+    assert facts(make_xa, PixelIntensityRelationship=relationship).pixels.logarithmic is logarithmic
+    assert facts(make_xa, PixelIntensityRelationship=None).warnings == (HeaderWarning.PIXEL_INTENSITY_UNKNOWN,)
+
+
+def test_bits_stored_that_lies(make_xa: MakeXa) -> None:
+    found = read_instance(make_xa(FRAMES + np.uint16(3000), BitsStored=10, HighBit=9))
+    assert found.pixels.bits_stored == 12
+    assert found.warnings == (HeaderWarning.BITS_STORED_EXCEEDED,)
+
+
+def test_shutters(make_xa: MakeXa) -> None:
+    found = facts(
+        make_xa,
+        CollimatorShape="RECTANGULAR",
+        CollimatorLeftVerticalEdge=1,
+        CollimatorRightVerticalEdge=14,
+        CollimatorUpperHorizontalEdge=3,
+        CollimatorLowerHorizontalEdge=9,
+        ShutterShape=["RECTANGULAR", "CIRCULAR", "POLYGONAL"],
+        ShutterLeftVerticalEdge=2,
+        ShutterRightVerticalEdge=16,
+        ShutterUpperHorizontalEdge=1,
+        ShutterLowerHorizontalEdge=8,
+        CenterOfCircularShutter=[4, 8],
+        RadiusOfCircularShutter=5,
+        VerticesOfThePolygonalShutter=[1, 1, 1, 16, 8, 16],
+    )
+    shutter = found.pixels.shutter
+    assert shutter is not None
+    assert shutter.rectangle == (1, 13, 2, 7)
+    assert shutter.circle == (7, 3, 5)
+    assert shutter.polygon == ((0, 0), (15, 0), (15, 7))
+    assert found.warnings == ()
+
+
+def test_senseless_shutter(make_xa: MakeXa) -> None:
+    found = facts(make_xa, ShutterShape="CIRCULAR", CenterOfCircularShutter=[4, 8])
+    assert found.pixels.shutter is None
+    assert found.warnings == (HeaderWarning.SHUTTER_IGNORED,)
+
+
+def test_display_window(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES, WindowCenter=100, WindowWidth=101)
+    found = read_instance(path)
+    frame = open_frames(path, found)[0]
+    shown = frame_to_8bit(frame, found)
+    assert shown.dtype == np.uint8
+    # PS3.3 C.11.2.1.2.1: black up to c - 0.5 - (w-1)/2, white beyond c - 0.5 + (w-1)/2.
+    assert shown[frame <= 49].max() == 0
+    assert frame_to_8bit(frame, found, (20.5, 2)).max() == 255
+    assert (np.diff(shown.ravel().astype(int)) >= 0).all()
+
+
+def test_display_without_window_uses_the_whole_range(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES)
+    shown = frame_to_8bit(open_frames(path, read_instance(path))[1], read_instance(path))
+    assert (shown.min(), shown.max()) == (0, 255)
+    flat = frame_to_8bit(np.full((4, 4), 7, np.uint16), read_instance(path))
+    assert len(np.unique(flat)) == 1
+
+
+def test_monochrome1_is_inverted_for_display_only(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES, PhotometricInterpretation="MONOCHROME1")
+    found = read_instance(path)
+    frame = open_frames(path, found)[0]
+    np.testing.assert_array_equal(frame, FRAMES[0])
+    shown = frame_to_8bit(frame, found)
+    assert found.pixels.monochrome1
+    assert shown[0, 0] == 255
+    assert shown[-1, -1] == 0
+
+
+def test_every_warning_has_its_sentence() -> None:
+    assert all(warning.sentence.endswith(".") for warning in HeaderWarning)

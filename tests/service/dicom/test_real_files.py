@@ -1,0 +1,64 @@
+"""Real XA and RF files (FLUOROMAP_SAMPLE_DATA): what real headers lack, and decoders that must agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydicom.pixels.utils import pixel_array
+
+from fluoromap.dicom import DicomCode, DicomProblem, open_frames, read_instance
+
+Sample = Callable[[str], Path]
+
+
+def test_real_cine(sample: Sample) -> None:
+    path = sample("xa_512x512x96_jpeg_baseline.dcm")
+    facts = read_instance(path)
+    assert (facts.frames, facts.rows, facts.columns) == (96, 512, 512)
+    assert (facts.primary_deg, facts.secondary_deg) == (-32, 2)
+    assert facts.missing == ("DistanceSourceToDetector", "DistanceSourceToPatient", "ImagerPixelSpacing")
+    assert facts.r_wave_frames == (19, 52, 76)
+    assert facts.frame_time_ms == 33
+    assert not facts.pixels.logarithmic
+    assert facts.warnings == ()
+    frames = open_frames(path, facts)
+    for index in (0, 40, 95):
+        expected = pixel_array(path, index=index, decoding_plugin="pillow")
+        # Two JPEG decoders may round differently.
+        assert np.abs(frames[index].astype(int) - expected).max() <= 3
+
+
+def test_real_cine_cut_short(sample: Sample, tmp_path: Path) -> None:
+    content = sample("xa_512x512x96_jpeg_baseline.dcm").read_bytes()
+    path = tmp_path / "cut.dcm"
+    for length in (len(content) - 1, len(content) // 2, 5000, 300):
+        path.write_bytes(content[:length])
+        with pytest.raises(DicomProblem) as caught:
+            read_instance(path)
+        assert caught.value.code is DicomCode.TRUNCATED
+
+
+def test_lossless_pair_is_identical(sample: Sample) -> None:
+    paths = [sample("xa_1024_jpeg_lossless.dcm"), sample("xa_1024_jpeg2000_lossless.dcm")]
+    first, second = (open_frames(path, read_instance(path))[0] for path in paths)
+    assert first.shape == (1024, 1024)
+    assert first.dtype == np.uint16
+    np.testing.assert_array_equal(first, second)
+
+
+def test_twelve_bit_jpeg_is_refused(sample: Sample) -> None:
+    with pytest.raises(DicomProblem, match="JPEG Extended") as caught:
+        read_instance(sample("xa_1024_jpeg_extended_12bit.dcm"))
+    assert (caught.value.code, caught.value.status) == (DicomCode.UNDECODABLE, 422)
+
+
+def test_radiofluoroscopy_shutter(sample: Sample) -> None:
+    facts = read_instance(sample("rf_1024_shutter.dcm"))
+    assert facts.pixels.shutter is not None
+    assert facts.pixels.shutter.circle == (479, 479, 470)
+    assert facts.pixels.shutter.rectangle == (9, 949, 9, 949)
+    assert facts.pixels.shutter.polygon is None
+    assert facts.window == (127, 255)
