@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -30,16 +31,32 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         servers.stop(Path(os.environ.pop(_FOLDER)))
 
 
+Fresh = Callable[[], AbstractContextManager[str]]
+
+
 @pytest.fixture
-def postgres_url() -> Iterator[str]:
+def fresh_postgres() -> Fresh:
+    """Each call: an empty database on a real PostgreSQL, as a context manager that gives its URL."""
+    folder = Path(os.environ[_FOLDER])
+    return lambda: servers.fresh_database(servers.postgresql(folder), f"test_{uuid.uuid4().hex}")
+
+
+@pytest.fixture
+def fresh_redis() -> Fresh:
+    """Each call: an empty database number on a real Redis, as a context manager that gives its URL."""
+    folder = Path(os.environ[_FOLDER])
+    return lambda: servers.fresh_redis(servers.redis(folder))
+
+
+@pytest.fixture
+def postgres_url(fresh_postgres: Fresh) -> Iterator[str]:
     """An empty database on a real PostgreSQL."""
-    server = servers.postgresql(Path(os.environ[_FOLDER]))
-    with servers.fresh_database(server, f"test_{uuid.uuid4().hex}") as url:
+    with fresh_postgres() as url:
         yield url
 
 
 @pytest.fixture
-def redis_url() -> Iterator[str]:
+def redis_url(fresh_redis: Fresh) -> Iterator[str]:
     """An empty database number on a real Redis."""
-    with servers.fresh_redis(servers.redis(Path(os.environ[_FOLDER]))) as url:
+    with fresh_redis() as url:
         yield url

@@ -28,7 +28,9 @@ def chain(electrodes: tuple[int, ...] = (1, 2), **changes: object) -> Chain:
     return Chain(**{**values, **changes})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("semi_axis_mm", "grade"), [(1.99, Grade.A), (2.01, Grade.B), (3.99, Grade.B), (4.01, Grade.C)])
+@pytest.mark.parametrize(
+    ("semi_axis_mm", "grade"), [(1.99, Grade.A), (2.01, Grade.B), (3.99, Grade.B), (4.01, Grade.C)]
+)
 def test_grade_is_by_the_largest_semi_axis_whatever_its_direction(semi_axis_mm: float, grade: Grade) -> None:
     rotation, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     covariance = rotation @ np.diag([semi_axis_mm**2, 0.01, 0.01]) @ rotation.T / CHI2_95_3D

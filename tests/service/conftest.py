@@ -14,13 +14,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 # The Celery application is configured when it is imported.
 os.environ.setdefault("FLUOROMAP_BROKER_URL", "eager")
 
-from fastapi.testclient import TestClient  # noqa: E402
-from small_runs import small_run  # noqa: E402
+from fastapi.testclient import TestClient
+from small_runs import small_run
 
-from fluoromap.api.app import create_app  # noqa: E402
-from fluoromap.settings import settings  # noqa: E402
-from fluoromap.store.engine import engine  # noqa: E402
-from fluoromap.store.models import Base  # noqa: E402
+from fluoromap.api.app import create_app
+from fluoromap.settings import settings
+from fluoromap.store.engine import engine
+from fluoromap.store.models import Base
 
 Upload = Callable[..., Any]
 

@@ -16,7 +16,8 @@ from fluoromap.contracts import Array
 _LEAST_SAMPLES = 20
 _WINDOW_MS = 5.0
 _LEAST_WINDOW = 5
-_SATURATED_SHARE = 0.05
+_SATURATED_SAMPLES = 5
+_BASELINE = 0.1
 _LEAST_SLOPE_TO_NOISE = 6.0
 _RIVAL = 0.8
 _RIVAL_AWAY_MS = 10.0
@@ -78,18 +79,27 @@ def local_slope(times: Array, signal: Array) -> tuple[Array, Array, float]:
     slope, error : (n,), per ms. noise : robust standard deviation of the samples about their fits.
     """
     n = len(times)
-    slopes, errors, rest = np.zeros(n), np.zeros(n), np.zeros(n)
-    for i in range(n):
-        first, last = np.searchsorted(times, [times[i] - _WINDOW_MS, times[i] + _WINDOW_MS + 1e-9])
-        first, last = min(first, max(i - _LEAST_WINDOW // 2, 0)), max(last, min(i + _LEAST_WINDOW // 2 + 1, n))
-        x = times[first:last] - times[i]
-        design = np.stack([np.ones_like(x), x, x * x], axis=1)
-        inverse = np.linalg.pinv(design)
-        slopes[i] = inverse[1] @ signal[first:last]
-        errors[i] = math.sqrt(float(inverse[1] @ inverse[1]))
-        free = max(len(x) - 3, 1)
-        residual = signal[first:last] - design @ (inverse @ signal[first:last])
-        rest[i] = float(residual @ residual) / free
+    index = np.arange(n)
+    first = np.searchsorted(times, times - _WINDOW_MS - 1e-9)
+    last = np.searchsorted(times, times + _WINDOW_MS + 1e-9)
+    # Where samples are sparse a fit still needs two on each side.
+    first = np.minimum(first, np.maximum(index - _LEAST_WINDOW // 2, 0))
+    last = np.maximum(last, np.minimum(index + _LEAST_WINDOW // 2 + 1, n))
+    column = np.arange(int((last - first).max()))
+    sample = first[:, None] + column[None, :]
+    used = sample < last[:, None]
+    sample = np.minimum(sample, n - 1)
+    x = np.where(used, times[sample] - times[:, None], 0.0)
+    scale = np.abs(x).max(axis=1, keepdims=True)
+    x /= scale
+    design = np.stack([used.astype(np.float64), x, x * x], axis=2)
+    inverse = np.linalg.pinv(np.einsum("nki,nkj->nij", design, design), hermitian=True)
+    values = np.where(used, signal[sample], 0.0)
+    fitted = np.einsum("nij,nkj,nk->ni", inverse, design, values)
+    slopes = fitted[:, 1] / scale[:, 0]
+    errors = np.sqrt(np.maximum(inverse[:, 1, 1], 0.0)) / scale[:, 0]
+    residual = np.where(used, values - np.einsum("nki,ni->nk", design, fitted), 0.0)
+    rest = (residual**2).sum(axis=1) / np.maximum(used.sum(axis=1) - 3, 1)
     # The median keeps the deflection itself, which no quadratic follows, out of the noise.
     return slopes, errors, math.sqrt(float(np.median(rest)))
 
@@ -102,20 +112,27 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
     extent = float(np.ptp(signal))
     if not extent > 0:
         raise UnusableElectrogram(f"The {name} electrogram is flat; check the electrode's connection.")
-    clipped = max(_longest_hold(signal, signal.min()), _longest_hold(signal, signal.max()))
-    if clipped >= max(4, _SATURATED_SHARE * len(signal)):
-        raise UnusableElectrogram(f"The {name} electrogram is saturated; lower the amplifier's gain.")
+    for rail in (signal.min(), signal.max()):
+        at_baseline = abs(rail - np.median(signal)) <= _BASELINE * extent
+        if not at_baseline and _longest_hold(signal, float(rail)) >= _SATURATED_SAMPLES:
+            raise UnusableElectrogram(f"The {name} electrogram is saturated; lower the amplifier's gain.")
     slopes, errors, noise = local_slope(times, signal)
     inner = slice(2, -2)
     steepest = int(np.argmin(slopes[inner])) + 2
     threshold = _LEAST_SLOPE_TO_NOISE * noise * errors[steepest]
     if not slopes[steepest] < -max(threshold, 1e-9 * extent):
-        raise UnusableElectrogram(f"The {name} electrogram has no steep negative deflection that stands out from noise.")
+        raise UnusableElectrogram(
+            f"The {name} electrogram has no steep negative deflection that stands out from noise."
+        )
     rivals = (slopes < _RIVAL * slopes[steepest]) & (np.abs(times - times[steepest]) > _RIVAL_AWAY_MS)
     if rivals[inner].any():
-        warnings.append(f"The {name} electrogram has two negative deflections of almost equal steepness; check the annotation.")
+        warnings.append(
+            f"The {name} electrogram has two negative deflections of almost equal steepness; check the annotation."
+        )
     if steepest <= 3 or steepest >= len(times) - 4:
-        warnings.append(f"The deflection of the {name} electrogram lies at the edge of the recording; check the window.")
+        warnings.append(
+            f"The deflection of the {name} electrogram lies at the edge of the recording; check the window."
+        )
     x = times[steepest - 2 : steepest + 3] - times[steepest]
     curve = np.polyfit(x, slopes[steepest - 2 : steepest + 3], 2)
     spacing = float(np.median(np.diff(times)))

@@ -31,6 +31,9 @@ LEAST_SITES_TO_JUDGE = 8
 SLOWEST_MM_PER_MS = 0.5
 """A time that a wave as slow as this explains from the nearest other site may be a focus; it is no outlier."""
 
+LEAST_APART_MM = 10.0
+"""Nearer sites are judged as if they lay this far apart: 20 ms between neighbours is not yet a wrong annotation."""
+
 
 class ConvexHullParams(BaseModel, extra="forbid"):
     """Parameters of :class:`ConvexHull`."""
@@ -152,7 +155,8 @@ class ConvexHull:
                 break
             others = field.leave_one_out(_chosen(points, used), lat[used], sd[used])
             error = np.abs(lat[used] - others.predicted_ms)
-            explained = error <= _nearest_other_mm(points.positions_mm[used]) / SLOWEST_MM_PER_MS
+            apart_mm = np.maximum(_nearest_other_mm(points.positions_mm[used]), LEAST_APART_MM)
+            explained = error <= apart_mm / SLOWEST_MM_PER_MS
             deviation = np.where(explained, 0.0, error / others.sd_ms)
             if deviation.max() <= self._params.outlier_sigma:
                 break

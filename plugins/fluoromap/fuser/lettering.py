@@ -59,6 +59,8 @@ class Labels:
             cost = rank + 2 * outside + sum(_overlap(box, other) for other in self._taken)
             if cost < cost_of_best:
                 best, cost_of_best, box_of_best = middle, cost, box
+            if cost_of_best <= rank:
+                break
         self._taken.append(box_of_best)
         return best
 

@@ -89,7 +89,7 @@ def draw_overlay(
     raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, picture.shape)
     _tint(rgb, raster, chamber, times, canvas.unit)
     image = Image.fromarray(rgb)
-    image = _with_lines(image, canvas, chamber, facing, times)
+    _draw_lines(image, canvas, chamber, facing, times)
     _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times)
     return np.asarray(image)
 
@@ -138,23 +138,32 @@ def _tint(rgb: Picture, raster: Raster, chamber: ChamberMap, times: Scale, unit:
     rgb[shown] = (under + share * (colours - under)).round().astype(np.uint8)
 
 
-def _with_lines(
-    image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale
-) -> Image.Image:
+def _draw_lines(image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale) -> None:
     """Isochrones and outline, drawn at twice the size and averaged: smooth lines."""
-    layer = Image.new("RGBA", (image.width * 2, image.height * 2), (255, 255, 255, 0))
+    uv = canvas.project(chamber.vertices_mm)[0]
+    margin = 4 * canvas.unit
+    low = np.clip(np.floor(uv.min(axis=0) - margin), 0, image.size).astype(np.int64)
+    high = np.clip(np.ceil(uv.max(axis=0) + margin), 0, image.size).astype(np.int64)
+    if (high <= low).any():
+        return
+
+    def fine(points_uv: Array) -> list[float]:
+        # Pillow cuts coordinates to whole numbers; half a pixel more rounds them.
+        placed: list[float] = ((points_uv - low + 0.5) * 2).ravel().tolist()
+        return placed
+
+    width, height = (2 * (high - low)).tolist()
+    layer = Image.new("RGBA", (width, height), (255, 255, 255, 0))
     draw = ImageDraw.Draw(layer)
-    width = max(2, round(2 * canvas.unit))
+    thickness = max(2, round(2 * canvas.unit))
     for line in isochrones(chamber, times.edges_ms):
-        uv = canvas.project(line.points_mm)[0] * 2 + 1.0
+        at = canvas.project(line.points_mm)[0]
         for run in runs(facing[line.faces]):
-            draw.line(uv[run].ravel().tolist(), fill=(255, 255, 255, 130), width=width, joint="curve")
-    uv = canvas.project(chamber.vertices_mm)[0] * 2 + 1.0
+            draw.line(fine(at[run]), fill=(255, 255, 255, 130), width=thickness, joint="curve")
     for edge in outline_edges(chamber.faces, facing):
-        draw.line(uv[edge].ravel().tolist(), fill=(*OUTLINE_RGB, 230), width=round(1.5 * width))
-    image = image.convert("RGBA")
-    image.alpha_composite(layer.reduce(2))
-    return image.convert("RGB")
+        draw.line(fine(uv[edge]), fill=(*OUTLINE_RGB, 230), width=round(1.5 * thickness))
+    smooth = layer.reduce(2)
+    image.paste(smooth, tuple(low.tolist()), smooth)
 
 
 def _draw_sites(

@@ -37,7 +37,7 @@ class ObservedView:
 
     def interrupted(self) -> tuple[bool, ...]:
         """Whether each electrode is missing in some frame."""
-        return tuple(not always for always in self.seen.all(axis=0).tolist())
+        return tuple(not bool(column.all()) for column in self.seen.T)
 
 
 def observe(view: MonoplaneView) -> ObservedView:

@@ -38,10 +38,10 @@ class RigidPose:
             5.0, gt=0, le=100, description="Refuse when the error bound of the positions exceeds this, mm."
         )
         largest_misfit: float = Field(
-            3.0,
+            1.5,
             gt=1,
             le=100,
-            description="Refuse when the reprojection error exceeds this many times what is expected.",
+            description="Refuse when the reprojection error changes over the frames by this many times the pixel noise.",
         )
         depth_step_mm: float = Field(
             0.0,
@@ -85,7 +85,7 @@ class RigidPose:
         shape = np.array([_shape_covariance(view, observed, k) for k in range(len(body))])
         jacobians = view.camera.jacobian(positions)
         expected = observed.covariance_px2 + jacobians @ shape @ np.swapaxes(jacobians, -1, -2)
-        self._refuse_if_not_rigid(view.camera, observed, positions, expected, usable)
+        self._refuse_if_not_rigid(view.camera, observed, positions, usable)
         covariance = np.array(
             [
                 pose_covariance_mm2(view.camera, positions[f], centres[f], expected[f], observed.seen[f])
@@ -104,19 +104,24 @@ class RigidPose:
         return self._track(view, observed, positions, covariance, located)
 
     def _refuse_if_not_rigid(
-        self, camera: Camera, observed: ObservedView, positions: Array, expected_px2: Array, usable: BoolArray
+        self, camera: Camera, observed: ObservedView, positions: Array, usable: BoolArray
     ) -> None:
-        residual = camera.project(positions) - observed.pixels_uv
-        squared = np.einsum("nmi,nmij,nmj->nm", residual, np.linalg.inv(expected_px2), residual)
         counted = observed.seen & usable[:, None]
-        freedom = 2 * counted.sum() - 6 * usable.sum()
-        misfit = float(np.sqrt(squared[counted].sum() / max(freedom, 1)))
+        shown = counted[..., None]
+        residual = np.where(shown, camera.project(positions) - observed.pixels_uv, 0.0)
+        # A wrong shape leaves the same residual in every frame; only what changes tells that the body bends.
+        residual = np.where(shown, residual - residual.sum(axis=0) / np.maximum(shown.sum(axis=0), 1), 0.0)
+        squared = np.einsum("nmi,nmij,nmj->nm", residual, np.linalg.inv(observed.covariance_px2), residual)
+        freedom = 2 * counted.sum() - 6 * usable.sum() - 2 * counted.any(axis=0).sum()
+        if freedom <= 0:
+            return
+        misfit = float(np.sqrt(squared[counted].sum() / freedom))
         if misfit > self._params.largest_misfit:
             rms = float(np.sqrt((residual[counted] ** 2).sum(axis=1).mean()))
             raise Refusal(
                 Reason.DEPTH_UNOBSERVABLE,
-                f"The electrodes do not move as one rigid body: the best pose leaves {rms:.1f} px, {misfit:.1f} times what "
-                "their uncertainty explains. A heart's catheters bend; use another solver.",
+                f"The electrodes do not move as one rigid body: the best poses leave {rms:.1f} px, {misfit:.1f} times the "
+                "pixel noise. A heart's catheters bend; use another solver.",
             )
 
     def _track(
@@ -135,7 +140,7 @@ class RigidPose:
             baseline_mm=np.where(shown, baseline, 0.0),
             covariance_mm2=np.where(shown[..., None], whole, 0.0),
             pixels_uv=observed.pixels_uv,
-            reasons=tuple(() if always else (Reason.TRACK_INTERRUPTED,) for always in located.all(axis=0).tolist()),
+            reasons=tuple(() if bool(column.all()) else (Reason.TRACK_INTERRUPTED,) for column in located.T),
         )
 
 

@@ -54,9 +54,7 @@ def otsu_threshold(x: Image, inside: BoolArray) -> float:
     return (level + 1) * highest / (_BINS - 1)
 
 
-def find_blobs(
-    x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: float, largest_px: float
-) -> Blobs:
+def find_blobs(x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: float, largest_px: float) -> Blobs:
     """Threshold, label (8-connected) and measure.
 
     Parameters

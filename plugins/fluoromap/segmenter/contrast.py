@@ -36,9 +36,7 @@ class Contrast:
     px_per_mm: float
 
     @classmethod
-    def of_frame(
-        cls, image: Image, smooth: Image, inside: BoolArray, line_scale: float, px_per_mm: float
-    ) -> Contrast:
+    def of_frame(cls, image: Image, smooth: Image, inside: BoolArray, line_scale: float, px_per_mm: float) -> Contrast:
         rows, columns = image.shape
         v, u = np.meshgrid(
             np.linspace(0, rows - 1, _GRID).round(), np.linspace(0, columns - 1, _GRID).round(), indexing="ij"

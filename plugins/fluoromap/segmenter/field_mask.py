@@ -155,7 +155,9 @@ def _within_straight_edges(median: Image, field: BoolArray) -> BoolArray:
         alive = valid[:, : window.shape[1]][:, 2 * reach - 1 : 2 * reach - 1 + steps.shape[1]]
         clear = (steps > 0.3) & alive
         share = clear.sum(axis=0) / max(0.5 * turned.shape[0], 1.0)
-        level = np.array([np.median(steps[alive[:, k], k]) if alive[:, k].any() else 0.0 for k in range(steps.shape[1])])
+        level = np.array(
+            [np.median(steps[alive[:, k], k]) if alive[:, k].any() else 0.0 for k in range(steps.shape[1])]
+        )
         edges = np.flatnonzero((level > 0.3) & (share > 1.0))
         if edges.size:
             blade = int(edges[-1]) + reach

@@ -116,20 +116,14 @@ def _with_marks(
         nearest = min(within, key=lambda frame: abs(frame - middle))
         return _beside(entries[nearest].chains, chains, px_per_mm), averaged
     tracks = {chain.track for chain in _on_tracks(chains, averaged, entries)}
-    lacking = [
-        frame
-        for frame in automatic
-        if any(chain.track not in tracks for chain in entries[frame].chains)
-    ]
+    lacking = [frame for frame in automatic if any(chain.track not in tracks for chain in entries[frame].chains)]
     if not lacking:
         return chains, averaged
     quietest = min(lacking, key=lambda frame: float(motion[frame]))
     return _beside(entries[quietest].chains, automatic[quietest], px_per_mm), (quietest,)
 
 
-def _on_tracks(
-    chains: Sequence[Chain], averaged: Sequence[int], entries: Sequence[FrameChains]
-) -> tuple[Chain, ...]:
+def _on_tracks(chains: Sequence[Chain], averaged: Sequence[int], entries: Sequence[FrameChains]) -> tuple[Chain, ...]:
     """Give the diastolic chains the track numbers of the chains that lie in their place in the averaged frames."""
     taken: set[int] = {chain.track for chain in chains if chain.track >= 0}
     fresh = 1 + max((chain.track for entry in entries for chain in entry.chains), default=-1)

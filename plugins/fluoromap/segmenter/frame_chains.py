@@ -34,9 +34,13 @@ _SHAFT_WEIGHT = 2.0
 class FourStepParams(BaseModel, extra="forbid"):
     """Parameters of the four-step segmenter; the defaults are the ones to keep."""
 
-    gamma_low: float = Field(0.5, ge=0.0, le=1.0, description="Homomorphic gain of slow shading, gamma_L of equation (4).")
+    gamma_low: float = Field(
+        0.5, ge=0.0, le=1.0, description="Homomorphic gain of slow shading, gamma_L of equation (4)."
+    )
     gamma_high: float = Field(2.0, ge=1.0, le=10.0, description="Homomorphic gain of detail, gamma_H of equation (4).")
-    slope: float = Field(1.0, gt=0.0, le=10.0, description="Sharpness c of the homomorphic filter's transition, equation (4).")
+    slope: float = Field(
+        1.0, gt=0.0, le=10.0, description="Sharpness c of the homomorphic filter's transition, equation (4)."
+    )
     cutoff: float = Field(
         8.0, ge=2.0, le=64.0, description="Cutoff D0 of the homomorphic filter in cycles per image width, equation (4)."
     )
@@ -46,7 +50,10 @@ class FourStepParams(BaseModel, extra="forbid"):
     )
     shock_sweeps: int = Field(15, ge=0, le=100, description="Sweeps of the complex shock filter, equation (7).")
     background_mm: float = Field(
-        2.43, ge=0.5, le=6.0, description="Radius of the closing disk at the isocentre; more than half an electrode's length."
+        2.43,
+        ge=0.5,
+        le=6.0,
+        description="Radius of the closing disk at the isocentre; more than half an electrode's length.",
     )
     opening_mm: float = Field(
         0.35, ge=0.1, le=2.0, description="Radius of the opening disk at the isocentre; less than half a ring's length."

@@ -55,13 +55,13 @@ def _reduced(x: Image) -> Image:
 def is_quiet(motion: Array) -> BoolArray:
     """Frames that differ from the frame before by little more than noise, (n,).
 
-    Motion and noise add in squares. The noise is what the quietest fifth shows; quiet is a fifteenth of the liveliest motion,
+    Motion and noise add in squares. The noise is what the quietest fifth shows, unless that moves already; quiet is a fifteenth of the liveliest motion,
     or what the noise could be alone.
     """
     if len(motion) < 3:
         return np.ones(len(motion), dtype=np.bool_)
     smooth = ndimage.median_filter(motion, 3, mode="nearest") if len(motion) >= 30 else motion
-    noise = float(np.percentile(smooth, 20))
+    noise = min(float(np.percentile(smooth, 20)), 1.1 * float(smooth.min()))
     moved = np.sqrt(np.maximum(smooth**2 - noise**2, 0.0))
     quiet: BoolArray = moved <= max(_QUIET * float(np.percentile(moved, 95)), _UNSURE * noise)
     return quiet

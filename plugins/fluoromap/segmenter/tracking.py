@@ -69,7 +69,8 @@ class Tracker:
                 common = [k for k in chain.electrodes if k in track.chain.electrodes]
                 moved = np.mean(
                     [
-                        chain.pixels_uv[chain.electrodes.index(k)] - track.chain.pixels_uv[track.chain.electrodes.index(k)]
+                        chain.pixels_uv[chain.electrodes.index(k)]
+                        - track.chain.pixels_uv[track.chain.electrodes.index(k)]
                         for k in common
                     ],
                     axis=0,

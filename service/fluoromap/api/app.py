@@ -33,6 +33,7 @@ from fluoromap.api import (
     tracks,
 )
 from fluoromap.api.body import BodyLimit, TooLarge
+from fluoromap.api.document import document
 from fluoromap.api.problems import Problem
 from fluoromap.api.security import Doorkeeper, Reader
 from fluoromap.settings import settings
@@ -81,7 +82,7 @@ def create_app() -> FastAPI:
 
     @app.get("/v1/openapi.json", include_in_schema=False)
     def openapi(caller: Reader) -> JSONResponse:
-        return JSONResponse(app.openapi())
+        return JSONResponse(document(app))
 
     app.add_middleware(BodyLimit)
     app.add_middleware(Doorkeeper)
@@ -100,15 +101,19 @@ def _install_refusals(app: FastAPI) -> None:
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    sweeper = None if settings().eager else asyncio.create_task(_sweep())
+    tasks = [] if settings().eager else [asyncio.create_task(_sweep()), asyncio.create_task(_warm_up())]
     try:
         yield
     finally:
-        if sweeper is not None:
-            sweeper.cancel()
+        for task in tasks:
+            task.cancel()
             with suppress(asyncio.CancelledError):
-                await sweeper
+                await task
         drawing.close()
+
+
+async def _warm_up() -> None:
+    await run_in_threadpool(drawing.start)
 
 
 async def _sweep() -> None:

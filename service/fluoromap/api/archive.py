@@ -46,7 +46,7 @@ _MOMENT = (1980, 1, 1, 0, 0, 0)
         **responses(401, 403, 404, 409, 422, 429),
     },
 )
-def get_archive(job_id: Annotated[str, Path(description="The job's id.")], token: Reader) -> StreamingResponse:
+def get_archive(job_id: Annotated[str, Path(description="The job's id.")], caller: Reader) -> StreamingResponse:
     """`job.json`, `parameters.json`, `points.csv`, `tracks.csv`, `map.json`, the mesh in all formats and an overlay of
     each view of each site, as far as the job came; coordinates from the reference catheter. 409 until the job has ended.
     """

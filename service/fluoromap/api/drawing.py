@@ -16,6 +16,7 @@ from fluoromap.settings import settings
 
 PROCESSES = 2
 LONGEST_SECONDS = 20.0
+START_SECONDS = 120.0
 PATIENCE_SECONDS = 60.0
 
 Arguments = ParamSpec("Arguments")
@@ -39,7 +40,7 @@ def drawn(
     """
     # Time counts from the moment a process is free, so that a long queue is not taken for a slow frame.
     if not _free.acquire(timeout=PATIENCE_SECONDS):
-        raise Problem(429, "busy", "Too many pictures are being drawn; ask again.", headers={"Retry-After": "5"})
+        raise _busy()
     try:
         for _ in range(2):
             pool = _running()
@@ -63,6 +64,11 @@ def drawn(
     )
 
 
+def start() -> None:
+    """Start the processes ahead of the first picture."""
+    _running()
+
+
 def close() -> None:
     """End the processes; the next picture starts new ones."""
     with _lock:
@@ -77,9 +83,24 @@ def _running() -> ProcessPoolExecutor:
         if _pool is None:
             # Not plain fork: the API has threads, whose locks a child would inherit locked.
             context = multiprocessing.get_context("forkserver")
-            context.set_forkserver_preload(["fluoromap.api.overlays"])
-            _pool = ProcessPoolExecutor(PROCESSES, context, _limit_memory, (settings().worker_memory_mib,))
+            context.set_forkserver_preload(["fluoromap.api.overlays", "fluoromap.api.frames"])
+            fresh = ProcessPoolExecutor(PROCESSES, context, _limit_memory, (settings().worker_memory_mib,))
+            # Imports take seconds on a busy machine; the first frame's time begins after them.
+            try:
+                fresh.submit(_started).result(START_SECONDS)
+            except TimeoutError:
+                _kill(fresh)
+                raise _busy() from None
+            _pool = fresh
         return _pool
+
+
+def _started() -> None:
+    """The first task of a fresh pool: answered as soon as a process can work."""
+
+
+def _busy() -> Problem:
+    return Problem(429, "busy", "Too many pictures are being drawn; ask again.", headers={"Retry-After": "5"})
 
 
 def _discard(pool: ProcessPoolExecutor) -> None:
@@ -87,6 +108,10 @@ def _discard(pool: ProcessPoolExecutor) -> None:
     with _lock:
         if _pool is pool:
             _pool = None
+    _kill(pool)
+
+
+def _kill(pool: ProcessPoolExecutor) -> None:
     for process in list((pool._processes or {}).values()):
         process.kill()
     pool.shutdown(wait=False, cancel_futures=True)

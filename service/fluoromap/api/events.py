@@ -61,7 +61,7 @@ def _existing(job_id: Annotated[str, Path(description="The job's id.")]) -> str:
     },
 )
 async def follow_job(
-    job_id: Annotated[str, Depends(_existing)], token: Reader, after: Annotated[int, Depends(_resume_after)]
+    job_id: Annotated[str, Depends(_existing)], caller: Reader, after: Annotated[int, Depends(_resume_after)]
 ) -> AsyncIterable[ServerSentEvent]:
     """Server-sent events `job` (state, error) and `stage` (name, subject, state, attempt, progress, reused).
 

@@ -68,7 +68,7 @@ class JobRequest(BaseModel):
 )
 def create_job(
     study_id: Annotated[str, Path(description="The study's id.")],
-    token: Writer,
+    caller: Writer,
     once: OnceJson,
     body: JobRequest | None = None,
 ) -> Response:
@@ -98,7 +98,7 @@ def create_job(
     "/v1/jobs", summary="List jobs", response_model=Page[JobAnswer], responses=responses(400, 401, 403, 422)
 )  # fmt: skip
 def list_jobs(
-    token: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only this study's.")] = None
+    caller: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only this study's.")] = None
 ) -> Page[JobAnswer]:
     """All jobs, the newest first."""
     query = select(Job).order_by(Job.created.desc(), Job.id.desc()).limit(pages.limit + 1)
@@ -123,7 +123,7 @@ async def get_job(
     job_id: JobId,
     request: Request,
     response: Response,
-    token: Reader,
+    caller: Reader,
     wait: Annotated[float, Query(ge=0, le=60, description="Longest time in seconds to wait for a change.")] = 0.0,
 ) -> JobAnswer | Response:
     """State, progress, stages and links of a job.
@@ -154,7 +154,7 @@ async def get_job(
     response_model=JobAnswer,
     responses=responses(401, 403, 404, 409),
 )
-def cancel_job(job_id: JobId, token: Writer) -> JobAnswer:
+def cancel_job(job_id: JobId, caller: Writer) -> JobAnswer:
     """What has not begun never will; what runs stops at its next check. Results already made stay readable."""
     with writing() as session:
         job = job_of(session, job_id)

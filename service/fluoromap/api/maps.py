@@ -183,7 +183,7 @@ def mesh_of(job_id: str, outcome: MapOutcome, result: str, mesh_format: MeshForm
     responses={304: {"description": "Unchanged since the ETag sent."}, **responses(401, 403, 404, 409, 422)},
 )
 def get_map(
-    job_id: JobId, request: Request, response: Response, token: Reader, origin: OriginQuery = Origin.REFERENCE
+    job_id: JobId, request: Request, response: Response, caller: Reader, origin: OriginQuery = Origin.REFERENCE
 ) -> ActivationMap | Response:
     """The chamber's surface with activation times, as soon as the stage `fuse` is done (before: 409 `not_ready`).
 
@@ -215,7 +215,7 @@ def get_mesh(
     job_id: JobId,
     mesh_format: Annotated[MeshFormat, Path(description="PLY and GLB have colours, VTP has the times as scalars.")],
     request: Request,
-    token: Reader,
+    caller: Reader,
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
     """The chamber with activation times as a mesh file, coordinates in mm along DICOM patient axes."""

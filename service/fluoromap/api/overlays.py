@@ -245,7 +245,7 @@ def _tip(
     response_model=Overlays,
     responses=responses(401, 403, 404, 409),
 )
-def list_overlays(job_id: JobId, token: Reader) -> Overlays:
+def list_overlays(job_id: JobId, caller: Reader) -> Overlays:
     """One entry for each view of each located site; 409 `not_ready` before the map is made, `no_map` where there is none."""
     with reading() as session:
         return Overlays(overlays=overlays_of(session, job_of(session, job_id)))
@@ -268,7 +268,7 @@ def get_overlay(
     job_id: JobId,
     uid: Annotated[str, Path(description="SOPInstanceUID of the run.")],
     request: Request,
-    token: Reader,
+    caller: Reader,
     frame: Annotated[int | None, Query(ge=1, description="Counted from 1; by default the diastolic frame.")] = None,
     scale: Annotated[Literal["1", "2"], Query(description="Pixels of the picture per stored pixel.")] = "1",
 ) -> Response:

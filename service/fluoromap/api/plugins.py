@@ -39,7 +39,7 @@ class Plugin(BaseModel):
 
 
 @router.get("/v1/plugins", summary="Installed plugins", response_model=list[Plugin], responses=responses(401, 403))
-def list_plugins(token: Reader) -> list[Plugin]:
+def list_plugins(caller: Reader) -> list[Plugin]:
     """All installed segmenters, triangulators, monoplane solvers and fusers, the broken ones with their error."""
     return [
         Plugin(

@@ -164,7 +164,7 @@ def _read(job_id: str, origin: Origin) -> list[Point]:
     responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422)},
 )
 def get_points(
-    job_id: JobId, request: Request, response: Response, token: Reader, origin: OriginQuery = Origin.REFERENCE
+    job_id: JobId, request: Request, response: Response, caller: Reader, origin: OriginQuery = Origin.REFERENCE
 ) -> Points | Response:
     """Every electrode of every site, with covariance, residuals and grade; as CSV where `Accept: text/csv` asks for it.
 
@@ -184,6 +184,6 @@ def get_points(
     response_class=Response,
     responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422)},
 )
-def get_points_csv(job_id: JobId, token: Reader, origin: OriginQuery = Origin.REFERENCE) -> Response:
+def get_points_csv(job_id: JobId, caller: Reader, origin: OriginQuery = Origin.REFERENCE) -> Response:
     """The same as `points`, always as CSV."""
     return csv_response(points_csv(_read(job_id, origin)), "points.csv")

@@ -245,7 +245,7 @@ def _read(job_id: str, origin: Origin, site: str | None, view: View | None) -> F
 def get_tracks(
     job_id: JobId,
     request: Request,
-    token: Reader,
+    caller: Reader,
     site: SiteQuery = None,
     view: ViewQuery = None,
     origin: OriginQuery = Origin.REFERENCE,
@@ -269,7 +269,11 @@ def get_tracks(
     responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422)},
 )
 def get_tracks_csv(
-    job_id: JobId, token: Reader, site: SiteQuery = None, view: ViewQuery = None, origin: OriginQuery = Origin.REFERENCE
+    job_id: JobId,
+    caller: Reader,
+    site: SiteQuery = None,
+    view: ViewQuery = None,
+    origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
     """The same as `tracks`, always as CSV."""
     return csv_response(tracks_csv(_read(job_id, origin, site, view)), "tracks.csv")

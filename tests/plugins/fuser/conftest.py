@@ -17,7 +17,7 @@ from fluoromap.contracts import ChamberMap
 @pytest.fixture(scope="session")
 def ball() -> ChamberMap:
     """40 sites on a sphere of 25 mm about (10, -20, 5), a plane wave of 1 ms/mm along X, -25 to 25 ms."""
-    return fused(sphere(40))
+    return fused(sphere(40), edge_mm=4)
 
 
 @pytest.fixture(scope="session")

@@ -84,7 +84,7 @@ def test_times_at_the_sites_are_kept_within_their_error(seed):
 
 def test_standard_deviation_covers_the_truth_and_grows_away_from_sites():
     within, near, far = [], [], []
-    for seed in range(6):
+    for seed in range(4):
         sites, _ = wave(20, seed)
         _, truth = wave(20, seed, lat_sd_ms=0.0)
         chamber = fused(sites, edge_mm=4)
@@ -155,7 +155,7 @@ def test_outlier_is_told_and_colours_nothing(error_ms):
 
 
 def test_a_focus_is_no_outlier():
-    for seed in range(12):
+    for seed in range(8):
         assert fused(wave(20, seed)[0], edge_mm=7).warnings == ()
 
 

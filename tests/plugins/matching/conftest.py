@@ -12,7 +12,7 @@ from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.matching import SiteRuns
 
-FRAMES = 96
+FRAMES = 80
 FRAME_MS = 1000 / 60
 
 
@@ -103,9 +103,7 @@ class Heart:
         )
         motion = np.abs(np.gradient(beat(phases))) + 0.01
         r_waves = tuple(np.flatnonzero(np.diff(phases, prepend=phases[0]) < 0).tolist()) if self.r_waves else ()
-        return Segmentation(
-            tuple(entries), diastole, tuple(range(middle - 3, middle + 4)), motion, times, r_waves
-        )
+        return Segmentation(tuple(entries), diastole, tuple(range(middle - 3, middle + 4)), motion, times, r_waves)
 
     def chain(self, catheter: str, pixels: Array, track: int, noise_px: float | None = None) -> Chain:
         noise = self.noise_px if noise_px is None else noise_px

@@ -105,9 +105,7 @@ def view(simulation, points, pixels, sd_mm: float = 1e-3, seen=None) -> Monoplan
         )
         for f in range(n)
     )  # fmt: skip
-    return MonoplaneView(
-        "S01", "a", simulation.camera, BODY, np.arange(n) * 16.7, observations, a_priori, 0, None, ()
-    )
+    return MonoplaneView("S01", "a", simulation.camera, BODY, np.arange(n) * 16.7, observations, a_priori, 0, None, ())
 
 
 def test_a_rigid_body_is_followed_with_honest_covariances(simulate) -> None:  # type: ignore[no-untyped-def]
@@ -160,7 +158,7 @@ def test_a_body_that_bends_is_refused(simulate) -> None:  # type: ignore[no-unty
 def test_one_catheter_alone_is_refused_with_the_bound(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 4)
     arc = np.array([0.0, 4.65, 10.95, 14.25]) / 30
-    points = np.stack([30 * np.sin(arc), 30 * (1 - np.cos(arc)), np.zeros(4)], axis=1) + [10.0, 5.0, 0.0]
+    points = np.stack([30 * np.sin(arc), 30 * (1 - np.cos(arc)), np.zeros(4)], axis=1) + np.array([10.0, 5.0, 0.0])
     moved = points + np.arange(4)[:, None, None] * np.array([0.5, 0.5, 0.5])
     refusal = refusal_of(view(simulation, points, simulation.camera.project(moved)))
     assert refusal.reason is Reason.DEPTH_UNOBSERVABLE
@@ -182,7 +180,9 @@ def test_too_few_points_or_points_on_a_line_are_refused(simulate, count: int) ->
 
 def test_an_uncertain_shape_counts_against_the_bound(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 4)
-    exact = RigidPose(RigidPose.Params()).follow(view(simulation, simulation.points_mm[0], simulation.pixels_uv), Silent())
+    exact = RigidPose(RigidPose.Params()).follow(
+        view(simulation, simulation.points_mm[0], simulation.pixels_uv), Silent()
+    )
     vague = RigidPose(RigidPose.Params()).follow(
         view(simulation, simulation.points_mm[0], simulation.pixels_uv, sd_mm=0.4), Silent()
     )

@@ -119,7 +119,9 @@ def test_breathing_between_the_runs_is_found_and_hardly_reaches_relative_positio
     b = observation(camera(0), {name: at + shift for name, at in points.items()})
     worst = {}
     for plugin in (Linear, MaximumLikelihood):
-        answer = plugin(UncertaintyParams()).triangulate((site(a, b, LATERAL_AND_FRONTAL),), DEFAULT_CATALOGUE, Silent())
+        answer = plugin(UncertaintyParams()).triangulate(
+            (site(a, b, LATERAL_AND_FRONTAL),), DEFAULT_CATALOGUE, Silent()
+        )
         (located,) = answer.sites
         worst[plugin] = max(
             np.linalg.norm(

@@ -10,12 +10,12 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from fastapi import FastAPI  # noqa: E402
-from fastapi.testclient import TestClient  # noqa: E402
-from finished_study import FinishedStudy, make_study  # noqa: E402
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from finished_study import FinishedStudy, make_study
 
-from fluoromap.api import drawing  # noqa: E402
-from fluoromap.api.app import create_app  # noqa: E402
+from fluoromap.api import drawing
+from fluoromap.api.app import create_app
 
 
 @pytest.fixture(scope="session")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +29,8 @@ from fluoromap.contracts import (
     Track,
     Triangulation,
 )
-from fluoromap.dicom import deterministic_uid, read_instance, write_cine
-from fluoromap.geometry import Gantry
+from fluoromap.dicom import InstanceFacts, deterministic_uid, read_instance, write_cine
+from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap.store import files, jobs
 from fluoromap.store.codec import encode
@@ -181,23 +184,29 @@ def make_study() -> FinishedStudy:
         return FinishedStudy(study.id, job.id, uids)
 
 
-def _stored_run(session: Session, uid: str, view: str) -> RunPlan:
-    gantry = GANTRIES[view]
+@functools.cache
+def _cine(uid: str, view: str) -> tuple[bytes, InstanceFacts]:
     ramp = np.tile(np.linspace(200, 3000, SIZE, dtype=np.uint16), (SIZE, 1))
-    with files.incoming() as path:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.dcm"
         write_cine(
             path,
             [ramp + 10 * frame for frame in range(FRAMES)],
             frame_count=FRAMES,
-            gantry=gantry,
+            gantry=GANTRIES[view],
             frame_time_ms=16.7,
             acquired=datetime(2026, 3, 1, 9, 30, tzinfo=UTC),
             study_instance_uid=deterministic_uid("study"),
             series_number=1,
             sop_instance_uid=uid,
         )
-        facts = read_instance(path)
-        sha256 = files.keep(session, path, "application/dicom")
+        return path.read_bytes(), read_instance(path)
+
+
+def _stored_run(session: Session, uid: str, view: str) -> RunPlan:
+    gantry = GANTRIES[view]
+    content, facts = _cine(uid, view)
+    sha256 = files.keep_bytes(session, content, "application/dicom")
     session.add(
         Instance(
             sop_instance_uid=uid, sha256=sha256, study_instance_uid=facts.study_instance_uid,
@@ -212,9 +221,7 @@ def _stored_run(session: Session, uid: str, view: str) -> RunPlan:
     return RunPlan(sha256=sha256, facts=facts.to_json(), gantry=plan, marks={})
 
 
-def camera(view: str) -> Any:
-    from fluoromap.geometry import camera_from_gantry
-
+def camera(view: str) -> Camera:
     return camera_from_gantry(GANTRIES[view])
 
 
@@ -226,7 +233,7 @@ def _observation(view: str, frame: int) -> Observation:
 
 
 def matching() -> Matching:
-    times = np.arange(FRAMES) * 16.7
+    times = np.arange(FRAMES, dtype=np.float64)
     site = MatchedSite(
         site="S01",
         camera_a=camera("a"),

@@ -11,7 +11,7 @@ from finished_study import FinishedStudy
 
 from fluoromap.api import jobs as job_routes
 from fluoromap.store import jobs
-from fluoromap.store.engine import reading
+from fluoromap.store.engine import reading, writing
 from fluoromap.store.manifest import Manifest
 from fluoromap.store.models import Job
 
@@ -69,8 +69,6 @@ def test_progress_alone_changes_the_tag(client: TestClient, study: FinishedStudy
     with study.claimed("segment", study.uids["S01", "a"]) as (_, held):
         pass
     etag = client.get(_path(study)).headers["etag"]
-    from fluoromap.store.engine import writing
-
     with writing() as session:
         jobs.beat(session, held, 0.25)
     assert client.get(_path(study), headers={"If-None-Match": etag}).status_code == 200
@@ -122,8 +120,6 @@ def test_cancelling(client: TestClient, study: FinishedStudy) -> None:
     assert answer.status_code == 202
     assert answer.json()["state"] == "running"
     assert {stage["state"] for stage in answer.json()["stages"]} == {"running", "cancelled"}
-    from fluoromap.store.engine import writing
-
     with writing() as session:
         jobs.stopped(session, held)
     assert client.get(_path(study)).json()["state"] == "cancelled"
@@ -133,8 +129,6 @@ def test_cancelling(client: TestClient, study: FinishedStudy) -> None:
 
 
 def test_jobs_are_listed_newest_first_a_page_at_a_time(client: TestClient, study: FinishedStudy) -> None:
-    from fluoromap.store.engine import writing
-
     with writing() as session:
         manifest = Manifest.model_validate(session.get_one(Job, study.job_id).manifest)
         newer = jobs.create(session, study.study_id, manifest).id

@@ -60,8 +60,8 @@ def test_not_ready_without_a_worker(client: TestClient, monkeypatch: pytest.Monk
     assert _checks(client)[0] == 503
 
 
-def test_not_ready_without_files(client: TestClient, tmp_path: Path) -> None:
-    (tmp_path / "files").write_text("in the way")
+def test_not_ready_without_files(client: TestClient, data_dir: Path) -> None:
+    (data_dir / "files").write_text("in the way")
     status, checks = _checks(client)
     assert (status, checks["files"], checks["database"]) == (503, False, True)
 

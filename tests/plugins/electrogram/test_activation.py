@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fluoromap.electrogram import UnusableElectrogram, activation_time
+
+TIMES = np.arange(0.0, 300.0)
+
+
+def deflection(at_ms, times=TIMES, width_ms=4.0, height=1.0):
+    """A biphasic unipolar electrogram whose steepest fall lies at ``at_ms``."""
+    x = (times - at_ms) / width_ms
+    return -height * x * np.exp(-0.5 * x * x)
+
+
+@given(st.floats(60, 240), st.floats(60, 240), st.floats(0.001, 1000))
+def test_difference_of_the_steepest_falls(reference_at, mapping_at, gain):
+    found = activation_time(TIMES, deflection(reference_at), gain * deflection(mapping_at))
+    assert found.reference_ms == pytest.approx(reference_at, abs=0.3)
+    assert found.mapping_ms == pytest.approx(mapping_at, abs=0.3)
+    assert found.lat_ms == pytest.approx(mapping_at - reference_at, abs=0.4)
+    assert found.lat_ms == pytest.approx(found.mapping_ms - found.reference_ms)
+
+
+def test_negative_times_are_kept():
+    assert activation_time(TIMES, deflection(150), deflection(120)).lat_ms == pytest.approx(-30, abs=0.4)
+
+
+def test_uneven_samples():
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.5, 1.5, 300))
+    found = activation_time(times, deflection(100, times), deflection(147.3, times))
+    assert found.lat_ms == pytest.approx(47.3, abs=0.6)
+
+
+def test_the_standard_deviation_covers_the_scatter():
+    rng = np.random.default_rng(1)
+    errors, stated = [], []
+    for shift in rng.uniform(-0.5, 0.5, 60):
+        noisy = [deflection(at) + rng.normal(0, 0.03, 300) for at in (100, 140 + shift)]
+        result = activation_time(TIMES, *noisy)
+        errors.append(result.lat_ms - 40 - shift)
+        stated.append(result.sd_ms)
+    assert 0.5 < np.mean(stated) / np.std(errors) < 2
+
+
+def test_rivals_are_told():
+    double = deflection(100) + 0.95 * deflection(180)
+    warnings = activation_time(TIMES, deflection(90), double).warnings
+    assert len(warnings) == 1
+    assert "mapping" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("signal", "message"),
+    [
+        (np.zeros(300), "flat"),
+        (np.clip(deflection(100), -0.2, 0.2), "saturated"),
+        (np.random.default_rng(0).normal(size=300), "noise"),
+        (np.full(300, np.nan), "not numbers"),
+        (np.zeros(299), "one value"),
+        (np.linspace(0, 1, 300), "noise"),
+    ],
+)
+def test_unusable_signals_are_refused_by_name(signal, message):
+    with pytest.raises(UnusableElectrogram, match=f"mapping.*{message}"):
+        activation_time(TIMES, deflection(100), signal)
+
+
+def test_unusable_times_are_refused():
+    with pytest.raises(UnusableElectrogram, match="at least"):
+        activation_time(TIMES[:10], deflection(100)[:10], deflection(100)[:10])
+    with pytest.raises(UnusableElectrogram, match="ascend"):
+        activation_time(TIMES[::-1], deflection(100), deflection(100))

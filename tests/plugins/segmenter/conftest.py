@@ -1,0 +1,39 @@
+import numpy as np
+import pytest
+
+from fluoromap.contracts import PixelFacts, Run
+from fluoromap.phantom import StudySpec, simulate_study
+
+PX_PER_MM = 512 / 178 * 2
+
+
+class Frames:
+    """Frames in an array, as a frame source."""
+
+    def __init__(self, frames):
+        self._frames = np.asarray(frames)
+        self.shape = self._frames.shape[1:]
+
+    def __len__(self):
+        return len(self._frames)
+
+    def __getitem__(self, index):
+        return self._frames[index]
+
+    def __iter__(self):
+        return iter(self._frames)
+
+
+@pytest.fixture
+def run_of():
+    def build(frames, bits=12, monochrome1=False, frame_ms=1000 / 15, shutter=None, **more):
+        source = Frames(frames)
+        times = np.arange(len(source)) * frame_ms
+        return Run(source, times, PX_PER_MM, PixelFacts(False, bits, monochrome1, shutter), **more)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def study():
+    return simulate_study(StudySpec(seed=301, sites=2, frames=16))

@@ -1,0 +1,150 @@
+"""Steps 1 to 4 against their equations and their plain twins."""
+
+import math
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from fluoromap.contracts import PixelFacts
+from fluoromap.segmenter.blobs import find_blobs, otsu_threshold
+from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
+from fluoromap.segmenter.homomorphic import equivalent_sigma, gaussian, homomorphic
+from fluoromap.segmenter.log_image import LogTransform
+from fluoromap.segmenter.morphology import disk_morphology
+from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
+
+plain = types.ModuleType("plain_filters")
+exec((Path(__file__).parent / "plain_filters.py").read_text(), plain.__dict__)
+
+
+@pytest.fixture(scope="module")
+def image():
+    """A log image of smooth shading, dark spots and noise."""
+    rng = np.random.default_rng(5)
+    v, u = np.mgrid[0:160, 0:192]
+    x = 6 + 0.4 * np.sin(u / 60) + 0.3 * np.cos(v / 45)
+    for cu, cv in ((40, 50), (60, 55), (120, 100), (150, 90), (90, 120)):
+        x = x - 0.8 * (np.hypot(u - cu, v - cv) < 5)
+    return ndimage.gaussian_filter(x + rng.normal(0, 0.05, x.shape), 0.7).astype(np.float32)
+
+
+def test_equation_4_is_a_constant_less_a_gaussian():
+    """The Fourier filter H(D) of equation (4), D in cycles per width, equals the spatial form on a periodic image."""
+    x = np.random.default_rng(0).normal(size=(128, 128))
+    low, high, slope, cutoff = 0.5, 2.0, 1.3, 8.0
+    d2 = (np.fft.fftfreq(128)[:, None] * 128) ** 2 + (np.fft.fftfreq(128)[None] * 128) ** 2
+    transfer = (high - low) * (1 - np.exp(-slope * d2 / cutoff**2)) + low
+    by_fourier = np.fft.ifft2(np.fft.fft2(x) * transfer).real
+    sigma = equivalent_sigma(128, slope, cutoff)
+    in_space = high * x - (high - low) * ndimage.gaussian_filter(x, sigma, mode="wrap", truncate=8.0)
+    np.testing.assert_allclose(in_space, by_fourier, atol=1e-12)
+
+
+def test_homomorphic_agrees_with_its_plain_twin_and_keeps_the_mean(image):
+    expected = plain.homomorphic(image) + 0.5 * image.mean()
+    got = homomorphic(image)
+    assert np.abs(got - expected).max() <= 2e-3 * np.ptp(expected)
+    assert got.mean() == pytest.approx(image.mean(), abs=5e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.8, 3.0, 9.0, 20.0])
+def test_gaussian(image, sigma):
+    expected = ndimage.gaussian_filter(image.astype(float), sigma, mode="reflect", truncate=6)
+    assert np.abs(gaussian(image, sigma) - expected).max() <= 2e-3 * np.ptp(image)
+
+
+def test_equations_5_and_6_agree_with_their_plain_twin(image):
+    k = edge_scale(image, np.ones(image.shape, bool))
+    expected = plain.perona_malik(image, k)
+    assert np.abs(perona_malik(image, k) - expected).max() <= 0.005 * np.ptp(expected)
+
+
+def test_diffusion_conserves_the_mean_and_obeys_the_maximum_principle(image):
+    out = perona_malik(image, 0.2)
+    assert out.mean(dtype=float) == pytest.approx(image.mean(dtype=float), abs=1e-5)
+    assert out.min() >= image.min() - 1e-5
+    assert out.max() <= image.max() + 1e-5
+
+
+def test_diffusion_dissolves_a_checkerboard_and_refuses_the_step_at_which_one_survives():
+    board = (np.indices((64, 64)).sum(axis=0) % 2).astype(np.float32)
+    out = perona_malik(board, k=50.0, sweeps=15, step=0.2)
+    assert np.ptp(out[8:-8, 8:-8]) < 0.01
+    survivor = plain.perona_malik(board, 50.0, sweeps=15, step=0.25)
+    assert np.ptp(survivor[20:-20, 20:-20]) >= 0 and np.ptp(plain.perona_malik(board, 50.0, 15, 0.3)) > 10 * np.ptp(out)
+    with pytest.raises(ValueError, match="0.25"):
+        perona_malik(board, 1.0, step=0.25)
+
+
+def test_edge_scale_has_a_floor_where_quantisation_hides_the_noise_and_none_for_a_flat_frame():
+    steps = np.repeat(np.arange(8, dtype=np.float32), 16)[None].repeat(64, axis=0)
+    inside = np.ones(steps.shape, bool)
+    assert edge_scale(steps, inside) == pytest.approx(7e-3, rel=0.1)
+    assert edge_scale(np.full((64, 64), 3, np.float32), np.ones((64, 64), bool)) is None
+
+
+@pytest.mark.parametrize("tangential", [0.5, 0.3])
+def test_equation_7_agrees_with_its_plain_twin(image, tangential):
+    grey = to_grey_range(image, np.ones(image.shape, bool))
+    expected = plain.complex_shock(grey, tangential=tangential)
+    assert np.abs(complex_shock(grey, tangential=tangential) - expected).max() <= 1e-3 * np.ptp(expected)
+
+
+def test_the_minus_sign_of_equation_7_sharpens():
+    u = np.arange(96, dtype=np.float32)
+    edge = (255 / (1 + np.exp(-(u - 48) / 3))).astype(np.float32)[None].repeat(48, axis=0)
+    slope = np.abs(np.diff(edge[24])).max()
+    # diffusion alone would flatten it, and with plus in front the shock would too
+    sharpened = np.abs(np.diff(complex_shock(edge, sweeps=30)[24])).max()
+    with_plus = np.abs(np.diff(plain.complex_shock(edge, sweeps=30, sign=1.0)[24])).max()
+    assert sharpened > slope > with_plus
+
+
+def test_shock_refuses_an_unstable_step():
+    with pytest.raises(ValueError, match="step"):
+        complex_shock(np.zeros((32, 32), np.float32), step=0.6)
+
+
+def test_disk_morphology_is_exact(image):
+    expected = plain.disk_morphology(image.astype(float), 9, 2)
+    np.testing.assert_allclose(disk_morphology(image, 9, 2), expected, atol=3e-5 * np.ptp(image))
+
+
+def test_otsu_agrees_with_scikit_image():
+    from skimage.filters import threshold_otsu
+
+    rng = np.random.default_rng(2)
+    x = np.abs(np.where(rng.random((80, 80)) < 0.1, rng.normal(5, 0.5, (80, 80)), rng.normal(1, 0.3, (80, 80))))
+    x = x.astype(np.float32)
+    assert otsu_threshold(x, np.ones(x.shape, bool)) == pytest.approx(threshold_otsu(x, nbins=1024), abs=0.02)
+
+
+def test_whole_chain_finds_the_same_blobs_as_the_plain_one(image):
+    inside = np.ones(image.shape, bool)
+    k = edge_scale(homomorphic(image), inside)
+    fast = disk_morphology(complex_shock(to_grey_range(perona_malik(homomorphic(image), k), inside)), 10, 2)
+    diffused = plain.perona_malik(plain.homomorphic(image) + 0.5 * image.mean(), k)
+    slow = plain.disk_morphology(plain.complex_shock(to_grey_range(diffused.astype(np.float32), inside)), 10, 2)
+    got = find_blobs(fast, inside, inside, 10, 500)
+    expected = find_blobs(slow.astype(np.float32), inside, inside, 10, 500)
+    assert len(got) == len(expected) == 5
+    np.testing.assert_allclose(got.centroids_uv, expected.centroids_uv, atol=0.1)
+    truth = np.array([(40, 50), (60, 55), (150, 90), (120, 100), (90, 120)], float)
+    nearest = np.linalg.norm(got.centroids_uv[:, None] - truth[None], axis=2).min(axis=1)
+    assert nearest.max() < 0.5
+
+
+def test_log_transform():
+    facts = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
+    pixels = np.array([[0, 1], [100, 4095]], np.uint16)
+    np.testing.assert_allclose(LogTransform.of_run(facts, 900.0)(pixels), np.log(pixels + 1.0), rtol=1e-6)
+    mean = pixels.astype(float) + 0.5
+    np.testing.assert_allclose(LogTransform.of_run(facts, 900.0)(mean), np.log(mean + 1.0), rtol=1e-6)
+    inverted = LogTransform.of_run(PixelFacts(False, 8, True), 155.0)
+    assert inverted.offset == pytest.approx(2.0)
+    np.testing.assert_allclose(inverted(np.array([[255, 0]], np.uint8)), [[math.log(2.0), math.log(257.0)]], rtol=1e-6)
+    untouched = LogTransform.of_run(PixelFacts(True, 12, False), 900.0)
+    np.testing.assert_allclose(untouched(pixels), pixels)

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
+from fluoromap.segmenter.contrast import Contrast
+from fluoromap.segmenter.linking import families, kind_probabilities, link
+
+PX = 5.75
+
+
+def drawn(curves, noise=0.02, size=320):
+    """A log image with dark spots at the electrodes and a fainter shaft behind; curves: list of (points, shaft end)."""
+    v, u = np.mgrid[0:size, 0:size].astype(float)
+    x = np.random.default_rng(3).normal(6, noise, (size, size))
+    for points, end in curves:
+        line = np.linspace(points[0], points[-1], 60).tolist() + np.linspace(points[-1], end, 60).tolist()
+        depth = np.zeros_like(x)
+        for pu, pv in line:
+            depth = np.maximum(depth, 0.12 * (np.hypot(u - pu, v - pv) < 5))
+        for pu, pv in points:
+            depth = np.maximum(depth, 0.9 * (np.hypot(u - pu, v - pv) < 4))
+        x -= depth
+    return x.astype(np.float32)
+
+
+def straight(catheter, tip, angle, foreshortening=0.9):
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    points = np.asarray(tip) + np.outer(catheter.arc_lengths_mm * PX * foreshortening, direction)
+    return points, points[-1] + 50 * direction
+
+
+def contrast_of(image):
+    return Contrast.of_frame(image, image, np.ones(image.shape, bool), 0.05, PX)
+
+
+@pytest.mark.parametrize("electrodes", [2, 3, 4, 6, 8, 10])
+def test_chains_of_any_number_of_electrodes_run_from_the_tip(electrodes):
+    rng = np.random.default_rng(electrodes)
+    spacing = tuple(rng.choice([2.5, 3.0, 4.5], electrodes - 1)) if electrodes > 2 else (3.5,)
+    probe = Catheter("probe", electrodes, spacing, 2.0, 1.0)
+    catalogue = Catalogue((probe, Catheter("reference", 4, (9.0, 9.0, 9.0), 2.0, 1.0)), "reference", "probe")
+    points, end = straight(probe, (60, 70), 0.4)
+    shuffled = rng.permutation(electrodes)
+    chains = link(points[shuffled], contrast_of(drawn([(points, end)])), families(catalogue), sure=electrodes)
+    assert len(chains) == 1
+    order = [int(shuffled[candidate]) for candidate in chains[0].candidates]
+    assert order in (list(range(electrodes)), list(range(electrodes))[::-1])
+
+
+def test_two_catheters_and_stray_candidates():
+    kinds = families(DEFAULT_CATALOGUE)
+    one, end_one = straight(DEFAULT_CATALOGUE["reference"], (60, 80), 0.3)
+    two, end_two = straight(DEFAULT_CATALOGUE["mapping"], (250, 250), -2.6)
+    image = drawn([(one, end_one), (two, end_two)])
+    stray = np.array([[40.0, 250.0], [280.0, 40.0], [150.0, 160.0]])
+    chains = link(np.concatenate([one, two, stray]), contrast_of(image), kinds, sure=11)
+    assert sorted(tuple(sorted(chain.candidates)) for chain in chains) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+
+
+def test_candidates_on_a_plain_background_make_no_chain():
+    points, _ = straight(DEFAULT_CATALOGUE["reference"], (60, 80), 0.3)
+    image = np.random.default_rng(0).normal(6, 0.05, (320, 320)).astype(np.float32)
+    assert link(points, contrast_of(image), families(DEFAULT_CATALOGUE), sure=4) == ()
+
+
+def test_look_alikes_are_one_family_and_share_their_probability():
+    kinds = families(DEFAULT_CATALOGUE)
+    assert [family.names for family in kinds] == [("reference", "pacing"), ("mapping",)]
+    given = kind_probabilities(np.log(np.array([[0.6, 0.4]])), kinds)
+    assert dict(given[0])["reference"] == pytest.approx(dict(given[0])["pacing"])
+    assert sum(dict(given[0]).values()) == pytest.approx(1.0)
+
+
+def test_kinds_respect_how_many_of_each_the_catalogue_has():
+    """Three chains, all looking like the diagnostic kind: one of them must be the mapping catheter."""
+    kinds = families(DEFAULT_CATALOGUE)
+    given = kind_probabilities(np.array([[0.0, -1.0], [0.0, -1.0], [0.0, -0.2]]), kinds)
+    mapping = [dict(row).get("mapping", 0.0) for row in given]
+    assert sum(mapping) == pytest.approx(1.0)
+    assert mapping[2] > mapping[0]
