@@ -23,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 START_SECONDS = 60
+_SSL_REQUEST = bytes([0, 0, 0, 8, 4, 210, 22, 47])
+"""PostgreSQL's request for encryption, which it answers with one byte as soon as it accepts connections."""
 _ATTEMPTS = 3
 
 
@@ -94,7 +96,7 @@ def _start_postgresql(folder: Path) -> tuple[str, int]:
         options = ("fsync=off", "max_connections=200", "listen_addresses=127.0.0.1", "unix_socket_directories=")
         return [programs / "postgres", "-D", data, "-p", str(port), *(f"-c{option}" for option in options)]
 
-    port, pid = _launch(launch, home, environment, as_user)
+    port, pid = _launch(launch, _SSL_REQUEST, home, environment, as_user)
     return f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres", pid
 
 
@@ -107,14 +109,18 @@ def _start_redis(folder: Path) -> tuple[str, int]:
         options = ("--bind", "127.0.0.1", "--dir", home, "--save", "", "--appendonly", "no", "--databases", "4096")
         return [program, "--port", str(port), *options]
 
-    port, pid = _launch(launch, home, {"PATH": "/usr/bin:/bin", "HOME": str(home)}, {})
+    port, pid = _launch(launch, b"PING\r\n", home, {"PATH": "/usr/bin:/bin", "HOME": str(home)}, {})
     return f"redis://127.0.0.1:{port}", pid
 
 
 def _launch(
-    arguments: Callable[[int], list[Any]], home: Path, environment: dict[str, str], as_user: dict[str, Any]
+    arguments: Callable[[int], list[Any]],
+    greeting: bytes,
+    home: Path,
+    environment: dict[str, str],
+    as_user: dict[str, Any],
 ) -> tuple[int, int]:
-    """Start a server on a free port and wait until it answers; another port when someone was faster."""
+    """Start a server on a free port and wait until it answers a greeting; another port when someone was faster."""
     for _ in range(_ATTEMPTS):
         port = free_port()
         # A session of its own: it must outlive the pytest process that happened to ask first.
@@ -122,16 +128,15 @@ def _launch(
             arguments(port), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             env=environment, cwd=home, start_new_session=True, **as_user,
         )  # fmt: skip
-        _wait_until(lambda server=server, port=port: server.poll() is not None or _answers(port), "no answer")
+        _wait_until(lambda server=server, port=port: server.poll() is not None or _answers(port, greeting), "no answer")
         if server.poll() is None:
             return port, server.pid
     raise RuntimeError("a test server could not be started; try its command by hand")
 
 
-def _answers(port: int) -> bool:
+def _answers(port: int, greeting: bytes) -> bool:
     with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5) as connection:
-        # PostgreSQL listens before it accepts; a request for encryption is answered by one byte. Redis calls it an error.
-        connection.sendall(bytes([0, 0, 0, 8, 4, 210, 22, 47, 13, 10]))
+        connection.sendall(greeting)
         return bool(connection.recv(1))
     return False
 

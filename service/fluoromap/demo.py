@@ -78,7 +78,6 @@ def run(data_dir: Path, out: Path, console: Console, *, keep: bool, spec: StudyS
     CommandFailed
         When the service or the job fails.
     """
-    stop = stop_on_signals() if keep else None
     with progress_bars(console) as progress:
         bar = progress.add_task("simulate", total=2 * spec.sites)
         files = simulate(data_dir / "simulated", spec, on_run=lambda: progress.advance(bar))
@@ -93,9 +92,9 @@ def run(data_dir: Path, out: Path, console: Console, *, keep: bool, spec: StudyS
                 console.print(f"note: {note}", highlight=False)
             rows = accuracy(points, json.loads(files.truth.read_text()))
             _print_result(console, spec, rows, chamber, out)
-            if stop is not None:
+            if keep:
                 console.print(f"The service is up at {url} (study {study}); Ctrl-C ends it.", highlight=False)
-                stop.wait()
+                stop_on_signals().wait()
 
 
 def _print_result(

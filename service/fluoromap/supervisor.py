@@ -176,10 +176,14 @@ class Supervisor:
             if child.alive:
                 child.process.terminate()
         end = time.monotonic() + STOP_SECONDS
-        for child in children:
-            with suppress(subprocess.TimeoutExpired):
-                child.process.wait(max(end - time.monotonic(), 0.1))
-            child.kill_group()
+        try:
+            for child in children:
+                with suppress(subprocess.TimeoutExpired):
+                    child.process.wait(max(end - time.monotonic(), 0.1))
+        finally:
+            # Also when the user would not wait and pressed Ctrl-C again.
+            for child in children:
+                child.kill_group()
 
     def _where_to_look(self) -> str:
         return f"see the logs in {self._log_folder}" if self._log_folder else "its own message stands above"
@@ -196,17 +200,21 @@ def run_until_stopped(supervisor: Supervisor, stop: threading.Event) -> None:
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGINT and SIGTERM set; a second signal ends the process the usual way."""
+    """An event that the first SIGINT or SIGTERM sets; a second one interrupts the process."""
     event = threading.Event()
 
     def stop(number: int, frame: object) -> None:
         event.set()
-        for each in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(each, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, _exit)
 
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, stop)
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
     return event
+
+
+def _exit(number: int, frame: object) -> None:
+    sys.exit(128 + number)
 
 
 @contextmanager
@@ -224,6 +232,9 @@ def private_service(data_dir: Path) -> Iterator[str]:
     if migrated.returncode != 0:
         raise CommandFailed(migrated.stderr.strip() or "The database could not be made.")
     supervisor = Supervisor("127.0.0.1", free_port(), environment, log_folder=data_dir)
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        # The default would end this process at once and leave its children running.
+        signal.signal(signal.SIGTERM, _exit)
     stop = threading.Event()
     watcher = threading.Thread(target=_watch, args=(supervisor, stop), daemon=True)
     try:

@@ -20,6 +20,7 @@ _SATURATED_SAMPLES = 5
 _BASELINE = 0.1
 _LEAST_SLOPE_TO_NOISE = 6.0
 _RIVAL = 0.8
+_PLACEMENT = 0.05
 _RIVAL_AWAY_MS = 10.0
 
 
@@ -141,7 +142,7 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
     place = float(np.clip(-curve[1] / (2.0 * curve[0]), x[0], x[-1]))
     # d(slope) / d(time) changes by 2 c per ms at the minimum: an error of the slope's derivative moves it by error / 2 c.
     derivative_error = noise * errors[steepest] * math.sqrt(10.0) / _WINDOW_MS
-    sd = math.hypot(derivative_error / (2.0 * float(curve[0])), spacing / math.sqrt(12.0))
+    sd = math.hypot(derivative_error / (2.0 * float(curve[0])), _PLACEMENT * spacing)
     return float(times[steepest]) + place, sd
 
 

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 SEMI_AXES_MM = (22.0, 22.0, 40.0)
 RADIUS_6F_MM, RADIUS_7F_MM = 1.0, 1.17
+PACING_SLIP_MM = 1.5
+"""Standard deviation an axis of where the pacing catheter's tip lies from site to site; the reference is fixed."""
 _SEPTUM_MM_PER_MS = 0.6
 # What the tips' mean excursion along an axis is brought to, unless that is too fast for the heart's rate.
 _EXCURSION_MM = (4.4, 5.6)
@@ -43,19 +45,20 @@ class Resident:
 class Anatomy:
     """One heart with its catheters.
 
-    right : reference and pacing catheter in the right ventricle, which stay. left : the mapping catheter, site by site.
-    contacts_mm : (sites, 3) where its tip's end touches the wall at diastole.
+    reference : in the right ventricle, fixed there. pacing : beside it, site by site, for it slips a little whenever the
+    mapping catheter is turned. mapping : in the left ventricle, site by site. contacts_mm : (sites, 3) where its tip's end touches the wall at diastole.
     """
 
     chamber: Chamber
     rate_hz: float
-    right: tuple[Resident, ...]
-    left: tuple[Resident, ...]
+    reference: Resident
+    pacing: tuple[Resident, ...]
+    mapping: tuple[Resident, ...]
     contacts_mm: Array
 
     def residents(self, site: int) -> tuple[Resident, ...]:
         """Reference, pacing and mapping catheter at a site."""
-        return (*self.right, self.left[site])
+        return (self.reference, self.pacing[site], self.mapping[site])
 
 
 def draw_anatomy(heart: HeartKind, sites: int, rng: np.random.Generator) -> Anatomy:
@@ -73,8 +76,15 @@ def draw_anatomy(heart: HeartKind, sites: int, rng: np.random.Generator) -> Anat
     common = follow * wall_vectors(chamber, tips, rocking)
     own = follow * np.stack([non_affine_vectors(rng) for _ in tips])
     vectors = _strength(common, own, rate, float(rng.uniform(*_EXCURSION_MM))) * common + own
-    placed = [Resident(shaft, v) for shaft, v in zip([reference, pacing, *mapping], vectors, strict=True)]
-    return Anatomy(chamber, rate, tuple(placed[:2]), tuple(placed[2:]), contacts)
+    slips = rng.normal(0, PACING_SLIP_MM, (sites, 3))
+    return Anatomy(
+        chamber,
+        rate,
+        Resident(reference, vectors[0]),
+        tuple(Resident(pacing.slipped(slip), vectors[1]) for slip in slips),
+        tuple(Resident(shaft, v) for shaft, v in zip(mapping, vectors[2:], strict=True)),
+        contacts,
+    )
 
 
 def _ventricles(rng: np.random.Generator) -> tuple[Chamber, Shaft, Shaft]:

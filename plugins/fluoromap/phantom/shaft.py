@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,10 @@ class Shaft:
         wanted = np.arange(0, length[-1], _STEP_MM)
         rest = np.stack([np.interp(wanted, length, curve[:, axis]) for axis in range(3)], axis=1)
         return cls(catheter, radius_mm, solid_tip, rest)
+
+    def slipped(self, displacement_mm: Array) -> Shaft:
+        """The same catheter with its tip at rest elsewhere, displaced by ``(3,)`` mm."""
+        return replace(self, rest_mm=self.moved(displacement_mm[None])[0])
 
     def moved(self, displacements_mm: Array) -> Array:
         """Centre lines for tip displacements ``(t, 3)``, shape (t, k, 3).

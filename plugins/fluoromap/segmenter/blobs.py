@@ -80,7 +80,7 @@ def find_blobs(x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: 
     return Blobs(centroids[keep], areas[keep], foreground)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _count(x, inside, scale, counts):  # type: ignore[no-untyped-def]  # pragma: no cover
     for v in range(x.shape[0]):
         for u in range(x.shape[1]):

@@ -79,13 +79,13 @@ def complex_shock(
     return np.ascontiguousarray(real[:rows, 1:-1])
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def _minmod(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     zero = np.float32(0)
     return max(zero, min(a, b)) + min(zero, max(a, b))
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def _two_over_pi_atan(x):  # type: ignore[no-untyped-def]  # pragma: no cover
     """(2/pi) atan(x) to 1e-5 by an odd polynomial (Abramowitz and Stegun 4.4.49); library calls break vectorisation."""
     size = abs(x)
@@ -100,7 +100,7 @@ def _two_over_pi_atan(x):  # type: ignore[no-untyped-def]  # pragma: no cover
     return series if x >= 0 else -series
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sharpen_row(  # type: ignore[no-untyped-def]  # pragma: no cover
     rw, rc, re, rnw, rn, rne, rsw, rs, rse, jw, jc, je, jnw, jn, jne, jsw, js, jse, real, imaginary,
     step, excess, drive, coupling, tangential, feedback,
@@ -138,7 +138,7 @@ def _sharpen_row(  # type: ignore[no-untyped-def]  # pragma: no cover
         imaginary[u] = j + step * (excess * jnn + tangential * (juu + jvv) + drive * rnn)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sharpen(real, imaginary, sweeps, step, excess, drive, coupling, tangential, feedback):  # type: ignore[no-untyped-def]  # pragma: no cover
     """All sweeps as one wavefront. A sweep leaves each row two rows higher in the buffer, where nothing is needed any more,
     so that neighbours still hold the values from before the sweep and no row is copied."""

@@ -83,7 +83,7 @@ def _radii(px_per_mm: float) -> tuple[float, float, float]:
     return max(1.0, _CORE_MM * px_per_mm), max(3.0, _RING_MM[0] * px_per_mm), max(4.5, _RING_MM[1] * px_per_mm)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _centre_surround(x, points, core, near, far):  # type: ignore[no-untyped-def]  # pragma: no cover
     rows, columns = x.shape
     reach = int(far) + 1
@@ -106,7 +106,7 @@ def _centre_surround(x, points, core, near, far):  # type: ignore[no-untyped-def
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _dark_line(x, u0, v0, u1, v1, side):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Mean over the piece of (darker of the two sides - middle); what leaves the image does not count."""
     rows, columns = x.shape

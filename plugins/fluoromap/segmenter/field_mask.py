@@ -115,10 +115,10 @@ def _largest_part(field: BoolArray) -> BoolArray:
 
 
 def _mask(field: BoolArray, median: Image) -> FieldMask:
-    distance = ndimage.distance_transform_edt(np.pad(field, 1, mode="edge"))[1:-1, 1:-1]
-    inside = distance > _ERODE_PX
-    if not inside.any():
-        inside = field
+    inside = field
+    if not field.all():  # a transform without any background has no meaning
+        eroded = ndimage.distance_transform_edt(np.pad(field, 1, mode="edge"))[1:-1, 1:-1] > _ERODE_PX
+        inside = eroded if eroded.any() else field
     # The border of the image is an edge too for a candidate: half an electrode cannot be placed.
     to_edge = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
     margin = min(MARGIN_PX, min(field.shape) // 8)

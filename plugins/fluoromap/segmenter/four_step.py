@@ -68,7 +68,7 @@ class FourStep:
         context.check()
         total = np.zeros(run.frames.shape, np.float64)
         for index in averaged:
-            total += run.frames[index]
+            total += run.frames[index].astype(np.float64)
         middle = averaged[len(averaged) // 2]
         mean = detector.chains(field.fill(transform(total / len(averaged))), middle)
         chains, averaged = _with_marks(mean.chains, averaged, entries, automatic, motion, run.px_per_mm)

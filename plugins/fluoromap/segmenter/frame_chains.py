@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
@@ -128,14 +127,14 @@ class Detector:
             of_family = [
                 sum(probability for name, probability in probabilities[row] if name in family.names) for family in kinds
             ]
-            place = places[row][int(np.argmax(of_family))] or places[row][chain.family]
-            assert place is not None
+            best = places[row][int(np.argmax(of_family))] or places[row][chain.family]
+            assert best is not None
             chains.append(
                 Chain(
                     electrodes=tuple(range(1, len(chain.candidates) + 1)),
-                    pixels_uv=place.points_uv,
-                    covariance_px2=place.covariance_px2,
-                    scores=contrast.of(place.points_uv),
+                    pixels_uv=best.points_uv,
+                    covariance_px2=best.covariance_px2,
+                    scores=contrast.of(best.points_uv),
                     kinds=probabilities[row],
                 )
             )

@@ -88,13 +88,13 @@ def _blur(x: Image, taps: Image) -> Image:
     return across
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _add_pair(out, first, second, weight):  # type: ignore[no-untyped-def]  # pragma: no cover
     for u in range(out.size):
         out[u] += weight * (first[u] + second[u])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _blur_down(padded, taps, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     reach = taps.size - 1
     for v in range(out.shape[0]):
@@ -106,7 +106,7 @@ def _blur_down(padded, taps, out):  # type: ignore[no-untyped-def]  # pragma: no
             _add_pair(row, padded[v + reach - k], padded[v + reach + k], taps[k])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _blur_across(padded, taps, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     reach = taps.size - 1
     width = out.shape[1]
@@ -120,7 +120,7 @@ def _blur_across(padded, taps, out):  # type: ignore[no-untyped-def]  # pragma: 
             _add_pair(row, source[reach - k : reach - k + width], source[reach + k : reach + k + width], taps[k])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _area_means(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     rows, columns = out.shape
     scale = np.float32(1.0 / (factor * factor))
@@ -136,7 +136,7 @@ def _area_means(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no c
             out[v, u] = total * scale
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _enlarge(small, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Linear interpolation between the centres of the reduced pixels."""
     rows, columns = small.shape

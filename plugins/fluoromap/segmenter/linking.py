@@ -98,8 +98,9 @@ def link(points_uv: Array, contrast: Contrast, kinds: Sequence[Family], sure: in
         for candidates in _paths(points_uv, weights, family.catheter, contrast.px_per_mm):
             if 2 * sum(candidate < sure for candidate in candidates) < len(candidates):
                 continue
-            score = _score(points_uv[list(candidates)], weights[list(candidates)], family.catheter, contrast)
-            score -= _LOST * sum(candidate >= sure for candidate in candidates)
+            chosen = list(candidates)
+            price = _LOST * sum(candidate >= sure for candidate in candidates)
+            score = _score(points_uv[chosen], weights[chosen], family.catheter, contrast, family.floor + price) - price
             if score >= family.floor:
                 found.append(Linked(candidates, index, score))
     found.sort(key=lambda chain: -chain.score)
@@ -141,7 +142,8 @@ def _paths(points: Array, weights: Array, catheter: Catheter, px_per_mm: float) 
     return [path for _, path, ratios in partial if SHORTEST <= sum(ratios) / len(ratios) <= LONGEST]
 
 
-def _score(points: Array, weights: Array, catheter: Catheter, contrast: Contrast) -> float:
+def _score(points: Array, weights: Array, catheter: Catheter, contrast: Contrast, least: float) -> float:
+    """Score of one chain; -inf, without a look at the shaft, where that cannot lift it to ``least``."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     along = steps / lengths[:, None]
@@ -156,6 +158,8 @@ def _score(points: Array, weights: Array, catheter: Catheter, contrast: Contrast
     score -= 0.5 * float(np.sum((turns / _BEND_SD) ** 2))
     if len(weights) > 2:
         score -= 0.6 * float(np.ptp(weights[1:]))
+    if score + 3.0 * _SHAFT_WEIGHT < least:
+        return -math.inf
     return score + _SHAFT_WEIGHT * shaft_evidence(points, catheter, contrast)
 
 

@@ -16,7 +16,7 @@ _FINE_BITS = 10
 _COARSE_OFFSET = 0.02
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _look_up(pixels, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     last = table.size - 1
     for v in range(pixels.shape[0]):

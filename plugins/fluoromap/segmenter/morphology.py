@@ -65,19 +65,19 @@ def _half_widths(radius: int) -> IntArray:
     return np.array([math.isqrt(radius**2 - k**2) for k in range(radius + 1)], dtype=np.int64)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _larger(out, first, second):  # type: ignore[no-untyped-def]  # pragma: no cover
     for u in range(out.size):
         out[u] = max(first[u], second[u])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _raise(out, other):  # type: ignore[no-untyped-def]  # pragma: no cover
     for u in range(out.size):
         out[u] = max(out[u], other[u])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _dilate(padded, half_widths, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Each row is widened to every width of the disk, by windows of 1, 2, 4, ... pixels overlapped in pairs, and raises the
     rows above and below that the disk reaches with that width. ``out`` has ``radius`` spare rows at both ends."""

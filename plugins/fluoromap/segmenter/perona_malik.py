@@ -60,7 +60,7 @@ def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Ima
     return out
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def _conduction(square):  # type: ignore[no-untyped-def]  # pragma: no cover
     """exp(-square) to 1e-4: the eighth power of a short series; library calls would break vectorisation."""
     y = np.float32(0.125) * min(square, np.float32(8))
@@ -71,7 +71,7 @@ def _conduction(square):  # type: ignore[no-untyped-def]  # pragma: no cover
     return series * series
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _diffuse_row(row, right, below, north, west, east, south, inverse, step):  # type: ignore[no-untyped-def]  # pragma: no cover
     """One sweep over one row; ``north`` holds the flux from above and leaves with the flux below. ``west`` and ``east`` are
     views of one array, the fluxes through the vertical pixel faces; ``right`` is the row shifted by a pixel."""
@@ -87,7 +87,7 @@ def _diffuse_row(row, right, below, north, west, east, south, inverse, step):  #
         north[u] = south[u]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _diffuse(x, sweeps, inverse, step):  # type: ignore[no-untyped-def]  # pragma: no cover
     rows, columns = x.shape
     north = np.zeros((sweeps, columns), np.float32)

@@ -55,8 +55,8 @@ def _reduced(x: Image) -> Image:
 def is_quiet(motion: Array) -> BoolArray:
     """Frames that differ from the frame before by little more than noise, (n,).
 
-    Motion and noise add in squares. The noise is what the quietest fifth shows, unless that moves already; quiet is a fifteenth of the liveliest motion,
-    or what the noise could be alone.
+    Motion and noise add in squares. The noise is what the quietest fifth shows, unless that moves already; quiet is a
+    fifteenth of the liveliest motion, or what the noise could be alone.
     """
     if len(motion) < 3:
         return np.ones(len(motion), dtype=np.bool_)

@@ -122,7 +122,7 @@ def _fit(
     return float(u), float(v), float(sd_along), float(sd_across), float(misfit)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sample(x, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     rows, columns = x.shape
     u = min(max(u, 0.0), columns - 1.001)
@@ -132,7 +132,7 @@ def _sample(x, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     return (x[j, i] * (1 - f) + x[j, i + 1] * f) * (1 - g) + (x[j + 1, i] * (1 - f) + x[j + 1, i + 1] * f) * g
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _band(u, half, dome, soft):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Profile of an electrode along its axis, 0 to 1; -half is the far end, a dome of that radius at a tip."""
     near = min(max(0.5 + (half - u) / soft, 0.0), 1.0)
@@ -143,12 +143,12 @@ def _band(u, half, dome, soft):  # type: ignore[no-untyped-def]  # pragma: no co
     return near * min(max(0.5 + depth / soft, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _cylinder(v, radius):  # type: ignore[no-untyped-def]  # pragma: no cover
     return np.sqrt(max(1.0 - (v / radius) ** 2, 0.0))
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _best_shift(profile, step, half, reach, dome, soft, chord, window):  # type: ignore[no-untyped-def]  # pragma: no cover
     """(shift, its standard deviation, unexplained share of the profile's variance) of the darkest matching template."""
     n = profile.size
@@ -198,7 +198,7 @@ def _best_shift(profile, step, half, reach, dome, soft, chord, window):  # type:
     return (chosen - shifts // 2 + fine) * step, sd, rest
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _fit_band(x, u, v, au, av, half, radius, reach, dome, window, step, soft):  # type: ignore[no-untyped-def]  # pragma: no cover
     n = 2 * int((window + reach) / step) + 1
     profile = np.zeros(n)

@@ -94,7 +94,7 @@ class Tracker:
                 if away <= gate and bent <= _BEND_PX and overlap > 0:
                     cost[row, column] = away + 2.0 * bent + _OTHER_KIND * (1.0 - min(overlap, 1.0))
         numbers = [-1] * len(chains)
-        for row, column in zip(*linear_sum_assignment(cost), strict=True):
-            if cost[row, column] < _IMPOSSIBLE:
-                numbers[int(row)] = int(column)
+        for taken_row, taken_column in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[taken_row, taken_column] < _IMPOSSIBLE:
+                numbers[int(taken_row)] = int(taken_column)
         return numbers

@@ -70,7 +70,7 @@ def test_diastole_stands_still(simulated):
 
 
 def test_tracks_are_catheters(simulated):
-    run, truth, found = simulated
+    _, truth, found = simulated
     names_of_track = {}
     for entry in (*found.frames, found.diastole):
         uv = {name: points[entry.frame] for name, points in truth.pixels_uv.items()}

@@ -66,7 +66,7 @@ def test_the_first_token_closes_the_service_at_once(service: TestClient) -> None
 @pytest.mark.parametrize("header", ["Bearer", "Bearer ", "Bearer wrong", "Basic dXNlcjpwYXNz", "wrong", "Bearer \xe4"])
 def test_what_is_no_token(service: TestClient, header: str) -> None:
     auth.create_token("one", ["admin"])
-    assert service.get("/v1/studies", headers={"Authorization": header.encode("latin-1")}).status_code == 401  # type: ignore[dict-item]
+    assert service.get("/v1/studies", headers={"Authorization": header.encode("latin-1")}).status_code == 401
 
 
 def test_scopes_imply_the_lower_ones(service: TestClient) -> None:

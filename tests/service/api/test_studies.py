@@ -82,7 +82,7 @@ def test_changing_a_study(service: TestClient, study_path: str) -> None:
 
 def test_a_study_with_a_running_job_stays(service: TestClient, study_path: str, upload: Upload) -> None:
     upload((1, -90.0))
-    manifest = {"runs": {run_uid(1): {}}}
+    manifest: dict[str, Any] = {"runs": {run_uid(1): {}}}
     with writing() as session:
         session.add(Job(id="j", study_id=study_path.rsplit("/", 1)[1], state="running", manifest=manifest))
     assert service.delete(study_path).status_code == 409

@@ -113,7 +113,8 @@ def _undecodable(run: bytes) -> bytes:
     dataset.file_meta.TransferSyntaxUID = pydicom.uid.JPEGLSLossless
     stream = io.BytesIO()
     pydicom.dcmwrite(stream, dataset)
-    return stream.getvalue()
+    content: bytes = stream.getvalue()
+    return content
 
 
 BAD: list[tuple[str, Callable[[bytes], bytes], int, set[str]]] = [
