@@ -154,55 +154,11 @@ class Client:
                 if "map.json" not in files.namelist():
                     return None
         chamber: dict[str, Any] = json.loads((out / "map.json").read_text())
-        draw_map(chamber, out / "map.png")
         return chamber
 
     def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
         content: dict[str, Any] = _good(self._http.request(method, path, **request)).json()
         return content
-
-
-def draw_map(answer: dict[str, Any], path: Path) -> None:
-    """Draw a map, as the service answers it, from six directions into a PNG file."""
-    # These take a second to import, and no other command draws.
-    import numpy as np
-    from PIL import Image
-
-    from fluoromap.contracts import ChamberMap, SurfaceSite
-    from fluoromap.fuser.map_picture import draw_map_views
-    from fluoromap.reasons import Reason
-
-    def times(values: list[float | None]) -> Any:
-        return np.array([0.0 if value is None else value for value in values])
-
-    sites = tuple(
-        SurfaceSite(
-            site["site"],
-            np.array([site["x_mm"], site["y_mm"], site["z_mm"]]),
-            np.array(site["surface_mm"]),
-            site["distance_mm"],
-            site["lat_ms"],
-            site["leave_one_out_error_ms"],
-            tuple(Reason(code) for code in site["reasons"]),
-        )
-        for site in answer["sites"]
-    )
-    chamber = ChamberMap(
-        vertices_mm=answer["vertices_mm"],
-        faces=answer["faces"],
-        lat_ms=times(answer["lat_ms"]),
-        lat_sd_ms=times(answer["lat_sd_ms"]),
-        covered=answer["covered"],
-        sites=sites,
-        earliest=tuple((entry["site"], entry["probability"]) for entry in answer["earliest"]),
-        total_activation_time_ms=answer["total_activation_time_ms"],
-        leave_one_out_rms_ms=answer["leave_one_out_rms_ms"],
-        volume_ml=answer["volume_ml"],
-        area_cm2=answer["area_cm2"],
-        coverage=answer["coverage"],
-        warnings=tuple(Reason(code) for code in answer["warnings"]),
-    )
-    Image.fromarray(draw_map_views(chamber)).save(path)
 
 
 def _good(answer: httpx.Response) -> httpx.Response:

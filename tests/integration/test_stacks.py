@@ -5,7 +5,6 @@ Each runs a study undisturbed, and once more from nothing with the worker killed
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
 import subprocess
@@ -18,32 +17,16 @@ from typing import Any
 import psutil
 import pytest
 
-from fluoromap.phantom import StudySpec
 from fluoromap.results import Client, inputs_of
-from fluoromap.simulation import simulate
 from fluoromap.supervisor import free_port, program
 
 PATIENCE_SECONDS = 240
-SPEC = StudySpec(seed=7, sites=4, frames=16, frame_rate_hz=15.0)
 
 pytestmark = pytest.mark.timeout(900)
 
 Fresh = Callable[[], AbstractContextManager[str]]
 Kill = Callable[[], None]
 """Kills the worker without warning and sees to it that there will be another."""
-
-
-@pytest.fixture(scope="session")
-def study_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated study, made once for all xdist workers."""
-    root = tmp_path_factory.getbasetemp()
-    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
-    folder = root / "stacks-study"
-    with (root / "stacks-study.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "truth.json").exists():
-            simulate(folder, SPEC, processes=1)
-    return folder
 
 
 @contextmanager
@@ -153,7 +136,7 @@ def _without_chance(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("stack", ["embedded", "servers"])
 def test_a_killed_worker_changes_nothing(
-    stack: str, study_folder: Path, tmp_path: Path, fresh_postgres: Fresh, fresh_redis: Fresh
+    stack: str, simulated_study: Path, tmp_path: Path, fresh_postgres: Fresh, fresh_redis: Fresh
 ) -> None:
     results = []
     for disturbed in (False, True):
@@ -163,13 +146,13 @@ def test_a_killed_worker_changes_nothing(
             if stack == "servers":
                 settings["FLUOROMAP_DATABASE_URL"] = opened.enter_context(fresh_postgres())
                 settings["FLUOROMAP_BROKER_URL"] = opened.enter_context(fresh_redis())
-            environment = _environment(data_dir, study_folder.parent / "numba", **settings)
+            environment = _environment(data_dir, simulated_study.parent / "numba", **settings)
             port = free_port()
             start = _embedded if stack == "embedded" else _with_servers
             kill = opened.enter_context(start(environment, port))
             url = f"http://127.0.0.1:{port}"
             _wait_until_ready(url, data_dir)
-            results.append(_run_job(url, study_folder, kill if disturbed else None))
+            results.append(_run_job(url, simulated_study, kill if disturbed else None))
     (undisturbed, points), (disturbed_job, disturbed_points) = results
     assert undisturbed["state"] == disturbed_job["state"] == "succeeded"
     assert max(row["attempt"] for row in undisturbed["stages"]) == 1

@@ -23,6 +23,8 @@ from fluoromap.api.problems import Problem, responses
 from fluoromap.api.readiness import job_of, manifest_of, map_of
 from fluoromap.api.security import Reader
 from fluoromap.api.tracks import tracks_csv, tracks_of
+from fluoromap.fuser.map_picture import draw_map_views
+from fluoromap.fuser.overlay import encode_png
 from fluoromap.settings import settings
 from fluoromap.store.engine import reading
 from fluoromap.store.files import CHUNK_BYTES
@@ -47,7 +49,7 @@ _MOMENT = (1980, 1, 1, 0, 0, 0)
     },
 )
 def get_archive(job_id: Annotated[str, Path(description="The job's id.")], caller: Reader) -> StreamingResponse:
-    """`job.json`, `parameters.json`, `points.csv`, `tracks.csv`, `map.json`, the mesh in all formats and an overlay of
+    """`job.json`, `parameters.json`, `points.csv`, `tracks.csv`, `map.json`, `map.png`, the mesh in all formats and an overlay of
     each view of each site, as far as the job came; coordinates from the reference catheter. 409 until the job has ended.
     """
     folder = settings().files_dir / "incoming"
@@ -113,7 +115,9 @@ def _map(job_id: str) -> Iterator[tuple[str, bytes, bool]]:
         if problem.code not in ("not_ready", "no_map"):
             raise
         return
-    yield "map.json", activation_map(outcome, chamber_of(outcome), Origin.REFERENCE).model_dump_json().encode(), True
+    chamber = chamber_of(outcome)
+    yield "map.png", encode_png(draw_map_views(chamber)), False
+    yield "map.json", activation_map(outcome, chamber, Origin.REFERENCE).model_dump_json().encode(), True
     for mesh_format in MeshFormat:
         mesh = mesh_of(job_id, outcome, str(stage.result), mesh_format, Origin.REFERENCE)
         yield f"mesh/chamber.{mesh_format}", mesh.path.read_bytes(), True

@@ -19,7 +19,6 @@ from fluoromap.store.engine import reading
 from fluoromap.store.models import File, Instance, StudyInstance
 
 Upload = Callable[..., Any]
-REAL = Path(__file__).parents[4] / "shared" / "data"
 
 
 def _stored(data_dir: Path) -> tuple[int, int, int, int]:
@@ -163,16 +162,16 @@ def test_all_rejected_answers_as_the_first(
     assert _stored(data_dir) == (0, 0, 0, 0)
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real sample files are not on this machine")
-def test_a_syntax_no_decoder_reads_is_refused(service: TestClient, study_path: str, data_dir: Path) -> None:
-    answer = _raw(service, study_path, (REAL / "xa_1024_jpeg_extended_12bit.dcm").read_bytes())
+def test_a_syntax_no_decoder_reads_is_refused(
+    service: TestClient, study_path: str, data_dir: Path, sample_data: Path
+) -> None:
+    answer = _raw(service, study_path, (sample_data / "xa_1024_jpeg_extended_12bit.dcm").read_bytes())
     assert (answer.status_code, answer.json()["code"]) == (422, "undecodable")
     assert _stored(data_dir) == (0, 0, 0, 0)
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real sample files are not on this machine")
-def test_a_real_cine_tells_what_it_lacks(service: TestClient, study_path: str) -> None:
-    answer = _raw(service, study_path, (REAL / "xa_512x512x96_jpeg_baseline.dcm").read_bytes())
+def test_a_real_cine_tells_what_it_lacks(service: TestClient, study_path: str, sample_data: Path) -> None:
+    answer = _raw(service, study_path, (sample_data / "xa_512x512x96_jpeg_baseline.dcm").read_bytes())
     assert answer.status_code == 201
     run = answer.json()["instances"][0]
     assert run["frames"] == 96

@@ -1,0 +1,203 @@
+"""The whole pipeline through the API, with the stages run at once in the calling process (eager)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydicom
+import pytest
+from fastapi.testclient import TestClient
+
+from fluoromap.contracts import Context, Marks, Run, Segmentation
+from fluoromap.segmenter.four_step import FourStep
+
+
+def _send(service: TestClient, study_path: str, folder: Path) -> None:
+    for path in sorted((folder / "dicom").iterdir()):
+        answer = service.post(
+            f"{study_path}/instances", content=path.read_bytes(), headers={"Content-Type": "application/dicom"}
+        )
+        assert answer.status_code == 201, answer.text
+    table = (folder / "activation_times.csv").read_bytes()
+    # The table names its runs by uploaded file names; sent raw, they are bound by row order.
+    rows = [row[:2] for row in csv.reader(io.StringIO(table.decode()))]
+    content = "\n".join(",".join(row) for row in rows)
+    answer = service.put(
+        f"{study_path}/activation-times", content=content, headers={"Content-Type": "text/csv"}
+    )
+    assert answer.json()["unmatched"] == [], answer.text
+
+
+def _job(service: TestClient, study_path: str, **body: Any) -> dict[str, Any]:
+    answer = service.post(f"{study_path}/jobs", json=body)
+    assert answer.status_code == 202, answer.text
+    job: dict[str, Any] = service.get(answer.headers["location"]).json()
+    return job
+
+
+def _fresh_stages(job: dict[str, Any]) -> Counter[str]:
+    """How many stages of each kind were really computed."""
+    return Counter(row["name"] for row in job["stages"] if row["state"] == "done" and not row["reused"])
+
+
+@pytest.fixture
+def sent(service: TestClient, study_path: str, simulated_study: Path) -> str:
+    """A study with all its runs and activation times."""
+    _send(service, study_path, simulated_study)
+    return study_path
+
+
+def test_a_study_becomes_points_map_meshes_and_overlays(
+    service: TestClient, sent: str, simulated_study: Path
+) -> None:
+    job = _job(service, sent)
+    assert job["state"] == "succeeded", job
+    assert job["progress"] == 1.0
+    base = f"/v1/jobs/{job['id']}"
+
+    points = service.get(f"{base}/points").json()
+    assert points["frame"] == {"axes": "LPS", "origin": "reference", "unit": "mm"}
+    truth = {site["site"]: site for site in json.loads((simulated_study / "truth.json").read_text())["sites"]}
+    tips = [p for p in points["points"] if p["catheter"] == "mapping" and p["electrode"] == 1 and p["grade"] != "rejected"]
+    assert len(tips) >= 3
+    errors = [
+        np.subtract([tip["x_mm"], tip["y_mm"], tip["z_mm"]], truth[tip["site"]]["relative_mm"]["mapping"][0])
+        for tip in tips
+    ]
+    # Simulated; the demo's bound is 1.0 mm over eight sites of 30 frames, this study is smaller.
+    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) <= 1.2
+    for point in points["points"]:
+        assert point["reasons"] or point["grade"] != "rejected"
+
+    rows = list(csv.DictReader(io.StringIO(service.get(f"{base}/points.csv").text)))
+    assert len(rows) == len(points["points"]) == 4 * 12
+
+    overlays = service.get(f"{base}/overlays").json()["overlays"]
+    assert overlays
+    picture = service.get(overlays[0]["href"])
+    assert picture.headers["content-type"] == "image/png"
+    tracks = service.get(f"{base}/tracks", params={"site": tips[0]["site"], "view": "a"}).json()["tracks"]
+    assert {track["solver"] for track in tracks} == {"a-priori-lm"}
+    assert all(len(track["samples"]) == 16 for track in tracks)
+    if len(tips) >= 4:
+        chamber = service.get(f"{base}/map").json()
+        assert len(chamber["lat_ms"]) == len(chamber["vertices_mm"])
+        assert service.get(f"{base}/mesh.ply").content.startswith(b"ply")
+
+
+def test_unchanged_work_is_not_done_again(service: TestClient, sent: str) -> None:
+    first = _job(service, sent)
+    assert _fresh_stages(first) == {"segment": 8, "match": 1, "triangulate": 1, "fuse": 1, "monoplane": 4}
+    second = _job(service, sent)
+    assert second["state"] == "succeeded"
+    assert _fresh_stages(second) == {}
+    answers = [service.get(f"/v1/jobs/{job['id']}/points").json() for job in (first, second)]
+    assert answers[0] == answers[1]
+
+
+def test_a_new_activation_time_redoes_the_map_alone(service: TestClient, sent: str) -> None:
+    _job(service, sent)
+    site = service.get(f"{sent}/sites").json()["items"][0]
+    changed = service.put(f"{sent}/sites/{site['site']}", json={"lat_ms": site["lat_ms"] + 5})
+    assert changed.status_code == 200, changed.text
+    assert _fresh_stages(_job(service, sent)) == {"fuse": 1}
+
+
+def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: str) -> None:
+    first = _job(service, sent)
+    tip = next(
+        p for p in service.get(f"/v1/jobs/{first['id']}/points").json()["points"]
+        if p["catheter"] == "mapping" and p["electrode"] == 1 and p["grade"] != "rejected"
+    )  # fmt: skip
+    uid, frame = tip["views"]["a"]["sop_instance_uid"], tip["views"]["a"]["frame"]
+    path = f"{sent}/instances/{uid}/frames/{frame}/electrodes"
+    electrodes = service.get(path).json()
+    for electrode in electrodes:
+        electrode["v_px"] += 6.0
+    keys = ("catheter", "electrode", "u_px", "v_px", "sd_px")
+    marks = [{key: electrode[key] for key in keys} for electrode in electrodes if electrode["catheter"] == "mapping"]
+    kept = [{key: e[key] for key in keys} for e in electrodes if e["catheter"] != "mapping"]
+    assert service.put(path, json=marks + kept).status_code == 200
+    second = _job(service, sent)
+    fresh = _fresh_stages(second)
+    assert fresh["segment"] == 1
+    assert fresh["monoplane"] <= 1
+    assert fresh["match"] == fresh["triangulate"] == 1
+    again = next(
+        p for p in service.get(f"/v1/jobs/{second['id']}/points").json()["points"]
+        if (p["site"], p["catheter"], p["electrode"]) == (tip["site"], "mapping", 1)
+    )  # fmt: skip
+    moved = np.subtract([again["x_mm"], again["y_mm"], again["z_mm"]], [tip["x_mm"], tip["y_mm"], tip["z_mm"]])
+    assert np.linalg.norm(moved) > 0.05
+
+
+def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
+    service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segment = FourStep.segment
+    calls: list[int] = []
+
+    def fails_once(self: FourStep, run: Run, catalogue: Any, marks: Marks, context: Context) -> Segmentation:
+        calls.append(1)
+        if len(calls) == 1:
+            raise ArithmeticError("the plugin's own words")
+        return segment(self, run, catalogue, marks, context)
+
+    monkeypatch.setattr(FourStep, "segment", fails_once)
+    job = _job(service, sent)
+    assert job["state"] == "succeeded"
+    failed = [row for row in job["stages"] if row["state"] == "failed"]
+    assert [row["name"] for row in failed] == ["segment"]
+    assert "the plugin's own words" in failed[0]["error"]["detail"]
+    sites = service.get(f"{sent}/sites").json()["items"]
+    site = next(site["site"] for site in sites if failed[0]["subject"] in (site["view_a"], site["view_b"]))
+    points = [p for p in service.get(f"/v1/jobs/{job['id']}/points").json()["points"] if p["site"] == site]
+    assert {p["grade"] for p in points} == {"rejected"}
+    assert {tuple(p["reasons"]) for p in points} == {("plugin_failed",)}
+
+
+def test_a_real_cine_without_electrodes_is_rejected_and_the_job_succeeds(
+    service: TestClient, study_path: str, sample_data: Path, tmp_path: Path
+) -> None:
+    """No electrode is invented on collimator, table marker or contrast-filled artery."""
+    original = sample_data / "xa_512x512x96_jpeg_baseline.dcm"
+    copy = pydicom.dcmread(original)
+    copy.SOPInstanceUID = "2.25.4711"
+    copy.file_meta.MediaStorageSOPInstanceUID = "2.25.4711"
+    copy.save_as(tmp_path / "other.dcm")
+    gantry = {"source_detector_mm": 1000, "source_isocentre_mm": 750, "pixel_spacing_mm": [0.3, 0.3]}
+    views = []
+    for path, primary_deg in ((original, -32.0), (tmp_path / "other.dcm", 58.0)):
+        answer = service.post(
+            f"{study_path}/instances", content=path.read_bytes(), headers={"Content-Type": "application/dicom"}
+        )
+        assert answer.status_code == 201, answer.text
+        run = answer.json()["instances"][0]
+        assert run["missing"] == ["DistanceSourceToDetector", "DistanceSourceToPatient", "ImagerPixelSpacing"]
+        patched = service.patch(
+            f"{study_path}/instances/{run['sop_instance_uid']}", json={"gantry": gantry | {"primary_deg": primary_deg}}
+        )
+        assert patched.json()["missing"] == []
+        views.append(run["sop_instance_uid"])
+    service.put(f"{study_path}/sites/S01", json={"lat_ms": 12.5, "view_a": views[1], "view_b": views[0]})
+    job = _job(service, study_path)
+    assert job["state"] == "succeeded"
+    points = service.get(f"/v1/jobs/{job['id']}/points").json()["points"]
+    assert {point["grade"] for point in points} == {"rejected"}
+    assert all(point["x_mm"] is None and point["reasons"] for point in points)
+    for uid in views:
+        assert service.get(f"{study_path}/instances/{uid}/frames/45/electrodes").json() == []
+    answer = service.get(f"/v1/jobs/{job['id']}/map")
+    assert (answer.status_code, answer.json()["code"]) == (409, "no_map")
+
+
+def test_cancelling_an_ended_job_is_a_conflict(service: TestClient, sent: str) -> None:
+    job = _job(service, sent)
+    answer = service.post(f"/v1/jobs/{job['id']}:cancel")
+    assert (answer.status_code, answer.json()["code"]) == (409, "job_ended")
