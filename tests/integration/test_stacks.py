@@ -5,112 +5,21 @@ Each runs a study undisturbed, and once more from nothing with the worker killed
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
-from fluoromap.results import Client, inputs_of
-from fluoromap.supervisor import free_port, program
+sys.path.insert(0, str(Path(__file__).parent))
 
-PATIENCE_SECONDS = 240
+from processes import Fresh, Kill, embedded, environment_of, wait_until_ready, with_servers
+
+from fluoromap.results import Client, inputs_of
+from fluoromap.supervisor import free_port
 
 pytestmark = pytest.mark.timeout(900)
-
-Fresh = Callable[[], AbstractContextManager[str]]
-Kill = Callable[[], None]
-"""Kills the worker without warning and sees to it that there will be another."""
-
-
-@contextmanager
-def _process(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
-    with (Path(environment["FLUOROMAP_DATA_DIR"]) / f"{arguments[0]}.log").open("ab") as log:
-        process = subprocess.Popen(
-            [program(), *arguments], env=environment, start_new_session=True, stdin=subprocess.DEVNULL,
-            stdout=log, stderr=log,
-        )  # fmt: skip
-    try:
-        yield process
-    finally:
-        process.terminate()
-        try:
-            process.wait(60)
-        finally:
-            _kill_group(process.pid)
-
-
-def _kill_group(pid: int) -> None:
-    try:
-        os.killpg(pid, signal.SIGKILL)
-    except ProcessLookupError:
-        return
-
-
-@contextmanager
-def _embedded(environment: dict[str, str], port: int) -> Iterator[Kill]:
-    """``fluoromap up``, which restarts its worker by itself."""
-    with _process("up", "--port", str(port), environment=environment) as up:
-
-        def kill() -> None:
-            children = psutil.Process(up.pid).children()
-            worker = next(child for child in children if "fluoromap worker" in " ".join(child.cmdline()))
-            _kill_group(worker.pid)
-
-        yield kill
-
-
-@contextmanager
-def _with_servers(environment: dict[str, str], port: int) -> Iterator[Kill]:
-    """API and worker each by itself, as on many machines."""
-    subprocess.run([program(), "db", "upgrade"], env=environment, check=True)
-    with ExitStack() as stack:
-        stack.enter_context(_process("api", "--port", str(port), environment=environment))
-        worker = stack.enter_context(_process("worker", environment=environment))
-
-        def kill() -> None:
-            _kill_group(worker.pid)
-            worker.wait()
-            stack.enter_context(_process("worker", environment=environment))
-
-        yield kill
-
-
-def _environment(data_dir: Path, numba_cache: Path, **settings: str) -> dict[str, str]:
-    data_dir.mkdir()
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
-    environment.setdefault("NUMBA_CACHE_DIR", str(numba_cache))
-    return environment | {
-        "FLUOROMAP_DATA_DIR": str(data_dir),
-        "FLUOROMAP_WORKERS": "2",
-        "FLUOROMAP_LEASE_SECONDS": "3",
-        "FLUOROMAP_HEARTBEAT_SECONDS": "1",
-        "FLUOROMAP_REPUBLISH_SECONDS": "1",
-        **settings,
-    }
-
-
-def _wait_until_ready(url: str, log_folder: Path) -> None:
-    import httpx
-
-    end = time.monotonic() + PATIENCE_SECONDS
-    answer = None
-    while time.monotonic() < end:
-        try:
-            answer = httpx.get(f"{url}/v1/ready", timeout=10)
-            if answer.status_code == 200:
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.1)
-    logs = "\n".join(f"{path.name}: {path.read_text()[-2000:]}" for path in log_folder.glob("*.log"))
-    pytest.fail(f"the service did not get ready: {answer and answer.text}\n{logs}")
 
 
 def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -146,12 +55,12 @@ def test_a_killed_worker_changes_nothing(
             if stack == "servers":
                 settings["FLUOROMAP_DATABASE_URL"] = opened.enter_context(fresh_postgres())
                 settings["FLUOROMAP_BROKER_URL"] = opened.enter_context(fresh_redis())
-            environment = _environment(data_dir, simulated_study.parent / "numba", **settings)
+            environment = environment_of(data_dir, simulated_study.parent / "numba", **settings)
             port = free_port()
-            start = _embedded if stack == "embedded" else _with_servers
+            start = embedded if stack == "embedded" else with_servers
             kill = opened.enter_context(start(environment, port))
             url = f"http://127.0.0.1:{port}"
-            _wait_until_ready(url, data_dir)
+            wait_until_ready(url, data_dir)
             results.append(_run_job(url, simulated_study, kill if disturbed else None))
     (undisturbed, points), (disturbed_job, disturbed_points) = results
     assert undisturbed["state"] == disturbed_job["state"] == "succeeded"

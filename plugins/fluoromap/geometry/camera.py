@@ -54,7 +54,7 @@ class Camera:
     @property
     def source_world_mm(self) -> Array:
         """Centre of projection (the X-ray source), shape (3,)."""
-        source: Array = np.linalg.solve(self.matrix[:, :3], -self.matrix[:, 3])
+        source: Array = np.asarray(np.linalg.solve(self.matrix[:, :3], -self.matrix[:, 3]), dtype=np.float64)
         return source
 
     @property

@@ -103,9 +103,7 @@ class RigidPose:
             )
         return self._track(view, observed, positions, covariance, located)
 
-    def _refuse_if_not_rigid(
-        self, camera: Camera, observed: ObservedView, positions: Array, usable: BoolArray
-    ) -> None:
+    def _refuse_if_not_rigid(self, camera: Camera, observed: ObservedView, positions: Array, usable: BoolArray) -> None:
         counted = observed.seen & usable[:, None]
         shown = counted[..., None]
         residual = np.where(shown, camera.project(positions) - observed.pixels_uv, 0.0)

@@ -46,7 +46,8 @@ class Anatomy:
     """One heart with its catheters.
 
     reference : in the right ventricle, fixed there. pacing : beside it, site by site, for it slips a little whenever the
-    mapping catheter is turned. mapping : in the left ventricle, site by site. contacts_mm : (sites, 3) where its tip's end touches the wall at diastole.
+    mapping catheter is turned. mapping : in the left ventricle, site by site.
+    contacts_mm : (sites, 3) where its tip's end touches the wall at diastole.
     """
 
     chamber: Chamber

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Body, Response
 from pydantic import BaseModel, ConfigDict, Field
@@ -15,13 +15,13 @@ from fluoromap.api.instances import InstanceUid
 from fluoromap.api.problems import Problem, not_found, responses
 from fluoromap.api.security import Reader, Writer
 from fluoromap.api.studies import StudyId
-from fluoromap.contracts import Segmentation
+from fluoromap.contracts import Chain, Matching, NamedChain, Segmentation
 from fluoromap.store import instances, marks, studies
 from fluoromap.store.engine import reading, writing
 from fluoromap.store.instances import StudyRun
-from fluoromap.store.manifest import MarkPlan
+from fluoromap.store.manifest import Manifest, MarkPlan
 from fluoromap.store.models import Job, Mark, StageRow, StageState, Study
-from fluoromap.store.outcomes import load
+from fluoromap.store.outcomes import load, stage_of
 
 router = APIRouter(prefix="/v1/studies/{study_id}/instances/{uid}/frames/{n}/electrodes", tags=["electrodes"])
 
@@ -126,16 +126,44 @@ def _detected(session: Session, study_id: str, uid: str, frame: int) -> list[Ele
     )
     if stage is None:
         return []
+    chains = load(Segmentation, stage).frames[frame].chains
     found: list[ElectrodeOut] = []
-    for chain in load(Segmentation, stage).frames[frame].chains:
-        kind: dict[str, Any] = {
-            "catheter": max(chain.kinds, key=lambda item: item[1])[0] if chain.kinds else None,
-            "source": "manual" if chain.manual else "automatic",
-        }
+    for chain, name in zip(chains, _names(session, stage.job_id, uid, frame, chains), strict=True):
+        source: Literal["manual", "automatic"] = "manual" if chain.manual else "automatic"
         for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
             sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
-            found.append(ElectrodeOut(electrode=electrode, u_px=float(u), v_px=float(v), sd_px=sd, **kind))
+            found.append(
+                ElectrodeOut(catheter=name, electrode=electrode, u_px=float(u), v_px=float(v), sd_px=sd, source=source)
+            )
     return found
+
+
+def _names(session: Session, job_id: str, uid: str, frame: int, chains: tuple[Chain, ...]) -> list[str | None]:
+    """A catheter for each chain, none twice: as the job's matching named it, else its most probable kind."""
+    named = {chain.pixels_uv.tobytes(): chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
+    names = [named.get(chain.pixels_uv.tobytes()) for chain in chains]
+    likely = sorted(
+        ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
+        key=lambda item: (-item[0], item[1]),
+    )
+    for _, index, name in likely:
+        if names[index] is None and name not in names:
+            names[index] = name
+    return names
+
+
+def _named_chains(session: Session, job_id: str, uid: str, frame: int) -> tuple[NamedChain, ...]:
+    stage = stage_of(session, job_id, "match")
+    if stage is None or stage.state != StageState.DONE:
+        return ()
+    manifest = Manifest.model_validate(session.get_one(Job, job_id).manifest)
+    views = {
+        site.site: "a" if site.view_a == uid else "b" for site in manifest.sites if uid in (site.view_a, site.view_b)
+    }
+    for site in load(Matching, stage).sites:
+        if site.site in views:
+            return (site.track_a if views[site.site] == "a" else site.track_b)[frame].chains
+    return ()
 
 
 def _check(study: Study, run: StudyRun, body: list[ElectrodeIn]) -> None:

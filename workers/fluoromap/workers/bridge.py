@@ -9,9 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -19,6 +20,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
     Chain,
     Context,
+    ElectrodePoint,
     LocatedSite,
     MatchedSite,
     Matching,
@@ -43,6 +45,7 @@ from fluoromap.store.results import FollowedSite, FollowedView, MapOutcome
 from fluoromap.workers.points import point_rows
 
 MATCH_VERSION = "1"
+NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 
 def _no_rows(content: bytes) -> Iterable[Base]:
@@ -87,7 +90,7 @@ def _segment(manifest: Manifest, uid: str) -> Work:
 
     def compute(context: Context) -> bytes:
         frames = open_frames(files.path_of(plan.sha256), facts)
-        run = Run(frames, facts.frame_times_ms, px_per_mm, facts.pixels, facts.r_wave_frames)
+        run = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
         segmenter = build_segmenter(manifest.segmenter.name, manifest.segmenter.params)
         return encode(segmenter.segment(run, catalogue, marks, context))
 
@@ -193,11 +196,16 @@ def _monoplane_view(
         catalogue=catalogue,
         frame_times_ms=matched.frame_times_a_ms if first else matched.frame_times_b_ms,
         observations=matched.track_a if first else matched.track_b,
-        a_priori=located.points,
+        a_priori=tuple(_without_name_doubts(point) for point in located.points),
         a_priori_frame=located.frame_a if first else located.frame_b,
         cycle=located.cycle,
         others=others,
     )
+
+
+def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
+    """How sure a name is does not move an electrode: naming a catheter at one site must not redo the others."""
+    return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
 
 
 def _rejected_view(view: View, name: str, triangulation: Triangulation) -> FollowedView:

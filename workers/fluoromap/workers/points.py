@@ -38,7 +38,9 @@ def point_rows(job_id: str, manifest: Manifest, matching: Matching, triangulatio
     return rows
 
 
-def _located(job_id: str, plan: SitePlan, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...]) -> Point:
+def _located(
+    job_id: str, plan: SitePlan, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...]
+) -> Point:
     relative = point.relative_mm is not None and point.relative_covariance_mm2 is not None
     reasons = dict.fromkeys((*point.reasons, *site.reasons, *doubts))
     if not relative:
