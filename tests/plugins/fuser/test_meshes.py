@@ -122,10 +122,18 @@ def test_vtp_holds_surface_times_and_sites(sparse_ball):
 
 
 def test_vtk_reads_the_vtp(sparse_ball, tmp_path):
-    vtk = pytest.importorskip("vtk", reason="VTK's own reader is not installed")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
     path = tmp_path / "chamber.vtp"
     path.write_bytes(mesh_bytes(sparse_ball, "vtp"))
-    reader = vtk.vtkXMLPolyDataReader()
+    reader = vtkXMLPolyDataReader()
     reader.SetFileName(str(path))
     reader.Update()
-    assert reader.GetOutput().GetNumberOfPolys() == len(sparse_ball.faces)
+    surface = reader.GetOutput()
+    assert surface.GetNumberOfPolys() == len(sparse_ball.faces)
+    np.testing.assert_allclose(vtk_to_numpy(surface.GetPoints().GetData()), sparse_ball.vertices_mm, atol=1e-5)
+    covered = vtk_to_numpy(surface.GetPointData().GetArray("covered")).astype(bool)
+    np.testing.assert_array_equal(covered, sparse_ball.covered)
+    lat_ms = vtk_to_numpy(surface.GetPointData().GetArray("lat_ms"))
+    np.testing.assert_allclose(lat_ms[covered], sparse_ball.lat_ms[covered], atol=1e-4)

@@ -120,7 +120,7 @@ def test_the_archive_holds_everything(client: TestClient, study: FinishedStudy) 
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         assert archive.testzip() is None
         assert set(archive.namelist()) == {
-            "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "mesh/chamber.ply",
+            "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "map.png", "mesh/chamber.ply",
             "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "overlays/S01-a.png", "overlays/S01-b.png",
         }  # fmt: skip
         assert json.loads(archive.read("job.json"))["state"] == "succeeded"
