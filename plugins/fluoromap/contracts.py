@@ -318,7 +318,8 @@ class ElectrodePoint:
 
     position_mm : (3,), covariance_mm2 : (3, 3), from the isocentre.
     relative_mm, relative_covariance_mm2 : the same from the reference catheter's mean; None where that was not located.
-    residual_px : reprojection residual in view a, b. reasons : what speaks against trusting it fully.
+    residual_px : reprojection residual in view a, b, less a
+    shift of the whole heart between the runs where the triangulator estimates one. reasons : what speaks against trusting it fully.
     """
 
     catheter: str

@@ -195,10 +195,21 @@ def upgrade(data_dir: DataDir = None) -> None:
     schema.upgrade()
 
 
+def _known_scopes(scopes: list[str]) -> list[str]:
+    from fluoromap.auth import Scope
+
+    for scope in scopes:
+        if scope not in list(Scope):
+            raise typer.BadParameter(f"{scope!r} is not one of {', '.join(Scope)}")
+    return scopes
+
+
 @token.command()
 def create(
     name: Annotated[str, typer.Option(help="What to call it.")],
-    scope: Annotated[list[str], typer.Option(help="read, write or admin; may be given more than once.")],
+    scope: Annotated[
+        list[str], typer.Option(help="read, write or admin; may be given more than once.", callback=_known_scopes)
+    ],
     expires: Annotated[str | None, typer.Option(help="Lifetime, for example 12h or 90d; by default for ever.")] = None,
     from_file: Annotated[
         Path | None, typer.Option(help="Take the token from this file instead of drawing one; done when it is known.")

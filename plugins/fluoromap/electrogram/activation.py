@@ -17,6 +17,7 @@ _LEAST_SAMPLES = 20
 _WINDOW_MS = 5.0
 _LEAST_WINDOW = 5
 _SATURATED_SAMPLES = 5
+_ABRUPT = 0.05
 _BASELINE = 0.1
 _LEAST_SLOPE_TO_NOISE = 6.0
 _RIVAL = 0.8
@@ -115,7 +116,7 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
         raise UnusableElectrogram(f"The {name} electrogram is flat; check the electrode's connection.")
     for rail in (signal.min(), signal.max()):
         at_baseline = abs(rail - np.median(signal)) <= _BASELINE * extent
-        if not at_baseline and _longest_hold(signal, float(rail)) >= _SATURATED_SAMPLES:
+        if not at_baseline and _clipped(signal, float(rail)):
             raise UnusableElectrogram(f"The {name} electrogram is saturated; lower the amplifier's gain.")
     slopes, errors, noise = local_slope(times, signal)
     inner = slice(2, -2)
@@ -144,6 +145,18 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
     derivative_error = noise * errors[steepest] * math.sqrt(10.0) / _WINDOW_MS
     sd = math.hypot(derivative_error / (2.0 * float(curve[0])), _PLACEMENT * spacing)
     return float(times[steepest]) + place, sd
+
+
+def _clipped(signal: Array, rail: float) -> bool:
+    """Whether the signal is held at an extreme that it runs into at speed; a smooth plateau is reached slowly."""
+    if _longest_hold(signal, rail) < _SATURATED_SAMPLES:
+        return False
+    held = np.concatenate([[True], signal == rail, [True]])
+    arrives = np.flatnonzero(~held[:-2] & held[1:-1])
+    leaves = np.flatnonzero(held[1:-1] & ~held[2:])
+    steps = [abs(signal[index] - signal[index - 1]) for index in arrives if index >= 1]
+    steps += [abs(signal[index + 1] - signal[index]) for index in leaves if index + 1 < len(signal)]
+    return bool(steps) and max(steps) > _ABRUPT * np.abs(np.diff(signal)).max()
 
 
 def _longest_hold(signal: Array, value: float) -> int:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 
-PARALLEL_BELOW_DEG = 20.0
+PARALLEL_BELOW_DEG = 20.0 - 1e-6
 """Views whose central rays are closer than this cannot tell depth."""
 
 

@@ -132,7 +132,7 @@ def _locate_site(
     )
     residuals = [
         np.linalg.norm(camera.project(points) - seen, axis=1)
-        for camera, seen in zip(nominal, pixels.pixels, strict=True)
+        for camera, seen in zip(cameras, pixels.pixels, strict=True)
     ]
     angles = _ray_angles_deg(nominal, pixels)
     reference = [index for index, catheter in enumerate(catheters) if catheter == catalogue.reference]

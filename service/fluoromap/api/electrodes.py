@@ -38,6 +38,9 @@ class ElectrodeIn(BaseModel):
     u_px: float = Field(allow_inf_nan=False, description="Column; 0 is the centre of the leftmost stored pixel.")
     v_px: float = Field(allow_inf_nan=False, description="Row; 0 is the centre of the topmost stored pixel.")
     sd_px: float = Field(1.0, gt=0, le=50, allow_inf_nan=False, description="Standard deviation of each coordinate.")
+    source: Literal["manual", "automatic"] = Field(
+        "manual", description="Whatever stands here, what is put is manual: an answer of GET can be corrected and put."
+    )
 
 
 class ElectrodeOut(BaseModel):
@@ -76,7 +79,9 @@ def put_electrodes(
         study = studies.lock(session, study_id)
         run = _run_with_frame(session, study_id, uid, n)
         _check(study, run, body)
-        mark = marks.put(session, study_id, uid, n, tuple(MarkPlan(**item.model_dump()) for item in body), caller)
+        mark = marks.put(
+            session, study_id, uid, n, tuple(MarkPlan(**item.model_dump(exclude={"source"})) for item in body), caller
+        )
         return _answer(session, study_id, uid, n, mark, response)
 
 
@@ -126,14 +131,16 @@ def _detected(session: Session, study_id: str, uid: str, frame: int) -> list[Ele
     )
     if stage is None:
         return []
-    chains = load(Segmentation, stage).frames[frame].chains
+    # A chain set by hand was deleted since; what would be found instead, the next job will tell.
+    chains = tuple(chain for chain in load(Segmentation, stage).frames[frame].chains if not chain.manual)
     found: list[ElectrodeOut] = []
     for chain, name in zip(chains, _names(session, stage.job_id, uid, frame, chains), strict=True):
-        source: Literal["manual", "automatic"] = "manual" if chain.manual else "automatic"
         for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
             sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
             found.append(
-                ElectrodeOut(catheter=name, electrode=electrode, u_px=float(u), v_px=float(v), sd_px=sd, source=source)
+                ElectrodeOut(
+                    catheter=name, electrode=electrode, u_px=float(u), v_px=float(v), sd_px=sd, source="automatic"
+                )
             )
     return found
 

@@ -14,7 +14,7 @@ from fluoromap.api.security import Writer
 from fluoromap.api.studies import StudyId
 from fluoromap.electrogram import UnusableElectrogram, activation_time
 from fluoromap.store import sites, studies
-from fluoromap.store.engine import writing
+from fluoromap.store.engine import reading, writing
 
 router = APIRouter(prefix="/v1/studies/{study_id}", tags=["sites"])
 
@@ -54,6 +54,8 @@ async def put_electrogram(
     text = await csv_text(request)
 
     def act() -> ElectrogramOut:
+        with reading() as session:
+            studies.get(session, study_id)
         time_ms, reference, mapping = electrogram(text)
         try:
             result = activation_time(time_ms, reference, mapping)

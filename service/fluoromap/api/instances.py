@@ -56,7 +56,7 @@ class InstanceOut(BaseModel):
     frames: int = Field(examples=[120])
     rows: int = Field(examples=[512])
     columns: int = Field(examples=[512])
-    frame_time_ms: float = Field(examples=[16.7])
+    frame_time_ms: float | None = Field(description="Null for a single frame.", examples=[16.7])
     acquired: str | None = Field(examples=["2026-03-01T09:30:00.000Z"])
     plane: Literal["single", "A", "B"]
     gantry: GantryOut
@@ -109,7 +109,7 @@ def instance_shape(run: StudyRun, views: dict[str, tuple[BoundSite, str]]) -> In
             "frames": run.facts.frames,
             "rows": run.facts.rows,
             "columns": run.facts.columns,
-            "frame_time_ms": run.facts.frame_time_ms,
+            "frame_time_ms": run.facts.frame_time_ms if run.facts.frames > 1 else None,
             "acquired": rfc3339_or_none(run.facts.acquired),
             "plane": run.facts.plane,
             "gantry": run.gantry,
@@ -198,6 +198,7 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
             raise Problem(first.status, first.code, first.detail, first.errors, extra={"rejected": documents})
         if site is not None:
             sites.mention(session, study_id, site)
+        sites.settle(session, study)
         body = {"instances": _shapes(session, study, stored), "rejected": documents}
         return JSONResponse(body, 201 if new else 200)
 
@@ -228,7 +229,6 @@ def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, A
 @router.get("", responses=responses(400, 401, 403, 404, 422))
 def list_instances(study_id: StudyId, paging: Pages, caller: Reader) -> Page[InstanceOut]:
     """The study's runs in the order of arrival."""
-    sites.settled(study_id)
     with reading() as session:
         study = studies.get(session, study_id)
         views = sites.views_of(sites.resolve(session, study))
@@ -244,7 +244,6 @@ def _one(session: Session, study: Study, uid: str) -> InstanceOut:
 @router.get("/{uid}", responses=responses(401, 403, 404, 422))
 def get_instance(study_id: StudyId, uid: InstanceUid, caller: Reader) -> InstanceOut:
     """One run."""
-    sites.settled(study_id)
     with reading() as session:
         return _one(session, studies.get(session, study_id), uid)
 
@@ -268,6 +267,10 @@ def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, ca
 
 
 def _check_gantry(run: StudyRun) -> None:
+    detector, isocentre = run.gantry["source_detector_mm"], run.gantry["source_isocentre_mm"]
+    if detector is not None and isocentre is not None and isocentre >= detector:
+        places = [("body.gantry.source_isocentre_mm", "the isocentre lies between source and detector")]
+        raise Problem(422, "invalid_gantry", "These gantry values do not fit together.", places)
     plan = instances.gantry_plan(run.facts, run.link.gantry)
     if plan is None:
         return
@@ -279,10 +282,11 @@ def _check_gantry(run: StudyRun) -> None:
         ) from None
 
 
-@router.delete("/{uid}", status_code=204, responses=responses(401, 403, 404, 409, 422))
+@router.delete("/{uid}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409, 422))
 def delete_instance(study_id: StudyId, uid: InstanceUid, caller: Writer) -> None:
     """Take a run out of the study; its file goes when no other study refers to it. 409 while a job works on it."""
     with writing() as session:
-        studies.lock(session, study_id)
+        study = studies.lock(session, study_id)
         gone = instances.remove(session, study_id, uid)
+        sites.settle(session, study)
     instances.unlink_unreferenced(gone)

@@ -90,9 +90,12 @@ def _encode(key: list[Any]) -> str:
 
 def _decode(cursor: str) -> Any:
     try:
-        return json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        key = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
     except (ValueError, binascii.Error):
         raise _bad_cursor() from None
+    if key is None:
+        raise _bad_cursor()
+    return key
 
 
 def _bad_cursor() -> Problem:

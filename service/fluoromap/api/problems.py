@@ -11,6 +11,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
+from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
 MEDIA_TYPE = "application/problem+json"
@@ -119,10 +120,21 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def validation(request: Request, error: RequestValidationError) -> JSONResponse:
         malformed = any(item["type"] == "json_invalid" for item in error.errors())
+        bodiless = any(tuple(item["loc"]) == ("body",) for item in error.errors())
+        media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
+        if bodiless and not (media_type == "application/json" or media_type.endswith("+json")):
+            return Problem(415, "unsupported_media_type", "Send the body as application/json.").response()
+        if bodiless and not await request.body():
+            return Problem(400, "malformed", "The request has no body.").response()
         places = [(".".join(str(part) for part in item["loc"]), item["msg"]) for item in error.errors()]
         if malformed:
             return Problem(400, "malformed", "The request body is not valid JSON.", places).response()
         return Problem(422, "invalid", "Some fields of the request are wrong.", places).response()
+
+    @app.exception_handler(DataError)
+    async def unstorable(request: Request, error: DataError) -> JSONResponse:
+        detail = "The request holds a value that cannot be kept: a NUL character, or a number out of range."
+        return Problem(422, "invalid", detail).response()
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:

@@ -63,7 +63,6 @@ def _shape(site: BoundSite) -> SiteOut:
 @router.get("", responses=responses(400, 401, 403, 404, 422))
 def list_sites(study_id: StudyId, paging: Pages, caller: Reader) -> Page[SiteOut]:
     """The study's sites in the order of first mention."""
-    sites.settled(study_id)
     with reading() as session:
         bound = sites.resolve(session, studies.get(session, study_id))
         return paging.slice(bound, _shape, lambda site: site.site)
@@ -72,7 +71,6 @@ def list_sites(study_id: StudyId, paging: Pages, caller: Reader) -> Page[SiteOut
 @router.get("/{site}", responses=responses(401, 403, 404, 422))
 def get_site(study_id: StudyId, site: SiteName, caller: Reader) -> SiteOut:
     """One site."""
-    sites.settled(study_id)
     with reading() as session:
         return _shape(sites.one(session, studies.get(session, study_id), site))
 

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from fastapi import APIRouter, Path, Response
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, model_validator
 from sqlalchemy.orm import Session
 
 from fluoromap.api.idempotency import OnceJson
@@ -23,6 +23,8 @@ from fluoromap.store.models import Study
 router = APIRouter(prefix="/v1/studies", tags=["studies"])
 
 StudyId = Annotated[str, Path(description="The study's id.")]
+Line = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")]
+"""Text of one line that is not blank."""
 Millimetres = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 
 _CATHETERS: list[JsonValue] = [
@@ -35,7 +37,7 @@ class CatheterIn(BaseModel):
     """A catheter as its maker describes it; electrode 1 is the tip."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": _CATHETERS})
-    name: str = Field(min_length=1, max_length=64)
+    name: Line = Field(min_length=1, max_length=64)
     electrodes: int = Field(ge=2, le=64)
     spacing_mm: list[Millimetres] | None = Field(
         None, description="From electrode centre to electrode centre along the shaft, from the tip on."
@@ -68,12 +70,12 @@ class StudyIn(BaseModel):
         extra="forbid",
         json_schema_extra={"examples": [{"label": "Dog 3, sinus rhythm", "chamber": "right ventricle"}]},
     )
-    label: str = Field(min_length=1, max_length=200, description="Your own name for it; no patient name.")
-    chamber: str | None = Field(None, max_length=100)
+    label: Line = Field(min_length=1, max_length=200, description="Your own name for it; no patient name.")
+    chamber: Line | None = Field(None, max_length=100)
     catheters: list[CatheterIn] | None = Field(
         None, max_length=32, description="Default: reference, pacing and mapping, 4 electrodes each."
     )
-    reference: str | None = Field(
+    reference: Line | None = Field(
         None, max_length=64, description="The catheter that coordinates are counted from; by default the one named so."
     )
     notes: str | None = Field(None, max_length=10_000)
@@ -83,10 +85,10 @@ class StudyPatch(BaseModel):
     """What to change; members left out stay."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"notes": "pacing from the apex"}]})
-    label: str | None = Field(None, min_length=1, max_length=200)
-    chamber: str | None = Field(None, max_length=100)
+    label: Line | None = Field(None, min_length=1, max_length=200)
+    chamber: Line | None = Field(None, max_length=100)
     catheters: list[CatheterIn] | None = Field(None, max_length=32)
-    reference: str | None = Field(None, max_length=64)
+    reference: Line | None = Field(None, max_length=64)
     notes: str | None = Field(None, max_length=10_000)
 
 
@@ -192,7 +194,7 @@ def _change_catheters(session: Session, study: Study, body: StudyPatch) -> None:
     study.reference, study.mapping = catalogue.reference, catalogue.mapping
 
 
-@router.delete("/{study_id}", status_code=204, responses=responses(401, 403, 404, 409))
+@router.delete("/{study_id}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409))
 def delete_study(study_id: StudyId, caller: Writer) -> None:
     """Delete a study with its jobs, and the files nothing else refers to; 409 while a job runs."""
     with writing() as session:

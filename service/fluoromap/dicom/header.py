@@ -115,6 +115,10 @@ class Header:
                 return values
         return ()
 
+    def holds(self, keyword: str) -> bool:
+        """Whether an attribute is there and not empty, readable or not."""
+        return any(self._value(dataset, keyword) not in (None, "", b"") for dataset in self._places(keyword))
+
     def number(self, keyword: str) -> float | None:
         """The first value of a numeric attribute."""
         values = self.numbers(keyword)

@@ -96,7 +96,7 @@ def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarn
 
 def _size(header: Header) -> tuple[int, int, int]:
     rows, columns = (_count(header, keyword) for keyword in ("Rows", "Columns"))
-    frames = _count(header, "NumberOfFrames") if header.numbers("NumberOfFrames") else 1
+    frames = _count(header, "NumberOfFrames") if header.holds("NumberOfFrames") else 1
     if max(rows, columns) > LARGEST_SIDE:
         raise DicomProblem(
             DicomCode.FRAME_TOO_LARGE, f"Frames larger than {LARGEST_SIDE} pixels a side are not accepted.", "Rows"

@@ -19,6 +19,8 @@ PAIRING_ANGLE_DEG = 30.0
 """Runs nearer to each other in direction are not paired by time."""
 PARALLEL_ANGLE_DEG = 20.0
 """Below this even an explicit pair is refused."""
+ROUNDING_DEG = 1e-6
+"""Angles are compared with this much tolerance, so that 30 degrees are 30 degrees."""
 TABLE_STILL_MM = 1.0
 """A table that moved farther between two runs moved the patient off the isocentre."""
 
@@ -103,10 +105,9 @@ def bind(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Binding:
 
 
 def _take_members(slots: dict[str, Slots], free: dict[str, StudyRun], runs: Sequence[StudyRun], by: str) -> None:
-    """Fill what is free of each site with the runs that were put there; a third one stays unbound."""
+    """Fill what is free of each site with the runs that were put there, as they arrived; a third one stays unbound."""
     for site, slot in slots.items():
         members = [run for run in runs if run.uid in free and run.link.site == site and run.link.site_by == by]
-        members.sort(key=_moment)
         while members and len(slot.runs) < 2:
             present = slot.runs
             chosen = next((run for run in members if present and _apart(present[0], run)), members[0])
@@ -171,7 +172,7 @@ def _moment(run: StudyRun) -> tuple[float, int]:
 
 def _apart(first: StudyRun, second: StudyRun) -> bool:
     angle = ray_angle_deg(first, second)
-    return angle is not None and angle >= PAIRING_ANGLE_DEG
+    return angle is not None and angle >= PAIRING_ANGLE_DEG - ROUNDING_DEG
 
 
 def table_moved(first: StudyRun, second: StudyRun) -> bool:

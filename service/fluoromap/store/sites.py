@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,10 +11,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from fluoromap.reasons import Reason
-from fluoromap.store.binding import PARALLEL_ANGLE_DEG, Slots, bind, table_moved
-from fluoromap.store.engine import reading, writing
+from fluoromap.store.binding import PARALLEL_ANGLE_DEG, ROUNDING_DEG, Slots, bind, table_moved
 from fluoromap.store.instances import StudyRun, gantry_plan, ray_angle_deg, runs_of
-from fluoromap.store.models import Site, Study
+from fluoromap.store.models import Job, Site, Study
 from fluoromap.store.refused import Refused
 
 
@@ -91,29 +91,33 @@ def resolve(session: Session, study: Study) -> list[BoundSite]:
 
 
 def settle(session: Session, study: Study) -> None:
-    """Give pairs that acquisition time joined their permanent names; call it in a writing transaction before a job."""
-    rows = rows_of(session, study.id)
-    runs = runs_of(session, study.id)
+    """Pair runs by acquisition time and name the pairs; call it in every transaction that changes the study's runs.
+
+    A name is given at the first pairing and stays with its run. Which run is the other one may still change while runs
+    arrive out of order, until the site has an activation time or a job was made: from then on the pair is for good.
+    """
+    rows, runs = rows_of(session, study.id), runs_of(session, study.id)
+    has_job = session.scalar(select(Job.id).where(Job.study_id == study.id).limit(1)) is not None
+    loose = [row for row in rows if row.paired_a and row.csv_row is None and row.lat_ms is None and not has_job]
+    before = {row: {row.paired_a, row.paired_b} for row in loose}
+    for row in loose:
+        row.paired_a = row.paired_b = None
     known = {row.name for row in rows} | {run.link.site for run in runs}
-    number = 1
+    numbers = itertools.count(1)
     for first, second in bind(rows, runs).fresh:
-        while f"S{number:02d}" in known:
-            number += 1
-        name = f"S{number:02d}"
-        known.add(name)
-        session.add(Site(study_id=study.id, name=name, paired_a=first.uid, paired_b=second.uid))
+        pair = {first.uid, second.uid}
+        owner = max(before, key=lambda row: len(before[row] & pair), default=None)
+        if owner is None or not before[owner] & pair:
+            name = next(name for number in numbers if (name := f"S{number:02d}") not in known)
+            owner = Site(study_id=study.id, name=name)
+            session.add(owner)
+        else:
+            del before[owner]
+        owner.paired_a, owner.paired_b = first.uid, second.uid
+    for row in before:
+        if row.explicit_a is None and row.explicit_b is None:
+            session.delete(row)
     session.flush()
-
-
-def settled(study_id: str) -> None:
-    """As :func:`settle` in a transaction of its own, begun only when there is something to name."""
-    with reading() as session:
-        fresh = bind(rows_of(session, study_id), runs_of(session, study_id)).fresh
-    if fresh:
-        with writing() as session:
-            study = session.scalar(select(Study).where(Study.id == study_id).with_for_update())
-            if study is not None:
-                settle(session, study)
 
 
 def _bound(row: Site, slot: Slots) -> BoundSite:
@@ -127,7 +131,7 @@ def _bound(row: Site, slot: Slots) -> BoundSite:
     angle: float | None = None
     if slot.a is not None and slot.b is not None:
         angle = ray_angle_deg(slot.a, slot.b)
-        if angle is not None and angle < PARALLEL_ANGLE_DEG:
+        if angle is not None and angle < PARALLEL_ANGLE_DEG - ROUNDING_DEG:
             refused = Reason.VIEWS_PARALLEL
         if table_moved(slot.a, slot.b):
             warnings.append("table_moved")
@@ -212,7 +216,7 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
     Returns
     -------
     list of str
-        Sites of the table that no run is bound to.
+        Sites of the table that no run is bound to, or not the run that the table names.
     """
     for row in rows_of(session, study.id):
         row.csv_row = row.csv_a = row.csv_b = None
@@ -224,7 +228,14 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
         row.lat_ms, row.lat_sd_ms, row.lat_by = entry.lat_ms, None, "csv"
     session.flush()
     bound = {site.site: site for site in resolve(session, study)}
-    return [entry.site for entry in table if bound[entry.site].view_a is None and bound[entry.site].view_b is None]
+    return [entry.site for entry in table if not _kept(entry, bound[entry.site])]
+
+
+def _kept(entry: ActivationTime, site: BoundSite) -> bool:
+    """Whether a row of the table found its runs: those it names, or else any."""
+    if entry.view_a is None and entry.view_b is None:
+        return site.view_a is not None or site.view_b is not None
+    return (entry.view_a is None or site.view_a is not None) and (entry.view_b is None or site.view_b is not None)
 
 
 def put_views(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
