@@ -85,10 +85,12 @@ def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     auth.check_may_start(configured.host)
     check_port(configured.host, configured.port)
     supervisor = Supervisor(configured.host, configured.port, os.environ)
-    typer.echo(f"fluoromap: {supervisor.url} (data in {configured.data_dir}); Ctrl-C ends it")
+    typer.echo(f"fluoromap: starting with the data in {configured.data_dir}")
     if not auth.any_token():
         typer.echo("fluoromap: open to every user of this machine, because no access token was made yet")
-    run_until_stopped(supervisor, stop_on_signals())
+    run_until_stopped(
+        supervisor, stop_on_signals(), lambda: typer.echo(f"fluoromap: ready at {supervisor.url}; Ctrl-C ends it")
+    )
 
 
 @app.command()
@@ -124,7 +126,7 @@ def worker(data_dir: DataDir = None) -> None:
 
     celery.worker_main(
         [
-            "worker", "--pool", "prefork", "-c", str(settings().workers), "-n", "fluoromap@%h",
+            "--quiet", "worker", "--pool", "prefork", "-c", str(settings().workers), "-n", "fluoromap@%h",
             "--without-gossip", "--without-mingle", "--loglevel", "WARNING",
         ]
     )  # fmt: skip

@@ -37,7 +37,7 @@ def _transport_options(url: str) -> dict[str, Any]:
 
 def _make_app() -> Celery:
     configured = settings()
-    url = "memory://" if configured.eager else configured.broker_url or "filesystem://"
+    url = "memory://" if configured.eager else configured.broker_url or "filesystem://localhost/"
     app = Celery("fluoromap", broker=url)
     app.conf.update(
         imports=("fluoromap.workers.tasks",),

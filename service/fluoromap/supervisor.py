@@ -11,7 +11,7 @@ import sys
 import sysconfig
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,8 +124,8 @@ class Supervisor:
         self._worker.start()
         self._api.start()
 
-    def wait_until_ready(self) -> None:
-        """Return when the API answers and a worker has been seen.
+    def wait_until_ready(self, stop: threading.Event | None = None) -> None:
+        """Return when the API answers and a worker has been seen, or when ``stop`` is set before.
 
         Raises
         ------
@@ -136,13 +136,17 @@ class Supervisor:
 
         end = time.monotonic() + READY_SECONDS
         with httpx.Client(trust_env=False, timeout=5) as client:
-            while time.monotonic() < end:
+            while time.monotonic() < end and not (stop and stop.is_set()):
                 self.tend()
                 with suppress(httpx.HTTPError):
                     if client.get(f"{self.url}/v1/ready").status_code == 200:
                         return
                 time.sleep(0.1)
-        raise CommandFailed(f"The service did not get ready within {READY_SECONDS:.0f} s; {self._where_to_look()}.")
+        if not (stop and stop.is_set()):
+            raise CommandFailed(self._not_ready())
+
+    def _not_ready(self) -> str:
+        return f"The service did not get ready within {READY_SECONDS:.0f} s; {self._where_to_look()}."
 
     def tend(self) -> None:
         """Look after the children once: restart a worker that died, later each time it dies young.
@@ -189,10 +193,13 @@ class Supervisor:
         return f"see the logs in {self._log_folder}" if self._log_folder else "its own message stands above"
 
 
-def run_until_stopped(supervisor: Supervisor, stop: threading.Event) -> None:
-    """Tend the children until ``stop`` is set, then stop them."""
+def run_until_stopped(supervisor: Supervisor, stop: threading.Event, on_ready: Callable[[], None]) -> None:
+    """Start the children, tend them until ``stop`` is set, then stop them; ``on_ready`` is called when they can be used."""
     try:
         supervisor.start()
+        supervisor.wait_until_ready(stop)
+        if not stop.is_set():
+            on_ready()
         while not stop.wait(0.2):
             supervisor.tend()
     finally:
