@@ -16,6 +16,7 @@ import typer.main
 import yaml
 
 from fluoromap.cli import app
+from fluoromap.reasons import Reason
 from fluoromap.settings import Settings
 
 TOP = Path(__file__).parent.parent
@@ -122,6 +123,12 @@ def test_settings_page_tells_the_defaults() -> None:
         if name in ("data_dir", "workers") or field.default == "":
             continue  # depend on user and machine
         assert f"| `FLUOROMAP_{name.upper()}` | `{field.default}` |" in page
+
+
+def test_reasons_page_is_complete() -> None:
+    page = (TOP / "docs" / "reasons.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", page, flags=re.MULTILINE))
+    assert rows == {str(reason): reason.sentence for reason in Reason}
 
 
 def test_every_entry_point_exists() -> None:

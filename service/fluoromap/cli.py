@@ -101,9 +101,10 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     _keep_compiled_kernels()
     import uvicorn
 
-    from fluoromap import auth
+    from fluoromap import auth, logs
     from fluoromap.api.app import create_app
 
+    logs.configure()
     auth.check_may_start(settings().host)
     uvicorn.run(
         create_app(),
@@ -122,8 +123,10 @@ def worker(data_dir: DataDir = None) -> None:
     _configure(data_dir=data_dir)
     _one_thread_each()
     _keep_compiled_kernels()
+    from fluoromap import logs
     from fluoromap.queue import app as celery
 
+    logs.configure()
     celery.worker_main(
         [
             "--quiet", "worker", "--pool", "prefork", "-c", str(settings().workers), "-n", "fluoromap@%h",

@@ -53,6 +53,7 @@ def _make_app() -> Celery:
         worker_max_memory_per_child=configured.worker_memory_mib * 1024 // 2,
         worker_send_task_events=False,
         worker_hijack_root_logger=False,
+        worker_redirect_stdouts=False,
         worker_soft_shutdown_timeout=20,
         broker_connection_retry_on_startup=True,
         broker_transport_options=_transport_options(url),
