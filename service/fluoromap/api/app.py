@@ -34,10 +34,8 @@ from fluoromap.api import (
 )
 from fluoromap.api.body import BodyLimit, TooLarge
 from fluoromap.api.document import document
-from fluoromap.api.problems import Problem
 from fluoromap.api.security import Doorkeeper, Reader
 from fluoromap.settings import settings
-from fluoromap.store.refused import Refused
 
 SWEEP_SECONDS = 1.0
 
@@ -77,7 +75,7 @@ def create_app() -> FastAPI:
         lifespan=_lifespan,
     )
     problems.install(app)
-    _install_refusals(app)
+    _install_body_limit(app)
     for router in ROUTERS:
         app.include_router(router)
 
@@ -90,11 +88,7 @@ def create_app() -> FastAPI:
     return app
 
 
-def _install_refusals(app: FastAPI) -> None:
-    @app.exception_handler(Refused)
-    async def refused(request: Request, error: Refused) -> JSONResponse:
-        return Problem(error.status, error.code, error.detail, error.errors, extra=error.extra).response()
-
+def _install_body_limit(app: FastAPI) -> None:
     @app.exception_handler(TooLarge)
     async def too_large(request: Request, error: TooLarge) -> JSONResponse:
         return error.problem.response()

@@ -188,10 +188,7 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
                 )
                 stored.append(facts.sop_instance_uid)
             except Refused as refused:
-                problem = Problem(refused.status, refused.code, refused.detail, refused.errors)
-                rejected.append(_of_part(problem, number))
-            except Problem as problem:
-                rejected.append(_of_part(problem, number))
+                rejected.append(_of_part(Problem.of(refused), number))
         documents = [problem.document() for problem in rejected]
         if not stored:
             first = rejected[0]

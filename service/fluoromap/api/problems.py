@@ -14,6 +14,8 @@ from pydantic import BaseModel, Field
 from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
+from fluoromap.store.refused import Refused
+
 MEDIA_TYPE = "application/problem+json"
 
 log = structlog.get_logger(__name__)
@@ -39,21 +41,15 @@ class ProblemDocument(BaseModel):
     errors: list[ProblemDetail] = Field(default_factory=list)
 
 
-class Problem(Exception):
-    """An error for the client.
+class Problem(Refused):
+    """A refusal as the client sees it: any status, and headers of its own.
 
     Parameters
     ----------
-    status : int
-        HTTP status.
-    code : str
-        Stable code, snake_case.
-    detail : str
-        A sentence that tells the user what to do; no patient data.
-    errors : iterable of (where, message)
-        The places that are wrong.
-    extra : mapping
-        Further members of the document, for example the sites that miss something.
+    status, code, detail, errors, extra
+        As for :class:`fluoromap.store.refused.Refused`.
+    headers : mapping, optional
+        Further headers of the answer.
     """
 
     def __init__(
@@ -64,15 +60,17 @@ class Problem(Exception):
         errors: list[tuple[str, str]] | None = None,
         *,
         headers: Mapping[str, str] | None = None,
-        extra: Mapping[str, Any] | None = None,
+        extra: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(detail)
-        self.status = status
-        self.code = code
-        self.detail = detail
-        self.errors = errors or []
+        super().__init__(status, code, detail, errors, extra)
         self.headers = dict(headers or {})
-        self.extra = dict(extra or {})
+
+    @classmethod
+    def of(cls, refused: Refused) -> Problem:
+        """The problem that tells a refusal of the store."""
+        if isinstance(refused, Problem):
+            return refused
+        return cls(refused.status, refused.code, refused.detail, refused.errors, extra=refused.extra)
 
     def document(self) -> dict[str, Any]:
         return {
@@ -108,9 +106,9 @@ _CODES = {400: "malformed", 404: "not_found", 405: "method_not_allowed", 415: "u
 def install(app: FastAPI) -> None:
     """Make every error of the application a problem document."""
 
-    @app.exception_handler(Problem)
-    async def problem(request: Request, error: Problem) -> JSONResponse:
-        return error.response()
+    @app.exception_handler(Refused)
+    async def refused(request: Request, error: Refused) -> JSONResponse:
+        return Problem.of(error).response()
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> JSONResponse:
