@@ -16,5 +16,6 @@ def configure() -> None:
             structlog.processors.format_exc_info,
             structlog.processors.JSONRenderer(),
         ],
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        # The process's own: sys.stderr may be somebody's stand-in that is closed later.
+        logger_factory=structlog.PrintLoggerFactory(sys.__stderr__),
     )
