@@ -80,7 +80,7 @@ def sample_data() -> Path:
 
 @pytest.fixture(scope="session")
 def simulated_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files of a simulated study of four sites, made once for all xdist workers."""
+    """Files of a simulated study of five sites, made once for all xdist workers."""
     from fluoromap.phantom import StudySpec
     from fluoromap.simulation import simulate
 
@@ -90,7 +90,7 @@ def simulated_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (root / "simulated-study.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "truth.json").exists():
-            simulate(folder, StudySpec(seed=7, sites=4, frames=24, frame_rate_hz=15.0), processes=1)
+            simulate(folder, StudySpec(seed=7, sites=5, frames=24, frame_rate_hz=15.0), processes=1)
     return folder
 
 

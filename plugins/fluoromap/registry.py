@@ -28,7 +28,7 @@ _METHODS: dict[Kind, str] = {
     "fuser": "fuse",
 }
 DEFAULTS: dict[Kind, str] = {
-    "segmenter": "four-step",
+    "segmenter": "catheter-chain",
     "triangulator": "maximum-likelihood",
     "monoplane": "a-priori-lm",
     "fuser": "convex-hull",

@@ -7,7 +7,6 @@ from urllib.parse import urlsplit
 
 import structlog
 from celery import Celery
-from kombu.exceptions import OperationalError
 
 from fluoromap.settings import settings
 from fluoromap.store import jobs
@@ -49,6 +48,8 @@ def _make_app() -> Celery:
         accept_content=["json"],
         task_time_limit=configured.stage_seconds,
         worker_prefetch_multiplier=1,
+        # A child that replaces a dead one compiles its kernels first; by default it would be killed after 4 s, again and again.
+        worker_proc_alive_timeout=180,
         worker_concurrency=configured.workers,
         worker_max_memory_per_child=configured.worker_memory_mib * 1024 // 2,
         worker_send_task_events=False,
@@ -72,7 +73,8 @@ def publish(stage_ids: list[int]) -> None:
         try:
             # A fresh signature each time: one made before the task was registered would bypass eager mode.
             app.signature(RUN_STAGE, args=(stage_id,)).apply_async(retry=False)
-        except OperationalError as error:
+        except Exception as error:
+            # Whatever the broker's fault is, the rows are committed: the request that made them must not fail.
             log.warning("broker_unreachable", error=type(error).__name__)
             return
 
@@ -87,6 +89,8 @@ def publish_due() -> int:
 
 def sweep() -> None:
     """Free the stages of dead workers and announce what is due; anyone may call it at any time."""
-    with writing() as session:
-        jobs.reap(session)
     publish_due()
+    with writing() as session:
+        freed = jobs.reap(session)
+    if freed:
+        publish_due()

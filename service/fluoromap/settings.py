@@ -25,8 +25,10 @@ class Settings(BaseSettings):
     host: str = Field("127.0.0.1", description="Address the API listens on.")
     port: int = Field(8000, ge=0, le=65535, description="Port the API listens on.")
     max_upload_bytes: int = Field(4 * 2**30, gt=0, description="Largest request body accepted, in bytes.")
-    workers: int = Field(max(os.cpu_count() or 1, 1), ge=1, description="Stages that one worker runs at the same time.")
-    worker_memory_mib: int = Field(8192, ge=512, description="Address space one running stage may take, in MiB.")
+    workers: int = Field(
+        len(os.sched_getaffinity(0)), ge=1, description="Stages that one worker runs at the same time."
+    )
+    worker_memory_mib: int = Field(8192, ge=2048, description="Address space one running stage may take, in MiB.")
     stage_seconds: int = Field(
         1800, gt=0, description="Longest time one stage may run before it is stopped, in seconds."
     )

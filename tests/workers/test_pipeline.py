@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from fluoromap.contracts import Context, Marks, Run, Segmentation
-from fluoromap.segmenter.four_step import FourStep
+from fluoromap.segmenter.catheter_chain import CatheterChain
 
 
 def _send(service: TestClient, study_path: str, folder: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sen
     tips = [
         p for p in points["points"] if p["catheter"] == "mapping" and p["electrode"] == 1 and p["grade"] != "rejected"
     ]
-    assert len(tips) >= 3
+    assert len(tips) >= 4
     errors = [
         np.subtract([tip["x_mm"], tip["y_mm"], tip["z_mm"]], truth[tip["site"]]["relative_mm"]["mapping"][0])
         for tip in tips
@@ -74,7 +74,7 @@ def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sen
         assert point["reasons"] or point["grade"] != "rejected"
 
     rows = list(csv.DictReader(io.StringIO(service.get(f"{base}/points.csv").text)))
-    assert len(rows) == len(points["points"]) == 4 * 12
+    assert len(rows) == len(points["points"]) == 5 * 12
 
     overlays = service.get(f"{base}/overlays").json()["overlays"]
     assert overlays
@@ -83,15 +83,14 @@ def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sen
     tracks = service.get(f"{base}/tracks", params={"site": tips[0]["site"], "view": "a"}).json()["tracks"]
     assert {track["solver"] for track in tracks} == {"a-priori-lm"}
     assert all(len(track["samples"]) == 24 for track in tracks)
-    if len(tips) >= 4:
-        chamber = service.get(f"{base}/map").json()
-        assert len(chamber["lat_ms"]) == len(chamber["vertices_mm"])
-        assert service.get(f"{base}/mesh.ply").content.startswith(b"ply")
+    chamber = service.get(f"{base}/map").json()
+    assert len(chamber["lat_ms"]) == len(chamber["vertices_mm"])
+    assert service.get(f"{base}/mesh.ply").content.startswith(b"ply")
 
 
 def test_unchanged_work_is_not_done_again(service: TestClient, sent: str) -> None:
     first = _job(service, sent)
-    assert _fresh_stages(first) == {"segment": 8, "match": 1, "triangulate": 1, "fuse": 1, "monoplane": 4}
+    assert _fresh_stages(first) == {"segment": 10, "match": 1, "triangulate": 1, "fuse": 1, "monoplane": 5}
     second = _job(service, sent)
     assert second["state"] == "succeeded"
     assert _fresh_stages(second) == {}
@@ -103,7 +102,7 @@ def test_unchanged_work_is_not_done_again(service: TestClient, sent: str) -> Non
 
 def test_a_new_activation_time_redoes_the_map_alone(service: TestClient, sent: str) -> None:
     _job(service, sent)
-    site = service.get(f"{sent}/sites").json()["items"][0]
+    site = service.get(f"{sent}/sites").json()["items"][2]
     changed = service.put(f"{sent}/sites/{site['site']}", json={"lat_ms": site["lat_ms"] + 5})
     assert changed.status_code == 200, changed.text
     assert _fresh_stages(_job(service, sent)) == {"fuse": 1}
@@ -140,16 +139,16 @@ def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: st
 def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    segment = FourStep.segment
+    segment = CatheterChain.segment
     calls: list[int] = []
 
-    def fails_once(self: FourStep, run: Run, catalogue: Any, marks: Marks, context: Context) -> Segmentation:
+    def fails_once(self: CatheterChain, run: Run, catalogue: Any, marks: Marks, context: Context) -> Segmentation:
         calls.append(1)
         if len(calls) == 1:
             raise ArithmeticError("the plugin's own words")
         return segment(self, run, catalogue, marks, context)
 
-    monkeypatch.setattr(FourStep, "segment", fails_once)
+    monkeypatch.setattr(CatheterChain, "segment", fails_once)
     job = _job(service, sent)
     assert job["state"] == "succeeded"
     failed = [row for row in job["stages"] if row["state"] == "failed"]

@@ -15,7 +15,6 @@ from fluoromap.segmenter.log_image import Image
 _CORE_MM = 0.55
 _RING_MM = (1.5, 2.0)
 _GRID = 24
-_SIDE_MM = 1.75
 _PEAK_MM = (0.35, 0.7)
 _MOST_PEAKS = 40
 
@@ -24,19 +23,16 @@ _MOST_PEAKS = 40
 class Contrast:
     """Contrast measured on one frame.
 
-    image : (rows, columns) float32 log units. smooth : the same after diffusion, on which shafts stand out.
-    noise : robust standard deviation of :meth:`of` over the field: photon noise and anatomy together.
-    line_scale : what counts as a clear shaft on ``smooth``. px_per_mm : at the isocentre.
+    image : (rows, columns) float32 log units. noise : robust standard deviation of :meth:`of` over the field: photon noise
+    and anatomy together. px_per_mm : at the isocentre.
     """
 
     image: Image
-    smooth: Image
     noise: float
-    line_scale: float
     px_per_mm: float
 
     @classmethod
-    def of_frame(cls, image: Image, smooth: Image, inside: BoolArray, line_scale: float, px_per_mm: float) -> Contrast:
+    def of_frame(cls, image: Image, inside: BoolArray, px_per_mm: float) -> Contrast:
         rows, columns = image.shape
         v, u = np.meshgrid(
             np.linspace(0, rows - 1, _GRID).round(), np.linspace(0, columns - 1, _GRID).round(), indexing="ij"
@@ -45,7 +41,7 @@ class Contrast:
         places = places[inside[places[:, 1].astype(int), places[:, 0].astype(int)]]
         values = _centre_surround(image, places, *_radii(px_per_mm)) if len(places) else np.zeros(1)
         noise = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-        return cls(image, smooth, max(noise, 1e-6), line_scale, px_per_mm)
+        return cls(image, max(noise, 1e-6), px_per_mm)
 
     def of(self, points_uv: Array) -> Array:
         """Contrast over noise at each point, (n,): surroundings minus centre, positive where dark."""
@@ -70,13 +66,6 @@ class Contrast:
         places = places[allowed]
         clear: Array = places[self.of(places) >= threshold]
         return clear
-
-    def shaft(self, start_uv: Array, end_uv: Array) -> float:
-        """How clearly the straight piece from start to end is a dark tube: -1 (bright) to 1."""
-        depth = _dark_line(
-            self.smooth, start_uv[0], start_uv[1], end_uv[0], end_uv[1], max(2.0, _SIDE_MM * self.px_per_mm)
-        )
-        return float(np.clip(depth / self.line_scale, -1.0, 1.0))
 
 
 def _radii(px_per_mm: float) -> tuple[float, float, float]:
@@ -104,29 +93,3 @@ def _centre_surround(x, points, core, near, far):  # type: ignore[no-untyped-def
         if n_inner > 0 and n_outer > 0:
             out[i] = outer / n_outer - inner / n_inner
     return out
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _dark_line(x, u0, v0, u1, v1, side):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Mean over the piece of (darker of the two sides - middle); what leaves the image does not count."""
-    rows, columns = x.shape
-    du, dv = u1 - u0, v1 - v0
-    length = np.sqrt(du * du + dv * dv) + 1e-9
-    across_u, across_v = -dv / length * side, du / length * side
-    steps = max(3, int(length / 2))
-    total = 0.0
-    count = 0
-    for i in range(steps):
-        t = (i + 0.5) / steps
-        cu, cv = u0 + t * du, v0 + t * dv
-        if (
-            min(cu - abs(across_u), cv - abs(across_v)) < 0
-            or cu + abs(across_u) > columns - 1
-            or cv + abs(across_v) > rows - 1
-        ):
-            continue
-        one = x[int(cv + across_v + 0.5), int(cu + across_u + 0.5)]
-        other = x[int(cv - across_v + 0.5), int(cu - across_u + 0.5)]
-        total += min(one, other) - x[int(cv + 0.5), int(cu + 0.5)]
-        count += 1
-    return total / count if count > 0 else 0.0

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -15,11 +16,11 @@ from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.contrast import Contrast
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.homomorphic import homomorphic
-from fluoromap.segmenter.linking import Family, Linked, families, kind_probabilities, link, shaft_evidence, spacing_fit
+from fluoromap.segmenter.linking import Shafts, evidence, families, link
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.morphology import disk_morphology
 from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
-from fluoromap.segmenter.refinement import Refined, refine
+from fluoromap.segmenter.placing import place_chains
 
 MOST_FOREGROUND = 0.02
 MOST_BLOBS = 40
@@ -27,7 +28,6 @@ MOST_BLOBS = 40
 
 _LEAST_LINE = 0.05
 _OWN_MM = 0.6
-_SHAFT_WEIGHT = 2.0
 
 
 class FourStepParams(BaseModel, extra="forbid"):
@@ -60,7 +60,7 @@ class FourStepParams(BaseModel, extra="forbid"):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Detector:
+class FourStepDetector:
     """Finds chains in the images of one run, whose field and scale are fixed."""
 
     catalogue: Catalogue
@@ -95,50 +95,19 @@ class Detector:
         blobs, diffused, k = found
         if blobs.foreground > MOST_FOREGROUND or len(blobs) > MOST_BLOBS:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
-        contrast = Contrast.of_frame(x, diffused, self.field.inside, max(_LEAST_LINE, 0.5 * k), self.px_per_mm)
+        contrast = Contrast.of_frame(x, self.field.inside, self.px_per_mm)
+        shafts = Shafts(diffused, 1, max(_LEAST_LINE, 0.5 * k), self.px_per_mm)
         kinds = families(self.catalogue)
         points = _with_lost(blobs.centroids_uv, contrast.peaks(self.field.candidates), self.px_per_mm)
-        linked = link(points, contrast, kinds, sure=len(blobs))
+        linked = link(points, evidence(contrast.of(points)), np.zeros(len(points)), shafts, kinds, sure=len(blobs))
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
-        return FrameChains(frame, self._refined(x, points, linked, contrast, kinds))
+        chains = [placed.chain for placed in place_chains(x, points, linked, shafts, kinds)]
+        return FrameChains(frame, tuple(replace(chain, scores=contrast.of(chain.pixels_uv)) for chain in chains))
 
-    def _refined(
-        self, x: Image, candidates: Array, linked: tuple[Linked, ...], contrast: Contrast, kinds: tuple[Family, ...]
-    ) -> tuple[Chain, ...]:
-        """Place, order and kind of each chain: whichever catheter of as many electrodes, tip first or last, fits best."""
-        likelihood = np.full((len(linked), len(kinds)), -np.inf)
-        places: list[list[Refined | None]] = [[None] * len(kinds) for _ in linked]
-        for row, chain in enumerate(linked):
-            for order in (chain.candidates, chain.candidates[::-1]):
-                points = candidates[list(order)]
-                for column, family in enumerate(kinds):
-                    if family.catheter.electrodes != len(points):
-                        continue
-                    place = refine(x, points, family.catheter, self.px_per_mm)
-                    fit = place.log_likelihood + spacing_fit(place.points_uv, family.catheter, self.px_per_mm)
-                    fit += _SHAFT_WEIGHT * shaft_evidence(place.points_uv, family.catheter, contrast)
-                    if fit > likelihood[row, column]:
-                        likelihood[row, column] = fit
-                        places[row][column] = place
-        probabilities = kind_probabilities(likelihood, kinds)
-        chains = []
-        for row, chain in enumerate(linked):
-            of_family = [
-                sum(probability for name, probability in probabilities[row] if name in family.names) for family in kinds
-            ]
-            best = places[row][int(np.argmax(of_family))] or places[row][chain.family]
-            assert best is not None
-            chains.append(
-                Chain(
-                    electrodes=tuple(range(1, len(chain.candidates) + 1)),
-                    pixels_uv=best.points_uv,
-                    covariance_px2=best.covariance_px2,
-                    scores=contrast.of(best.points_uv),
-                    kinds=probabilities[row],
-                )
-            )
-        return tuple(chains)
+    def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        """Always None: the paper looks at whole frames."""
+        return None
 
 
 def _with_lost(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:

@@ -10,23 +10,35 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array
-from fluoromap.segmenter.contrast import Contrast
+from fluoromap.segmenter import chain_search
+from fluoromap.segmenter.log_image import Image
 
-SHORTEST, LONGEST = 0.45, 1.12
-"""A spacing seen over the same spacing lying across the rays at the isocentre: foreshortened, or nearer to the source."""
-
-_SPACING_SD = 0.10
-_BEND_SD = 0.40
-_LEAST_COSINE = 0.55
-_TIP_SLACK = 0.8, 1.1
-_SPREAD = 0.45
 _EVIDENCE_FROM, _EVIDENCE_MOST = 4.0, 2.2
 _SHAFT_WEIGHT = 0.4
 _SHARED = 1.5
 _LOST = 2.0
 _WORTH = 6.0
 _BEST = 80
-_PARTIAL = 600
+_SIDE_MM = 1.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shafts:
+    """Where shafts are looked for.
+
+    smooth : the log image without most of its noise, ``reduction`` times smaller than the frame. clear : depth in log
+    units that counts as a clear shaft. px_per_mm : of the frame, at the isocentre.
+    """
+
+    smooth: Image
+    reduction: int
+    clear: float
+    px_per_mm: float
+
+    @property
+    def side_px(self) -> float:
+        """How far beside a shaft its surroundings are looked at."""
+        return max(2.0, _SIDE_MM * self.px_per_mm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,139 +82,103 @@ def evidence(contrast_over_noise: Array) -> Array:
     return np.clip(rising, -1.0, _EVIDENCE_MOST)
 
 
-def link(points_uv: Array, contrast: Contrast, kinds: Sequence[Family], sure: int) -> tuple[Linked, ...]:
+def link(
+    points_uv: Array,
+    weights: Array,
+    variance_px2: Array,
+    shafts: Shafts,
+    kinds: Sequence[Family],
+    sure: int | None = None,
+    slack: float = 0.0,
+) -> tuple[Linked, ...]:
     """The best set of chains: ordered from the tip, at most as many of a family as the catalogue has.
 
-    A chain's score is the sum of its candidates' :func:`evidence`, less penalties for spacings that are not foreshortened
+    A chain's score is the sum of its candidates' weights, less penalties for spacings that are not foreshortened
     alike (0.10 SD), for bends (0.40 rad SD; S-bends count half more), for strong foreshortening and for rings of
-    unlike contrast, plus evidence of a dark shaft between the electrodes and behind the last but not before the tip.
-    Crossing catheters may share one candidate, at a price.
+    unlike weight, plus evidence of a dark shaft between the electrodes and behind the last but not before the tip.
+    A set is worth its scores and 6 for each chain, so that a third, weaker catheter is not dropped; crossing catheters may
+    share one candidate, at a price.
 
     Parameters
     ----------
     points_uv : (n, 2)
         Candidates, pixels.
-    contrast : Contrast
+    weights : (n,)
+        Their :func:`evidence`.
+    variance_px2 : (n,)
+        Of each coordinate of theirs.
+    shafts : Shafts
     kinds : sequence of Family
     sure : int
-        The first so many candidates passed the threshold; the others may make up half of a chain at most.
+        The first so many candidates are sound; others may make up half of a chain at most, at a price. All by default.
+    slack : float
+        How far below its family's floor a chain may lie.
 
     Returns
     -------
     tuple of Linked
-        None below its family's floor.
+        Best first.
     """
+    sure = len(points_uv) if sure is None else sure
+    points = np.ascontiguousarray(points_uv, dtype=np.float64)
     found: list[Linked] = []
-    weights = evidence(contrast.of(points_uv)) if len(points_uv) else np.zeros(0)
     for index, family in enumerate(kinds):
-        for candidates in _paths(points_uv, weights, family.catheter, contrast.px_per_mm):
-            if 2 * sum(candidate < sure for candidate in candidates) < len(candidates):
-                continue
-            chosen = list(candidates)
-            price = _LOST * sum(candidate >= sure for candidate in candidates)
-            score = _score(points_uv[chosen], weights[chosen], family.catheter, contrast, family.floor + price) - price
-            if score >= family.floor:
-                found.append(Linked(candidates, index, score))
-    found.sort(key=lambda chain: -chain.score)
-    return _best_set(found[:_BEST], [len(family.names) for family in kinds])
-
-
-def spacing_fit(points_uv: Array, catheter: Catheter, px_per_mm: float) -> float:
-    """Log-likelihood, up to a constant, of the points' spacings as those of this catheter, one foreshortening free."""
-    seen = np.linalg.norm(np.diff(points_uv, axis=0), axis=1) / (np.asarray(catheter.spacing_mm) * px_per_mm)
-    return float(-0.5 * np.sum(((seen - seen.mean()) / _SPACING_SD) ** 2))
-
-
-def _paths(points: Array, weights: Array, catheter: Catheter, px_per_mm: float) -> list[tuple[int, ...]]:
-    """All orders of candidates whose spacings and bends this catheter could show; the best few hundred at each length."""
-    n = len(points)
-    if n < catheter.electrodes:
-        return []
-    steps = points[None, :, :] - points[:, None, :]
-    lengths = np.hypot(steps[..., 0], steps[..., 1])
-    partial: list[tuple[float, tuple[int, ...], tuple[float, ...]]] = [(float(weights[i]), (i,), ()) for i in range(n)]
-    for spacing in catheter.spacing_mm:
-        seen = lengths / (spacing * px_per_mm)
-        reachable = (seen >= SHORTEST * _TIP_SLACK[0]) & (seen <= LONGEST * _TIP_SLACK[1])
-        longer = []
-        for value, path, ratios in partial:
-            last = path[-1]
-            for following in np.flatnonzero(reachable[last]).tolist():
-                ratio = float(seen[last, following])
-                if following in path or any(abs(ratio - other) > _SPREAD for other in ratios):
-                    continue
-                if len(path) > 1:
-                    before, after = steps[path[-2], last], steps[last, following]
-                    cosine = float(before @ after) / float(lengths[path[-2], last] * lengths[last, following])
-                    if cosine < _LEAST_COSINE:
-                        continue
-                longer.append((value + float(weights[following]), (*path, following), (*ratios, ratio)))
-        longer.sort(key=lambda item: -item[0])
-        partial = longer[:_PARTIAL]
-    return [path for _, path, ratios in partial if SHORTEST <= sum(ratios) / len(ratios) <= LONGEST]
-
-
-def _score(points: Array, weights: Array, catheter: Catheter, contrast: Contrast, least: float) -> float:
-    """Score of one chain; -inf, without a look at the shaft, where that cannot lift it to ``least``."""
-    steps = np.diff(points, axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    along = steps / lengths[:, None]
-    foreshortening = float(lengths.sum() / (sum(catheter.spacing_mm) * contrast.px_per_mm))
-    score = float(weights.sum()) + spacing_fit(points, catheter, contrast.px_per_mm)
-    score -= 2.0 * max(0.0, 0.75 - foreshortening)
-    turns = np.arctan2(
-        along[:-1, 0] * along[1:, 1] - along[:-1, 1] * along[1:, 0], np.einsum("ij,ij->i", along[:-1], along[1:])
+        if len(points) < family.catheter.electrodes:
+            continue
+        spacing_px = _spacing_px(family.catheter, shafts.px_per_mm)
+        paths = chain_search.paths(points, weights, spacing_px)
+        scores = chain_search.scores(
+            paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
+            shafts.reduction, shafts.clear, shafts.side_px, _SHAFT_WEIGHT, family.floor - slack,
+        )  # fmt: skip
+        best = np.argsort(-scores)[:_BEST]
+        found += [
+            Linked(tuple(paths[row].tolist()), index, float(scores[row])) for row in best if np.isfinite(scores[row])
+        ]
+    if not found:
+        return ()
+    found = sorted(found, key=lambda chain: -chain.score)[:_BEST]
+    within = np.zeros((len(found), len(points)), np.int64)
+    for row, chain in enumerate(found):
+        within[row, list(chain.candidates)] = 1
+    chosen = chain_search.best_set(
+        np.array([chain.score + _WORTH for chain in found]),
+        within @ within.T,
+        np.array([chain.family for chain in found]),
+        np.array([len(family.names) for family in kinds]),
+        _SHARED,
     )
-    if len(turns) > 1 and turns.min() < -0.12 and turns.max() > 0.12:
-        turns = 1.5 * turns
-    score -= 0.5 * float(np.sum((turns / _BEND_SD) ** 2))
-    if len(weights) > 2:
-        score -= 0.6 * float(np.ptp(weights[1:]))
-    if score + 3.0 * _SHAFT_WEIGHT < least:
-        return -math.inf
-    return score + _SHAFT_WEIGHT * shaft_evidence(points, catheter, contrast)
+    return tuple(found[int(index)] for index in chosen)
 
 
-def shaft_evidence(points: Array, catheter: Catheter, contrast: Contrast) -> float:
+def chain_score(points_uv: Array, weights: Array, variance_px2: Array, shafts: Shafts, family: Family) -> float:
+    """Score of the chain that the points make in this order, as in :func:`link`."""
+    return float(
+        chain_search.scores(
+            np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,
+            _spacing_px(family.catheter, shafts.px_per_mm), family.catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
+            shafts.reduction, shafts.clear, shafts.side_px, _SHAFT_WEIGHT, -np.inf,
+        )[0]
+    )  # fmt: skip
+
+
+def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> float:
+    """Log-likelihood, up to a constant, of the points' spacings as those of this catheter, one foreshortening free."""
+    return float(chain_search.spacing_fit(points_uv, _spacing_px(catheter, px_per_mm), variance_px2))
+
+
+def shaft_evidence(points_uv: Array, catheter: Catheter, shafts: Shafts) -> float:
     """Dark between the electrodes of the widest gap and behind the last electrode, not before the tip: -3 to 3."""
-    along = np.diff(points, axis=0)
-    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    widest = int(np.argmax(catheter.spacing_mm))
-    step = points[widest + 1] - points[widest]
-    between = contrast.shaft(points[widest] + 0.25 * step, points[widest + 1] - 0.25 * step)
-    one_mm = contrast.px_per_mm
-    behind = contrast.shaft(points[-1] + 2.4 * one_mm * along[-1], points[-1] + 5.9 * one_mm * along[-1])
-    clear = 0.5 * catheter.tip_mm + 2.1
-    before = contrast.shaft(points[0] - clear * one_mm * along[0], points[0] - (clear + 3.5) * one_mm * along[0])
-    return between + behind - before
+    return float(
+        chain_search.shaft_evidence(
+            points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
+            shafts.reduction, shafts.clear, shafts.side_px,
+        )
+    )  # fmt: skip
 
 
-def _best_set(chains: Sequence[Linked], capacity: list[int]) -> tuple[Linked, ...]:
-    """Branch and bound over chains sorted by score: each chain is worth its score plus 6, so that a third, weaker catheter
-    is not dropped; two chains may share one candidate at a price of 1.5."""
-    best_value, best = 0.0, ()  # type: tuple[float, tuple[Linked, ...]]
-    most = sum(capacity)
-
-    def extend(start: int, chosen: tuple[Linked, ...], value: float) -> None:
-        nonlocal best_value, best
-        if value > best_value:
-            best_value, best = value, chosen
-        room = most - len(chosen)
-        if not room:
-            return
-        for index in range(start, len(chains)):
-            chain = chains[index]
-            if value + room * (chain.score + _WORTH) <= best_value:
-                return
-            if sum(other.family == chain.family for other in chosen) >= capacity[chain.family]:
-                continue
-            shared = [len(set(chain.candidates) & set(other.candidates)) for other in chosen]
-            if sum(shared) > 1:
-                continue
-            extend(index + 1, (*chosen, chain), value + chain.score + _WORTH - _SHARED * sum(shared))
-
-    extend(0, (), 0.0)
-    return best
+def _spacing_px(catheter: Catheter, px_per_mm: float) -> Array:
+    return np.asarray(catheter.spacing_mm, dtype=np.float64) * px_per_mm
 
 
 def kind_probabilities(log_likelihoods: Array, kinds: Sequence[Family]) -> tuple[tuple[tuple[str, float], ...], ...]:

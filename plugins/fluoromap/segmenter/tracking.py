@@ -1,41 +1,62 @@
-"""Chains of successive frames that are the same catheter get the same track number."""
+"""Catheters followed along a run: chains of successive frames that are the same catheter get the same track number."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from fluoromap.contracts import Array, Chain
+from fluoromap.contracts import Array, Chain, FrameChains
+from fluoromap.reasons import Reason
 
 _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
 _NEAREST_PX = 13.0
 _BEND_PX = 8.0
+_STIFF_PX = 3.5
+_BENDING_PX_PER_MS = 0.05
 _KEPT_VELOCITY = 0.6
+_STALE_MS = 50.0
 _OTHER_KIND = 6.0
 _IMPOSSIBLE = 1e6
+_CONFIRMED_PX = 18.0
+_CONFIRMERS = 60
+_SAME_PLACE_PX = 4.0
+_SEEN_AT_LEAST = 0.2
+_LONG_RUN = 5
+
+Carry = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
+"""(frame, chain last seen, shift expected, reach in pixels, chains that stand in the frame) -> the chain in that frame."""
 
 
 @dataclass(slots=True)
 class _Track:
+    """Where a catheter was met last; ``velocity`` in pixels a millisecond, forwards in time. detected : in how many frames."""
+
     chain: Chain
     time_ms: float
     velocity: Array
+    detected: int = 1
+    manual: bool = False
+    chains: dict[int, Chain] = field(default_factory=dict)
 
 
 def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
     """(mean shift, largest rest after that shift) in pixels over the electrodes both chains have; infinite without any."""
-    common = sorted(set(one.electrodes) & set(other.electrodes))
-    if not common:
-        return np.inf, np.inf
-    mine = one.pixels_uv[[one.electrodes.index(number) for number in common]]
-    theirs = other.pixels_uv[[other.electrodes.index(number) for number in common]]
-    difference = theirs - mine - (0.0 if shift is None else shift)
-    mean = difference.mean(axis=0)
-    return float(np.linalg.norm(mean)), float(np.linalg.norm(difference - mean, axis=1).max())
+    if one.electrodes == other.electrodes:
+        mine, theirs = one.pixels_uv, other.pixels_uv
+    else:
+        common = sorted(set(one.electrodes) & set(other.electrodes))
+        if not common:
+            return np.inf, np.inf
+        mine = one.pixels_uv[[one.electrodes.index(number) for number in common]]
+        theirs = other.pixels_uv[[other.electrodes.index(number) for number in common]]
+    difference = theirs - mine if shift is None else theirs - mine - shift
+    mean = difference.sum(axis=0) / len(difference)
+    rest = difference - mean
+    return float(np.sqrt(mean @ mean)), float(np.sqrt((rest * rest).sum(axis=1).max()))
 
 
 def kind_overlap(one: Chain, other: Chain) -> float:
@@ -45,56 +66,212 @@ def kind_overlap(one: Chain, other: Chain) -> float:
     return agreement / max(*squares, 1e-9)
 
 
-class Tracker:
-    """Assigns the chains of each frame to tracks: predicted by 0.6 of the last velocity, gated, least total cost.
+def follow(
+    found: Sequence[FrameChains],
+    frame_times_ms: Array,
+    catheters: int,
+    carry: Carry | None = None,
+    seed: FrameChains | None = None,
+) -> tuple[FrameChains, ...]:
+    """Give the chains of a run track numbers.
 
-    Cost is the mean shift plus twice the largest change of shape, plus a price for unlike kinds. A track waits for ever: a
-    catheter comes back to its place with the next beat. Keeps one chain a track.
+    Starts from the first frame marked by hand, else from the seed, else from the frame that most others confirm, and goes
+    both ways. Each catheter is predicted by 0.6 of its last velocity and the chains of the frame are assigned to the
+    predictions: least total cost (mean shift, twice the largest change of shape, a price for unlike kinds), gated. A
+    catheter that no chain was assigned to, or one that bends too fast, is carried, where there is a way to; else its track
+    waits: it comes back with the next beat.
+
+    Parameters
+    ----------
+    found : sequence of FrameChains
+        Chains of each frame. Those of a frame with ``manual_needed`` are not sure: they may continue a track, not begin one.
+    frame_times_ms : (n,)
+    catheters : int
+        Of the catalogue: at most so many chains stand in a frame.
+    carry : Carry, optional
+    seed : FrameChains, optional
+        What the mean of the frames round ``seed.frame`` shows, which is surer than any of them.
+
+    Returns
+    -------
+    tuple of FrameChains
+        ``manual_needed`` is MANUAL_NEEDED in a frame without chains, TRACK_INTERRUPTED where a catheter is missing that
+        stands in most of the frames.
     """
+    if not found:
+        return ()
+    marked = [entry.frame for entry in found if any(chain.manual for chain in entry.chains)]
+    tracks: list[_Track] = []
+    if seed is not None and seed.chains and not marked:
+        start = seed.frame
+        at = float(frame_times_ms[start])
+        tracks = [_Track(chain, at, np.zeros(2), detected=0) for chain in seed.chains]
+    else:
+        start = marked[0] if marked else _start(found, catheters)
+    for frames in (range(start, len(found)), range(start - 1, -1, -1)):
+        if frames.step < 0:
+            for track in tracks:
+                first = min(track.chains, default=None)
+                if first is None:
+                    continue
+                track.chain, track.time_ms = track.chains[first], float(frame_times_ms[first])
+                track.velocity = _first_velocity(track.chains, frame_times_ms)
+        for frame in frames:
+            _step(tracks, found[frame], float(frame_times_ms[frame]), catheters, carry)
+    least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
+    lasting = [track for track in tracks if track.manual or track.detected >= least]
+    lasting.sort(key=lambda track: -track.detected)
+    usual = [track for track in lasting if len(track.chains) > len(found) / 2]
+    entries = []
+    for frame in range(len(found)):
+        chains: list[Chain] = []
+        for number, track in enumerate(lasting):
+            chain = track.chains.get(frame)
+            room = len(chains) < catheters or (chain is not None and chain.manual)
+            if chain is not None and room and (chain.manual or not _covered(chain, chains)):
+                chains.append(replace(chain, track=number))
+        missing = any(frame not in track.chains for track in usual)
+        reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
+        entries.append(FrameChains(frame, tuple(chains), reason))
+    return tuple(entries)
 
-    def __init__(self) -> None:
-        self._tracks: list[_Track] = []
 
-    def follow(self, chains: Sequence[Chain], time_ms: float) -> tuple[Chain, ...]:
-        """The chains of the next frame with their track numbers; new ones where nothing fits."""
-        numbers = self._assign(chains, time_ms)
-        numbered = []
-        for chain, number in zip(chains, numbers, strict=True):
-            if number < 0:
-                number = len(self._tracks)
-                self._tracks.append(_Track(chain, time_ms, np.zeros(2)))
-            else:
-                track = self._tracks[number]
-                elapsed = max(time_ms - track.time_ms, 1e-6)
-                common = [k for k in chain.electrodes if k in track.chain.electrodes]
-                moved = np.mean(
-                    [
-                        chain.pixels_uv[chain.electrodes.index(k)]
-                        - track.chain.pixels_uv[track.chain.electrodes.index(k)]
-                        for k in common
-                    ],
-                    axis=0,
-                )
-                self._tracks[number] = _Track(chain, time_ms, _KEPT_VELOCITY * moved / elapsed)
-            numbered.append(replace(chain, track=number))
-        return tuple(numbered)
+def _start(found: Sequence[FrameChains], catheters: int) -> int:
+    sure = [entry for entry in found if entry.chains and entry.manual_needed is None]
+    if not sure:
+        return 0
+    tried = sure[:: max(1, len(sure) // _CONFIRMERS)]
+    sizes = {len(chain.electrodes) for entry in tried for chain in entry.chains}
+    confirmed = np.zeros(len(tried))
+    for size in sizes:
+        rows = [
+            (index, chain.pixels_uv)
+            for index, entry in enumerate(tried)
+            for chain in entry.chains
+            if len(chain.electrodes) == size
+        ]
+        owner = np.array([index for index, _ in rows])
+        places = np.array([points for _, points in rows])
+        for index, points in rows:
+            near = np.abs(places - points).max(axis=(1, 2)) < _CONFIRMED_PX
+            confirmed[index] += len(set(owner[near].tolist())) - 1
+    weakest = np.array(
+        [
+            min(float(np.median(chain.scores)) for chain in entry.chains) if len(entry.chains) >= catheters else 0.0
+            for entry in tried
+        ]
+    )
+    return tried[int(np.argmax(confirmed + 0.15 * np.minimum(weakest, 6.0)))].frame
 
-    def _assign(self, chains: Sequence[Chain], time_ms: float) -> list[int]:
-        if not chains or not self._tracks:
-            return [-1] * len(chains)
-        cost = np.full((len(chains), len(self._tracks)), _IMPOSSIBLE)
-        for column, track in enumerate(self._tracks):
-            elapsed = time_ms - track.time_ms
-            gate = min(max(_NEAREST_PX, _SPEED_PX_PER_MS * elapsed), _FARTHEST_PX)
-            # An old velocity says nothing about where the heart is now.
-            shift = track.velocity * elapsed if elapsed < 50.0 else np.zeros(2)
-            for row, chain in enumerate(chains):
-                away, bent = chain_distance(track.chain, chain, shift)
-                overlap = kind_overlap(track.chain, chain)
-                if away <= gate and bent <= _BEND_PX and overlap > 0:
-                    cost[row, column] = away + 2.0 * bent + _OTHER_KIND * (1.0 - min(overlap, 1.0))
-        numbers = [-1] * len(chains)
-        for taken_row, taken_column in zip(*linear_sum_assignment(cost), strict=True):
-            if cost[taken_row, taken_column] < _IMPOSSIBLE:
-                numbers[int(taken_row)] = int(taken_column)
-        return numbers
+
+def _first_velocity(chains: dict[int, Chain], frame_times_ms: Array) -> Array:
+    first = min(chains)
+    after = chains.get(first + 1)
+    if after is None:
+        return np.zeros(2)
+    return (
+        _KEPT_VELOCITY
+        * _moved(chains[first], after)
+        / max(float(frame_times_ms[first + 1] - frame_times_ms[first]), 1e-6)
+    )
+
+
+def _moved(one: Chain, other: Chain) -> Array:
+    common = [number for number in one.electrodes if number in other.electrodes]
+    if not common:
+        return np.zeros(2)
+    mine = one.pixels_uv[[one.electrodes.index(number) for number in common]]
+    moved: Array = (other.pixels_uv[[other.electrodes.index(number) for number in common]] - mine).mean(axis=0)
+    return moved
+
+
+def _covered(chain: Chain, others: Sequence[Chain]) -> bool:
+    """Whether two or more of its electrodes lie on those of another chain."""
+    for other in others:
+        apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
+        if np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < _SAME_PLACE_PX**2) >= 2:
+            return True
+    return False
+
+
+def _step(tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, carry: Carry | None) -> None:
+    numbers = _assign(tracks, entry.chains, time_ms)
+    by_hand = any(chain.manual for chain in entry.chains)
+    standing: list[Chain] = []
+    bent: list[tuple[int, Chain]] = []
+    for chain, number in zip(entry.chains, numbers, strict=True):
+        if number < 0:
+            continue
+        tracks[number].detected += 1
+        if carry is not None and not by_hand and _is_bent(tracks[number], chain, time_ms):
+            bent.append((number, chain))
+        else:
+            _meet(tracks[number], chain, entry.frame, time_ms)
+            standing.append(chain)
+    for number, chain in bent:
+        # One of its electrodes may be another catheter's.
+        track = tracks[number]
+        shift, reach = _expected(track, time_ms)
+        carried = carry(entry.frame, track.chain, shift, reach, standing) if carry is not None else None
+        if carried is not None and not _is_bent(track, carried, time_ms) and not _covered(carried, standing):
+            chain = replace(carried, kinds=chain.kinds)
+        _meet(track, chain, entry.frame, time_ms)
+        standing.append(chain)
+    loose = [chain for chain, number in zip(entry.chains, numbers, strict=True) if number < 0]
+    if carry is not None and not by_hand:
+        for number, track in enumerate(tracks):
+            if number in numbers or len(standing) >= catheters:
+                continue
+            shift, reach = _expected(track, time_ms)
+            carried = carry(entry.frame, track.chain, shift, reach, standing)
+            if carried is not None and not _covered(carried, standing):
+                _meet(track, carried, entry.frame, time_ms)
+                standing.append(carried)
+    for chain in loose:
+        if chain.manual or (entry.manual_needed is None and not _covered(chain, standing)):
+            standing.append(chain)
+            tracks.append(_Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain}))
+
+
+def _is_bent(track: _Track, chain: Chain, time_ms: float) -> bool:
+    """Whether its shape changed by more than a heart bends a catheter in that time."""
+    allowed = _STIFF_PX + _BENDING_PX_PER_MS * abs(time_ms - track.time_ms)
+    return chain_distance(track.chain, chain)[1] > min(allowed, _BEND_PX)
+
+
+def _meet(track: _Track, chain: Chain, frame: int, time_ms: float) -> None:
+    elapsed = time_ms - track.time_ms
+    if elapsed != 0:
+        track.velocity = _KEPT_VELOCITY * _moved(track.chain, chain) / elapsed
+    track.chain, track.time_ms = chain, time_ms
+    track.manual |= chain.manual
+    track.chains[frame] = chain
+
+
+def _expected(track: _Track, time_ms: float) -> tuple[Array, float]:
+    """Shift of a track since it was met last, and how far from there it may be."""
+    elapsed = time_ms - track.time_ms
+    # An old velocity says nothing about where the heart is now.
+    shift = track.velocity * elapsed if abs(elapsed) < _STALE_MS else np.zeros(2)
+    return shift, min(max(_NEAREST_PX, _SPEED_PX_PER_MS * abs(elapsed)), _FARTHEST_PX)
+
+
+def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -> list[int]:
+    """Track number of each chain, -1 where none fits."""
+    if not chains or not tracks:
+        return [-1] * len(chains)
+    cost = np.full((len(chains), len(tracks)), _IMPOSSIBLE)
+    for column, track in enumerate(tracks):
+        shift, gate = _expected(track, time_ms)
+        for row, chain in enumerate(chains):
+            away, bent = chain_distance(track.chain, chain, shift)
+            if away > gate or bent > _BEND_PX:
+                continue
+            overlap = kind_overlap(track.chain, chain)
+            if overlap > 0:
+                cost[row, column] = away + 2.0 * bent + _OTHER_KIND * (1.0 - min(overlap, 1.0))
+    numbers = [-1] * len(chains)
+    for taken_row, taken_column in zip(*linear_sum_assignment(cost), strict=True):
+        if cost[taken_row, taken_column] < _IMPOSSIBLE:
+            numbers[int(taken_row)] = int(taken_column)
+    return numbers

@@ -87,8 +87,8 @@ _CHECKS: dict[Literal["database", "broker", "files", "worker"], tuple[Callable[[
 
 
 @router.get("/v1/health", summary="Alive", response_model=Health)
-def health() -> Health:
-    """The process answers; open to all."""
+async def health() -> Health:
+    """The process answers, however busy its threads are; open to all."""
     return Health()
 
 

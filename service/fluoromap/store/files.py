@@ -12,13 +12,14 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sqlalchemy import delete, exists, select
+from sqlalchemy import delete, exists, select, text
 from sqlalchemy.orm import Session
 
 from fluoromap.settings import settings
 from fluoromap.store.models import File, Instance, Rendering, StageResult, StageRow
 
 CHUNK_BYTES = 1 << 20
+_FILES_LOCK = 0x66696C65  # "file": any number that nobody else takes in this database
 
 
 def path_of(sha256: str) -> Path:
@@ -48,12 +49,19 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
+def lock(session: Session) -> None:
+    """Hold off others that add or remove files until this transaction ends; SQLite's writers are alone already."""
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _FILES_LOCK})
+
+
 def keep(session: Session, path: Path, media_type: str, sha256: str | None = None) -> str:
     """Move an incoming file to its content address and add its row to the session. Returns the hash.
 
     A caller that knows the file's hash already gives it, so that a long file is not read again inside the transaction.
     """
     sha256 = sha256 or sha256_of(path)
+    lock(session)
     target = path_of(sha256)
     size = path.stat().st_size
     if not target.exists():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, select, text
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from fluoromap.dicom.facts import InstanceFacts
@@ -28,8 +28,6 @@ GANTRY_KEYWORDS = {
     "pixel_spacing_mm": "ImagerPixelSpacing",
 }
 """Gantry fields and the DICOM keywords that tell them."""
-
-_FILES_LOCK = 0x66696C65  # "file": any number that nobody else takes in this database
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +142,7 @@ def add(
     Refused
         409 when other bytes are stored under the same SOP Instance UID.
     """
-    lock_files(session)
+    files.lock(session)
     known = session.get(Instance, facts.sop_instance_uid)
     if known is not None and known.sha256 != sha256:
         raise Refused(
@@ -223,7 +221,7 @@ def forget_instances(session: Session, uids: Iterable[str], also: Iterable[str] 
 
     Returns the hashes of the files whose rows went, for :func:`unlink_unreferenced` after the commit.
     """
-    lock_files(session)
+    files.lock(session)
     candidates = list(also)
     for uid in uids:
         if session.scalar(select(StudyInstance.id).where(StudyInstance.sop_instance_uid == uid).limit(1)) is None:
@@ -239,12 +237,6 @@ def unlink_unreferenced(hashes: Iterable[str]) -> None:
     """Remove files from the disk whose rows are gone, unless the same content has arrived again since."""
     for sha256 in hashes:
         with writing() as session:
-            lock_files(session)
+            files.lock(session)
             if session.get(File, sha256) is None:
                 files.path_of(sha256).unlink(missing_ok=True)
-
-
-def lock_files(session: Session) -> None:
-    """Hold off others that add or remove files until this transaction ends; SQLite's writers are alone already."""
-    if session.get_bind().dialect.name == "postgresql":
-        session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _FILES_LOCK})

@@ -101,7 +101,7 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
 
 def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
     """Take a ready stage; None when the announcement was stale or doubled."""
-    job_id = session.scalar(select(StageRow.job_id).where(StageRow.id == stage_id))
+    job_id = session.scalar(select(StageRow.job_id).where(StageRow.id == stage_id, StageRow.state == StageState.READY))
     if job_id is None:
         return None
     job = _lock(session, job_id)
@@ -182,11 +182,15 @@ def cancel(session: Session, job_id: str) -> bool:
 def reap(session: Session) -> int:
     """Free the stages whose workers fell silent; after the last attempt they fail. Returns how many."""
     expired = session.execute(
-        select(StageRow.id, StageRow.job_id).where(
-            StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now()
-        )
+        select(StageRow.id, StageRow.job_id)
+        .where(StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now())
+        .order_by(StageRow.job_id, StageRow.id)
     ).all()
     for stage_id, job_id in expired:
+        # Whoever holds the job now either renews the lease or is another reaper.
+        free = session.scalar(select(Job.id).where(Job.id == job_id).with_for_update(skip_locked=True))
+        if free is None:
+            continue
         job = _lock(session, job_id)
         stage = session.get_one(StageRow, stage_id, populate_existing=True)
         still_silent = session.scalar(
@@ -202,7 +206,8 @@ def reap(session: Session) -> int:
             stage.state = StageState.FAILED
             stage.error = {
                 "code": "worker_lost",
-                "detail": f"The worker died {stage.attempt} times while it ran this stage; see its log and memory.",
+                "detail": f"This stage was begun {stage.attempt} times and never came to an end: the worker died, ran out of "
+                "time or could not store the result; see its log, memory and disk.",
             }
         else:
             stage.state = StageState.READY

@@ -107,8 +107,12 @@ def get(session: Session, study_id: str) -> Study:
 
 def lock(session: Session, study_id: str) -> Study:
     """As :func:`get`, and nobody else changes what hangs on the study until this transaction ends."""
-    get(session, study_id)
-    return session.scalars(select(Study).where(Study.id == study_id).with_for_update()).one()
+    query = select(Study).where(Study.id == study_id).with_for_update()
+    # Read again under the lock: what this session saw before may have changed since.
+    study = session.scalars(query.execution_options(populate_existing=True)).one_or_none()
+    if study is None:
+        raise Refused(404, "not_found", "There is no such study.")
+    return study
 
 
 def newest_first(session: Session, limit: int, after: tuple[float, str] | None) -> list[Study]:

@@ -3,7 +3,7 @@ import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap.segmenter.contrast import Contrast
-from fluoromap.segmenter.linking import families, kind_probabilities, link
+from fluoromap.segmenter.linking import Shafts, evidence, families, kind_probabilities, link
 
 PX = 5.75
 
@@ -29,8 +29,9 @@ def straight(catheter, tip, angle, foreshortening=0.9):
     return points, points[-1] + 50 * direction
 
 
-def contrast_of(image):
-    return Contrast.of_frame(image, image, np.ones(image.shape, bool), 0.05, PX)
+def linked(points, image, catalogue=DEFAULT_CATALOGUE):
+    weights = evidence(Contrast.of_frame(image, np.ones(image.shape, bool), PX).of(points))
+    return link(points, weights, np.zeros(len(points)), Shafts(image, 1, 0.05, PX), families(catalogue))
 
 
 @pytest.mark.parametrize("electrodes", [2, 3, 4, 6, 8, 10])
@@ -41,26 +42,25 @@ def test_chains_of_any_number_of_electrodes_run_from_the_tip(electrodes):
     catalogue = Catalogue((probe, Catheter("reference", 4, (9.0, 9.0, 9.0), 2.0, 1.0)), "reference", "probe")
     points, end = straight(probe, (60, 70), 0.4)
     shuffled = rng.permutation(electrodes)
-    chains = link(points[shuffled], contrast_of(drawn([(points, end)])), families(catalogue), sure=electrodes)
+    chains = linked(points[shuffled], drawn([(points, end)]), catalogue)
     assert len(chains) == 1
     order = [int(shuffled[candidate]) for candidate in chains[0].candidates]
     assert order in (list(range(electrodes)), list(range(electrodes))[::-1])
 
 
 def test_two_catheters_and_stray_candidates():
-    kinds = families(DEFAULT_CATALOGUE)
     one, end_one = straight(DEFAULT_CATALOGUE["reference"], (60, 80), 0.3)
     two, end_two = straight(DEFAULT_CATALOGUE["mapping"], (250, 250), -2.6)
     image = drawn([(one, end_one), (two, end_two)])
     stray = np.array([[40.0, 250.0], [280.0, 40.0], [150.0, 160.0]])
-    chains = link(np.concatenate([one, two, stray]), contrast_of(image), kinds, sure=11)
+    chains = linked(np.concatenate([one, two, stray]), image)
     assert sorted(tuple(sorted(chain.candidates)) for chain in chains) == [(0, 1, 2, 3), (4, 5, 6, 7)]
 
 
 def test_candidates_on_a_plain_background_make_no_chain():
     points, _ = straight(DEFAULT_CATALOGUE["reference"], (60, 80), 0.3)
     image = np.random.default_rng(0).normal(6, 0.05, (320, 320)).astype(np.float32)
-    assert link(points, contrast_of(image), families(DEFAULT_CATALOGUE), sure=4) == ()
+    assert linked(points, image) == ()
 
 
 def test_look_alikes_are_one_family_and_share_their_probability():

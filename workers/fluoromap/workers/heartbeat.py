@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Literal
 
 import structlog
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap.contracts import StageStopped
 from fluoromap.settings import settings
@@ -63,7 +63,7 @@ class Heartbeat:
             try:
                 with writing() as session:
                     answer = jobs.beat(session, self._held, self._fraction)
-            except OperationalError as error:
+            except SQLAlchemyError as error:
                 log.warning("heartbeat_missed", stage=self._held.stage_id, error=type(error).__name__)
                 continue
             told, since = self._fraction, 0.0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import structlog
+from sqlalchemy.exc import OperationalError
+from structlog.typing import FilteringBoundLogger as BoundLogger
 
 from fluoromap.contracts import StageStopped
 from fluoromap.store import files, jobs
@@ -13,6 +15,11 @@ from fluoromap.workers.bridge import Work, prepare
 from fluoromap.workers.heartbeat import Heartbeat
 
 LONGEST_MESSAGE = 500
+
+
+class PluginFailed(Exception):
+    """The plugin raised; the message is what the job's reader is told."""
+
 
 log = structlog.get_logger(__name__)
 
@@ -27,36 +34,51 @@ def run(stage_id: int, worker: str) -> None:
     bound.info("stage_started")
     with Heartbeat(held) as heartbeat:
         try:
-            work = _prepare(held)
-            kept = _kept_result(work.key)
-            content = None if kept else work.compute(heartbeat)
-            heartbeat.check()
+            _run(held, heartbeat, bound)
         except StageStopped:
             if heartbeat.cancelled:
                 with writing() as session:
                     jobs.stopped(session, held)
             bound.info("stage_stopped")
-            return
-        except Exception as error:
-            bound.warning("stage_failed", error=type(error).__name__, exc_info=error)
+        except (OperationalError, OSError) as error:
+            # The machine's fault, not the plugin's: the lease runs out and the stage is tried again.
+            bound.warning("stage_interrupted", error=type(error).__name__)
+        except PluginFailed as failure:
+            bound.warning("stage_failed", exc_info=failure.__cause__)
             with writing() as session:
-                jobs.fail(session, held, {"code": "plugin_failed", "detail": _sentence(held, error)})
-            return
-    with files.incoming() as path:
-        if content is not None:
-            path.write_bytes(content)
-        with writing() as session:
-            if kept is None:
-                sha256 = files.keep(session, path, "application/json")
-                if session.get(StageResult, work.key) is None:
-                    session.add(StageResult(key=work.key, sha256=sha256))
-            else:
-                sha256 = kept
-            rows = work.rows(files.path_of(sha256).read_bytes())
-            if not jobs.finish(session, held, sha256, reused=kept is not None, rows=rows):
-                bound.info("stage_came_late")
-                return
+                jobs.fail(session, held, {"code": "plugin_failed", "detail": str(failure)})
+        except Exception as error:
+            bound.error("stage_broken", error=type(error).__name__, exc_info=error)
+            detail = "The service could not prepare or store this stage's work; its log tells more."
+            with writing() as session:
+                jobs.fail(session, held, {"code": "internal", "detail": detail})
+
+
+def _run(held: jobs.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
+    work = _prepare(held)
+    kept = _kept_result(work.key)
+    content = files.path_of(kept).read_bytes() if kept else _computed(held, work, heartbeat)
+    heartbeat.check()
+    # Kept again even when it was kept before: then nobody can have removed it since.
+    with files.incoming() as path, writing() as session:
+        path.write_bytes(content)
+        sha256 = files.keep(session, path, "application/json")
+        if session.get(StageResult, work.key) is None:
+            session.add(StageResult(key=work.key, sha256=sha256))
+        if not jobs.finish(session, held, sha256, reused=kept is not None, rows=work.rows(content)):
+            raise StageStopped("the claim was lost while the result was stored")
     bound.info("stage_done", reused=kept is not None)
+
+
+def _computed(held: jobs.Claim, work: Work, heartbeat: Heartbeat) -> bytes:
+    try:
+        return work.compute(heartbeat)
+    except StageStopped:
+        raise
+    except Exception as error:
+        message = " ".join(str(error).split()) or "no message"
+        sentence = f"The stage {held.name!r} failed: {type(error).__name__}: {message}"
+        raise PluginFailed(sentence[:LONGEST_MESSAGE]) from error
 
 
 def _prepare(held: jobs.Claim) -> Work:
@@ -69,8 +91,3 @@ def _kept_result(key: str) -> str | None:
     with reading() as session:
         kept = session.get(StageResult, key)
         return kept.sha256 if kept is not None and files.path_of(kept.sha256).exists() else None
-
-
-def _sentence(held: jobs.Claim, error: Exception) -> str:
-    message = " ".join(str(error).split()) or type(error).__name__
-    return f"The stage {held.name!r} failed: {type(error).__name__}: {message}"[:LONGEST_MESSAGE]

@@ -10,7 +10,7 @@ from typing import Any
 import structlog
 from celery import bootsteps
 from celery.signals import worker_process_init
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap import queue
 from fluoromap.store import jobs
@@ -55,7 +55,7 @@ class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
 
     def sweep(self, name: str) -> None:
         # A database that is away for a moment must not end the worker: the next sweep finds it again.
-        with contextlib.suppress(OperationalError):
+        with contextlib.suppress(SQLAlchemyError):
             with writing() as session:
                 jobs.worker_seen(session, name)
             queue.sweep()

@@ -1,0 +1,333 @@
+"""How well and how fast electrodes are found: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
+
+Prints, for both segmenters on runs of the phantom at 60 frames a second, recall, precision, the share of frames with all
+electrodes of the reference and the mapping catheter, RMS, how many catheter-frames are on the right track and how many 95 %
+ellipses hold the truth, each with a bootstrap interval over the runs; then what is accepted in runs without catheters; then
+milliseconds a frame beside the plain NumPy, SciPy and scikit-image twins of the filters, on the same frame.
+A detection is right within 5 px of the truth. Processor time of one thread.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from skimage.filters import threshold_otsu
+from skimage.measure import label, regionprops
+
+from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.contracts import Chain, PixelFacts, Run, Segmentation, Segmenter, Silent
+from fluoromap.geometry import Gantry
+from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, Contrast, SimulatedRun, StudySpec, simulate_study
+from fluoromap.phantom.fluoroscopy import detect, expected_photons
+from fluoromap.phantom.torso import torso
+from fluoromap.segmenter.blob_chains import BlobDetector
+from fluoromap.segmenter.blobs import find_blobs
+from fluoromap.segmenter.catheter_chain import CatheterChain
+from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
+from fluoromap.segmenter.field_mask import find_field
+from fluoromap.segmenter.four_step import FourStep
+from fluoromap.segmenter.frame_chains import FourStepDetector, FourStepParams
+from fluoromap.segmenter.homomorphic import homomorphic
+from fluoromap.segmenter.log_image import Image, LogTransform
+from fluoromap.segmenter.morphology import disk_morphology
+from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
+
+Array = NDArray[np.float64]
+
+NEAR_PX = 5.0
+TRACK_PX = 6.0
+MOVING_PX = 3.0
+FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
+CHI2_95_2D = 5.991464547107979
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"four-step": FourStep, "catheter-chain": CatheterChain}
+VIEWS: tuple[Contrast, Contrast] = ("LAT", "PA")
+
+
+class Kept:
+    """The frames of a run in memory, so that rendering is not timed."""
+
+    def __init__(self, frames: Iterable[NDArray[np.uint16]]) -> None:
+        self.frames = list(frames)
+        self.shape: tuple[int, int] = (self.frames[0].shape[0], self.frames[0].shape[1])
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> NDArray[np.uint16]:
+        return self.frames[index]
+
+    def __iter__(self) -> Iterator[NDArray[np.uint16]]:
+        return iter(self.frames)
+
+
+@dataclass
+class Counts:
+    """What was right in one run, or a part of it."""
+
+    right: int = 0
+    there: int = 0
+    found: int = 0
+    complete: int = 0
+    frames: int = 0
+    squares: float = 0.0
+    on_track: int = 0
+    catheter_frames: int = 0
+    inside: int = 0
+    ellipses: int = 0
+
+
+@dataclass
+class Table:
+    """Counts of each run under each heading."""
+
+    rows: dict[str, list[Counts]] = field(default_factory=dict)
+
+    def add(self, heading: str, counts: Counts) -> None:
+        if counts.frames:
+            self.rows.setdefault(heading, []).append(counts)
+
+    def show(self) -> None:
+        print(
+            f"{'':40}{'recall':>19}{'precision':>19}{'ref+map':>19}{'RMS px':>17}{'on track':>19}{'in ellipse':>19}  runs"
+        )
+        for heading, runs in self.rows.items():
+            sums = np.array([list(vars(counts).values()) for counts in runs], dtype=np.float64)
+            drawn = np.random.default_rng(0).integers(0, len(runs), (1000, len(runs)))
+            cells = []
+            for name in ("recall", "precision", "complete", "rms", "track", "ellipse"):
+                value = _ratio(sums.sum(axis=0), name)
+                if not np.isfinite(value):
+                    cells.append("-")
+                    continue
+                low, high = np.nanpercentile([_ratio(sums[rows].sum(axis=0), name) for rows in drawn], [2.5, 97.5])
+                cells.append(
+                    f"{value:6.3f} {low:.3f}-{high:.3f}" if name != "rms" else f"{value:5.2f} {low:.2f}-{high:.2f}"
+                )
+            print(
+                f"{heading:40}" + "".join(f"{cell:>19}" if k != 3 else f"{cell:>17}" for k, cell in enumerate(cells)),
+                f"{len(runs):5}",
+            )
+
+
+def _ratio(sums: Array, name: str) -> float:
+    of = dict(zip(vars(Counts()), sums, strict=True))
+    upper, lower = {
+        "recall": ("right", "there"),
+        "precision": ("right", "found"),
+        "complete": ("complete", "frames"),
+        "rms": ("squares", "right"),
+        "track": ("on_track", "catheter_frames"),
+        "ellipse": ("inside", "ellipses"),
+    }[name]
+    value = float(of[upper] / of[lower]) if of[lower] else np.nan
+    return float(np.sqrt(value)) if name == "rms" else value
+
+
+def main(first: int, seeds: int, frames: int) -> None:
+    """All tables, on seeds ``first`` to ``first + seeds - 1``."""
+    table = Table()
+    spent = {name: [0.0, 0] for name in SEGMENTERS}
+    for seed in range(first, first + seeds):
+        study = simulate_study(StudySpec(seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS))
+        for view, simulated in zip(VIEWS, study.sites[0].runs, strict=True):
+            _score_run(table, spent, view, simulated, tuple(SEGMENTERS))
+        for what, spec in _hard(seed, frames).items():
+            for view, simulated in zip(VIEWS, simulate_study(spec).sites[0].runs, strict=True):
+                _score_run(table, None, f"{view} {what}", simulated, ("catheter-chain",))
+    print(f"seeds {first} to {first + seeds - 1}, {frames} frames a run; mean and 95 % bootstrap interval over runs")
+    table.show()
+    for name, (seconds, count) in spent.items():
+        print(f"{name}: {1000 * seconds / count:.1f} ms a frame, all included")
+    _without_catheters(first, seeds)
+    _speed(first)
+
+
+def _without_catheters(first: int, seeds: int) -> None:
+    """Single frames of the phantom's torso alone: none should be accepted."""
+    for name, segmenter in SEGMENTERS.items():
+        accepted = count = 0
+        for seed in range(first, first + seeds):
+            for contrast, gantry in zip(VIEWS, (LATERAL, FRONTAL), strict=True):
+                appearance = APPEARANCES[contrast]
+                behind = torso(gantry, appearance, np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.0)
+                photons = expected_photons(behind, np.ones((gantry.rows, gantry.columns), np.float32), appearance, 1.0)
+                for key in range(3):
+                    kept = Kept([detect(photons, appearance.photons, 10 * seed + key)])
+                    found = segmenter().segment(
+                        Run(kept, np.zeros(1), 1024 / 178, FACTS), DEFAULT_CATALOGUE, {}, Silent()
+                    )
+                    accepted += bool(found.frames[0].chains)
+                    count += 1
+        print(f"{name}: {accepted} of {count} frames without catheters accepted")
+
+
+def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
+    wide = tuple(Gantry(angle, 0.0, 1000.0, 500.0, (250 / 512, 250 / 512), 512, 512) for angle in (90.0, 0.0))
+    return {
+        "dose 0.4": StudySpec(seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, dose=0.4),
+        "4.1 px/mm": StudySpec(
+            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=(wide[0], wide[1])
+        ),
+    }
+
+
+def _score_run(
+    table: Table, spent: dict[str, list[float]] | None, view: str, simulated: SimulatedRun, names: tuple[str, ...]
+) -> None:
+    kept = Kept(simulated.frames)
+    gantry = simulated.gantry
+    px_per_mm = gantry.source_detector_mm / gantry.source_isocentre_mm / gantry.pixel_spacing_mm[0]
+    run = Run(kept, simulated.frame_times_ms, px_per_mm, FACTS)
+    truth = simulated.truth.pixels_uv
+    moved = np.linalg.norm(np.diff(np.concatenate(list(truth.values()), axis=1), axis=0), axis=2).max(axis=1)
+    moving = np.concatenate([moved[:1], moved]) > MOVING_PX
+    for name in names:
+        start = time.process_time()
+        found = SEGMENTERS[name]().segment(run, DEFAULT_CATALOGUE, {}, Silent())
+        if spent is not None:
+            spent[name][0] += time.process_time() - start
+            spent[name][1] += len(kept)
+        parts = {"": np.ones(len(kept), bool)} if spent is None else {" quiet": ~moving, " moving": moving}
+        for part, chosen in parts.items():
+            frames = np.flatnonzero(chosen)
+            counts = Counts()
+            for frame in frames:
+                _count(counts, found.frames[frame].chains, {key: uv[frame] for key, uv in truth.items()})
+            _count_tracks(counts, found, truth, frames)
+            table.add(f"{name} {view}{part}", counts)
+        averaged = list(found.diastole_frames)
+        if found.diastole is not None:
+            counts = Counts()
+            _count(counts, found.diastole.chains, {key: uv[averaged].mean(axis=0) for key, uv in truth.items()})
+            table.add(f"{name} {view} diastolic mean", counts)
+
+
+def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -> None:
+    points = np.concatenate([chain.pixels_uv for chain in chains]) if chains else np.zeros((0, 2))
+    everything = np.concatenate(list(truth.values()))
+    distances = _matched(points, everything)
+    counts.right += len(distances)
+    counts.there += len(everything)
+    counts.found += len(points)
+    counts.squares += float((distances**2).sum())
+    wanted = np.concatenate([truth[DEFAULT_CATALOGUE.reference], truth[DEFAULT_CATALOGUE.mapping]])
+    counts.complete += len(_matched(points, wanted)) == len(wanted)
+    counts.frames += 1
+    for chain in chains:
+        for uv in truth.values():
+            error = chain.pixels_uv - uv
+            if len(chain.electrodes) == len(uv) and np.linalg.norm(error, axis=1).max() < TRACK_PX:
+                squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(chain.covariance_px2), error)
+                counts.inside += int((squared <= CHI2_95_2D).sum())
+                counts.ellipses += len(error)
+
+
+def _matched(points: Array, truth: Array) -> Array:
+    """Distances of the detections that are right, each true electrode taken once."""
+    if not len(points):
+        return np.zeros(0)
+    distance = np.linalg.norm(points[:, None] - truth[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(distance, 4 * NEAR_PX))
+    pairs: Array = distance[rows, columns]
+    return pairs[pairs <= NEAR_PX]
+
+
+def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array], frames: NDArray[np.int64]) -> None:
+    """A catheter-frame is right when the track that is this catheter's in most of the run lies on all its electrodes."""
+    of_track: dict[int, dict[str, list[int]]] = {}
+    for entry in found.frames:
+        for chain in entry.chains:
+            for name, uv in truth.items():
+                error = chain.pixels_uv - uv[entry.frame] if len(chain.electrodes) == uv.shape[1] else np.inf
+                if np.max(np.linalg.norm(error, axis=-1)) < TRACK_PX:
+                    of_track.setdefault(chain.track, {}).setdefault(name, []).append(entry.frame)
+    named: set[str] = set()
+    for names in sorted(of_track.values(), key=lambda names: -max(map(len, names.values()))):
+        name = max(names, key=lambda name: len(names[name]))
+        if name not in named:
+            named.add(name)
+            counts.on_track += len(set(names[name]) & set(frames.tolist()))
+    counts.catheter_frames += len(truth) * len(frames)
+
+
+def _milliseconds(work: Callable[[], object], repeats: int) -> float:
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        times.append(time.process_time() - start)
+    return 1000 * float(np.median(times))
+
+
+def _plain() -> ModuleType:
+    path = Path(__file__).parents[1] / "tests" / "plugins" / "segmenter" / "test_filters.py"
+    spec = importlib.util.spec_from_file_location("plain_filters", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _speed(seed: int) -> None:
+    plain = _plain()
+    for view, simulated in zip(
+        VIEWS, simulate_study(StudySpec(seed, sites=1, frames=1, contrast=VIEWS)).sites[0].runs, strict=True
+    ):
+        kept = Kept(simulated.frames)
+        mask = find_field(kept, FACTS)
+        x: Image = mask.fill(LogTransform.of_run(FACTS, mask.mean_level)(kept[0]))
+        px_per_mm = 1024 / 178
+        blobs = BlobDetector(DEFAULT_CATALOGUE, mask, px_per_mm)
+        steps = FourStepDetector(DEFAULT_CATALOGUE, mask, px_per_mm, FourStepParams())
+        filtered = homomorphic(x)
+        k = edge_scale(filtered, mask.inside)
+        assert k is not None
+        diffused = perona_malik(filtered, k)
+        grey = to_grey_range(diffused, mask.inside)
+        sharp = complex_shock(grey)
+        bright = disk_morphology(sharp)
+
+        def components(bright: Image = bright) -> object:
+            return regionprops(label(bright > threshold_otsu(bright, nbins=1024), connectivity=2))  # type: ignore[no-untyped-call]
+
+        rows: list[tuple[str, Callable[[], object], Callable[[], object] | None]] = [
+            ("homomorphic (4)", lambda x=x: homomorphic(x), lambda x=x: plain.plain_homomorphic(x)),  # type: ignore[misc]
+            (
+                "Perona-Malik (5)(6)",
+                lambda f=filtered, k=k: perona_malik(f, k),  # type: ignore[misc]
+                lambda f=filtered, k=k: plain.plain_perona_malik(f, k),  # type: ignore[misc]
+            ),
+            ("complex shock (7)", lambda g=grey: complex_shock(g), lambda g=grey: plain.plain_complex_shock(g)),  # type: ignore[misc]
+            (
+                "disks",
+                lambda s=sharp: disk_morphology(s),  # type: ignore[misc]
+                lambda s=sharp: plain.plain_disk_morphology(s.astype(float), 14, 2),  # type: ignore[misc]
+            ),
+            (
+                "Otsu, components",
+                lambda b=bright, m=mask: find_blobs(b, m.inside, m.candidates, 20, 800),  # type: ignore[misc]
+                components,
+            ),
+            ("four-step, one frame", lambda s=steps, x=x: s.chains(x, 0), None),  # type: ignore[misc]
+            ("catheter-chain, one frame", lambda b=blobs, x=x: b.chains(x, 0), None),  # type: ignore[misc]
+        ]
+        print(f"512x512 {view:24} ours      plain   ms")
+        for name, ours, twin in rows:
+            beside = f"{_milliseconds(twin, 1):10.1f}" if twin is not None else ""
+            print(f"  {name:28} {_milliseconds(ours, 9):8.2f}{beside}")
+
+
+if __name__ == "__main__":
+    given = [int(argument) for argument in sys.argv[1:]]
+    main(*(given + [7000, 20, 40][len(given) :]))

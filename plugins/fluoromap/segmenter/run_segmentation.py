@@ -1,0 +1,198 @@
+"""The way of every built-in segmenter through a run: field, frames, tracks, diastole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
+from fluoromap.reasons import Reason
+from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced, find_field
+from fluoromap.segmenter.log_image import Image, LogTransform
+from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
+from fluoromap.segmenter.tracking import Carry, chain_distance, follow
+
+_SAME_PLACE_MM = 2.5
+_SAME_TRACK_PX = 12.0
+
+
+class Detector(Protocol):
+    """Finds chains in the images of one run."""
+
+    def chains(self, x: Image, frame: int) -> FrameChains:
+        """Chains of one log image; with ``manual_needed`` they are not sure: good for continuing a track only."""
+
+    def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        """A chain seen before, moved by about ``shift`` and at most ``reach_px`` farther, beside those that are taken; None
+        where it does not show, or from a detector that only sees whole frames."""
+
+
+def segment_run(
+    run: Run,
+    catalogue: Catalogue,
+    marks: Marks,
+    context: Context,
+    detector_of: Callable[[FieldMask], Detector],
+    carry: bool = False,
+) -> Segmentation:
+    """Chains of all frames, followed along the run, and of the mean of the quiet frames round diastole.
+
+    Marks stand in for what was found in their frames, and the tracks start from the first of them. At diastole they count
+    like this: a mark in one of the averaged frames replaces the automatic chain of the same catheter or place; a mark
+    elsewhere, of a catheter that diastole lacks, makes the quietest marked frame stand for diastole, with what was found
+    automatically beside it in that frame.
+    """
+    context.check()
+    field = find_field(run.frames, run.pixels)
+    transform = LogTransform.of_run(run.pixels, field.mean_level)
+    detector = detector_of(field)
+    count = len(run.frames)
+
+    def log_image(frame: int) -> Image:
+        return field.fill(transform(run.frames[frame]))
+
+    meter = MotionMeter((log_image(index) for index in evenly_spaced(count)), field.inside)
+    motion = np.zeros(count)
+    found: list[FrameChains] = []
+    automatic: dict[int, tuple[Chain, ...]] = {}
+    for index in range(count):
+        context.check()
+        x = log_image(index)
+        motion[index] = meter(x)
+        entry = detector.chains(x, index)
+        if index in marks:
+            automatic[index] = entry.chains if entry.manual_needed is None else ()
+            entry = FrameChains(index, tuple(replace(chain, manual=True) for chain in marks[index]))
+        found.append(entry)
+        context.progress(0.8 * (index + 1) / count)
+    if count > 1:
+        motion[0] = motion[1]
+    context.check()
+    averaged = diastolic_frames(motion, run.frame_times_ms, run.r_wave_frames)
+    middle = averaged[len(averaged) // 2]
+    total = np.zeros(run.frames.shape, np.float64)
+    for index in averaged:
+        total += run.frames[index].astype(np.float64)
+    mean_image = field.fill(transform(total / len(averaged)))
+    mean = detector.chains(mean_image, middle)
+    mean = mean if mean.manual_needed is None else FrameChains(middle, ())
+    catheters = len(catalogue.catheters)
+    carrying = _carry(detector, log_image, context) if carry else None
+    entries = follow(found, run.frame_times_ms, catheters, carrying, mean if len(averaged) > 1 else None)
+    context.progress(0.95)
+    chains = mean.chains
+    if carry:
+        chains = _with_carried(mean_image, chains, detector, averaged, entries, catheters)
+    chains, averaged = _with_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
+    chains = _on_tracks(chains, averaged, entries)
+    diastole = FrameChains(averaged[len(averaged) // 2], chains, None if chains else Reason.MANUAL_NEEDED)
+    context.progress(1.0)
+    return Segmentation(
+        frames=entries,
+        diastole=diastole,
+        diastole_frames=averaged,
+        motion=motion,
+        frame_times_ms=run.frame_times_ms,
+        r_wave_frames=run.r_wave_frames,
+    )
+
+
+def _carry(detector: Detector, log_image: Callable[[int], Image], context: Context) -> Carry:
+    kept: tuple[int, Image] | None = None
+
+    def carry(frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        nonlocal kept
+        if kept is None or kept[0] != frame:
+            context.check()
+            kept = frame, log_image(frame)
+        return detector.carried(kept[1], chain, shift, reach_px, taken)
+
+    return carry
+
+
+def _with_carried(
+    x: Image,
+    found: tuple[Chain, ...],
+    detector: Detector,
+    averaged: tuple[int, ...],
+    entries: Sequence[FrameChains],
+    catheters: int,
+) -> tuple[Chain, ...]:
+    """Chains of the mean image, and the catheters that its frames show but were not found in it."""
+    middle = averaged[len(averaged) // 2]
+    chains = list(found)
+    on_tracks = {chain.track for chain in _on_tracks(chains, averaged, entries)}
+    for frame in sorted(averaged, key=lambda frame: abs(frame - middle)):
+        for known in entries[frame].chains:
+            if known.track not in on_tracks and len(chains) < catheters and not known.manual:
+                on_tracks.add(known.track)
+                carried = detector.carried(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
+                chains += [] if carried is None else [replace(carried, track=-1)]
+    return tuple(chains)
+
+
+def _same(one: Chain, other: Chain, px_per_mm: float) -> bool:
+    """Whether two chains of one moment are the same catheter: the same certain name, or the same place."""
+    if any(probability > 0.99 and other.probability(name) > 0.99 for name, probability in one.kinds):
+        return True
+    return sum(chain_distance(one, other)) <= _SAME_PLACE_MM * px_per_mm
+
+
+def _beside(marked: Sequence[Chain], automatic: Sequence[Chain], px_per_mm: float) -> tuple[Chain, ...]:
+    return (
+        *marked,
+        *(chain for chain in automatic if not any(_same(chain, mark, px_per_mm) for mark in marked)),
+    )
+
+
+def _with_marks(
+    chains: tuple[Chain, ...],
+    averaged: tuple[int, ...],
+    entries: Sequence[FrameChains],
+    automatic: dict[int, tuple[Chain, ...]],
+    motion: Array,
+    px_per_mm: float,
+) -> tuple[tuple[Chain, ...], tuple[int, ...]]:
+    if not automatic:
+        return chains, averaged
+    middle = averaged[len(averaged) // 2]
+    within = [frame for frame in automatic if frame in averaged]
+    if within:
+        nearest = min(within, key=lambda frame: abs(frame - middle))
+        return _beside(entries[nearest].chains, chains, px_per_mm), averaged
+    tracks = {chain.track for chain in _on_tracks(chains, averaged, entries)}
+    lacking = [frame for frame in automatic if any(chain.track not in tracks for chain in entries[frame].chains)]
+    if not lacking:
+        return chains, averaged
+    quietest = min(lacking, key=lambda frame: float(motion[frame]))
+    return _beside(entries[quietest].chains, automatic[quietest], px_per_mm), (quietest,)
+
+
+def _on_tracks(chains: Sequence[Chain], averaged: Sequence[int], entries: Sequence[FrameChains]) -> tuple[Chain, ...]:
+    """Give the diastolic chains the track numbers of the chains that lie in their place in the averaged frames."""
+    taken: set[int] = {chain.track for chain in chains if chain.track >= 0}
+    fresh = 1 + max((chain.track for entry in entries for chain in entry.chains), default=-1)
+    numbered: list[Chain] = []
+    for chain in chains:
+        if chain.track < 0:
+            votes: dict[int, int] = {}
+            for frame in averaged:
+                near = [
+                    (sum(chain_distance(chain, other)), other.track)
+                    for other in entries[frame].chains
+                    if other.track not in taken
+                ]
+                if near and min(near)[0] <= _SAME_TRACK_PX:
+                    votes[min(near)[1]] = votes.get(min(near)[1], 0) + 1
+            if votes:
+                number = max(votes, key=lambda track: votes[track])
+            else:
+                number, fresh = fresh, fresh + 1
+            taken.add(number)
+            chain = replace(chain, track=number)
+        numbered.append(chain)
+    return tuple(numbered)
