@@ -1,0 +1,101 @@
+"""One stage from claim to finish: whose fault ends how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fluoromap.contracts import Context
+from fluoromap.store import files
+from fluoromap.store.engine import reading, writing
+from fluoromap.store.models import Job, JobState, StageRow, StageState, Study
+from fluoromap.workers import runner
+from fluoromap.workers.bridge import Work
+
+
+@pytest.fixture
+def stage(data_dir: Path) -> int:
+    """A ready stage, the only one of its job."""
+    with writing() as session:
+        session.add(Study(id="s", label="x", catheters=[], reference="r", mapping="m", frame_of_reference_uid="1.2"))
+        session.flush()
+        session.add(Job(id="j", study_id="s", state=JobState.QUEUED, manifest={}))
+        session.flush()
+        row = StageRow(
+            job_id="j", name="segment", subject="1.2.3", plugin="p", plugin_version="1", depends_on=[],
+            state=StageState.READY,
+        )  # fmt: skip
+        session.add(row)
+        session.flush()
+        return row.id
+
+
+def _run(stage: int, monkeypatch: pytest.MonkeyPatch, compute: Callable[[Context], bytes]) -> StageRow:
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, compute))
+    runner.run(stage, "test")
+    with reading() as session:
+        return session.get_one(StageRow, stage)
+
+
+def _raises(error: Exception) -> Callable[[Any], bytes]:
+    def compute(context: Context) -> bytes:
+        raise error
+
+    return compute
+
+
+def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = _run(stage, monkeypatch, lambda context: b'{"answer": 42}')
+    assert row.state == StageState.DONE
+    assert row.result is not None
+    assert files.path_of(row.result).read_bytes() == b'{"answer": 42}'
+    with reading() as session:
+        assert session.get_one(Job, "j").state == JobState.SUCCEEDED
+
+
+@pytest.mark.parametrize("error", [ValueError("no electrode"), OSError("the plugin's own file")])
+def test_a_plugin_that_raises_fails_its_stage_in_its_own_words(
+    stage: int, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    row = _run(stage, monkeypatch, _raises(error))
+    assert row.state == StageState.FAILED
+    assert row.error is not None
+    assert row.error["code"] == "plugin_failed"
+    assert str(error) in row.error["detail"]
+
+
+def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: Any) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files, "keep", full)
+    row = _run(stage, monkeypatch, lambda context: b"{}")
+    assert row.state == StageState.RUNNING
+    assert row.lease_until is not None
+    assert list((files.path_of("00").parent.parent / "incoming").iterdir()) == []
+
+
+def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: Any) -> str:
+        raise RuntimeError("a name that must not be told")
+
+    monkeypatch.setattr(files, "keep", broken)
+    row = _run(stage, monkeypatch, lambda context: b"{}")
+    assert row.state == StageState.FAILED
+    assert row.error is not None
+    assert row.error["code"] == "internal"
+    assert "name" not in row.error["detail"]
+
+
+def test_a_result_that_comes_late_is_thrown_away(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def overtaken(context: Context) -> bytes:
+        with writing() as session:
+            session.get_one(StageRow, stage).attempt += 1
+        return b'{"late": true}'
+
+    row = _run(stage, monkeypatch, overtaken)
+    assert row.state == StageState.RUNNING
+    assert row.result is None
