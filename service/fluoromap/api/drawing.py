@@ -6,7 +6,7 @@ import multiprocessing
 import resource
 import threading
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
@@ -49,8 +49,8 @@ def drawn(
             except TimeoutError:
                 _discard(pool)
                 raise Problem(422, "undecodable", "This frame takes too long to decode; check the file.") from None
-            except BrokenProcessPool:
-                # Perhaps another request's frame broke the pool: once more, in a new one.
+            except (BrokenProcessPool, CancelledError, RuntimeError):
+                # Perhaps another request's frame broke or ended the pool: once more, in a new one.
                 _discard(pool)
             except DicomProblem as problem:
                 places = [] if problem.where is None else [(problem.where, problem.message)]
@@ -119,4 +119,5 @@ def _kill(pool: ProcessPoolExecutor) -> None:
 
 def _limit_memory(mib: int) -> None:
     limit = mib * 2**20
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
