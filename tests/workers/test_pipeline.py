@@ -191,6 +191,7 @@ def test_a_real_cine_without_electrodes_is_rejected_and_the_job_succeeds(
     assert {point["grade"] for point in points} == {"rejected"}
     assert all(point["x_mm"] is None and point["reasons"] for point in points)
     for uid in views:
-        assert service.get(f"{study_path}/instances/{uid}/frames/45/electrodes").json() == []
+        for frame in range(1, 97):
+            assert service.get(f"{study_path}/instances/{uid}/frames/{frame}/electrodes").json() == []
     answer = service.get(f"/v1/jobs/{job['id']}/map")
     assert (answer.status_code, answer.json()["code"]) == (409, "no_map")
