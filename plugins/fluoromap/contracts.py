@@ -272,6 +272,18 @@ class PhasePair:
     b: Observation
 
 
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """Another way to pair the catheters of a site across its views, with the probability (0 to 0.5) that it is the right one."""
+
+    diastole: PhasePair
+    probability: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.probability <= 0.5:
+            raise ValueError("an alternative more probable than not is the answer itself")
+
+
 @dataclass(frozen=True, eq=False)
 class MatchedSite:
     """One site with its catheters named in both views.
@@ -279,6 +291,7 @@ class MatchedSite:
     diastole : the pair that locates the site. cycle : pairs over the cardiac cycle by rising phase; empty where unknown.
     track_a, track_b : every frame of each run, for following the single view.
     notes : (catheter, reason) of catheters that are missing or doubtful here.
+    alternative : the next best pairing of the catheters across the views, kept where it cannot be ruled out.
     """
 
     site: str
@@ -291,6 +304,7 @@ class MatchedSite:
     frame_times_a_ms: Array
     frame_times_b_ms: Array
     notes: tuple[tuple[str, Reason], ...] = ()
+    alternative: Alternative | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,6 +334,8 @@ class ElectrodePoint:
     relative_mm, relative_covariance_mm2 : the same from the reference catheter's mean; None where that was not located.
     residual_px : reprojection residual in view a, b, less a
     shift of the whole heart between the runs where the triangulator estimates one. reasons : what speaks against trusting it fully.
+    alternative_mm : (3,) where it would be, from the isocentre, if the catheters were paired the other way that cannot be
+    ruled out; the covariance contains it, weighted with ``alternative_probability``.
     """
 
     catheter: str
@@ -331,10 +347,14 @@ class ElectrodePoint:
     residual_px: tuple[float, float]
     ray_angle_deg: float
     reasons: tuple[Reason, ...] = ()
+    alternative_mm: Array | None = None
+    alternative_probability: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position_mm", frozen(self.position_mm, (3,), "position_mm"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3, 3), "covariance_mm2"))
+        if self.alternative_mm is not None:
+            object.__setattr__(self, "alternative_mm", frozen(self.alternative_mm, (3,), "alternative_mm"))
         if (self.relative_mm is None) != (self.relative_covariance_mm2 is None):
             raise ValueError("a relative position needs its covariance")
         if self.relative_mm is not None:
@@ -391,13 +411,48 @@ class LocatedSite:
         return None
 
 
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What the electrodes of a study say about the gantry: how view b's camera was turned and shifted against the header.
+
+    applied : whether the cameras of the located sites contain it. rotation_deg : (3,) rotation vector about the isocentre;
+    offset_mm : (3,), both in the world frame. epipolar_before_px, epipolar_after_px : Sampson RMS over the study.
+    """
+
+    applied: bool
+    rotation_deg: Array
+    offset_mm: Array
+    epipolar_before_px: float
+    epipolar_after_px: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotation_deg", frozen(self.rotation_deg, (3,), "rotation_deg"))
+        object.__setattr__(self, "offset_mm", frozen(self.offset_mm, (3,), "offset_mm"))
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBudget:
+    """How many millimetres (RMS, 3D, of a located electrode at diastole) each source of error contributes in this study."""
+
+    pixels_mm: float
+    angles_mm: float
+    source_distances_mm: float
+    phase_mismatch_mm: float
+    breathing_mm: float
+
+
 @dataclass(frozen=True, slots=True)
 class Triangulation:
-    """All sites of a study in 3D, and those that could not be located. ``notes``: sentences for the report."""
+    """All sites of a study in 3D, and those that could not be located.
+
+    notes : sentences for the report. calibration, budget : None where the triangulator makes none.
+    """
 
     sites: tuple[LocatedSite, ...]
     rejected: tuple[RejectedSite, ...]
     notes: tuple[str, ...] = ()
+    calibration: Calibration | None = None
+    budget: ErrorBudget | None = None
 
 
 # --- what a monoplane solver gets and gives --------------------------------------------------------------------------
@@ -435,7 +490,9 @@ class Track:
 
     labels : (catheter, electrode) of each of the m electrodes. located : (n, m), False where there is no position; the
     arrays hold 0 there. positions_mm, baseline_mm : (n, m, 3), the baseline being the plain back-projection at the
-    prior's depth. covariance_mm2 : (n, m, 3, 3). pixels_uv : (n, m, 2) as seen. reasons : one tuple an electrode.
+    prior's depth. covariance_mm2 : (n, m, 3, 3), from the isocentre. relative_covariance_mm2 : (n, m, 3, 3) of the position
+    less the mean of the reference catheter's electrodes in the same frame; None where the solver does not tell.
+    pixels_uv : (n, m, 2) as seen. reasons : one tuple an electrode.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -445,6 +502,7 @@ class Track:
     covariance_mm2: Array
     pixels_uv: Array
     reasons: tuple[tuple[Reason, ...], ...]
+    relative_covariance_mm2: Array | None = None
 
     def __post_init__(self) -> None:
         m = len(self.labels)
@@ -454,6 +512,9 @@ class Track:
         object.__setattr__(self, "baseline_mm", frozen(self.baseline_mm, (n, m, 3), "baseline_mm"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (n, m, 3, 3), "covariance_mm2"))
         object.__setattr__(self, "pixels_uv", frozen(self.pixels_uv, (n, m, 2), "pixels_uv"))
+        if self.relative_covariance_mm2 is not None:
+            relative = frozen(self.relative_covariance_mm2, (n, m, 3, 3), "relative_covariance_mm2")
+            object.__setattr__(self, "relative_covariance_mm2", relative)
         if len(self.reasons) != m:
             raise ValueError("reasons need one tuple an electrode")
 
@@ -502,13 +563,22 @@ class SurfaceSite:
         object.__setattr__(self, "surface_mm", frozen(self.surface_mm, (3,), "surface_mm"))
 
 
+@dataclass(frozen=True, slots=True)
+class ConductionVelocity:
+    """Median speed of activation along the wall where sites lie close together, with its 95 % interval; metres a second."""
+
+    median_m_per_s: float
+    low_m_per_s: float
+    high_m_per_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class ChamberMap:
     """The chamber's surface with activation times, relative to the reference catheter.
 
     vertices_mm : (n, 3). faces : (f, 3), outward by the right-hand rule, watertight. lat_ms, lat_sd_ms : (n,), where
     ``covered`` (n,); elsewhere no site is near enough and the numbers are 0. earliest : (site, probability), most probable
-    first. coverage : covered share of the area, 0..1.
+    first. coverage : covered share of the area, 0..1. conduction_velocity : None where no sites lie close enough.
     """
 
     vertices_mm: Array
@@ -524,6 +594,7 @@ class ChamberMap:
     area_cm2: float
     coverage: float
     warnings: tuple[Reason, ...] = field(default=())
+    conduction_velocity: ConductionVelocity | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices_mm", frozen(self.vertices_mm, (None, 3), "vertices_mm"))

@@ -30,6 +30,16 @@ class Reason(StrEnum):
     LAT_OUTLIER = "lat_outlier"
     TOO_FEW_SITES = "too_few_sites"
     SITES_COPLANAR = "sites_coplanar"
+    EXTRA_CATHETER = "extra_catheter"
+    OUT_OF_FIELD = "out_of_field"
+    PRIOR_GATE = "prior_gate"
+    MOTION_FROM_OTHERS = "motion_from_others"
+    IRREGULAR_RHYTHM = "irregular_rhythm"
+    VIEW_MIRRORED = "view_mirrored"
+    GEOMETRY_DOUBTFUL = "geometry_doubtful"
+    SITES_COINCIDE = "sites_coincide"
+    TIMES_EQUAL = "times_equal"
+    OUTSIDE_WINDOW = "outside_window"
     PLUGIN_FAILED = "plugin_failed"
 
     @property
@@ -59,5 +69,15 @@ _SENTENCES: dict[Reason, str] = {
     Reason.LAT_OUTLIER: "The activation time does not agree with its neighbours; check the annotation.",
     Reason.TOO_FEW_SITES: "Fewer than four sites could be located; a chamber surface needs at least four.",
     Reason.SITES_COPLANAR: "All located sites lie in one plane; a chamber surface needs sites on several walls.",
+    Reason.EXTRA_CATHETER: "More catheters were found than the study describes; add the missing one to its catheters.",
+    Reason.OUT_OF_FIELD: "This catheter leaves the field of view in some frames; those frames hold no position.",
+    Reason.PRIOR_GATE: "The image contradicts the expected motion of this catheter; its depth is the expected one.",
+    Reason.MOTION_FROM_OTHERS: "This site has no cardiac cycle of its own in two views; the motion of the other sites was used.",
+    Reason.IRREGULAR_RHYTHM: "The beats of this run differ in length; positions away from diastole are less certain.",
+    Reason.VIEW_MIRRORED: "The two views fit only when one is mirrored; check the image orientation of both runs.",
+    Reason.GEOMETRY_DOUBTFUL: "The two views disagree more than the gantry tolerance allows; check the geometry of both runs.",
+    Reason.SITES_COINCIDE: "All located sites lie in one place; a chamber surface needs sites on several walls.",
+    Reason.TIMES_EQUAL: "All activation times are equal; there is no order of activation to show.",
+    Reason.OUTSIDE_WINDOW: "This activation time lies outside the window of interest and was brought into it by whole cycles.",
     Reason.PLUGIN_FAILED: "The plugin for this stage failed; its message stands with the job's stage.",
 }
