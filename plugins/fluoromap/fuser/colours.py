@@ -1,12 +1,14 @@
-"""Colours of activation times: steps, bands, and a colour map that colour-blind readers can order.
+"""Colours of activation times: steps, bands, and two colour maps.
 
-Early is warm and light, late is cold and dark, so that the order survives in grey too. Where no site is near enough
-there is a hatched neutral grey, which no band has.
+In the palette ``safe`` early is warm and light, late is cold and dark: colour-blind readers can order it, and the order
+survives in grey too. ``red-early`` is what mapping systems show: red is early, violet late. Where no site is near enough there
+is a hatched neutral grey, which no band has.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,30 +17,38 @@ from fluoromap.contracts import Array, ChamberMap
 from fluoromap.reasons import Reason
 
 Colours = NDArray[np.uint8]
+Palette = Literal["safe", "red-early"]
 
 NO_DATA_RGB = (150, 150, 150)
 NO_DATA_HATCH_RGB = (205, 205, 205)
 STEPS_MS = (5.0, 10.0, 20.0, 50.0)
 MOST_BANDS = 13
 
-# The map "plasma" of matplotlib (S. van der Walt and N. Smith, public domain, CC0), reversed, without its darkest end:
-# perceptually uniform and ordered under all common colour-vision deficiencies.
-_ANCHORS_RGB = np.array(
-    [
-        (240, 249, 33), (253, 202, 38), (252, 162, 54), (242, 125, 76), (225, 93, 101), (203, 66, 127),
-        (174, 36, 146), (138, 9, 165), (100, 0, 167), (62, 4, 156),
-    ],
-    dtype=np.float64,
-)  # fmt: skip
+_ANCHORS_RGB: dict[Palette, Array] = {
+    # The map "plasma" of matplotlib (S. van der Walt and N. Smith, public domain, CC0), reversed, without its darkest end:
+    # perceptually uniform and ordered under all common colour-vision deficiencies.
+    "safe": np.array(
+        [
+            (240, 249, 33), (253, 202, 38), (252, 162, 54), (242, 125, 76), (225, 93, 101), (203, 66, 127),
+            (174, 36, 146), (138, 9, 165), (100, 0, 167), (62, 4, 156),
+        ],
+        dtype=np.float64,
+    ),
+    "red-early": np.array(
+        [(230, 20, 20), (255, 140, 0), (255, 235, 0), (60, 200, 40), (0, 200, 220), (30, 70, 230), (150, 30, 220)],
+        dtype=np.float64,
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Iso-time steps of one map: ``bands`` bands of ``step_ms``, the first one from ``start_ms`` on."""
+    """Iso-time steps of one map: ``bands`` bands of ``step_ms``, the first one from ``start_ms`` on, and their colours."""
 
     start_ms: float
     step_ms: float
     bands: int
+    palette: Palette = "safe"
 
     @property
     def stop_ms(self) -> float:
@@ -55,34 +65,43 @@ class Scale:
 
     def band_colours(self) -> Colours:
         """RGB of each band, (bands, 3)."""
-        return colour_map((np.arange(self.bands) + 0.5) / self.bands)
+        return colour_map((np.arange(self.bands) + 0.5) / self.bands, self.palette)
 
     def colours(self, lat_ms: Array) -> Colours:
         """Continuous RGB (k, 3) of times (k,), without bands: what mesh files carry."""
-        return colour_map((lat_ms - self.start_ms) / (self.stop_ms - self.start_ms))
+        return colour_map((lat_ms - self.start_ms) / (self.stop_ms - self.start_ms), self.palette)
 
 
-def colour_map(fraction: Array) -> Colours:
+def colour_map(fraction: Array, palette: Palette = "safe") -> Colours:
     """RGB (k, 3) of fractions (k,) of the scale, 0 early, 1 late; beyond is clipped."""
-    position = np.clip(fraction, 0, 1) * (len(_ANCHORS_RGB) - 1)
-    channels = [np.interp(position, np.arange(len(_ANCHORS_RGB)), channel) for channel in _ANCHORS_RGB.T]
+    anchors = _ANCHORS_RGB[palette]
+    position = np.clip(fraction, 0, 1) * (len(anchors) - 1)
+    channels = [np.interp(position, np.arange(len(anchors)), channel) for channel in anchors.T]
     return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 
-def scale_of(chamber: ChamberMap) -> Scale:
-    """Iso-time steps for a map: 5 or 10 ms, 20 or 50 only where those would be too many to tell apart.
+def scale_of(chamber: ChamberMap, step_ms: float | None = None, palette: Palette = "safe") -> Scale:
+    """Iso-time steps for a map.
 
     Covers every coloured vertex and every site that agrees with its neighbours; edges are multiples of the step.
+
+    Parameters
+    ----------
+    chamber : ChamberMap
+    step_ms : float or None
+        None takes 5 or 10 ms, 20 or 50 only where those would be too many to tell apart.
+    palette : {"safe", "red-early"}
     """
     at_sites = [site.lat_ms for site in chamber.sites if Reason.LAT_OUTLIER not in site.reasons]
     times = np.concatenate([chamber.lat_ms[chamber.covered], at_sites])
     low, high = (float(times.min()), float(times.max())) if times.size else (0.0, 0.0)
-    for step in STEPS_MS:
+    steps = STEPS_MS if step_ms is None else (step_ms,)
+    for step in steps:
         start, stop = np.floor(low / step) * step, np.ceil(high / step) * step
         bands = max(1, round((stop - start) / step))
-        if bands <= MOST_BANDS or step == STEPS_MS[-1]:
+        if bands <= MOST_BANDS or step == steps[-1]:
             break
-    return Scale(float(start), step, bands)
+    return Scale(float(start), step, bands, palette)
 
 
 def vertex_colours(chamber: ChamberMap) -> Colours:

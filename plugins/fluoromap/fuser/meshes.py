@@ -13,7 +13,7 @@ from fluoromap.fuser.mesh_glb import glb_bytes
 from fluoromap.fuser.mesh_vtp import vtp_bytes
 from fluoromap.fuser.surface import face_normals
 
-MeshFormat = Literal["ply", "stl", "glb", "vtp"]
+MeshFormat = Literal["ply", "stl", "glb", "vtp", "mat", "csv"]
 
 STATEMENT = "fluoromap chamber, unit mm, axes LPS (DICOM patient)"
 
@@ -25,11 +25,12 @@ def mesh_bytes(chamber: ChamberMap, format: MeshFormat, origin_shift_mm: ArrayLi
     ----------
     chamber : ChamberMap
         Relative to the reference catheter.
-    format : {"ply", "stl", "glb", "vtp"}
+    format : {"ply", "stl", "glb", "vtp", "mat", "csv"}
         PLY: binary, colours and the scalars ``lat_ms``, ``lat_sd_ms`` (NaN where not covered), ``covered``. STL: binary,
         the shape alone. GLB: colours, the same scalars as ``_LAT_MS``, ``_LAT_SD_MS`` (0 where not covered) and
         ``_COVERED``; its numbers are millimetres and LPS too, though glTF assumes metres. VTP: the scalars, NaN where not
-        covered, and the sites as field data.
+        covered, and the sites as field data. MAT: OpenEP's structure. CSV: a line a vertex, the scalars empty where not
+        covered.
     origin_shift_mm : (3,)
         Added to all positions: where the reference catheter lies in the coordinates that are wanted.
 
@@ -49,6 +50,12 @@ def mesh_bytes(chamber: ChamberMap, format: MeshFormat, origin_shift_mm: ArrayLi
             return glb_bytes(chamber, vertices, STATEMENT)
         case "vtp":
             return vtp_bytes(chamber, vertices, shift, STATEMENT)
+        case "mat":
+            from fluoromap.fuser.mesh_openep import openep_bytes
+
+            return openep_bytes(chamber, vertices, shift, STATEMENT)
+        case "csv":
+            return _csv(chamber, vertices)
     raise ValueError(f"no mesh format is called {format!r}")
 
 
@@ -77,6 +84,15 @@ def _ply(chamber: ChamberMap, vertices_mm: Array) -> bytes:
         f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
     ]  # fmt: skip
     return ("\n".join(header) + "\n").encode("ascii") + rows.tobytes() + faces.tobytes()
+
+
+def _csv(chamber: ChamberMap, vertices_mm: Array) -> bytes:
+    lines = ["x_mm,y_mm,z_mm,lat_ms,lat_sd_ms,covered"]
+    rows = zip(vertices_mm, chamber.lat_ms, chamber.lat_sd_ms, chamber.covered.tolist(), strict=True)
+    for (x, y, z), lat, sd, covered in rows:
+        times = f"{lat:.3f},{sd:.3f},1" if covered else ",,0"
+        lines.append(f"{x:.4f},{y:.4f},{z:.4f},{times}")
+    return ("\r\n".join(lines) + "\r\n").encode("ascii")
 
 
 def _stl(chamber: ChamberMap, vertices_mm: Array) -> bytes:

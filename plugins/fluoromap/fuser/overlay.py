@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, ChamberMap
-from fluoromap.fuser.colours import Scale, scale_of
+from fluoromap.fuser.colours import Palette, Scale, milliseconds, scale_of
 from fluoromap.fuser.isochrones import isochrones
 from fluoromap.fuser.lettering import BLACK, WHITE, Labels, Point, bar_box, draw_colour_bar, halo_text
 from fluoromap.fuser.raster import Raster, rasterise
@@ -27,8 +29,32 @@ HATCH_TINT = 0.4
 OUTLINE_RGB = (140, 225, 255)
 LEAST_DEPTH_MM = 10.0
 OUT_OF_SIGHT_PX = -1e6
+CHI2_95_2D = 5.991464547107979
+ELLIPSE_RGB = (255, 255, 120)
 PNG_LEVEL = 3
 """Noise does not compress: more effort takes twice as long and saves 2 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How an overlay is drawn.
+
+    scale : pixels of the picture per pixel of the frame, along each side. palette, step_ms : of the isochrones, None being
+    the step that suits the map. covariances_mm2 : site -> (3, 3) of its position, drawn as the 95 % ellipse. until_ms : the
+    wall is coloured only where it is activated by then, its front a thick line; None colours all.
+    """
+
+    scale: int = 1
+    palette: Palette = "safe"
+    step_ms: float | None = None
+    covariances_mm2: Mapping[str, Array] = field(default_factory=dict)
+    until_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale < 1:
+            raise ValueError("scale must be 1 or more")
+        if self.step_ms is not None and not self.step_ms > 0:
+            raise ValueError("step_ms must be positive")
 
 
 def draw_overlay(
@@ -38,7 +64,7 @@ def draw_overlay(
     shift_world_mm: ArrayLike,
     highlight_site: str,
     tip_uv: ArrayLike | None,
-    scale: int = 1,
+    look: Look | None = None,
 ) -> Picture:
     """The map projected into a frame, as the paper fuses it.
 
@@ -61,8 +87,7 @@ def draw_overlay(
         The site this run belongs to; a name that is not in the map draws no time.
     tip_uv : (2,) or None
         Where the tip was seen in this frame; None takes the site's position from the map.
-    scale : int
-        Pixels of the picture per pixel of the frame, along each side.
+    look : Look
 
     Returns
     -------
@@ -76,21 +101,23 @@ def draw_overlay(
     """
     if frame.dtype != np.uint8 or frame.shape != (camera.rows, camera.columns):
         raise ValueError(f"the frame must be uint8 of shape {(camera.rows, camera.columns)}, not {frame.shape}")
-    if scale < 1:
-        raise ValueError("scale must be 1 or more")
-    canvas = _Canvas(camera.translated(shift_world_mm), scale)
-    times = scale_of(chamber)
-    size = (camera.columns * scale, camera.rows * scale)
+    look = look or Look()
+    canvas = _Canvas(camera.translated(shift_world_mm), look.scale)
+    times = scale_of(chamber, look.step_ms, look.palette)
+    size = (camera.columns * look.scale, camera.rows * look.scale)
     grey = Image.fromarray(frame)
-    picture = np.array(grey if scale == 1 else grey.resize(size, Image.Resampling.BICUBIC))
+    picture = np.array(grey if look.scale == 1 else grey.resize(size, Image.Resampling.BICUBIC))
     rgb = np.repeat(picture[..., None], 3, axis=2)
 
     facing = canvas.facing(chamber)
     raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, picture.shape)
-    _tint(rgb, raster, chamber, times, canvas.unit)
+    _tint(rgb, raster, chamber, times, canvas.unit, look.until_ms)
     image = Image.fromarray(rgb)
-    _draw_lines(image, canvas, chamber, facing, times)
-    _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times)
+    _draw_lines(image, canvas, chamber, facing, times, look)
+    _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms)
+    if look.until_ms is not None:
+        text, size_px = f"{milliseconds(look.until_ms)} ms", round(1.6 * canvas.letters)
+        halo_text(ImageDraw.Draw(image), (3.2 * size_px, size_px), text, size_px, WHITE, BLACK)
     return np.asarray(image)
 
 
@@ -122,6 +149,17 @@ class _Canvas:
         uv = self._camera.project(np.where(behind[:, None], self._camera.axis_world * 1e3, points_mm))
         return self.to_picture(np.where(behind[:, None], OUT_OF_SIGHT_PX, uv)), depth
 
+    def ellipse(self, point_mm: Array, covariance_mm2: Array) -> Array:
+        """Outline (k, 2) in the picture of the 95 % ellipse of a point's projection, to first order."""
+        step = 1e-3
+        ends = self.project(point_mm + step * np.concatenate([np.eye(3), -np.eye(3)]))[0]
+        jacobian = (ends[:3] - ends[3:]).T / (2 * step)
+        values, vectors = np.linalg.eigh(jacobian @ covariance_mm2 @ jacobian.T)
+        angles = np.linspace(0, 2 * np.pi, 49)
+        circle = np.stack([np.cos(angles), np.sin(angles)]) * np.sqrt(CHI2_95_2D * np.maximum(values, 0.0))[:, None]
+        outline: Array = self.project(point_mm[None])[0] + (vectors @ circle).T
+        return outline
+
     def facing(self, chamber: ChamberMap) -> BoolArray:
         """Faces whose outer side looks at the detector: the ray from the source leaves the chamber through them."""
         normals = face_normals(chamber.vertices_mm, chamber.faces)
@@ -130,20 +168,28 @@ class _Canvas:
         return outward
 
 
-def _tint(rgb: Picture, raster: Raster, chamber: ChamberMap, times: Scale, unit: float) -> None:
-    colours, covered, hatched = pixel_colours(raster, chamber, times, unit)
+def _tint(rgb: Picture, raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None) -> None:
+    colours, covered, hatched = pixel_colours(raster, chamber, times, unit, until_ms)
     share = np.where(covered, TINT, np.where(hatched, HATCH_TINT, 0.0)).astype(np.float32)[:, None]
     shown = raster.shown()
     under = rgb[shown].astype(np.float32)
     rgb[shown] = (under + share * (colours - under)).round().astype(np.uint8)
 
 
-def _draw_lines(image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale) -> None:
-    """Isochrones and outline, drawn at twice the size and averaged: smooth lines."""
+def _draw_lines(
+    image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale, look: Look
+) -> None:
+    """Isochrones, outline and ellipses, drawn at twice the size and averaged: smooth lines."""
     uv = canvas.project(chamber.vertices_mm)[0]
+    ellipses = [
+        canvas.ellipse(site.position_mm, look.covariances_mm2[site.site])
+        for site in chamber.sites
+        if site.site in look.covariances_mm2
+    ]
     margin = 4 * canvas.unit
-    low = np.clip(np.floor(uv.min(axis=0) - margin), 0, image.size).astype(np.int64)
-    high = np.clip(np.ceil(uv.max(axis=0) + margin), 0, image.size).astype(np.int64)
+    drawn = np.concatenate([uv, *ellipses])
+    low = np.clip(np.floor(drawn.min(axis=0) - margin), 0, image.size).astype(np.int64)
+    high = np.clip(np.ceil(drawn.max(axis=0) + margin), 0, image.size).astype(np.int64)
     if (high <= low).any():
         return
 
@@ -156,19 +202,26 @@ def _draw_lines(image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing
     layer = Image.new("RGBA", (width, height), (255, 255, 255, 0))
     draw = ImageDraw.Draw(layer)
     thickness = max(2, round(2 * canvas.unit))
-    for line in isochrones(chamber, times.edges_ms):
+    edges = times.edges_ms if look.until_ms is None else times.edges_ms[times.edges_ms < look.until_ms]
+    for line in isochrones(chamber, edges):
         at = canvas.project(line.points_mm)[0]
         for run in runs(facing[line.faces]):
             draw.line(fine(at[run]), fill=(255, 255, 255, 130), width=thickness, joint="curve")
+    for line in isochrones(chamber, np.array([] if look.until_ms is None else [look.until_ms])):
+        at = canvas.project(line.points_mm)[0]
+        for run in runs(facing[line.faces]):
+            draw.line(fine(at[run]), fill=(255, 255, 255, 255), width=3 * thickness, joint="curve")
     for edge in outline_edges(chamber.faces, facing):
         draw.line(fine(uv[edge]), fill=(*OUTLINE_RGB, 230), width=round(1.5 * thickness))
+    for ellipse in ellipses:
+        draw.line(fine(ellipse), fill=(*ELLIPSE_RGB, 230), width=thickness, joint="curve")
     smooth = layer.reduce(2)
     image.paste(smooth, tuple(low.tolist()), smooth)
 
 
 def _draw_sites(
     image: Image.Image, canvas: _Canvas, chamber: ChamberMap, raster: Raster, highlight_site: str,
-    tip_uv: ArrayLike | None, times: Scale,
+    tip_uv: ArrayLike | None, times: Scale, until_ms: float | None,
 ) -> None:  # fmt: skip
     size, unit = canvas.letters, canvas.unit
     uv, _ = canvas.project(np.array([site.position_mm for site in chamber.sites]))
@@ -196,5 +249,7 @@ def _draw_sites(
         draw_dot(image, places[i], chamber.sites[i], times, unit, near=bool(on_near_wall[i]))
     if star is not None:
         draw_star(image, star, 8 * unit)
-    mark = None if highlighted is None or is_outlier(highlighted) else highlighted.lat_ms
+    mark = until_ms
+    if mark is None and highlighted is not None and not is_outlier(highlighted):
+        mark = highlighted.lat_ms
     draw_colour_bar(image, times, size, dark=True, mark_ms=mark)

@@ -11,19 +11,22 @@ from fluoromap.fuser.raster import Raster
 
 
 def pixel_colours(
-    raster: Raster, chamber: ChamberMap, times: Scale, unit: float
+    raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None = None
 ) -> tuple[NDArray[np.float32], BoolArray, BoolArray]:
-    """Of the p pixels that show the wall, in row-major order: RGB (p, 3), covered (p,), on the "no data" hatch (p,).
+    """Of the p pixels that show the wall, in row-major order: RGB (p, 3), coloured (p,), on the "no data" hatch (p,).
 
-    ``unit`` is the size of the picture's details, 1 for a picture of 512 pixels.
+    Coloured is what is covered and, where ``until_ms`` is given, activated by then. ``unit`` is the size of the picture's
+    details, 1 for a picture of 512 pixels.
     """
     covered = raster.sample(chamber.covered.astype(np.float64)) > 0.5
-    bands = times.band(raster.sample(_times_past_rim(chamber)))
-    colours = times.band_colours()[bands].astype(np.float32)
+    lat = raster.sample(_times_past_rim(chamber))
+    colours = times.band_colours()[times.band(lat)].astype(np.float32)
     v, u = np.nonzero(raster.shown())
     hatched = ~covered & ((u + v) % max(4, round(7 * unit)) < max(1, round(unit)))
     colours[~covered] = NO_DATA_RGB
     colours[hatched] = NO_DATA_HATCH_RGB
+    if until_ms is not None:
+        covered &= lat <= until_ms
     return colours, covered, hatched
 
 

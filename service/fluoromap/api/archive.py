@@ -24,7 +24,7 @@ from fluoromap.api.readiness import job_of, manifest_of, map_of
 from fluoromap.api.security import Reader
 from fluoromap.api.tracks import tracks_csv, tracks_of
 from fluoromap.fuser.map_picture import draw_map_views
-from fluoromap.fuser.overlay import encode_png
+from fluoromap.fuser.overlay import Look, encode_png
 from fluoromap.settings import settings
 from fluoromap.store.engine import reading
 from fluoromap.store.files import CHUNK_BYTES
@@ -128,7 +128,7 @@ def _map(job_id: str) -> Iterator[tuple[str, bytes, bool]]:
             name = f"overlays/{plain(overlay.site)}-{overlay.view}-{len(taken) + 1}.png"
         taken.add(name)
         try:
-            picture = picture_of(job_id, fusion, 1)
+            picture = picture_of(job_id, fusion, Look())
         except Problem as problem:
             yield name.removesuffix(".png") + ".txt", f"{problem.detail}\n".encode(), True
             continue

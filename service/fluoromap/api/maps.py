@@ -98,6 +98,8 @@ class MeshFormat(StrEnum):
     STL = "stl"
     GLB = "glb"
     VTP = "vtp"
+    MAT = "mat"
+    CSV = "csv"
 
 
 MESH_MEDIA_TYPES = {
@@ -105,6 +107,8 @@ MESH_MEDIA_TYPES = {
     MeshFormat.STL: "model/stl",
     MeshFormat.GLB: "model/gltf-binary",
     MeshFormat.VTP: "model/vnd.vtp+xml",
+    MeshFormat.MAT: "application/x-matlab-data",
+    MeshFormat.CSV: "text/csv",
 }
 
 
@@ -213,7 +217,10 @@ _MESHES = {media: {"schema": {"type": "string", "format": "binary"}} for media i
 )
 def get_mesh(
     job_id: JobId,
-    mesh_format: Annotated[MeshFormat, Path(description="PLY and GLB have colours, VTP has the times as scalars.")],
+    mesh_format: Annotated[
+        MeshFormat,
+        Path(description="PLY and GLB have colours, VTP has the times as scalars, MAT is OpenEP's structure."),
+    ],
     request: Request,
     caller: Reader,
     origin: OriginQuery = Origin.REFERENCE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 from urllib.parse import quote
@@ -22,7 +22,9 @@ from fluoromap.api.readiness import done_stage, job_of, manifest_of, map_of
 from fluoromap.api.security import Reader
 from fluoromap.contracts import Array, ChamberMap, LocatedSite, Matching, Triangulation, View
 from fluoromap.dicom import InstanceFacts, frame_to_8bit, open_frames
-from fluoromap.fuser.overlay import draw_overlay, encode_png
+from fluoromap.fuser.animation import draw_propagation
+from fluoromap.fuser.colours import Palette
+from fluoromap.fuser.overlay import Look, draw_overlay, encode_png
 from fluoromap.geometry import Camera
 from fluoromap.store import files
 from fluoromap.store.engine import reading
@@ -82,8 +84,10 @@ class Fusion:
     shift_mm: Array
     site: str
     tip_uv: Array | None
+    covariances_mm2: dict[str, Array]
+    """Of each site on the map, (3, 3)."""
 
-    def asked(self, scale: int) -> dict[str, Any]:
+    def asked(self, look: Look, moving: bool) -> dict[str, Any]:
         """What the picture depends on, as JSON values."""
         return {
             "overlay": self.uid,
@@ -93,7 +97,12 @@ class Fusion:
             "map": self.map_sha256,
             "shift_mm": self.shift_mm.tolist(),
             "tip_uv": None if self.tip_uv is None else self.tip_uv.tolist(),
-            "scale": scale,
+            "scale": look.scale,
+            "palette": look.palette,
+            "step_ms": look.step_ms,
+            "until_ms": look.until_ms,
+            "ellipses": {site: covariance.tolist() for site, covariance in look.covariances_mm2.items()},
+            "moving": moving,
         }
 
 
@@ -126,7 +135,8 @@ def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion
     """
     outcome, fuse = map_of(session, job)
     manifest = manifest_of(job)
-    located, view = _view_of(load(Triangulation, done_stage(session, job, "triangulate")), manifest, uid)
+    triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
+    located, view = _view_of(triangulation, manifest, uid)
     plan = manifest.runs[uid]
     facts = InstanceFacts.from_json(plan.facts)
     index = _diastolic_frame(located, view) if frame is None else frame - 1
@@ -147,28 +157,37 @@ def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion
         shift_mm=shift,
         site=located.site,
         tip_uv=_tip(session, job, manifest, located, view, index, shift),
+        covariances_mm2=_covariances(triangulation, manifest.mapping),
     )
 
 
-def picture_of(job_id: str, fusion: Fusion, scale: int) -> Rendered:
-    """The kept PNG of an overlay."""
+def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> Rendered:
+    """The kept PNG of an overlay, or the GIF of its propagation."""
 
     def make() -> bytes:
         path = files.path_of(fusion.sha256)
         if not path.exists():
             raise Problem(409, "run_deleted", "This run was deleted; its overlay can no longer be drawn.")
-        return drawn(draw, path, fusion, scale)
+        return drawn(draw, path, fusion, look, moving)
 
-    return rendered(job_id, fusion.asked(scale), "image/png", make)
+    return rendered(job_id, fusion.asked(look, moving), "image/gif" if moving else "image/png", make)
 
 
-def draw(path: FilePath, fusion: Fusion, scale: int) -> bytes:
-    """PNG of an overlay from the run's file; called in a process of its own."""
+def draw(path: FilePath, fusion: Fusion, look: Look, moving: bool) -> bytes:
+    """PNG or GIF of an overlay from the run's file; called in a process of its own."""
     shown = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
-    picture = draw_overlay(
-        shown, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv, scale
-    )  # fmt: skip
-    return encode_png(picture)
+    of = (shown, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv)
+    return draw_propagation(*of, look) if moving else encode_png(draw_overlay(*of, look))
+
+
+def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]:
+    """Of the mapping tip of each site, relative to the reference catheter where that was located."""
+    tips = {located.site: located.point(mapping, 1) for located in triangulation.sites}
+    return {
+        site: tip.covariance_mm2 if tip.relative_covariance_mm2 is None else tip.relative_covariance_mm2
+        for site, tip in tips.items()
+        if tip is not None
+    }
 
 
 def _view_of(triangulation: Triangulation, manifest: Manifest, uid: str) -> tuple[LocatedSite, View]:
@@ -251,31 +270,87 @@ def list_overlays(job_id: JobId, caller: Reader) -> Overlays:
         return Overlays(overlays=overlays_of(session, job_of(session, job_id)))
 
 
+UidPath = Annotated[str, Path(description="SOPInstanceUID of the run.")]
+FrameQuery = Annotated[int | None, Query(ge=1, description="Counted from 1; by default the diastolic frame.")]
+ScaleQuery = Annotated[Literal["1", "2"], Query(description="Pixels of the picture per stored pixel.")]
+ColoursQuery = Annotated[
+    Literal["safe", "red-early"],
+    Query(description="`safe`: ordered for colour-blind readers too; `red-early`: as mapping systems show it."),
+]
+StepQuery = Annotated[
+    Literal["5", "10"] | None, Query(description="Between isochrones, in ms; by default what suits the map.")
+]
+EllipsesQuery = Annotated[bool, Query(description="Draw each site's 95 % ellipse.")]
+
+
+def _look(fusion: Fusion, scale: str, colours: Palette, step_ms: str | None, ellipses: bool) -> Look:
+    return Look(
+        scale=int(scale),
+        palette=colours,
+        step_ms=None if step_ms is None else float(step_ms),
+        covariances_mm2=fusion.covariances_mm2 if ellipses else {},
+    )
+
+
+def _picture_answers(media_type: str) -> dict[int | str, dict[str, Any]]:
+    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    return {
+        200: {"content": content, "description": "The picture."},
+        304: {"description": "Unchanged since the ETag sent."},
+        **responses(401, 403, 404, 409, 422, 429),
+    }
+
+
 @router.get(
     "/v1/jobs/{job_id}/overlays/{uid}.png",
     summary="The map on one fluoroscopy frame",
     response_class=Response,
-    responses={
-        200: {
-            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
-            "description": "The picture.",
-        },
-        304: {"description": "Unchanged since the ETag sent."},
-        **responses(401, 403, 404, 409, 422, 429),
-    },
+    responses=_picture_answers("image/png"),
 )
 def get_overlay(
     job_id: JobId,
-    uid: Annotated[str, Path(description="SOPInstanceUID of the run.")],
+    uid: UidPath,
     request: Request,
     caller: Reader,
-    frame: Annotated[int | None, Query(ge=1, description="Counted from 1; by default the diastolic frame.")] = None,
-    scale: Annotated[Literal["1", "2"], Query(description="Pixels of the picture per stored pixel.")] = "1",
+    frame: FrameQuery = None,
+    scale: ScaleQuery = "1",
+    colours: ColoursQuery = "safe",
+    step_ms: StepQuery = None,
+    ellipses: EllipsesQuery = False,
+    until_ms: Annotated[
+        float | None,
+        Query(ge=-10_000, le=10_000, description="Colour only what is activated by then; the front as a thick line."),
+    ] = None,
 ) -> Response:
     """Isochrones, hull outline, sites with their times in ms, a star at the tip and a colour bar, in stored pixels."""
     with reading() as session:
-        job = job_of(session, job_id)
-        fusion = fusion_of(session, job, uid, frame)
-    picture = picture_of(job_id, fusion, int(scale))
+        fusion = fusion_of(session, job_of(session, job_id), uid, frame)
+    look = replace(_look(fusion, scale, colours, step_ms, ellipses), until_ms=until_ms)
+    picture = picture_of(job_id, fusion, look)
     name = f"overlay-{plain(fusion.site)}-{fusion.frame + 1}.png"
     return file_response(request, picture.path, picture.sha256, "image/png", name, inline=True)
+
+
+@router.get(
+    "/v1/jobs/{job_id}/overlays/{uid}.gif",
+    summary="The activation running over the map, on one fluoroscopy frame",
+    response_class=Response,
+    responses=_picture_answers("image/gif"),
+)
+def get_propagation(
+    job_id: JobId,
+    uid: UidPath,
+    request: Request,
+    caller: Reader,
+    frame: FrameQuery = None,
+    scale: ScaleQuery = "1",
+    colours: ColoursQuery = "safe",
+    step_ms: StepQuery = None,
+    ellipses: EllipsesQuery = False,
+) -> Response:
+    """The overlay as a moving picture: from the earliest time to the latest the wall is coloured as far as it is activated."""
+    with reading() as session:
+        fusion = fusion_of(session, job_of(session, job_id), uid, frame)
+    picture = picture_of(job_id, fusion, _look(fusion, scale, colours, step_ms, ellipses), moving=True)
+    name = f"propagation-{plain(fusion.site)}-{fusion.frame + 1}.gif"
+    return file_response(request, picture.path, picture.sha256, "image/gif", name, inline=True)

@@ -1,6 +1,7 @@
 """Mesh files, read again by libraries that did not write them."""
 
 import base64
+import csv
 import io
 import struct
 from xml.etree import ElementTree
@@ -8,12 +9,13 @@ from xml.etree import ElementTree
 import meshio
 import numpy as np
 import pytest
+import scipy.io
 import trimesh
 
 from fluoromap.fuser.colours import NO_DATA_RGB, vertex_colours
 from fluoromap.fuser.meshes import mesh_bytes
 
-FORMATS = ("ply", "stl", "glb", "vtp")
+FORMATS = ("ply", "stl", "glb", "vtp", "mat", "csv")
 SHIFT = np.array([7.0, -3.0, 110.0])
 
 
@@ -22,7 +24,7 @@ def test_same_map_same_bytes(sparse_ball, name):
     assert mesh_bytes(sparse_ball, name) == mesh_bytes(sparse_ball, name)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", ["ply", "stl", "glb", "vtp", "mat"])
 def test_unit_and_axes_are_stated(sparse_ball, name):
     data = mesh_bytes(sparse_ball, name)
     codes = " ".join(str(code) for code in b"unit mm, axes LPS").encode()
@@ -137,3 +139,37 @@ def test_vtk_reads_the_vtp(sparse_ball, tmp_path):
     np.testing.assert_array_equal(covered, sparse_ball.covered)
     lat_ms = vtk_to_numpy(surface.GetPointData().GetArray("lat_ms"))
     np.testing.assert_allclose(lat_ms[covered], sparse_ball.lat_ms[covered], atol=1e-4)
+
+
+def test_openep_reads_shape_times_and_sites(sparse_ball):
+    read = scipy.io.loadmat(io.BytesIO(mesh_bytes(sparse_ball, "mat", SHIFT)), simplify_cells=True)["userdata"]
+    surface, electric = read["surface"], read["electric"]
+    np.testing.assert_allclose(surface["triRep"]["X"], sparse_ball.vertices_mm + SHIFT, atol=1e-9)
+    np.testing.assert_array_equal(surface["triRep"]["Triangulation"], sparse_ball.faces + 1)
+    covered = sparse_ball.covered
+    lat, bipolar = surface["act_bip"].T
+    np.testing.assert_allclose(lat[covered], sparse_ball.lat_ms[covered], atol=1e-9)
+    assert np.isnan(lat[~covered]).all()
+    assert np.isnan(bipolar).all()
+    assert electric["tags"].tolist() == [site.site for site in sparse_ball.sites]
+    positions = np.array([site.position_mm for site in sparse_ball.sites]) + SHIFT
+    np.testing.assert_allclose(electric["egmX"], positions, atol=1e-9)
+    annotations = electric["annotations"]
+    samples = annotations["mapAnnot"] - annotations["referenceAnnot"]
+    np.testing.assert_allclose(samples, [site.lat_ms for site in sparse_ball.sites], atol=0.5)
+    low, high = annotations["woi"].T
+    assert ((low <= samples) & (samples <= high)).all()
+    assert annotations["referenceAnnot"].min() >= 1
+    assert (annotations["mapAnnot"] <= electric["egm"].shape[1]).all()
+    outward = ((surface["normals"] * (sparse_ball.vertices_mm - sparse_ball.vertices_mm.mean(axis=0))).sum(axis=1)) > 0
+    assert outward.all()
+
+
+def test_csv_has_a_line_a_vertex(sparse_ball):
+    lines = list(csv.DictReader(io.StringIO(mesh_bytes(sparse_ball, "csv", SHIFT).decode())))
+    positions = np.array([[float(line[f"{axis}_mm"]) for axis in "xyz"] for line in lines])
+    np.testing.assert_allclose(positions, sparse_ball.vertices_mm + SHIFT, atol=1e-4)
+    assert [line["covered"] == "1" for line in lines] == sparse_ball.covered.tolist()
+    assert all(line["lat_ms"] == "" for line in lines if line["covered"] == "0")
+    known = [float(line["lat_ms"]) for line in lines if line["covered"] == "1"]
+    np.testing.assert_allclose(known, sparse_ball.lat_ms[sparse_ball.covered], atol=1e-3)

@@ -7,11 +7,12 @@ import pytest
 from chambers import fused, sites_at, sphere
 from PIL import Image
 
+from fluoromap.fuser.animation import PICTURES, draw_propagation
 from fluoromap.fuser.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
 from fluoromap.fuser.isochrones import isochrones
 from fluoromap.fuser.lettering import bar_box
 from fluoromap.fuser.map_picture import draw_map_views
-from fluoromap.fuser.overlay import draw_overlay, encode_png
+from fluoromap.fuser.overlay import Look, draw_overlay, encode_png
 from fluoromap.fuser.raster import rasterise
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 
@@ -68,6 +69,15 @@ class TestColours:
                                          [-0.011820, 0.042940, 0.968881]]).T  # fmt: skip
         assert (np.diff(deuteranope @ [0.2126, 0.7152, 0.0722]) < 0).all()
 
+    def test_red_early_begins_red_and_ends_violet(self):
+        first, middle, last = colour_map(np.array([0.0, 0.5, 1.0]), "red-early").astype(int)
+        assert first[0] > 2 * max(first[1:])
+        assert middle[1] > middle[0]
+        assert last[2] > last[0] > last[1]
+
+    def test_a_step_that_is_asked_for_is_kept(self, ball):
+        assert [scale_of(ball, step).step_ms for step in (5.0, 10.0)] == [5.0, 10.0]
+
     def test_no_data_is_grey_and_no_band_is(self, sparse_ball):
         colours = vertex_colours(sparse_ball).astype(int)
         assert (np.ptp(colours[~sparse_ball.covered], axis=1) == 0).all()
@@ -99,7 +109,7 @@ class TestOverlay:
     @pytest.mark.parametrize("scale", [1, 2])
     def test_size_and_kind(self, ball, scale):
         view = camera(rows=400, columns=512)
-        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, scale)
+        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, Look(scale=scale))
         assert picture.shape == (400 * scale, 512 * scale, 3)
         assert picture.dtype == np.uint8
 
@@ -109,13 +119,53 @@ class TestOverlay:
         view = camera(primary, secondary)
         site = next(site for site in ball.sites if site.site == "S05")
         tip = (view.project(site.position_mm + SHIFT) + 0.5) * scale - 0.5
-        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, scale)
+        picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, Look(scale=scale))
         white = (picture == 255).all(axis=2)
         v, u = np.nonzero(white)
         pixels = np.stack([u, v], axis=1)
         star = pixels[np.linalg.norm(pixels - tip, axis=1) < 5 * scale]
         assert len(star) > 20 * scale
         assert np.linalg.norm(star.mean(axis=0) - tip) <= scale
+
+    def test_ellipse_is_the_projected_covariance(self, ball):
+        view = camera()
+        site = next(site for site in ball.sites if site.site == "S05")
+        # A lateral view looks along X: what is uncertain there is not seen, Z is up.
+        tall = {"S05": np.diag([900.0, 1.0, 9.0])}
+        black = np.zeros((512, 512), np.uint8)
+        plain = draw_overlay(black, view, ball, SHIFT, "none", None).astype(int)
+        drawn = draw_overlay(black, view, ball, SHIFT, "none", None, Look(covariances_mm2=tall)).astype(int)
+        v, u = np.nonzero(np.abs(drawn - plain).sum(axis=2) > 60)
+        centre = view.project(site.position_mm + SHIFT)
+        px_per_mm = np.linalg.norm(view.project(site.position_mm + SHIFT + [0, 0, 1]) - centre)
+        reach = np.sqrt(5.9915) * px_per_mm
+        assert np.ptp(v) / 2 == pytest.approx(3 * reach, abs=2)
+        assert np.ptp(u) / 2 == pytest.approx(reach, abs=2)
+        assert v.mean() == pytest.approx(centre[1], abs=3)
+
+    def test_wall_is_coloured_up_to_the_time_asked_for(self, ball):
+        view = camera(0.0)
+        early, late = (
+            draw_overlay(grey(view), view, ball, SHIFT, "none", None, Look(until_ms=until)).astype(int)
+            for until in (-10.0, 10.0)
+        )
+        everything = draw_overlay(grey(view), view, ball, SHIFT, "none", None).astype(int)
+
+        def coloured(picture):
+            return (np.ptp(picture, axis=2) > 12)[:, :440].sum()
+
+        assert 0 < coloured(early) < coloured(late) < coloured(everything)
+
+    def test_propagation_runs_from_the_earliest_to_the_latest(self, ball):
+        view = camera(0.0)
+        moving = Image.open(io.BytesIO(draw_propagation(grey(view), view, ball, SHIFT, "none", None, Look())))
+        assert moving.n_frames == PICTURES
+        shares = []
+        for index in (1, PICTURES // 2, PICTURES - 1):
+            moving.seek(index)
+            picture = np.asarray(moving.convert("RGB")).astype(int)
+            shares.append((np.ptp(picture, axis=2) > 12)[:, :440].sum())
+        assert shares == sorted(set(shares))
 
     def test_star_takes_the_tip_that_was_seen(self, ball):
         view = camera()
@@ -193,7 +243,7 @@ class TestOverlay:
         with pytest.raises(ValueError, match="frame"):
             draw_overlay(np.zeros((10, 10), np.uint8), view, ball, SHIFT, "S05", None)
         with pytest.raises(ValueError, match="scale"):
-            draw_overlay(grey(view), view, ball, SHIFT, "S05", None, 0)
+            draw_overlay(grey(view), view, ball, SHIFT, "S05", None, Look(scale=0))
 
     def test_png_is_the_picture_and_always_the_same(self, ball):
         view = camera()

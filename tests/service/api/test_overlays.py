@@ -15,6 +15,7 @@ from sqlalchemy import select
 
 from fluoromap.api import overlays as overlay_routes
 from fluoromap.api.overlays import fusion_of
+from fluoromap.fuser.animation import PICTURES
 from fluoromap.store import files
 from fluoromap.store.engine import reading
 from fluoromap.store.models import Job, Rendering
@@ -64,11 +65,34 @@ def test_the_file_name_tells_site_and_frame_only(client: TestClient, study: Fini
     assert answer.headers["content-disposition"] == 'inline; filename="overlay-S01-1.png"'
 
 
-@pytest.mark.parametrize("query", ["frame=0", "frame=4", "scale=3", "frame=x"])
+@pytest.mark.parametrize(
+    "query",
+    ["frame=0", "frame=4", "scale=3", "frame=x", "colours=rainbow", "step_ms=7", "until_ms=nan", "ellipses=perhaps"],
+)
 def test_wrong_frames_and_scales(client: TestClient, study: FinishedStudy, query: str) -> None:
     study.mapped()
     answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png?{query}")
     assert answer.status_code == 422
+
+
+@pytest.mark.parametrize("query", ["colours=red-early", "step_ms=5", "until_ms=25", "ellipses=true"])
+def test_each_wish_changes_the_picture(client: TestClient, study: FinishedStudy, query: str) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    plain, wished = client.get(path), client.get(f"{path}?{query}")
+    assert wished.status_code == 200, wished.text
+    assert wished.content != plain.content
+
+
+def test_the_propagation_is_a_moving_picture(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.gif"
+    answer = client.get(path)
+    assert answer.headers["content-type"] == "image/gif"
+    assert answer.headers["content-disposition"] == 'inline; filename="propagation-S01-2.gif"'
+    moving = Image.open(io.BytesIO(answer.content))
+    assert (moving.size, moving.n_frames) == ((SIZE, SIZE), PICTURES)
+    assert client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 
 
 def test_runs_without_overlay(client: TestClient, study: FinishedStudy) -> None:
@@ -121,7 +145,8 @@ def test_the_archive_holds_everything(client: TestClient, study: FinishedStudy) 
         assert archive.testzip() is None
         assert set(archive.namelist()) == {
             "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "map.png", "mesh/chamber.ply",
-            "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "overlays/S01-a.png", "overlays/S01-b.png",
+            "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "mesh/chamber.mat", "mesh/chamber.csv",
+            "overlays/S01-a.png", "overlays/S01-b.png",
         }  # fmt: skip
         assert json.loads(archive.read("job.json"))["state"] == "succeeded"
         assert json.loads(archive.read("parameters.json"))["segmenter"]["name"] == "by-hand"

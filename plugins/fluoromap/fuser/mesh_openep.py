@@ -1,0 +1,120 @@
+"""The map as OpenEP's MATLAB structure ``userdata``, for its users' analyses."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from scipy.io import savemat
+from scipy.spatial import cKDTree
+
+from fluoromap.contracts import Array, ChamberMap, IntArray
+from fluoromap.fuser.surface import face_normals
+
+SAMPLES_PER_S = 1000.0
+WINDOW_MARGIN_MS = 50
+_TEXT_BYTES = 116
+"""Length of the descriptive text at the head of a MAT-file, level 5."""
+
+
+def openep_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, statement: str) -> bytes:
+    """The map as a MAT-file (level 5) that holds one variable, ``userdata``, as OpenEP names its fields.
+
+    ``surface.triRep`` is a struct with ``X`` and ``Triangulation`` (from 1); ``surface.act_bip`` holds activation time in
+    ms and bipolar voltage, which is not known here: NaN; where no site is near the time is NaN too. ``electric`` holds one
+    mapping point a site: ``egmX`` where it lies, ``egmSurfX`` where it counts on the surface, and its annotation in samples
+    (1 ms) from the reference's. Electrograms are not part of a map: ``egm`` is NaN over the window of interest. Beyond
+    OpenEP's fields there are ``surface.lat_sd_ms`` and ``surface.covered``.
+
+    Parameters
+    ----------
+    chamber : ChamberMap
+    vertices_mm : (n, 3)
+        Its vertices in the wanted coordinates.
+    shift_mm : (3,)
+        Added to the sites' positions likewise.
+    statement : str
+        Unit and axes, written at the head of the file and into ``notes``.
+
+    References
+    ----------
+    S. E. Williams et al., "OpenEP: a cross-platform electroanatomic mapping data format and analysis platform for
+    electrophysiology research", Front. Physiol. 12, 646023 (2021).
+    """
+    stream = io.BytesIO()
+    userdata = {
+        "notes": _cells([statement, "made from fluoroscopy: positions are single moments at diastole; times in ms"]),
+        "surface": _surface(chamber, vertices_mm),
+        "electric": _electric(chamber, vertices_mm, shift_mm),
+        "rf": {"originaldata": {"ablparams": {}}},
+    }
+    options: dict[str, Any] = {"format": "5", "long_field_names": True, "oned_as": "column", "do_compression": True}
+    savemat(stream, {"userdata": userdata}, **options)  # type: ignore[arg-type]
+    # scipy writes the time of day here; the same map must give the same bytes.
+    text = f"MATLAB 5.0 MAT-file, {statement}".encode("ascii").ljust(_TEXT_BYTES)[:_TEXT_BYTES]
+    return text + stream.getvalue()[_TEXT_BYTES:]
+
+
+def _surface(chamber: ChamberMap, vertices_mm: Array) -> dict[str, Any]:
+    known = np.where(chamber.covered, chamber.lat_ms, np.nan)
+    unknown = np.full(len(known), np.nan)
+    return {
+        "triRep": {"X": vertices_mm, "Triangulation": (chamber.faces + 1).astype(np.float64)},
+        "isVertexAtRim": np.zeros(len(known)),
+        "act_bip": np.stack([known, unknown], axis=1),
+        "uni_imp_frc": np.stack([unknown, unknown, unknown], axis=1),
+        "normals": _vertex_normals(vertices_mm, chamber.faces),
+        "lat_sd_ms": np.where(chamber.covered, chamber.lat_sd_ms, np.nan),
+        "covered": chamber.covered.astype(np.float64),
+    }
+
+
+def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[str, Any]:
+    sites = chamber.sites
+    names = _cells([site.site for site in sites])
+    lat = np.array([site.lat_ms for site in sites])
+    window = (np.floor(lat.min()) - WINDOW_MARGIN_MS, np.ceil(lat.max()) + WINDOW_MARGIN_MS)
+    # Samples count from 1 and the window starts with the first one.
+    reference = 1 - window[0]
+    surface_mm = np.array([site.surface_mm for site in sites]) + shift_mm
+    nearest = cKDTree(vertices_mm).query(surface_mm)[1]
+    signals = np.full((len(sites), int(window[1] - window[0]) + 1), np.nan)
+    per_site = np.full((len(sites), 1), np.nan)
+    return {
+        "tags": names,
+        "names": names,
+        "include": np.ones((len(sites), 1)),
+        "sampleFrequency": SAMPLES_PER_S,
+        "electrodeNames_bip": _cells([""] * len(sites)),
+        "egmX": np.array([site.position_mm for site in sites]) + shift_mm,
+        "egmSurfX": surface_mm,
+        "barDirection": _vertex_normals(vertices_mm, chamber.faces)[nearest],
+        "egm": signals,
+        "egmRef": signals,
+        "ecg": signals,
+        "annotations": {
+            "woi": np.tile(window, (len(sites), 1)),
+            "referenceAnnot": np.full((len(sites), 1), reference),
+            "mapAnnot": (reference + np.round(lat))[:, None],
+        },
+        "voltages": {"bipolar": per_site, "unipolar": per_site},
+        "impedances": {"time": per_site, "value": per_site},
+    }
+
+
+def _vertex_normals(vertices_mm: Array, faces: IntArray) -> Array:
+    """Outward unit normals (n, 3), the mean of the faces round a vertex weighted by their area."""
+    of_faces = face_normals(vertices_mm, faces)
+    total = np.zeros_like(vertices_mm)
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], of_faces)
+    normals: Array = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return normals
+
+
+def _cells(texts: list[str]) -> np.ndarray[tuple[int, int], np.dtype[np.object_]]:
+    """A MATLAB cell array, one text a row."""
+    cells = np.empty((len(texts), 1), dtype=object)
+    cells[:, 0] = texts
+    return cells
