@@ -130,8 +130,8 @@ class TestOverlay:
     def test_ellipse_is_the_projected_covariance(self, ball):
         view = camera()
         site = next(site for site in ball.sites if site.site == "S05")
-        # A lateral view looks along X: what is uncertain there is not seen, Z is up.
-        tall = {"S05": np.diag([900.0, 1.0, 9.0])}
+        # A lateral view looks along X; Z is up.
+        tall = {"S05": np.diag([1.0, 1.0, 9.0])}
         black = np.zeros((512, 512), np.uint8)
         plain = draw_overlay(black, view, ball, SHIFT, "none", None).astype(int)
         drawn = draw_overlay(black, view, ball, SHIFT, "none", None, Look(covariances_mm2=tall)).astype(int)

@@ -75,13 +75,20 @@ def test_wrong_frames_and_scales(client: TestClient, study: FinishedStudy, query
     assert answer.status_code == 422
 
 
-@pytest.mark.parametrize("query", ["colours=red-early", "step_ms=5", "until_ms=25", "ellipses=true"])
+@pytest.mark.parametrize("query", ["colours=red-early", "step_ms=10", "until_ms=25"])
 def test_each_wish_changes_the_picture(client: TestClient, study: FinishedStudy, query: str) -> None:
     study.mapped()
     path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
     plain, wished = client.get(path), client.get(f"{path}?{query}")
     assert wished.status_code == 200, wished.text
     assert wished.content != plain.content
+
+
+def test_ellipses_are_of_the_tip_from_the_reference(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    assert client.get(f"{path}?ellipses=true").status_code == 200
+    np.testing.assert_allclose(_fusion(study, "a", None).covariances_mm2["S01"], 0.1 * np.eye(3))
 
 
 def test_the_propagation_is_a_moving_picture(client: TestClient, study: FinishedStudy) -> None:
