@@ -21,6 +21,7 @@ from fluoromap.api.overlays import fusion_of, overlays_of, picture_of
 from fluoromap.api.points import points_csv, points_of
 from fluoromap.api.problems import Problem, responses
 from fluoromap.api.readiness import job_of, manifest_of, map_of
+from fluoromap.api.report import report_page
 from fluoromap.api.security import Reader
 from fluoromap.api.tracks import tracks_csv, tracks_of
 from fluoromap.fuser.map_picture import draw_map_views
@@ -49,8 +50,9 @@ _MOMENT = (1980, 1, 1, 0, 0, 0)
     },
 )
 def get_archive(job_id: Annotated[str, Path(description="The job's id.")], caller: Reader) -> StreamingResponse:
-    """`job.json`, `parameters.json`, `points.csv`, `tracks.csv`, `map.json`, `map.png`, the mesh in all formats and an overlay of
-    each view of each site, as far as the job came; coordinates from the reference catheter. 409 until the job has ended.
+    """`job.json`, `parameters.json`, `points.csv`, `tracks.csv`, `report.html`, `map.json`, `map.png`, the mesh in all formats
+    and an overlay of each view of each site, as far as the job came; coordinates from the reference catheter. 409 until the
+    job has ended.
     """
     folder = settings().files_dir / "incoming"
     folder.mkdir(parents=True, exist_ok=True)
@@ -86,6 +88,7 @@ def _entries(job_id: str) -> Iterator[tuple[str, bytes, bool]]:
         yield "parameters.json", _json(_parameters(job)), True
         tables = list(_tables(session, job))
     yield from tables
+    yield "report.html", report_page(job_id).encode(), True
     yield from _map(job_id)
 
 

@@ -40,7 +40,7 @@ class Links(BaseModel):
     tracks: str
     map: str
     overlays: str
-    report: str | None = Field(description="Null: this version makes no report.")
+    report: str
 
 
 class JobAnswer(BaseModel):
@@ -65,7 +65,7 @@ class JobAnswer(BaseModel):
                         "tracks": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/tracks",
                         "map": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/map",
                         "overlays": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/overlays",
-                        "report": None,
+                        "report": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/report.html",
                     },
                 }
             ]
@@ -101,7 +101,7 @@ def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
             tracks=f"{root}/tracks",
             map=f"{root}/map",
             overlays=f"{root}/overlays",
-            report=None,
+            report=f"{root}/report.html",
         ),
     )
 

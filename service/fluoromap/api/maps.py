@@ -35,13 +35,21 @@ class MapSite(BaseModel):
     surface_mm: Position = Field(description="Where on the surface the site counts.")
     distance_mm: float = Field(description="From the site to that place.")
     lat_ms: float
-    leave_one_out_error_ms: float | None = Field(description="Measured minus what the other sites predict here.")
+    leave_one_out_error_ms: float | None = Field(description="What the other sites predict here minus what was measured.")
     reasons: list[Reason] = Field(description="For example `lat_outlier`.")
 
 
 class Earliest(BaseModel):
     site: str
     probability: float = Field(description="That this site is the earliest, given the errors of the times.")
+
+
+class Velocity(BaseModel):
+    """Speed of activation along the wall: the median where at least four sites lie within 15 mm, and its 95 % interval."""
+
+    median_m_per_s: float
+    low_m_per_s: float
+    high_m_per_s: float
 
 
 class ActivationMap(BaseModel):
@@ -70,6 +78,8 @@ class ActivationMap(BaseModel):
                     "area_cm2": 104.0,
                     "coverage": 0.83,
                     "warnings": [],
+                    "conduction_velocity": {"median_m_per_s": 0.78, "low_m_per_s": 0.7, "high_m_per_s": 0.87},
+                    "cycle_length_ms": None,
                 }
             ]
         }
@@ -89,6 +99,8 @@ class ActivationMap(BaseModel):
     area_cm2: float
     coverage: float = Field(ge=0, le=1, description="Covered share of the area.")
     warnings: list[Reason]
+    conduction_velocity: Velocity | None = Field(description="Null where no sites lie close enough together.")
+    cycle_length_ms: float | None = Field(description="Of a re-entry: times repeat after it, so that early meets late.")
 
 
 class MeshFormat(StrEnum):
@@ -140,6 +152,17 @@ def activation_map(outcome: MapOutcome, chamber: ChamberMap, origin: Origin) -> 
         area_cm2=chamber.area_cm2,
         coverage=chamber.coverage,
         warnings=list(chamber.warnings),
+        conduction_velocity=_velocity(chamber),
+        cycle_length_ms=chamber.cycle_length_ms,
+    )
+
+
+def _velocity(chamber: ChamberMap) -> Velocity | None:
+    velocity = chamber.conduction_velocity
+    if velocity is None:
+        return None
+    return Velocity(
+        median_m_per_s=velocity.median_m_per_s, low_m_per_s=velocity.low_m_per_s, high_m_per_s=velocity.high_m_per_s
     )
 
 

@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 from finished_study import REFERENCE_MM, TIP_MM, FinishedStudy, map_outcome, no_map
 from sqlalchemy import select
 
+from fluoromap.contracts import ConductionVelocity
 from fluoromap.store.engine import reading
 from fluoromap.store.models import Rendering
 
@@ -31,6 +32,17 @@ def test_the_map_is_relative_to_the_reference(client: TestClient, study: Finishe
     assert answer["earliest"] == [{"site": "S01", "probability": 1.0}]
     assert answer["sites"][0]["leave_one_out_error_ms"] is None
     assert {"total_activation_time_ms", "leave_one_out_rms_ms", "volume_ml", "area_cm2", "coverage"} <= set(answer)
+    assert (answer["conduction_velocity"], answer["cycle_length_ms"]) == (None, None)
+
+
+def test_the_map_tells_conduction_velocity_and_cycle(client: TestClient, study: FinishedStudy) -> None:
+    outcome = map_outcome()
+    assert outcome.chamber is not None
+    chamber = replace(outcome.chamber, conduction_velocity=ConductionVelocity(0.8, 0.7, 0.9), cycle_length_ms=240.0)
+    study.mapped(replace(outcome, chamber=chamber))
+    answer = client.get(f"/v1/jobs/{study.job_id}/map").json()
+    assert answer["conduction_velocity"] == {"median_m_per_s": 0.8, "low_m_per_s": 0.7, "high_m_per_s": 0.9}
+    assert answer["cycle_length_ms"] == 240.0
 
 
 def test_the_map_from_the_isocentre_is_shifted_as_a_whole(client: TestClient, study: FinishedStudy) -> None:

@@ -152,7 +152,7 @@ def test_the_archive_holds_everything(client: TestClient, study: FinishedStudy) 
         assert archive.testzip() is None
         assert set(archive.namelist()) == {
             "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "map.png", "mesh/chamber.ply",
-            "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "mesh/chamber.mat", "mesh/chamber.csv",
+            "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "mesh/chamber.mat", "mesh/chamber.csv", "report.html",
             "overlays/S01-a.png", "overlays/S01-b.png",
         }  # fmt: skip
         assert json.loads(archive.read("job.json"))["state"] == "succeeded"
@@ -166,7 +166,7 @@ def test_the_archive_without_a_map(client: TestClient, study: FinishedStudy) -> 
     study.finish(no_map())
     content = client.get(f"/v1/jobs/{study.job_id}/archive.zip").content
     names = set(zipfile.ZipFile(io.BytesIO(content)).namelist())
-    assert names == {"job.json", "parameters.json", "points.csv", "tracks.csv"}
+    assert names == {"job.json", "parameters.json", "points.csv", "tracks.csv", "report.html"}
 
 
 def test_the_archive_waits_for_the_end(client: TestClient, study: FinishedStudy) -> None:

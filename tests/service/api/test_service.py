@@ -18,10 +18,10 @@ from fluoromap.store.models import WorkerSeen
 def test_plugins_are_listed_with_their_parameters(client: TestClient) -> None:
     listed = client.get("/v1/plugins").json()
     assert [(row["kind"], row["name"]) for row in listed] == [(row.kind, row.name) for row in registry.plugins()]
-    hull = next(row for row in listed if row["name"] == "convex-hull")
-    assert set(hull) == {"kind", "name", "version", "distribution", "default", "parameters", "error"}
-    assert hull["default"] is True
-    assert "fill_mm" in hull["parameters"]["properties"]
+    fuser = next(row for row in listed if row["name"] == "smooth-surface")
+    assert set(fuser) == {"kind", "name", "version", "distribution", "default", "parameters", "error"}
+    assert fuser["default"] is True
+    assert "fill_mm" in fuser["parameters"]["properties"]
 
 
 def test_a_broken_plugin_is_a_row(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
