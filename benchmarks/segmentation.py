@@ -1,27 +1,21 @@
-"""How well and how fast electrodes are found: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
+"""How well electrodes are found: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
 
 Prints, for both segmenters on runs of the phantom at 60 frames a second, recall, precision, the share of frames with all
 electrodes of the reference and the mapping catheter, RMS, how many catheter-frames are on the right track and how many 95 %
-ellipses hold the truth, each with a bootstrap interval over the runs; then what is accepted in runs without catheters; then
-milliseconds a frame beside the plain NumPy, SciPy and scikit-image twins of the filters, on the same frame.
-A detection is right within 5 px of the truth. Processor time of one thread.
+ellipses hold the truth, each with a bootstrap interval over the runs; then what is accepted in runs without catheters.
+A detection is right within 5 px of the truth. Speed: ``benchmarks/segmentation_speed.py``.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from skimage.filters import threshold_otsu
-from skimage.measure import label, regionprops
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import Chain, PixelFacts, Run, Segmentation, Segmenter, Silent
@@ -29,17 +23,8 @@ from fluoromap.geometry import Gantry
 from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, Contrast, SimulatedRun, StudySpec, simulate_study
 from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
-from fluoromap.segmenter.blob_chains import BlobDetector
-from fluoromap.segmenter.blobs import find_blobs
 from fluoromap.segmenter.catheter_chain import CatheterChain
-from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
-from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.four_step import FourStep
-from fluoromap.segmenter.frame_chains import FourStepDetector, FourStepParams
-from fluoromap.segmenter.homomorphic import homomorphic
-from fluoromap.segmenter.log_image import Image, LogTransform
-from fluoromap.segmenter.morphology import disk_morphology
-from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
 
 Array = NDArray[np.float64]
 
@@ -148,7 +133,6 @@ def main(first: int, seeds: int, frames: int) -> None:
     for name, (seconds, count) in spent.items():
         print(f"{name}: {1000 * seconds / count:.1f} ms a frame, all included")
     _without_catheters(first, seeds)
-    _speed(first)
 
 
 def _without_catheters(first: int, seeds: int) -> None:
@@ -257,75 +241,6 @@ def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array
             named.add(name)
             counts.on_track += len(set(names[name]) & set(frames.tolist()))
     counts.catheter_frames += len(truth) * len(frames)
-
-
-def _milliseconds(work: Callable[[], object], repeats: int) -> float:
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return 1000 * float(np.median(times))
-
-
-def _plain() -> ModuleType:
-    path = Path(__file__).parents[1] / "tests" / "plugins" / "segmenter" / "test_filters.py"
-    spec = importlib.util.spec_from_file_location("plain_filters", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def _speed(seed: int) -> None:
-    plain = _plain()
-    for view, simulated in zip(
-        VIEWS, simulate_study(StudySpec(seed, sites=1, frames=1, contrast=VIEWS)).sites[0].runs, strict=True
-    ):
-        kept = Kept(simulated.frames)
-        mask = find_field(kept, FACTS)
-        x: Image = mask.fill(LogTransform.of_run(FACTS, mask.mean_level)(kept[0]))
-        px_per_mm = 1024 / 178
-        blobs = BlobDetector(DEFAULT_CATALOGUE, mask, px_per_mm)
-        steps = FourStepDetector(DEFAULT_CATALOGUE, mask, px_per_mm, FourStepParams())
-        filtered = homomorphic(x)
-        k = edge_scale(filtered, mask.inside)
-        assert k is not None
-        diffused = perona_malik(filtered, k)
-        grey = to_grey_range(diffused, mask.inside)
-        sharp = complex_shock(grey)
-        bright = disk_morphology(sharp)
-
-        def components(bright: Image = bright) -> object:
-            return regionprops(label(bright > threshold_otsu(bright, nbins=1024), connectivity=2))  # type: ignore[no-untyped-call]
-
-        rows: list[tuple[str, Callable[[], object], Callable[[], object] | None]] = [
-            ("homomorphic (4)", lambda x=x: homomorphic(x), lambda x=x: plain.plain_homomorphic(x)),  # type: ignore[misc]
-            (
-                "Perona-Malik (5)(6)",
-                lambda f=filtered, k=k: perona_malik(f, k),  # type: ignore[misc]
-                lambda f=filtered, k=k: plain.plain_perona_malik(f, k),  # type: ignore[misc]
-            ),
-            ("complex shock (7)", lambda g=grey: complex_shock(g), lambda g=grey: plain.plain_complex_shock(g)),  # type: ignore[misc]
-            (
-                "disks",
-                lambda s=sharp: disk_morphology(s),  # type: ignore[misc]
-                lambda s=sharp: plain.plain_disk_morphology(s.astype(float), 14, 2),  # type: ignore[misc]
-            ),
-            (
-                "Otsu, components",
-                lambda b=bright, m=mask: find_blobs(b, m.inside, m.candidates, 20, 800),  # type: ignore[misc]
-                components,
-            ),
-            ("four-step, one frame", lambda s=steps, x=x: s.chains(x, 0), None),  # type: ignore[misc]
-            ("catheter-chain, one frame", lambda b=blobs, x=x: b.chains(x, 0), None),  # type: ignore[misc]
-        ]
-        print(f"512x512 {view:24} ours      plain   ms")
-        for name, ours, twin in rows:
-            beside = f"{_milliseconds(twin, 1):10.1f}" if twin is not None else ""
-            print(f"  {name:28} {_milliseconds(ours, 9):8.2f}{beside}")
 
 
 if __name__ == "__main__":

@@ -579,6 +579,7 @@ class ChamberMap:
     vertices_mm : (n, 3). faces : (f, 3), outward by the right-hand rule, watertight. lat_ms, lat_sd_ms : (n,), where
     ``covered`` (n,); elsewhere no site is near enough and the numbers are 0. earliest : (site, probability), most probable
     first. coverage : covered share of the area, 0..1. conduction_velocity : None where no sites lie close enough.
+    cycle_length_ms : of a re-entry: times repeat after it, so that early meets late; None where they do not.
     """
 
     vertices_mm: Array
@@ -595,6 +596,7 @@ class ChamberMap:
     coverage: float
     warnings: tuple[Reason, ...] = field(default=())
     conduction_velocity: ConductionVelocity | None = None
+    cycle_length_ms: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices_mm", frozen(self.vertices_mm, (None, 3), "vertices_mm"))
@@ -619,6 +621,7 @@ class Stage(Protocol):
 
     name : as clients write it. version : raise it whenever the answer to the same input changes; results are kept by it.
     Params : a pydantic model with ``extra="forbid"``, a default and a description for each field.
+    A plugin with kernels to compile may have a class method ``warm_up()``: a worker process calls it before it takes work.
     """
 
     name: ClassVar[str]

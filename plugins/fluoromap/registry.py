@@ -30,8 +30,8 @@ _METHODS: dict[Kind, str] = {
 DEFAULTS: dict[Kind, str] = {
     "segmenter": "catheter-chain",
     "triangulator": "maximum-likelihood",
-    "monoplane": "a-priori-lm",
-    "fuser": "convex-hull",
+    "monoplane": "motion-prior",
+    "fuser": "smooth-surface",
 }
 """The plugin that stands in for a stage a client does not name."""
 

@@ -124,4 +124,8 @@ def _print_result(
             highlight=False,
             soft_wrap=True,
         )
-    console.print(f"Results: {out.resolve()} (points.csv, map.png, mesh/, overlays/)", highlight=False, soft_wrap=True)
+    console.print(
+        f"Results: {out.resolve()} (report.html, points.csv, map.png, mesh/, overlays/)",
+        highlight=False,
+        soft_wrap=True,
+    )

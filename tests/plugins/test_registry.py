@@ -101,6 +101,7 @@ def test_the_installed_triangulators_and_monoplane_solvers_load() -> None:
         ("triangulator", "linear"),
         ("triangulator", "maximum-likelihood"),
         ("monoplane", "a-priori-lm"),
+        ("monoplane", "motion-prior"),
         ("monoplane", "rigid-pose"),
     ):
         assert rows[kind, name].error is None  # type: ignore[index]

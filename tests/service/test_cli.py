@@ -130,5 +130,5 @@ def test_run_says_what_is_missing(fluoromap: Program, tmp_path: Path) -> None:
 def test_plugins_are_listed(fluoromap: Program) -> None:
     answer = fluoromap("plugins")
     assert answer.returncode == 0
-    for name in ("four-step", "maximum-likelihood", "a-priori-lm", "convex-hull"):
+    for name in ("four-step", "maximum-likelihood", "motion-prior", "convex-hull"):
         assert name in answer.stdout

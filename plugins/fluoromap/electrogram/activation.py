@@ -15,14 +15,19 @@ from fluoromap.contracts import Array
 
 _LEAST_SAMPLES = 20
 _WINDOW_MS = 5.0
-_LEAST_WINDOW = 5
+_WIDTHS = 1.25
+_WIDER = 1.5
+_WIDEST_MS = 12.0
+_LEAST_WINDOW = 7
 _SATURATED_SAMPLES = 5
 _ABRUPT = 0.05
 _BASELINE = 0.1
-_LEAST_SLOPE_TO_NOISE = 6.0
+_LEAST_SLOPE_TO_NOISE = 5.0
 _RIVAL = 0.8
 _PLACEMENT = 0.05
 _RIVAL_AWAY_MS = 10.0
+_QUARTILE_OF_NORMAL = 0.31863936396437514
+"""25th percentile of the absolute value of a standard normal variable."""
 
 
 class UnusableElectrogram(ValueError):
@@ -44,9 +49,11 @@ class ElectrogramResult:
 def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike) -> ElectrogramResult:
     """Local activation time of one site from its two electrograms.
 
-    The slope at each sample is that of a quadratic fitted to the samples within 5 ms on each side (Savitzky and Golay,
-    Anal. Chem. 36 (1964) 1627, for samples at any spacing); the minimum is placed between samples by a parabola. Its
-    standard deviation follows from the noise about the fits and from how sharp the minimum is.
+    The slope at each sample is that of a cubic fitted to the samples within 5 ms on each side (Savitzky and Golay, Anal.
+    Chem. 36 (1964) 1627, for samples at any spacing), which follows a deflection of a few ms; its steepest place lies
+    between samples where the cubic's curvature vanishes. The standard deviation follows from how sharp that minimum is and
+    from the curvatures the same fits find in the quieter parts of the recording, so that hum, far field and filtered
+    noise count as they are and not as if samples erred one by one.
 
     Parameters
     ----------
@@ -75,16 +82,13 @@ def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike
     )
 
 
-def local_slope(times: Array, signal: Array) -> tuple[Array, Array, float]:
-    """(slope, its standard error for unit noise, noise) of quadratics fitted to 5 ms on each side of each sample.
-
-    slope, error : (n,), per ms. noise : robust standard deviation of the samples about their fits.
-    """
+def local_cubics(times: Array, signal: Array, window_ms: float) -> Array:
+    """Coefficients (n, 4) of cubics fitted to ``window_ms`` on each side of each sample, in powers of ms from it."""
     n = len(times)
     index = np.arange(n)
-    first = np.searchsorted(times, times - _WINDOW_MS - 1e-9)
-    last = np.searchsorted(times, times + _WINDOW_MS + 1e-9)
-    # Where samples are sparse a fit still needs two on each side.
+    first = np.searchsorted(times, times - window_ms - 1e-9)
+    last = np.searchsorted(times, times + window_ms + 1e-9)
+    # Where samples are sparse a fit still needs three on each side.
     first = np.minimum(first, np.maximum(index - _LEAST_WINDOW // 2, 0))
     last = np.maximum(last, np.minimum(index + _LEAST_WINDOW // 2 + 1, n))
     column = np.arange(int((last - first).max()))
@@ -94,16 +98,16 @@ def local_slope(times: Array, signal: Array) -> tuple[Array, Array, float]:
     x = np.where(used, times[sample] - times[:, None], 0.0)
     scale = np.abs(x).max(axis=1, keepdims=True)
     x /= scale
-    design = np.stack([used.astype(np.float64), x, x * x], axis=2)
+    design = used[..., None] * x[..., None] ** np.arange(4)
     inverse = np.linalg.pinv(np.einsum("nki,nkj->nij", design, design), hermitian=True)
-    values = np.where(used, signal[sample], 0.0)
-    fitted = np.einsum("nij,nkj,nk->ni", inverse, design, values)
-    slopes = fitted[:, 1] / scale[:, 0]
-    errors = np.sqrt(np.maximum(inverse[:, 1, 1], 0.0)) / scale[:, 0]
-    residual = np.where(used, values - np.einsum("nki,ni->nk", design, fitted), 0.0)
-    rest = (residual**2).sum(axis=1) / np.maximum(used.sum(axis=1) - 3, 1)
-    # The median keeps the deflection itself, which no quadratic follows, out of the noise.
-    return slopes, errors, math.sqrt(float(np.median(rest)))
+    fitted = np.einsum("nij,nkj,nk->ni", inverse, design, np.where(used, signal[sample], 0.0))
+    coefficients: Array = fitted / scale ** np.arange(4)
+    return coefficients
+
+
+def _quiet_sd(values: Array) -> float:
+    """Standard deviation of the quieter half of a recording, from the lower quartile, so that deflections do not count."""
+    return float(np.percentile(np.abs(values), 25)) / _QUARTILE_OF_NORMAL
 
 
 def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> tuple[float, float]:
@@ -118,10 +122,11 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
         at_baseline = abs(rail - np.median(signal)) <= _BASELINE * extent
         if not at_baseline and _clipped(signal, float(rail)):
             raise UnusableElectrogram(f"The {name} electrogram is saturated; lower the amplifier's gain.")
-    slopes, errors, noise = local_slope(times, signal)
-    inner = slice(2, -2)
-    steepest = int(np.argmin(slopes[inner])) + 2
-    threshold = _LEAST_SLOPE_TO_NOISE * noise * errors[steepest]
+    cubics = local_cubics(times, signal, _WINDOW_MS)
+    slopes = cubics[:, 1]
+    inner = slice(3, -3)
+    steepest = int(np.argmin(slopes[inner])) + 3
+    threshold = _LEAST_SLOPE_TO_NOISE * _quiet_sd(slopes[inner])
     if not slopes[steepest] < -max(threshold, 1e-9 * extent):
         raise UnusableElectrogram(
             f"The {name} electrogram has no steep negative deflection that stands out from noise."
@@ -131,20 +136,36 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
         warnings.append(
             f"The {name} electrogram has two negative deflections of almost equal steepness; check the annotation."
         )
-    if steepest <= 3 or steepest >= len(times) - 4:
+    if steepest <= 4 or steepest >= len(times) - 5:
         warnings.append(
             f"The deflection of the {name} electrogram lies at the edge of the recording; check the window."
         )
-    x = times[steepest - 2 : steepest + 3] - times[steepest]
-    curve = np.polyfit(x, slopes[steepest - 2 : steepest + 3], 2)
+    return _placed(times, signal, steepest, cubics[steepest])
+
+
+def _placed(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[float, float]:
+    """(time, standard deviation) of the steepest place near a sample, from cubics as wide as the deflection is."""
     spacing = float(np.median(np.diff(times)))
-    if curve[0] <= 0:
+    if cubic[3] <= 0:
         return float(times[steepest]), 2.0 * spacing
-    place = float(np.clip(-curve[1] / (2.0 * curve[0]), x[0], x[-1]))
-    # d(slope) / d(time) changes by 2 c per ms at the minimum: an error of the slope's derivative moves it by error / 2 c.
-    derivative_error = noise * errors[steepest] * math.sqrt(10.0) / _WINDOW_MS
-    sd = math.hypot(derivative_error / (2.0 * float(curve[0])), _PLACEMENT * spacing)
-    return float(times[steepest]) + place, sd
+    # The derivative of a Gaussian of this standard deviation has such a slope and third power at its steepest place.
+    width = min(max(_WIDTHS * math.sqrt(-cubic[1] / (2.0 * cubic[3])), _WINDOW_MS), _WIDEST_MS)
+    near = np.flatnonzero(np.abs(times - times[steepest]) <= max(_WINDOW_MS, spacing))
+    places = []
+    for window in (_WIDER * width, width):
+        cubics = local_cubics(times, signal, window)
+        best = int(near[np.argmin(cubics[near, 1])])
+        curvature, sharpness = cubics[best, 2], 3.0 * cubics[best, 3]
+        # The steepest of many noisy places looks sharper than it is: count on a standard deviation less.
+        sure = sharpness - 3.0 * _quiet_sd(cubics[:, 3])
+        if sure <= 0:
+            return float(times[best]), 2.0 * spacing
+        before, behind = times[max(best - 1, 0)] - times[best], times[min(best + 1, len(times) - 1)] - times[best]
+        places.append(float(times[best] + np.clip(-curvature / sharpness, before, behind)))
+        noise_sd = _quiet_sd(cubics[:, 2]) / sure
+    # What lies under the deflection, far field above all, draws its steepest place away, a wider fit's more than a close one's.
+    drawn = places[0] - places[1]
+    return places[1], math.hypot(max(noise_sd, abs(drawn)), _PLACEMENT * spacing)
 
 
 def _clipped(signal: Array, rail: float) -> bool:

@@ -34,7 +34,7 @@ def draw_propagation(
     Parameters as of :func:`fluoromap.fuser.overlay.draw_overlay`; ``look.until_ms`` is not read. Every picture is the overlay
     with its time written in the corner, the wall coloured as far as it is activated by then.
     """
-    times = scale_of(chamber, look.step_ms, look.palette)
+    times = look.times or scale_of(chamber, look.step_ms, look.palette)
     pictures = [
         Image.fromarray(
             draw_overlay(

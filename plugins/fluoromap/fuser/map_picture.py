@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,15 @@ from PIL import Image, ImageDraw
 from fluoromap.contracts import Array, ChamberMap
 from fluoromap.fuser.colours import Scale, scale_of
 from fluoromap.fuser.isochrones import Isochrone, isochrones
-from fluoromap.fuser.lettering import Labels, draw_colour_bar, font
+from fluoromap.fuser.lettering import Labels, Point, draw_colour_bar, font
 from fluoromap.fuser.raster import rasterise
 from fluoromap.fuser.surface import face_normals
 from fluoromap.fuser.symbols import draw_dot, draw_time, is_outlier
 from fluoromap.fuser.wall import outline_edges, pixel_colours, runs
 
-VIEWS: tuple[tuple[str, float, float, tuple[str, str, str, str]], ...] = (
+Direction = tuple[str, float, float, tuple[str, str, str, str]]
+
+VIEWS: tuple[Direction, ...] = (
     ("AP", 0, 0, ("R", "L", "H", "F")),
     ("LAO 45", 45, 0, ("RA", "LP", "H", "F")),
     ("left lateral (LAO 90)", 90, 0, ("A", "P", "H", "F")),
@@ -27,6 +30,7 @@ VIEWS: tuple[tuple[str, float, float, tuple[str, str, str, str]], ...] = (
 )
 """Name, primary and secondary angle as of a C-arm, letters of the patient's directions left, right, top, bottom."""
 
+PANELS_A_ROW = 3
 PANEL_PX = 340
 MARGIN_PX = 40
 BAR_PX = 110
@@ -38,29 +42,46 @@ SMOOTH = 2
 """Panels are drawn this much larger and averaged: smooth edges."""
 
 
-def draw_map_views(chamber: ChamberMap) -> NDArray[np.uint8]:
-    """The map from six directions, all at one scale, with its sites, isochrones, colour bar and figures of merit.
+def draw_map_views(
+    chamber: ChamberMap,
+    views: Sequence[Direction] = VIEWS,
+    like: ChamberMap | None = None,
+    times: Scale | None = None,
+) -> NDArray[np.uint8]:
+    """The map from several directions, all at one scale, with its sites, isochrones, colour bar and figures of merit.
 
     Orthographic; the viewer stands where a C-arm's detector would. Sites on the far wall are not drawn.
+
+    Parameters
+    ----------
+    chamber : ChamberMap
+    views : sequence of Direction
+        As in :data:`VIEWS`, three a row.
+    like : ChamberMap or None
+        The map whose middle and size place this one in its panels: pictures of two maps then can be laid side by side.
+    times : Scale or None
+        Colour scale that several pictures share; None takes the one that suits the map.
 
     Returns
     -------
     (rows, columns, 3) uint8
         RGB.
     """
-    times = scale_of(chamber)
+    times = times or scale_of(chamber)
     lines = isochrones(chamber, times.edges_ms)
-    middle = (chamber.vertices_mm.max(axis=0) + chamber.vertices_mm.min(axis=0)) / 2
-    radius = float(np.linalg.norm(chamber.vertices_mm - middle, axis=1).max())
+    placed = (like or chamber).vertices_mm
+    middle = (placed.max(axis=0) + placed.min(axis=0)) / 2
+    radius = float(np.linalg.norm(placed - middle, axis=1).max())
     px_per_mm = (PANEL_PX / 2 - MARGIN_PX) / radius
-    picture = Image.new("RGB", (3 * PANEL_PX + BAR_PX, 2 * PANEL_PX + FOOTER_PX), BACKGROUND)
-    for index, (name, primary, secondary, letters) in enumerate(VIEWS):
+    width, height = PANELS_A_ROW * PANEL_PX, -(-len(views) // PANELS_A_ROW) * PANEL_PX
+    picture = Image.new("RGB", (width + BAR_PX, height + FOOTER_PX), BACKGROUND)
+    for index, (name, primary, secondary, letters) in enumerate(views):
         panel = _Panel(primary, secondary, middle, px_per_mm).drawn(chamber, lines, times)
         _caption(panel, name, letters)
-        picture.paste(panel, (PANEL_PX * (index % 3), PANEL_PX * (index // 3)))
-    _scale_bar(ImageDraw.Draw(picture), px_per_mm)
+        picture.paste(panel, (PANEL_PX * (index % PANELS_A_ROW), PANEL_PX * (index // PANELS_A_ROW)))
+    _scale_bar(ImageDraw.Draw(picture), px_per_mm, (width + 14.0, height + 0.55 * FOOTER_PX))
     draw_colour_bar(picture, times, 14, dark=False)
-    place = (3 * PANEL_PX / 2, 2 * PANEL_PX + 0.4 * FOOTER_PX)
+    place = (width / 2, height + 0.4 * FOOTER_PX)
     ImageDraw.Draw(picture).text(place, _figures(chamber), fill=INK, font=font(14), anchor="mm")
     return np.asarray(picture)
 
@@ -134,9 +155,9 @@ def _caption(panel: Image.Image, name: str, letters: tuple[str, str, str, str]) 
         draw.text(place, letter, fill=(140, 140, 145), font=font(12), anchor="mm")
 
 
-def _scale_bar(draw: ImageDraw.ImageDraw, px_per_mm: float) -> None:
+def _scale_bar(draw: ImageDraw.ImageDraw, px_per_mm: float, start: Point) -> None:
     length_mm = next(length for length in (50, 20, 10, 5, 2, 1) if length * px_per_mm <= 90 or length == 1)
-    left, level = 3 * PANEL_PX + 14.0, 2 * PANEL_PX + 0.55 * FOOTER_PX
+    left, level = start
     right = left + length_mm * px_per_mm
     draw.line((left, level, right, level), fill=INK, width=2)
     for end in (left, right):

@@ -41,7 +41,8 @@ class Look:
 
     scale : pixels of the picture per pixel of the frame, along each side. palette, step_ms : of the isochrones, None being
     the step that suits the map. covariances_mm2 : site -> (3, 3) of its position, drawn as the 95 % ellipse. until_ms : the
-    wall is coloured only where it is activated by then, its front a thick line; None colours all.
+    wall is coloured only where it is activated by then, its front a thick line; None colours all. times : colour scale that
+    several pictures share, in place of palette and step.
     """
 
     scale: int = 1
@@ -49,6 +50,7 @@ class Look:
     step_ms: float | None = None
     covariances_mm2: Mapping[str, Array] = field(default_factory=dict)
     until_ms: float | None = None
+    times: Scale | None = None
 
     def __post_init__(self) -> None:
         if self.scale < 1:
@@ -103,7 +105,7 @@ def draw_overlay(
         raise ValueError(f"the frame must be uint8 of shape {(camera.rows, camera.columns)}, not {frame.shape}")
     look = look or Look()
     canvas = _Canvas(camera.translated(shift_world_mm), look.scale)
-    times = scale_of(chamber, look.step_ms, look.palette)
+    times = look.times or scale_of(chamber, look.step_ms, look.palette)
     size = (camera.columns * look.scale, camera.rows * look.scale)
     grey = Image.fromarray(frame)
     picture = np.array(grey if look.scale == 1 else grey.resize(size, Image.Resampling.BICUBIC))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.fuser.cycle import around
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +29,15 @@ class Raster:
         """Pixels (rows, columns) that show the surface."""
         return self.face >= 0
 
-    def sample(self, values: Array) -> Array:
-        """Values (n,) of the vertices at the shown pixels, linear within each face; (p,) in row-major order."""
+    def sample(self, values: Array, cycle: float | None = None) -> Array:
+        """Values (n,) of the vertices at the shown pixels, linear within each face; (p,) in row-major order.
+
+        Values that repeat after ``cycle`` are taken by the shorter way round from corner to corner, and answered from the
+        least of them on.
+        """
         v, u = np.nonzero(self.shown())
-        return self._inside(self.face[v, u], np.stack([u, v], axis=1).astype(np.float64), values)
+        sampled = self._inside(self.face[v, u], np.stack([u, v], axis=1).astype(np.float64), values, cycle)
+        return sampled if cycle is None else values.min() + (sampled - values.min()) % cycle
 
     def visible(self, uv: Array, nearness: Array, tolerance_mm: float = 1.5) -> BoolArray:
         """Whether points (k, 2) at their nearness (k,) are not behind the surface by more than the tolerance."""
@@ -45,8 +51,11 @@ class Raster:
         answer[inside] = nearness[inside] >= wall - tolerance_mm
         return answer
 
-    def _inside(self, face: NDArray[np.int32], uv: Array, values: Array) -> Array:
+    def _inside(self, face: NDArray[np.int32], uv: Array, values: Array, cycle: float | None = None) -> Array:
         corners, at_corners = self.uv[self.faces], values[self.faces]
+        if cycle is not None:
+            first_corner = at_corners[:, :1]
+            at_corners = first_corner + around(at_corners - first_corner, cycle)
         first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         determinant = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
         determinant = np.where(np.abs(determinant) < 1e-9, np.inf, determinant)

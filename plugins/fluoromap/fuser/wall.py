@@ -19,7 +19,7 @@ def pixel_colours(
     details, 1 for a picture of 512 pixels.
     """
     covered = raster.sample(chamber.covered.astype(np.float64)) > 0.5
-    lat = raster.sample(_times_past_rim(chamber))
+    lat = raster.sample(_times_past_rim(chamber), chamber.cycle_length_ms)
     colours = times.band_colours()[times.band(lat)].astype(np.float32)
     v, u = np.nonzero(raster.shown())
     hatched = ~covered & ((u + v) % max(4, round(7 * unit)) < max(1, round(unit)))
@@ -33,12 +33,24 @@ def pixel_colours(
 def _times_past_rim(chamber: ChamberMap) -> Array:
     """Times at the vertices, those just past the covered part taking the mean of their covered neighbours: else a face on
     the rim would run through all bands down to 0."""
-    lat, faces = chamber.lat_ms.copy(), chamber.faces
+    lat, faces, cycle = chamber.lat_ms.copy(), chamber.faces, chamber.cycle_length_ms
+    if not chamber.covered.any():
+        return lat
+    lat[~chamber.covered] = low = float(lat[chamber.covered].min())
     known = chamber.covered[faces].astype(np.float64)
-    total = np.bincount(faces.ravel(), np.repeat((known * lat[faces]).sum(axis=1), 3), minlength=len(lat))
+    # Round a cycle times have no mean but their directions on a circle have.
+    turns = lat[faces].astype(np.complex128) if cycle is None else np.exp(2j * np.pi * (lat[faces] - low) / cycle)
+    of_face = (known * turns).sum(axis=1)
+    parts = [
+        np.bincount(faces.ravel(), np.repeat(part, 3), minlength=len(lat)) for part in (of_face.real, of_face.imag)
+    ]
     count = np.bincount(faces.ravel(), np.repeat(known.sum(axis=1), 3), minlength=len(lat))
     rim = ~chamber.covered & (count > 0)
-    lat[rim] = total[rim] / count[rim]
+    total = parts[0][rim] + 1j * parts[1][rim]
+    if cycle is None:
+        lat[rim] = total.real / count[rim]
+    else:
+        lat[rim] = low + np.angle(total) % (2 * np.pi) * cycle / (2 * np.pi)
     return lat
 
 

@@ -75,18 +75,18 @@ class Camera:
         return depth
 
     def project(self, points_world_mm: ArrayLike) -> Array:
-        """Full perspective projection, the paper's equation (1): points ``(..., 3)`` to pixels ``(..., 2)``."""
+        """Full perspective projection, eq. (1) of the paper: points ``(..., 3)`` to pixels ``(..., 2)``."""
         points = np.asarray(points_world_mm, dtype=np.float64)
         homogeneous = points @ self.matrix[:, :3].T + self.matrix[:, 3]
         pixels: Array = homogeneous[..., :2] / homogeneous[..., 2:]
         return pixels
 
     def project_parallel(self, points_world_mm: ArrayLike) -> Array:
-        """Parallel projection, the paper's equation (2): the scale of the isocentre for every point, no depth."""
+        """Parallel projection, eq. (2) of the paper: the scale of the isocentre for every point, no depth."""
         return self._project_at_depth(points_world_mm, self.matrix[2, 3])
 
     def project_weak(self, points_world_mm: ArrayLike) -> Array:
-        """Weak perspective, the paper's equation (3): the depth of the cloud's centroid for every point."""
+        """Weak perspective, eq. (3) of the paper: the depth of the cloud's centroid for every point."""
         points = np.asarray(points_world_mm, dtype=np.float64)
         return self._project_at_depth(points, float(self.depth_mm(points.reshape(-1, 3).mean(axis=0))))
 

@@ -2,4 +2,7 @@
 
 from fluoromap.matching.study import SiteRuns, match_study
 
-__all__ = ["SiteRuns", "match_study"]
+__all__ = ["VERSION", "SiteRuns", "match_study"]
+
+VERSION = "2"
+"""Of the answers: raised whenever the same chains are matched otherwise; results are kept by it."""

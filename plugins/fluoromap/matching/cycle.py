@@ -1,107 +1,179 @@
-"""Two runs of a site brought to the same cardiac phase."""
+"""Two runs of a site brought to the same cardiac phase, and whether catheters move alike in both."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from fluoromap.contracts import Array, NamedChain, Observation, PhasePair
 from fluoromap.geometry import Camera
 from fluoromap.matching.phase import phase_distance
+from fluoromap.matching.run_catheters import RunCatheter
 from fluoromap.matching.two_view import signed_epipolar_px
 
 NEAREST_PHASE = 0.03
 """Frames of the two views are the same moment of the cycle when their phases differ by no more than this."""
-_SHIFTS = np.linspace(-0.5, 0.5, 101)
+WIDEST_GAP = 0.15
+"""Between frames that are further apart in phase nothing is interpolated: systole would be cut short."""
+MOMENTS = 50
+"""Phases at which a run's motion is compared with the other's."""
+_BLUR = 0.025
 _LEAST_MOTION_PX = 0.5
+_MOTION_SD_PX = 1.5
+_MOTION_SD_SHARE = 0.12
+_INDEPENDENT_MOMENTS = 4.0
 
 
-def pair_by_phase(track_a: Sequence[Observation], track_b: Sequence[Observation]) -> tuple[PhasePair, ...]:
-    """Each frame of view a with the frame of view b nearest in phase, by rising phase; only frames that show catheters."""
-    shown_a = [seen for seen in track_a if seen.chains and seen.phase is not None]
-    shown_b = [seen for seen in track_b if seen.chains and seen.phase is not None]
-    if not shown_a or not shown_b:
-        return ()
-    phases_b = np.array([seen.phase for seen in shown_b])
-    pairs = []
-    for seen in sorted(shown_a, key=lambda entry: (entry.phase, entry.frame)):
-        apart = phase_distance(np.array(seen.phase), phases_b)
-        nearest = int(np.argmin(apart))
-        if apart[nearest] <= NEAREST_PHASE:
-            pairs.append(PhasePair(seen.phase, seen, shown_b[nearest]))
-    return tuple(pairs)
+@dataclass(frozen=True, eq=False)
+class FoldedRun:
+    """The motion of a run's catheters over one cycle, all beats taken together.
+
+    paths : for each catheter electrode number -> pixels (MOMENTS, 2) at phases evenly from 0 on.
+    told : the phases count from R waves.
+    """
+
+    paths: tuple[dict[int, Array], ...]
+    told: bool
 
 
-def align_phases(
-    camera_a: Camera, camera_b: Camera, track_a: Sequence[Observation], track_b: Sequence[Observation]
-) -> Array:
-    """Phases of view b's frames, shifted so that both views count from the same moment of the cycle.
+def fold(catheters: Sequence[RunCatheter], phases: Array, told: bool) -> FoldedRun:
+    """Take all beats of a run together; phases (n,) of its frames."""
+    paths: list[dict[int, Array]] = []
+    for catheter in catheters:
+        frames, electrodes, pixels = catheter.seen_throughout
+        if len(frames) < 4:
+            paths.append({})
+            continue
+        at = phases[frames]
+        blur = max(_BLUR, 0.5 * float(np.diff(np.sort(at), append=np.sort(at)[:1] + 1).max()))
+        apart = phase_distance(np.arange(MOMENTS)[:, None] / MOMENTS, at[None, :])
+        weights = np.exp(-0.5 * (apart / blur) ** 2)
+        weights /= weights.sum(axis=1, keepdims=True)
+        smooth = np.einsum("kn,nei->kei", weights, pixels)
+        paths.append({number: smooth[:, row] for row, number in enumerate(electrodes)})
+    return FoldedRun(tuple(paths), told)
 
-    What moves across the epipolar lines is seen by both views: at equal phases the epipolar distance of an electrode
-    stays what it is, at unequal ones it follows the heart. The shift is the one that leaves the least variation. Where
-    hardly anything moves in that direction the phases stay as they are.
+
+def _variations(
+    cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, FoldedRun], pairs: Sequence[tuple[int, int]]
+) -> tuple[Array, Array]:
+    """How much the epipolar distance of each pair varies over the cycle, px^2: (p, MOMENTS) for each shift of view b's
+    phases by k / MOMENTS, and (p,) were the two not the same. NaN where no electrode is followed in both runs.
+
+    What moves across the epipolar lines is seen by both views: at equal phases the distance stays what it is.
+    """
+    known, first, second = [], [], []
+    for row, (i, j) in enumerate(pairs):
+        path_a, path_b = folded[0].paths[i], folded[1].paths[j]
+        common = sorted(set(path_a) & set(path_b))
+        if common:
+            known.append(row)
+            first.append(np.mean([path_a[number] for number in common], axis=0))
+            second.append(np.mean([path_b[number] for number in common], axis=0))
+    variation, unlike = np.full((len(pairs), MOMENTS), np.nan), np.full(len(pairs), np.nan)
+    if known:
+        distance = signed_epipolar_px(*cameras, np.array(first)[:, :, None], np.array(second)[:, None, :])
+        moments = np.arange(MOMENTS)
+        # View b's phases shifted by s: what it shows at phase p it has recorded at p - s.
+        recorded = (moments[None, :] - moments[:, None]) % MOMENTS
+        variation[known] = distance[:, moments[None, :], recorded].var(axis=2)
+        unlike[known] = distance.var(axis=1).mean(axis=1) + distance.var(axis=2).mean(axis=1)
+    return variation, unlike
+
+
+def motion_misfit(cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, FoldedRun] | None, n: int, m: int) -> Array:
+    """What each pair of n and m catheters costs for moving otherwise in the two views, in nats.
 
     Returns
     -------
-    ndarray, shape (n_b,)
-        For the observations of ``track_b``, which must all have a phase.
+    ndarray, shape (n, m, k)
+        For k shifts of view b's phases: one where R waves tell both phases, all round the cycle else; none without phases.
     """
-    phases_a = np.array([seen.phase for seen in track_a], dtype=np.float64)
-    phases_b = np.array([seen.phase for seen in track_b], dtype=np.float64)
-    labels = _electrodes_in_most(track_a) & _electrodes_in_most(track_b)
-    if not labels:
-        return phases_b
-    pixels_a, pixels_b = _pixels(track_a, sorted(labels)), _pixels(track_b, sorted(labels))
-    good_a, good_b = np.isfinite(pixels_a).all(axis=(1, 2)), np.isfinite(pixels_b).all(axis=(1, 2))
-    if good_a.sum() < 4 or good_b.sum() < 4:
-        return phases_b
-    pixels_a, times_a = pixels_a[good_a], phases_a[good_a]
-    order = np.argsort(phases_b[good_b])
-    pixels_b, times_b = pixels_b[good_b][order], phases_b[good_b][order]
-    variation = np.array(
-        [
-            signed_epipolar_px(camera_a, camera_b, pixels_a, _at_phases(times_b + shift, pixels_b, times_a))
-            .var(axis=0)
-            .mean()
-            for shift in _SHIFTS
-        ]
-    )
+    if folded is None:
+        return np.zeros((n, m, 0))
+    pairs = [(i, j) for i in range(n) for j in range(m)]
+    variation, unlike = _variations(cameras, folded, pairs)
+    if folded[0].told and folded[1].told:
+        variation = variation[:, :1]
+    usual = _MOTION_SD_PX**2 + _MOTION_SD_SHARE**2 * unlike[:, None]
+    cost = _INDEPENDENT_MOMENTS / 2 * np.log1p(np.nan_to_num(variation / usual, nan=1.0))
+    misfit: Array = cost.reshape(n, m, -1)
+    return misfit
+
+
+def phase_shift(
+    cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, FoldedRun], pairs: Sequence[tuple[int, int]]
+) -> float:
+    """What to add to view b's phases so that both views count from the same moment of the cycle, -0.5 to 0.5.
+
+    The shift that leaves the paired catheters' epipolar distances the least variation; 0 where R waves tell the phases of
+    both runs or hardly anything moves across the epipolar lines.
+    """
+    if folded[0].told and folded[1].told:
+        return 0.0
+    variation = np.nansum(_variations(cameras, folded, pairs)[0], axis=0) / max(len(pairs), 1)
     best = int(np.argmin(variation))
     if np.sqrt(variation.max()) - np.sqrt(variation[best]) < _LEAST_MOTION_PX:
-        return phases_b
-    shifted: Array = (phases_b + _SHIFTS[best]) % 1.0
-    return shifted
+        return 0.0
+    left, middle, right = variation[(best + np.array([-1, 0, 1])) % MOMENTS]
+    bend = left - 2 * middle + right
+    between = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    return float(((best + between) / MOMENTS + 0.5) % 1.0 - 0.5)
 
 
-def _electrodes_in_most(track: Sequence[Observation]) -> set[tuple[str, int]]:
-    counts: dict[tuple[str, int], int] = {}
-    for seen in track:
-        for chain in seen.chains:
-            for electrode in chain.electrodes:
-                counts[chain.catheter, electrode] = counts.get((chain.catheter, electrode), 0) + 1
-    return {label for label, count in counts.items() if count >= 0.8 * len(track)}
+def pair_by_phase(track_a: Sequence[Observation], track_b: Sequence[Observation]) -> tuple[PhasePair, ...]:
+    """Each frame of view a with what view b shows at that phase, by rising phase; only frames that show catheters.
+
+    View b's frame nearest in phase, of any beat. At low frame rates there may be none near enough: then what lies between
+    the frames next before and after in phase, on straight lines; where those are too far apart the moment is left out.
+    """
+    shown_a = [seen for seen in track_a if seen.chains and seen.phase is not None]
+    shown_b = sorted((seen for seen in track_b if seen.chains and seen.phase is not None), key=_phase_of)
+    if not shown_a or not shown_b:
+        return ()
+    phases_b = np.array([_phase_of(seen) for seen in shown_b])
+    pairs = []
+    for seen in sorted(shown_a, key=lambda entry: (_phase_of(entry), entry.frame)):
+        apart = phase_distance(np.array(seen.phase), phases_b)
+        nearest = int(np.argmin(apart))
+        partner: Observation | None = shown_b[nearest]
+        if apart[nearest] > NEAREST_PHASE:
+            after = int(np.searchsorted(phases_b, _phase_of(seen))) % len(shown_b)
+            partner = _between(shown_b[after - 1], shown_b[after], _phase_of(seen))
+        if partner is not None:
+            pairs.append(PhasePair(seen.phase, seen, partner))
+    return tuple(pairs)
 
 
-def _pixels(track: Sequence[Observation], labels: Sequence[tuple[str, int]]) -> Array:
-    """Pixels (n, m, 2) of these electrodes, NaN where not seen."""
-    pixels = np.full((len(track), len(labels), 2), np.nan)
-    place = {label: index for index, label in enumerate(labels)}
-    for row, seen in enumerate(track):
-        for chain in seen.chains:
-            _put(pixels[row], chain, place)
-    return pixels
+def _phase_of(seen: Observation) -> float:
+    assert seen.phase is not None
+    return seen.phase
 
 
-def _put(row: Array, chain: NamedChain, place: dict[tuple[str, int], int]) -> None:
-    for electrode, pixel in zip(chain.electrodes, chain.pixels_uv, strict=True):
-        if (chain.catheter, electrode) in place:
-            row[place[chain.catheter, electrode]] = pixel
-
-
-def _at_phases(phases: Array, pixels: Array, wanted: Array) -> Array:
-    """Pixels (n, m, 2), known at ``phases`` (n,), interpolated round the cycle at ``wanted`` (k,): (k, m, 2)."""
-    flat = pixels.reshape(len(pixels), -1)
-    columns = [np.interp(wanted, phases, flat[:, column], period=1.0) for column in range(flat.shape[1])]
-    interpolated: Array = np.stack(columns, axis=1).reshape(len(wanted), *pixels.shape[1:])
-    return interpolated
+def _between(before: Observation, after: Observation, phase: float) -> Observation | None:
+    """What is seen at ``phase``, between two moments of the cycle; None where they are too far apart or share nothing."""
+    gap = (_phase_of(after) - _phase_of(before)) % 1.0
+    if not 0 < gap <= WIDEST_GAP:
+        return None
+    share = ((phase - _phase_of(before)) % 1.0) / gap
+    later = {chain.catheter: chain for chain in after.chains}
+    chains = []
+    for early in before.chains:
+        late = later.get(early.catheter)
+        common = tuple(number for number in early.electrodes if late is not None and number in late.electrodes)
+        if late is None or not common:
+            continue
+        first = [early.electrodes.index(number) for number in common]
+        second = [late.electrodes.index(number) for number in common]
+        chains.append(
+            NamedChain(
+                early.catheter,
+                common,
+                (1 - share) * early.pixels_uv[first] + share * late.pixels_uv[second],
+                (1 - share) ** 2 * early.covariance_px2[first] + share**2 * late.covariance_px2[second],
+            )
+        )
+    frame = before.frame if share <= 0.5 else after.frame
+    return Observation(frame, phase, tuple(chains)) if chains else None

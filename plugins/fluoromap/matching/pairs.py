@@ -1,4 +1,4 @@
-"""Which chain of one view is which chain of the other."""
+"""How well each chain of one view fits each chain of the other: costs in nats, the less the likelier."""
 
 from __future__ import annotations
 
@@ -6,98 +6,147 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array, Chain
+from fluoromap.contracts import Array, BoolArray
 from fluoromap.geometry import Camera
-from fluoromap.matching.run_catheters import common_electrodes
+from fluoromap.matching.run_catheters import RunCatheter, common_electrodes
 from fluoromap.matching.two_view import signed_epipolar_px, triangulate_linear
 
-COST_LIMIT_MM = 2.0
-"""A pair that costs more (in pixels, over the pixels per mm at the isocentre) is not one."""
-SHIFT_LIMIT_MM = 20.0
-"""The heart is never farther from its place in the other run than this."""
-_NEVER = 1e6
-_SPACING_WEIGHT_PX_PER_MM = 3.0
-_OFFSET_WEIGHT = 0.5
-_COMMON_WEIGHT = 0.1
+LEAST_VOTE = 0.15
+"""A catheter is not given a name that fewer votes speak for."""
+GANTRY_SD_RAD = np.radians(np.sqrt(2.0))
+"""Of the rotation of one view against the other about each axis: 1 degree in each view."""
+CATHETER_SD_MM = 0.6
+"""Of a catheter's place in one run against the other: beat to beat, and another moment of the cycle."""
+TAILS = 3.0
+"""Degrees of freedom of the Student distributions that stand for normal ones with a few gross errors."""
+_TURN_RAD = 1e-3
+_PIXEL_FLOOR_PX = 0.8
+_SPACING_SD_MM = 0.45
+_BEND_SD_DEG = 35.0
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """Chain ``a`` of one view and chain ``b`` of the other show the same catheter. cost_px : without the common offset."""
+@dataclass(frozen=True, eq=False)
+class PairTable:
+    """Every chain of view a (n of them) against every chain of view b (m).
 
-    a: int
-    b: int
-    cost_px: float
-
-
-def spacing_misfit_mm(points_world_mm: Array, electrodes: Sequence[int], catheter: Catheter) -> float:
-    """Mean difference between the distances of neighbouring electrodes and the catalogue's; 0 for a single electrode.
-
-    points_world_mm : (m, 3) of the electrodes with these numbers, ascending.
+    possible : (n, m), whether the two can be one catheter at all. distance_px : (n, m) mean signed epipolar distance of
+    their electrodes. variance_px2 : (n, m) of that, were the gantry right and the heart in one place in both runs.
+    turn_px : (n, m, 3) how a rotation of view b about the world's axes by one radian changes it. shape_cost : (n, m), how
+    the distances differ along the catheter and whether it bends as a catheter can. group_cost : (groups, n, m), spacing and
+    votes; infinite where the name is out of the question. motion_cost : (n, m, shifts) over the cycle, for each shift of
+    view b's phases. position_mm : (n, m, 3), mean of the electrodes in the world.
     """
-    if len(electrodes) < 2:
-        return 0.0
+
+    possible: BoolArray
+    distance_px: Array
+    variance_px2: Array
+    turn_px: Array
+    shape_cost: Array
+    group_cost: Array
+    motion_cost: Array
+    position_mm: Array
+
+
+def student_cost(chi2: Array, terms: int | Array = 1) -> Array:
+    """Negative logarithm of a Student density of ``terms`` numbers whose squares over their variances sum to ``chi2``."""
+    cost: Array = (TAILS + terms) / 2 * np.log1p(chi2 / TAILS)
+    return cost
+
+
+def common_distance(distances: Array, variances: Array) -> float:
+    """Weighted mean of distances (m,) that a few gross errors do not draw away."""
+    mean = float(np.median(distances))
+    for _ in range(3):
+        weights = (TAILS + 1) / (TAILS + (distances - mean) ** 2 / variances) / variances
+        mean = float((weights * distances).sum() / weights.sum())
+    return mean
+
+
+def spacing_cost(points_world_mm: Array, electrodes: Sequence[int], catheter: Catheter) -> float:
+    """Cost of the differences between the distances of neighbouring electrodes and the catalogue's.
+
+    points_world_mm : (m, 3) of the electrodes with these numbers, ascending. 0 for one, infinite for too many.
+    """
     if electrodes[-1] > catheter.electrodes:
-        return _NEVER
+        return np.inf
     along = np.diff(catheter.arc_lengths_mm[np.array(electrodes) - 1])
     found = np.linalg.norm(np.diff(points_world_mm, axis=0), axis=1)
-    return float(np.abs(found - along).mean())
+    return float(student_cost(((found - along) / _SPACING_SD_MM) ** 2).sum())
 
 
-def common_points(camera_a: Camera, camera_b: Camera, first: Chain, second: Chain) -> tuple[tuple[int, ...], Array]:
-    """Numbers of the electrodes that both chains hold, and their points (m, 3) in the world, mm."""
-    i, j = common_electrodes(first, second)
-    electrodes = tuple(first.electrodes[k] for k in i)
-    if not electrodes:
-        return (), np.zeros((0, 3))
-    return electrodes, triangulate_linear(camera_a, camera_b, first.pixels_uv[i], second.pixels_uv[j])
+def bend_cost(points_world_mm: Array) -> float:
+    """Cost of the bends of the line through points (m, 3)."""
+    steps = np.diff(points_world_mm, axis=0)
+    steps = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+    cosine = np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1.0, 1.0)
+    return float(student_cost((np.degrees(np.arccos(cosine)) / _BEND_SD_DEG) ** 2).sum())
 
 
-def pair_chains(
-    camera_a: Camera, camera_b: Camera, chains_a: Sequence[Chain], chains_b: Sequence[Chain], catalogue: Catalogue
-) -> tuple[Pair, ...]:
-    """Pair the chains of two views at least total cost.
-
-    A pair costs ``mean|d - mean d| + 0.5 |mean d - o| + 3 x spacing misfit`` (pixels, mm), d the signed epipolar
-    distance of each electrode. ``o`` is the offset that all catheters of the site share because the heart was breathed
-    elsewhere, or the table stood elsewhere, when the second run was taken. It is searched for, up to 20 mm, and costs
-    ``0.1 |o|`` once: a deep breath must not cost a site. Chains set by hand under different names are never paired.
-
-    Returns
-    -------
-    tuple of Pair
-        Pairs within the cost limit only.
-    """
-    if not chains_a or not chains_b:
-        return ()
-    own = np.full((len(chains_a), len(chains_b)), _NEVER)
-    offsets = np.zeros_like(own)
-    for i, first in enumerate(chains_a):
-        for j, second in enumerate(chains_b):
-            if first.manual and second.manual and first.kinds[:1] != second.kinds[:1]:
+def pair_table(
+    cameras: tuple[Camera, Camera],
+    catheters_a: Sequence[RunCatheter],
+    catheters_b: Sequence[RunCatheter],
+    motion_cost: Array,
+    catalogue: Catalogue,
+    groups: Sequence[tuple[str, ...]],
+) -> PairTable:
+    """Compare all chains of the two runs of a site at diastole; ``motion_cost`` tells how they compare over the cycle."""
+    n, m = len(catheters_a), len(catheters_b)
+    shared = {}
+    for i, first in enumerate(catheters_a):
+        for j, second in enumerate(catheters_b):
+            if first.manual_name and second.manual_name and first.manual_name != second.manual_name:
                 continue
-            in_a, in_b = common_electrodes(first, second)
-            if not in_a:
-                continue
-            d = signed_epipolar_px(camera_a, camera_b, first.pixels_uv[in_a], second.pixels_uv[in_b])
-            electrodes, points = common_points(camera_a, camera_b, first, second)
-            misfit = min(spacing_misfit_mm(points, electrodes, catheter) for catheter in catalogue.catheters)
-            offsets[i, j] = d.mean()
-            own[i, j] = min(np.abs(d - d.mean()).mean() + _SPACING_WEIGHT_PX_PER_MM * misfit, _NEVER)
-    scale = camera_b.px_per_mm
-    limit = COST_LIMIT_MM * scale
-    candidates = [0.0, *offsets[(own <= limit) & (np.abs(offsets) <= SHIFT_LIMIT_MM * scale)]]
-    return min((_pairs_at(own, offsets, o, limit) for o in candidates), key=lambda answer: answer[0])[1]
-
-
-def _pairs_at(own: Array, offsets: Array, common: float, limit: float) -> tuple[float, tuple[Pair, ...]]:
-    """Total cost and pairs when every catheter is displaced by ``common`` pixels across the epipolar lines."""
-    cost = np.minimum(own + _OFFSET_WEIGHT * np.abs(offsets - common), limit + 1.0)
-    rows, columns = linear_sum_assignment(cost)
-    kept = tuple(
-        Pair(int(r), int(c), float(cost[r, c])) for r, c in zip(rows, columns, strict=True) if cost[r, c] <= limit
+            in_a, in_b = common_electrodes(first.diastole, second.diastole)
+            if in_a:
+                shared[i, j] = (in_a, in_b)
+    table = PairTable(
+        np.zeros((n, m), dtype=np.bool_), np.zeros((n, m)), np.ones((n, m)), np.zeros((n, m, 3)), np.zeros((n, m)),
+        np.full((len(groups), n, m), np.inf), motion_cost, np.zeros((n, m, 3)),
+    )  # fmt: skip
+    if not shared:
+        return table
+    pixels_a = np.concatenate([catheters_a[i].diastole.pixels_uv[rows] for (i, _), (rows, _) in shared.items()])
+    pixels_b = np.concatenate([catheters_b[j].diastole.pixels_uv[rows] for (_, j), (_, rows) in shared.items()])
+    distances = signed_epipolar_px(*cameras, pixels_a, pixels_b)
+    turned = np.stack(
+        [signed_epipolar_px(cameras[0], _turned(cameras[1], axis), pixels_a, pixels_b) for axis in range(3)], axis=1
     )
-    return float(cost[rows, columns].sum()) + _COMMON_WEIGHT * abs(common), kept
+    slopes = (turned - distances[:, None]) / _TURN_RAD
+    points = triangulate_linear(*cameras, pixels_a, pixels_b)
+    ends = np.cumsum([len(rows) for rows, _ in shared.values()])
+    catheter_variance = (CATHETER_SD_MM * cameras[1].px_per_mm) ** 2
+    for ((i, j), (in_a, in_b)), end in zip(shared.items(), ends, strict=True):
+        own = slice(end - len(in_a), end)
+        first, second = catheters_a[i], catheters_b[j]
+        noise = _PIXEL_FLOOR_PX**2 + sum(
+            np.trace(chain.covariance_px2[rows], axis1=1, axis2=2) / 2
+            for chain, rows in ((first.diastole, in_a), (second.diastole, in_b))
+        )
+        mean = common_distance(distances[own], noise)
+        table.distance_px[i, j] = mean
+        table.variance_px2[i, j] = catheter_variance + 1 / (1 / noise).sum()
+        table.turn_px[i, j] = slopes[own].mean(axis=0)
+        table.position_mm[i, j] = points[own].mean(axis=0)
+        uneven = float(student_cost((distances[own] - mean) ** 2 / noise).sum())
+        table.shape_cost[i, j] = uneven + bend_cost(points[own])
+        electrodes = [first.diastole.electrodes[row] for row in in_a]
+        for k, group in enumerate(groups):
+            spacing = min(spacing_cost(points[own], electrodes, catalogue[name]) for name in group)
+            votes = np.array([one.vote(group) for one in (first, second)])
+            if votes.mean() >= LEAST_VOTE:
+                table.group_cost[k, i, j] = spacing - np.log(np.maximum(votes, 0.02)).sum()
+        table.possible[i, j] = bool(np.isfinite(table.group_cost[:, i, j]).any())
+    return table
+
+
+def _turned(camera: Camera, axis: int) -> Camera:
+    """The camera with the world turned a little about one of its axes."""
+    c, s = np.cos(_TURN_RAD), np.sin(_TURN_RAD)
+    first, second = [k for k in range(3) if k != axis] if axis != 1 else (2, 0)
+    turn = np.eye(4)
+    turn[first, first] = turn[second, second] = c
+    turn[first, second], turn[second, first] = -s, s
+    return Camera(camera.matrix @ turn, camera.rows, camera.columns)

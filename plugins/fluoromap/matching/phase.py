@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from fluoromap.contracts import Array, Segmentation
+from fluoromap.matching.beats import SMOOTH_MS, is_irregular, systole_starts_ms
 from fluoromap.matching.run_catheters import RunCatheter
 
 SHORTEST_CYCLE_MS = 300.0
@@ -16,42 +18,60 @@ MUST_SHOW = 0.7
 """A catheter serves as a clock when it is seen in this share of the frames."""
 PERIODIC_BELOW = 0.5
 """Mean squared change over one cycle, as a share of that over any time: above it, nothing repeats."""
+_SAME_CYCLE = 0.15
 _BINS = 60
 
 
-def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter]) -> Array | None:
-    """Phase of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next; None where unknown.
+@dataclass(frozen=True, eq=False)
+class Rhythm:
+    """The cardiac cycle in one run.
+
+    phases : (n,) of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next. irregular : the beats
+    differ in length.
+    """
+
+    phases: Array
+    irregular: bool
+
+
+def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter]) -> Rhythm | None:
+    """Phase of each frame; None where unknown.
 
     With R waves told the time between two of them is one cycle; before the first and after the last the neighbouring
     cycle's length goes on. Without, the length of the cycle is the time after which the catheters are back where they
-    were, and systole begins where the longest quiet stretch of the cycle ends.
-
-    Returns
-    -------
-    ndarray, shape (n,), or None
+    were, and systole begins where the longest quiet stretch of the cycle ends. Where the catheters show beats that differ
+    in length, each beat counts from its own start of systole.
     """
     times = segmentation.frame_times_ms
     beats = times[np.array(sorted(set(segmentation.r_wave_frames)), dtype=np.intp)]
     if len(beats) >= 2:
-        return _phases_from_beats(times, beats)
+        return Rhythm(_phases_from_beats(times, beats), is_irregular(beats))
     if len(times) < 8 or np.any(np.diff(times) <= 0):
         return None
     step_ms = float(np.median(np.diff(times)))
     grid = np.arange(times[0], times[-1] + step_ms / 2, step_ms)
     places = _places(segmentation, catheters, grid)
+    marks = np.zeros(0) if places is None else times[0] + systole_starts_ms(places, step_ms)
+    if is_irregular(marks):
+        return Rhythm(_phases_from_beats(times, marks), True)
     signal = places if places is not None else np.interp(grid, times, segmentation.motion)[:, None]
     cycle_ms = cycle_length_ms(signal, step_ms)
+    if len(marks) >= 2:
+        # Two beats repeat as well as one does: the marks tell how many there are.
+        mean_ms = float(np.polyfit(np.arange(len(marks)), marks, 1)[0])
+        if cycle_ms is None or abs(cycle_ms - mean_ms) > _SAME_CYCLE * mean_ms:
+            cycle_ms = mean_ms
     if cycle_ms is None:
         return None
     if len(beats) == 1:
-        return np.asarray(((times - beats[0]) / cycle_ms) % 1.0)
+        return Rhythm(np.asarray(((times - beats[0]) / cycle_ms) % 1.0), False)
     if places is not None:
-        smooth = gaussian_filter1d(places, max(25.0 / step_ms, 0.5), axis=0)
+        smooth = gaussian_filter1d(places, max(SMOOTH_MS / step_ms, 0.5), axis=0)
         speed = np.linalg.norm(np.gradient(smooth, axis=0), axis=1)
     else:
         speed = signal[:, 0]
     start = start_of_systole(((grid - grid[0]) / cycle_ms) % 1.0, speed)
-    return np.asarray(((times - grid[0]) / cycle_ms - start) % 1.0)
+    return Rhythm(np.asarray(((times - grid[0]) / cycle_ms - start) % 1.0), False)
 
 
 def _phases_from_beats(times: Array, beats: Array) -> Array:
@@ -69,10 +89,10 @@ def _places(segmentation: Segmentation, catheters: Sequence[RunCatheter], grid_m
     """Centroids of the catheters that are seen nearly throughout, on an even time grid, shape (g, 2 k); drift removed."""
     columns: list[Array] = []
     for catheter in catheters:
-        frames, centroids = catheter.centroids_uv()
+        frames, centroids = catheter.centroids_uv
         if len(frames) < MUST_SHOW * len(segmentation.frames):
             continue
-        at = segmentation.frame_times_ms[frames.astype(np.intp)]
+        at = segmentation.frame_times_ms[frames]
         columns.extend(np.interp(grid_ms, at, centroids[:, axis]) for axis in (0, 1))
     if not columns:
         return None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import collections
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from fluoromap.contracts import Array, Chain, Segmentation
+from fluoromap.contracts import Array, Chain, IntArray, Segmentation
 
 LINK_GATE_MM = 3.0
 """A chain without a track number continues the catheter that was this near in a neighbouring frame (at the isocentre)."""
@@ -15,6 +18,8 @@ LINK_MEMORY_FRAMES = 10
 """How many frames back a catheter's last place is still a guide."""
 SEEN_AT_LEAST = 0.2
 """A track in fewer of the run's frames, absent from the diastolic mean and not set by hand, is taken for a false one."""
+SHOWN_IN_MOST = 0.7
+"""An electrode is followed when it is in this share of the frames that show its catheter's most constant electrode."""
 _NEVER = 1e6
 
 
@@ -32,20 +37,41 @@ class RunCatheter:
     votes: dict[str, float]
     manual_name: str | None
 
-    def centroids_uv(self) -> tuple[Array, Array]:
-        """Frames (k,) and the mean pixel (k, 2) of the electrodes that are common to all its chains."""
-        common = set.intersection(*(set(chain.electrodes) for chain in self.chains.values())) if self.chains else set()
-        frames = sorted(self.chains) if common else []
-        centroids = [
-            self.chains[f].pixels_uv[[e in common for e in self.chains[f].electrodes]].mean(axis=0) for f in frames
-        ]
-        return np.array(frames, dtype=np.float64), np.array(centroids).reshape(-1, 2)
+    @functools.cached_property
+    def seen_throughout(self) -> tuple[IntArray, tuple[int, ...], Array]:
+        """Frames (k,), electrodes (e of them) and pixels (k, e, 2): the electrodes that most of its frames show, in the
+        frames that show all of those."""
+        counts = collections.Counter(number for chain in self.chains.values() for number in chain.electrodes)
+        most = max(counts.values(), default=0)
+        common = tuple(sorted(number for number, count in counts.items() if count >= SHOWN_IN_MOST * most))
+        frames = [f for f in sorted(self.chains) if set(common) <= set(self.chains[f].electrodes)] if common else []
+        pixels = np.zeros((len(frames), len(common), 2))
+        for row, frame in enumerate(frames):
+            chain = self.chains[frame]
+            pixels[row] = (
+                chain.pixels_uv
+                if chain.electrodes == common
+                else chain.pixels_uv[[chain.electrodes.index(number) for number in common]]
+            )
+        return np.array(frames, dtype=np.int64), common, pixels
+
+    @functools.cached_property
+    def centroids_uv(self) -> tuple[IntArray, Array]:
+        """Frames (k,) and the mean pixel (k, 2) of the electrodes of :attr:`seen_throughout`."""
+        frames, _, pixels = self.seen_throughout
+        return frames, pixels.mean(axis=1) if len(frames) else np.zeros((0, 2))
 
     @property
     def motion_px(self) -> float:
         """How far it moves through the run: RMS distance of its centroid from its mean place."""
-        _, centroids = self.centroids_uv()
+        _, centroids = self.centroids_uv
         return float(np.sqrt(centroids.var(axis=0).sum())) if len(centroids) else np.inf
+
+    def vote(self, names: Sequence[str]) -> float:
+        """Probability that it is one of these, voted over the frames; certain where named by hand."""
+        if self.manual_name is not None:
+            return float(self.manual_name in names)
+        return sum(self.votes.get(name, 0.0) for name in names)
 
 
 def common_electrodes(first: Chain, second: Chain) -> tuple[list[int], list[int]]:

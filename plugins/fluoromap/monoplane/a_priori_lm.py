@@ -180,17 +180,17 @@ def start_displacement(camera: Camera, mean_depth_mm: float, moved_px: Array, de
 
 
 def column_residual(camera: Camera, points_mm: Array, u: Array) -> tuple[Array, Array]:
-    """Equation (8): (m1 X + m2 Y + m3 Z + m4) / (m9 X + m10 Y + m11 Z + m12) - u, with its gradient (m, 3) in px/mm."""
+    """Eq. (8) of the paper: (m1 X + m2 Y + m3 Z + m4) / (m9 X + m10 Y + m11 Z + m12) - u, with its gradient (m, 3) in px/mm."""
     return camera.project(points_mm)[:, 0] - u, camera.jacobian(points_mm)[:, 0]
 
 
 def row_residual(camera: Camera, points_mm: Array, v: Array) -> tuple[Array, Array]:
-    """Equation (9): (m5 X + m6 Y + m7 Z + m8) / (m9 X + m10 Y + m11 Z + m12) - v, with its gradient (m, 3) in px/mm."""
+    """Eq. (9) of the paper: (m5 X + m6 Y + m7 Z + m8) / (m9 X + m10 Y + m11 Z + m12) - v, with its gradient (m, 3) in px/mm."""
     return camera.project(points_mm)[:, 1] - v, camera.jacobian(points_mm)[:, 1]
 
 
 def distance_residual(camera: Camera, points_mm: Array, before_uv: Array, distance_px: Array) -> tuple[Array, Array]:
-    """Equation (10): length of the projected displacement minus d = sqrt(du^2 + dv^2), with its gradient (m, 3) in px/mm.
+    """Eq. (10) of the paper: length of the projected displacement minus d = sqrt(du^2 + dv^2), with its gradient (m, 3) in px/mm.
 
     The paper prints d^2 for d. Its model side is read as the perspective image displacement from the point's pixel in the
     frame before: of the readings only this one reproduces the paper's Table 1.

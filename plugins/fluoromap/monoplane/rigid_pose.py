@@ -2,46 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from pydantic import BaseModel, Field
+from scipy.special import gammaincc
 
-from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, Track
-from fluoromap.geometry import Camera
-from fluoromap.monoplane.observed import (
-    ObservedView,
-    lateral_covariance_mm2,
-    observe,
-    outwards,
-    turned_covariance_mm2,
-)
+from fluoromap.contracts import Array, Context, IntArray, MonoplaneView, Refusal, Track
+from fluoromap.monoplane.body_pose import follow_body, pose_covariance_mm2, solve_poses, spans
+from fluoromap.monoplane.bundle import AdjustedBody, BodyView, adjust
+from fluoromap.monoplane.observed import ObservedView, observe, turned_covariance_mm2
+from fluoromap.monoplane.rigidity import rigid_error_mm
 from fluoromap.reasons import Reason
 
-FEWEST_ELECTRODES = 4
-LEAST_BREADTH_MM = 0.2
-"""Second singular value of the body's points: below it they lie on one line, whose turn about itself nothing shows."""
-_SETTLED = 1e-12
+__all__ = ["RigidPose", "follow_body", "pose_covariance_mm2", "solve_poses"]
+
+_CHANCE = 0.01
+_NO_BOUND_MM = 500.0
 
 
 class RigidPose:
     """Monoplane solver ``rigid-pose``: rotation and translation of the whole set of electrodes, frame by frame.
 
-    Right for a rigid phantom. Catheters in a beating heart are not one rigid body: there it refuses, with the figure.
+    Right for a rigid phantom. Catheters in a beating heart are not one rigid body, and one catheter is too small a body to
+    tell its depth: there it refuses, with the figure.
     """
 
     class Params(BaseModel, extra="forbid"):
-        """When to refuse."""
+        """When to refuse, and what is known of the body's motion."""
 
-        iterations: int = Field(6, ge=1, le=50, description="Gauss-Newton steps a frame, from the frame before.")
+        iterations: int = Field(6, ge=1, le=50, description="Steps of the pose a frame, from the frame before.")
         largest_bound_mm: float = Field(
-            5.0, gt=0, le=100, description="Refuse when the error bound of the positions exceeds this, mm."
+            5.0,
+            gt=0,
+            le=100,
+            description="Largest error bound (RMS) of a frame's positions, and error of a rigid pose over a known cycle, mm.",
         )
         largest_misfit: float = Field(
-            1.5,
+            1.2,
             gt=1,
             le=100,
-            description="Refuse when the reprojection error changes over the frames by this many times the pixel noise.",
+            description="Refuse when the best rigid body misses the electrodes by this many times the pixel noise. A heart's "
+            "contraction looks like depth: what is left over at 1.5 goes with ten millimetres.",
         )
         depth_step_mm: float = Field(
             0.0,
@@ -50,245 +53,195 @@ class RigidPose:
             description="Start value of each frame's displacement along the ray; the answer has none of it.",
         )
         gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of the gantry angles, degrees.")
+        acceleration_sd_mm: float | None = Field(
+            None,
+            gt=0,
+            le=100,
+            description="For a body on a smooth path: by how much its displacement from frame to frame changes, mm, one "
+            "standard deviation; its turn changes by as much at 50 mm from its middle. Empty: every frame for itself.",
+        )
 
     name: ClassVar[str] = "rigid-pose"
-    version: ClassVar[str] = "1"
+    version: ClassVar[str] = "2"
 
     def __init__(self, params: RigidPose.Params) -> None:
         self._params = params
 
     def follow(self, view: MonoplaneView, context: Context) -> Track:
-        """Follow the body of all electrodes with an a-priori position.
+        """Follow the body of all electrodes with an a-priori position, which is refined within its covariance.
 
         Raises
         ------
         Refusal
-            NO_A_PRIORI; DEPTH_UNOBSERVABLE when the electrodes are fewer than four or lie on one line, when they do not
-            move as one rigid body, or when the bound says that depth cannot be had.
+            NO_A_PRIORI; DEPTH_UNOBSERVABLE when no frame shows four electrodes off one line, when they do not move as one
+            rigid body, or when the Cramer-Rao bound says that their depth cannot be had; VIEW_MIRRORED when they would be
+            a rigid body if the image were mirrored.
         """
-        p = self._params
         observed = observe(view)
         context.check()
-        body = observed.a_priori_mm
-        usable = np.array([_spans(body[row]) for row in observed.seen])
+        usable = np.array([spans(observed.a_priori_mm[row]) for row in observed.seen])
         if not usable.any():
-            raise Refusal(
-                Reason.DEPTH_UNOBSERVABLE,
-                "A rigid pose needs at least four electrodes that do not lie on one line; no frame of this view shows them.",
-            )
-        rotations, centres = follow_body(
-            view.camera, body, observed.pixels_uv, observed.seen, view.a_priori_frame, p.depth_step_mm, p.iterations
-        )
+            raise _too_few(view, observed)
+        self._refuse_if_known_to_bend(view, observed)
+        usable[view.a_priori_frame] = True
+        frames = np.flatnonzero(usable)
+        body = self._fit(view, observed, frames)
         context.progress(0.7)
-        positions = (body - body.mean(axis=0)) @ np.swapaxes(rotations, 1, 2) + centres[:, None]
-        # The shape's own uncertainty reaches the image like noise; what displaces the whole body does not count here.
-        shape = np.array([_shape_covariance(view, observed, k) for k in range(len(body))])
-        jacobians = view.camera.jacobian(positions)
-        expected = observed.covariance_px2 + jacobians @ shape @ np.swapaxes(jacobians, -1, -2)
-        self._refuse_if_not_rigid(view.camera, observed, positions, usable)
-        covariance = np.array(
-            [
-                pose_covariance_mm2(view.camera, positions[f], centres[f], expected[f], observed.seen[f])
-                if usable[f] else np.zeros((len(body), 3, 3))
-                for f in range(len(positions))
-            ]
-        )  # fmt: skip
-        located = observed.seen & usable[:, None]
-        bound = float(np.sqrt(np.trace(covariance[located], axis1=-2, axis2=-1).mean()))
-        if bound > p.largest_bound_mm:
+        context.check()
+        if body.misfit > self._params.largest_misfit:
+            raise self._not_rigid(view, observed, frames, body)
+        return self._track(view, observed, frames, body)
+
+    def _refuse_if_known_to_bend(self, view: MonoplaneView, observed: ObservedView) -> None:
+        cycles = view.others if view.cycle is None else (view.cycle,)
+        told = [rigid_error_mm(view.camera, cycle, observed.labels) for cycle in cycles]
+        errors = [error for error in told if error is not None]
+        if errors and (error := float(np.median(errors))) > self._params.largest_bound_mm:
             raise Refusal(
                 Reason.DEPTH_UNOBSERVABLE,
-                f"From this view a rigid pose cannot be known better than {bound:.1f} mm (RMS over the electrodes); "
-                f"{p.largest_bound_mm:.1f} mm is the limit.",
+                f"The electrodes do not move as one rigid body: over the cycle known from two views a rigid pose would be "
+                f"{error:.1f} mm wrong (RMS over the electrodes); {self._params.largest_bound_mm:.1f} mm is the limit. A "
+                "heart's catheters move by themselves; use another solver.",
             )
-        return self._track(view, observed, positions, covariance, located)
 
-    def _refuse_if_not_rigid(self, camera: Camera, observed: ObservedView, positions: Array, usable: BoolArray) -> None:
-        counted = observed.seen & usable[:, None]
-        shown = counted[..., None]
-        residual = np.where(shown, camera.project(positions) - observed.pixels_uv, 0.0)
-        # A wrong shape leaves the same residual in every frame; only what changes tells that the body bends.
-        residual = np.where(shown, residual - residual.sum(axis=0) / np.maximum(shown.sum(axis=0), 1), 0.0)
-        squared = np.einsum("nmi,nmij,nmj->nm", residual, np.linalg.inv(observed.covariance_px2), residual)
-        freedom = 2 * counted.sum() - 6 * usable.sum() - 2 * counted.any(axis=0).sum()
-        if freedom <= 0:
-            return
-        misfit = float(np.sqrt(squared[counted].sum() / freedom))
-        if misfit > self._params.largest_misfit:
-            rms = float(np.sqrt((residual[counted] ** 2).sum(axis=1).mean()))
+    def _fit(self, view: MonoplaneView, observed: ObservedView, frames: IntArray) -> AdjustedBody:
+        p = self._params
+        poses = follow_body(
+            view.camera,
+            observed.a_priori_mm,
+            observed.pixels_uv,
+            observed.seen,
+            view.a_priori_frame,
+            p.depth_step_mm,
+            p.iterations,
+        )
+        shape, displacement = _prior_covariances(observed)
+        smooth = p.acceleration_sd_mm
+        body = BodyView(
+            camera=view.camera,
+            prior_mm=observed.a_priori_mm,
+            shape_mm2=shape,
+            displacement_mm2=displacement,
+            frames=frames,
+            start=int(np.searchsorted(frames, view.a_priori_frame)),
+            pixels_uv=observed.pixels_uv[frames],
+            covariance_px2=observed.covariance_px2[frames],
+            seen=observed.seen[frames],
+            acceleration_sd=None if smooth is None else (smooth / 50.0, smooth),
+        )
+        return adjust(body, poses[0][frames], poses[1][frames])
+
+    def _not_rigid(self, view: MonoplaneView, observed: ObservedView, frames: IntArray, body: AdjustedBody) -> Refusal:
+        last = np.array([view.camera.columns - 1.0, view.camera.rows - 1.0])
+        for axis, sides in enumerate(("left to right", "top to bottom")):
+            pixels = observed.pixels_uv.copy()
+            pixels[..., axis] = last[axis] - pixels[..., axis]
+            if self._fit(view, replace(observed, pixels_uv=pixels), frames).misfit <= self._params.largest_misfit:
+                return Refusal(
+                    Reason.VIEW_MIRRORED,
+                    f"The electrodes fit their positions from two views only when this image is mirrored {sides}; check the "
+                    "image orientation of the run.",
+                )
+        counted = observed.seen[frames]
+        off_px = (view.camera.project(body.positions_mm) - observed.pixels_uv[frames])[counted]
+        return Refusal(
+            Reason.DEPTH_UNOBSERVABLE,
+            f"The electrodes do not move as one rigid body: the best poses leave {_rms(off_px):.1f} px, {body.misfit:.1f} "
+            "times what the pixel noise explains, and a bend of a tenth of a millimetre passes for millimetres of depth. A "
+            "heart's catheters bend; use another solver.",
+        )
+
+    def _track(self, view: MonoplaneView, observed: ObservedView, frames: IntArray, body: AdjustedBody) -> Track:
+        n, m = observed.seen.shape
+        located = observed.seen.copy()
+        located[np.setdiff1d(np.arange(n), frames)] = False
+        positions = np.zeros((n, m, 3))
+        positions[frames] = body.positions_mm
+        covariance, relative = np.zeros((2, n, m, 3, 3))
+        of_reference = np.array([catheter == view.catalogue.reference for catheter in observed.catheters])
+        # A misfit beyond chance means noise or priors larger than stated: what they make of the positions grows alike.
+        grown = body.misfit**2 if gammaincc(body.freedom / 2, body.freedom * body.misfit**2 / 2) < _CHANCE else 1.0
+        turn_sd_deg = self._params.gantry_angle_sd_deg
+        bounds = np.zeros(n)
+        for index, frame in enumerate(frames):
+            joint = grown * body.covariance_mm2(index)
+            covariance[frame] = _of_each(joint)
+            bounds[frame] = np.sqrt(np.trace(covariance[frame], axis1=1, axis2=2).mean())
+            if of_reference.any():
+                # Where the reference catheter is hidden the body tells where it is.
+                shown = of_reference & located[frame]
+                origin = shown if shown.any() else of_reference
+                apart = positions[frame] - positions[frame, origin].mean(axis=0)
+                joint = joint - joint[origin].mean(axis=0)
+                joint = joint - joint[:, :, origin].mean(axis=2)[:, :, None]
+                relative[frame] = _of_each(joint) + turned_covariance_mm2(apart, turn_sd_deg)
+        covariance[frames] += turned_covariance_mm2(positions[frames], turn_sd_deg)
+        vague = bounds > self._params.largest_bound_mm
+        followed = np.setdiff1d(frames, [view.a_priori_frame])
+        if len(followed) and vague[followed].all():
             raise Refusal(
                 Reason.DEPTH_UNOBSERVABLE,
-                f"The electrodes do not move as one rigid body: the best poses leave {rms:.1f} px, {misfit:.1f} times the "
-                "pixel noise. A heart's catheters bend; use another solver.",
+                f"From this view a rigid pose cannot be known better than {_rms(bounds[followed, None]):.1f} mm (RMS over "
+                f"the electrodes); {self._params.largest_bound_mm:.1f} mm is the limit.",
             )
-
-    def _track(
-        self, view: MonoplaneView, observed: ObservedView, positions: Array, covariance: Array, located: BoolArray
-    ) -> Track:
+        reasons: list[list[Reason]] = [[] for _ in range(m)]
+        for electrode in np.flatnonzero((located & vague[:, None]).any(axis=0)):
+            reasons[electrode].append(Reason.DEPTH_UNOBSERVABLE)
+        located[vague] = False
+        for electrode in np.flatnonzero(~located.all(axis=0)):
+            reasons[electrode].append(Reason.TRACK_INTERRUPTED)
         baseline = view.camera.back_project(observed.pixels_uv, view.camera.depth_mm(observed.a_priori_mm))
-        lateral = lateral_covariance_mm2(view.camera.jacobian(positions), observed.covariance_px2)
-        turned = turned_covariance_mm2(positions, self._params.gantry_angle_sd_deg)
-        # A tiny share of the pixel noise keeps the ellipsoid of a body's turning axis from being flat.
-        whole = covariance + turned + 1e-3 * lateral
         shown = located[..., None]
         return Track(
             labels=observed.labels,
             located=located,
             positions_mm=np.where(shown, positions, 0.0),
             baseline_mm=np.where(shown, baseline, 0.0),
-            covariance_mm2=np.where(shown[..., None], whole, 0.0),
+            covariance_mm2=np.where(shown[..., None], covariance, 0.0),
             pixels_uv=observed.pixels_uv,
-            reasons=tuple(() if bool(column.all()) else (Reason.TRACK_INTERRUPTED,) for column in located.T),
+            reasons=tuple(tuple(codes) for codes in reasons),
+            relative_covariance_mm2=np.where(shown[..., None], relative, 0.0) if of_reference.any() else None,
         )
 
 
-def _shape_covariance(view: MonoplaneView, observed: ObservedView, index: int) -> Array:
-    point = observed.a_priori[index]
-    relative = point.relative_covariance_mm2
-    covariance: Array = point.covariance_mm2 if relative is None else relative
-    return covariance
-
-
-def _spans(points_mm: Array) -> bool:
-    if len(points_mm) < FEWEST_ELECTRODES:
-        return False
-    return bool(np.linalg.svd(points_mm - points_mm.mean(axis=0), compute_uv=False)[1] > LEAST_BREADTH_MM)
-
-
-def follow_body(
-    camera: Camera,
-    body_mm: Array,
-    pixels_uv: Array,
-    seen: BoolArray,
-    start: int,
-    depth_step_mm: float,
-    iterations: int,
-) -> tuple[Array, Array]:
-    """Poses of a rigid body through n frames, from frame ``start`` to both ends, each from the pose before.
-
-    Parameters
-    ----------
-    body_mm : ndarray, shape (m, 3)
-        World positions at frame ``start``.
-    pixels_uv : ndarray, shape (n, m, 2)
-    seen : ndarray of bool, shape (n, m)
-        A frame that shows too few points keeps the pose before it.
-    depth_step_mm : float
-        Added to each start along the central ray.
-
-    Returns
-    -------
-    rotations : ndarray, shape (n, 3, 3)
-        About the body's mean.
-    centres : ndarray, shape (n, 3)
-        Where the mean is.
-    """
-    n = len(pixels_uv)
-    mean = body_mm.mean(axis=0)
-    model = body_mm - mean
-    rotations, centres = np.empty((n, 3, 3)), np.empty((n, 3))
-
-    def solve(frame: int, rotation: Array, centre: Array) -> None:
-        rotations[frame], centres[frame] = rotation, centre
-        shown = seen[frame]
-        if not _spans(model[shown]):
-            return
-        points = model[shown] @ rotation.T + centre
-        # Start: displaced in parallel to the image so that the points lie right on average.
-        off_px = (pixels_uv[frame, shown] - camera.project(points)).mean(axis=0)
-        moved = np.linalg.pinv(camera.jacobian(centre)) @ off_px + depth_step_mm * camera.axis_world
-        found = solve_poses(
-            camera, model[shown], pixels_uv[frame, shown][None], rotation[None], (centre + moved)[None], iterations
+def _too_few(view: MonoplaneView, observed: ObservedView) -> Refusal:
+    """The refusal, with the bound of the frame that shows most."""
+    best = int(observed.seen.sum(axis=1).argmax())
+    body, shown = observed.a_priori_mm, observed.seen[best]
+    bound = np.inf
+    if shown.any():
+        covariance = pose_covariance_mm2(
+            view.camera, body, body[shown].mean(axis=0), observed.covariance_px2[best], shown
         )
-        rotations[frame], centres[frame] = found[0][0], found[1][0]
+        bound = float(np.sqrt(np.trace(covariance[shown], axis1=1, axis2=2).mean()))
+    told = f"better than {bound:.0f} mm" if bound < _NO_BOUND_MM else "at all"
+    return Refusal(
+        Reason.DEPTH_UNOBSERVABLE,
+        "A rigid pose needs at least four electrodes that do not lie on one line; no frame of this view shows them. From what "
+        f"it shows, {int(shown.sum())} electrodes, their positions cannot be known {told}.",
+    )
 
-    solve(start, np.eye(3), mean)
-    for frame, before in outwards(n, start):
-        solve(frame, rotations[before], centres[before])
-    return rotations, centres
 
+def _prior_covariances(observed: ObservedView) -> tuple[Array, Array]:
+    """Of the body's points: (m, 3, 3) of each, and (3, 3) of what displaces all of them.
 
-def solve_poses(
-    camera: Camera, model_mm: Array, pixels_uv: Array, rotations: Array, centres: Array, iterations: int
-) -> tuple[Array, Array]:
-    """Least-squares poses of B images of one body at once, by damped Gauss-Newton with a left-multiplied rotation update.
-
-    A point is ``R A + c``; the update is ``R <- exp([w]x) R``, ``c <- c + t``, solved from 6x6 normal equations.
-
-    Parameters
-    ----------
-    model_mm : ndarray, shape (m, 3)
-        The body's points about its mean.
-    pixels_uv : ndarray, shape (B, m, 2)
-    rotations, centres : ndarray, shape (B, 3, 3), (B, 3)
-        Where to start.
-    iterations : int
-        At most; it stops when nothing moves.
-
-    Returns
-    -------
-    rotations, centres : ndarray, shape (B, 3, 3), (B, 3)
+    Relative to the reference catheter a point has the error of the body's shape; what its error from the isocentre has
+    beyond that, breathing above all, is shared.
     """
-    batch = len(pixels_uv)
-    damping = np.full(batch, 1e-6)
-    turned = model_mm @ np.swapaxes(rotations, 1, 2)
-    residual = pixels_uv - camera.project(turned + centres[:, None])
-    cost = (residual**2).sum(axis=(1, 2))
-    for _ in range(iterations):
-        rows = pose_jacobian(camera, turned, centres).reshape(batch, -1, 6)
-        normal = np.swapaxes(rows, 1, 2) @ rows
-        scale = np.einsum("bii->bi", normal) * damping[:, None]
-        normal = normal + scale[:, :, None] * np.eye(6)
-        gradient = np.swapaxes(rows, 1, 2) @ residual.reshape(batch, -1, 1)
-        step = np.linalg.solve(normal, gradient)[..., 0]
-        tried_rotations = rotation_of(step[:, :3]) @ rotations
-        tried_centres = centres + step[:, 3:]
-        tried_turned = model_mm @ np.swapaxes(tried_rotations, 1, 2)
-        tried_residual = pixels_uv - camera.project(tried_turned + tried_centres[:, None])
-        tried_cost = (tried_residual**2).sum(axis=(1, 2))
-        better = tried_cost <= cost
-        one, two = better[:, None], better[:, None, None]
-        rotations, centres = np.where(two, tried_rotations, rotations), np.where(one, tried_centres, centres)
-        turned, residual = np.where(two, tried_turned, turned), np.where(two, tried_residual, residual)
-        cost = np.where(better, tried_cost, cost)
-        damping = np.where(better, damping * 0.1, damping * 100)
-        if np.abs(step).max() < _SETTLED:
-            break
-    return rotations, centres
+    absolute = np.array([point.covariance_mm2 for point in observed.a_priori])
+    known = [point.relative_covariance_mm2 for point in observed.a_priori]
+    shape = np.array([whole if part is None else part for whole, part in zip(absolute, known, strict=True)])
+    values, axes = np.linalg.eigh((absolute - shape).mean(axis=0))
+    return shape, (axes * np.maximum(values, 0)) @ axes.T
 
 
-def pose_jacobian(camera: Camera, turned_mm: Array, centres_mm: Array) -> Array:
-    """d(u, v)/d(rotation vector, translation) of points R A (B, m, 3) at centres (B, 3): (B, m, 2, 6), px/rad and px/mm."""
-    by_translation = camera.jacobian(turned_mm + centres_mm[:, None])
-    by_rotation = np.cross(turned_mm[:, :, None], by_translation)
-    rows: Array = np.concatenate([by_rotation, by_translation], axis=-1)
-    return rows
+def _of_each(joint_mm2: Array) -> Array:
+    """Covariances (m, 3, 3) of the points in a joint one (m, 3, m, 3)."""
+    each = np.arange(len(joint_mm2))
+    blocks: Array = joint_mm2[each, :, each, :]
+    return blocks
 
 
-def pose_covariance_mm2(
-    camera: Camera, positions_mm: Array, centre_mm: Array, covariance_px2: Array, seen: BoolArray
-) -> Array:
-    """Cramer-Rao bound of the positions (m, 3) of a rigid body whose seen points have these pixel covariances: (m, 3, 3)."""
-    turned = positions_mm - centre_mm
-    rows = pose_jacobian(camera, turned[None], centre_mm[None])[0][seen]
-    weight = np.linalg.inv(covariance_px2[seen])
-    information = np.einsum("mki,mkl,mlj->ij", rows, weight, rows)
-    pose = np.linalg.inv(information)
-    x, y, z = turned.T
-    zero = np.zeros_like(x)
-    # Turning by w moves a point by w x (R A).
-    by_rotation = np.stack([np.stack([zero, z, -y], -1), np.stack([-z, zero, x], -1), np.stack([y, -x, zero], -1)], -2)
-    gain = np.concatenate([by_rotation, np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=-1)
-    covariance: Array = gain @ pose @ np.swapaxes(gain, 1, 2)
-    return covariance
-
-
-def rotation_of(vectors: Array) -> Array:
-    """Rotation matrices (B, 3, 3) of rotation vectors (B, 3) in radians, by Rodrigues' formula."""
-    angles = np.linalg.norm(vectors, axis=1)[:, None, None]
-    safe = np.maximum(angles, 1e-12)
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
-    rotations: Array = np.eye(3) + np.sin(safe) / safe * cross + 2 * (np.sin(safe / 2) / safe) ** 2 * (cross @ cross)
-    return rotations
+def _rms(values: Array) -> float:
+    """Root of the mean squared length of vectors (k, d)."""
+    return float(np.sqrt((values**2).sum(axis=1).mean()))

@@ -2,45 +2,54 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Chain, FrameChains
+from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.blob_response import BlobResponse
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.linking import Family, Shafts, chain_score, evidence, families, link
+from fluoromap.segmenter.linking import Family, Linked, Shafts, chain_score, evidence, families, link
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.placing import place_chains
+from fluoromap.segmenter.placing import place_chains, widened_covariance
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.unseen_electrodes import complete
 
 _BLUR_MM = 1.75
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
 _SURE_CLEARNESS = 1.1
 _LEAST_CLEARNESS = 0.75
+_LEAST_SNR = 3.5
 _CARRIED_SLACK = 2.5
 _CARRIED_CLEARNESS = 0.6
 _STRAYED_PX = 5.0
 _HIDING_MM = 1.2
+_FITS = 2.0
+_BENDING = 0.12
+_BESIDE_MM, _EXTRA_CLEARNESS = 2.0, 1.3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class BlobDetector:
-    """Finds chains in the images of one run, whose field and scale are fixed."""
+    """Finds chains in the images of one run, whose field and scale are fixed. Keeps the response of the image it saw last."""
 
     catalogue: Catalogue
     field: FieldMask
     px_per_mm: float
+    _last: tuple[Image, BlobResponse] | None = dataclasses.field(default=None, init=False, repr=False)
 
     def response(self, x: Image) -> BlobResponse:
         """Response of a log image to blobs of the size of this catalogue's electrodes."""
-        ring_mm = min(catheter.ring_mm for catheter in self.catalogue.catheters)
-        return BlobResponse.of_image(x, self.field.inside, ring_mm, self.px_per_mm)
+        if self._last is None or self._last[0] is not x:
+            ring_mm = min(catheter.ring_mm for catheter in self.catalogue.catheters)
+            self._last = x, BlobResponse.of_image(x, self.field.inside, ring_mm, self.px_per_mm)
+        return self._last[1]
 
     def chains(self, x: Image, frame: int) -> FrameChains:
         """Chains of one log image, or why there are none.
@@ -55,43 +64,101 @@ class BlobDetector:
         points, snr = response.candidates(self.field.candidates, max(2, electrodes // 2))
         kinds = families(self.catalogue)
         shafts = self._shafts(response)
-        linked = link(points, evidence(snr), self._variance(snr), shafts, kinds, slack=_COMPANION_SLACK)
+        weights, variance = evidence(snr), self._variance(snr)
+        sound = len(points)
+        linked = link(points, weights, variance, shafts, kinds, slack=_COMPANION_SLACK)
+        if not self._settled(linked, weights):
+
+            def dark(places: Array) -> Array:
+                return np.where(self._in_field(places), evidence(response.at(places)), -1.0)
+
+            more = complete(points, weights, variance, dark, kinds, self.px_per_mm)
+            linked = link(
+                more.points_uv, more.weights, more.variance_px2, shafts, kinds, len(points), _COMPANION_SLACK, more.rows
+            )
+            points = more.points_uv
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
-        placed = [one for one in place_chains(x, points, linked, shafts, kinds) if one.clearness >= _LEAST_CLEARNESS]
+        placed = [
+            one for one in place_chains(x, points, linked, shafts, kinds, sound) if one.clearness >= _LEAST_CLEARNESS
+        ]
         floor = min(family.floor for family in kinds)
         sure = any(one.clearness >= _SURE_CLEARNESS and one.chain.scores[0] >= floor for one in placed)
-        chains = tuple(replace(one.chain, scores=response.at(one.chain.pixels_uv)) for one in placed)
-        return FrameChains(frame, chains, None if sure else Reason.MANUAL_NEEDED)
+        found = [one.chain for one in placed]
+        chains = tuple(
+            replace(
+                chain,
+                covariance_px2=widened_covariance(
+                    chain, [other for other in found if other is not chain], self.px_per_mm
+                ),
+                scores=response.at(chain.pixels_uv),
+            )
+            for chain in found
+        )
+        chains = tuple(chain for chain in chains if np.median(chain.scores) >= _LEAST_SNR)
+        return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
+
+    def _settled(self, linked: Sequence[Linked], weights: Array) -> bool:
+        """Whether there is a chain of its own candidates for each catheter, none of them much worse than its candidates are."""
+        if len(linked) < len(self.catalogue.catheters):
+            return False
+        return all(chain.score >= weights[list(chain.candidates)].sum() - _FITS for chain in linked)
 
     def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
         """A chain seen before, found again by a rigid search on the blob response and refined; None where the image does
-        not support it. An electrode that refinement moves by more than 5 px stays where the search put it, less sure; one
-        that another catheter hides is put where the others have it."""
+        not support it. What refinement measures is weighed against where the search put it; an electrode that it
+        moves by more than 5 px stays there, less sure; one that another catheter hides is put where the others have it."""
         family = self._family(chain)
         if family is None:
             return None
         response = self.response(x)
         guess = rigid_search(response, chain.pixels_uv, shift, reach_px, taken)
-        near = np.array([np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1) for other in taken])
-        hidden = (
-            np.flatnonzero((near < _HIDING_MM * self.px_per_mm).any(axis=0)) if len(taken) else np.zeros(0, np.int64)
+        hidden = np.zeros(len(guess), np.bool_)
+        for other in taken:
+            near = np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
+            hidden |= near < _HIDING_MM * self.px_per_mm
+        place = refine(
+            x, guess[None], family.catheter, self.px_per_mm, hidden[None], np.zeros((1, len(guess)), np.bool_)
         )
-        place = refine(x, guess, family.catheter, self.px_per_mm, hidden.tolist())
-        strayed = np.linalg.norm(place.points_uv - guess, axis=1) > _STRAYED_PX
-        points = np.where(strayed[:, None], guess, place.points_uv)
-        covariance = np.where(strayed[:, None, None], (_STRAYED_PX / 2) ** 2 * np.eye(2), place.covariance_px2)
-        u, v = np.rint(points).astype(np.int64).T
-        rows, columns = self.field.candidates.shape
-        if u.min() < 0 or v.min() < 0 or u.max() >= columns or v.max() >= rows or not self.field.candidates[v, u].all():
+        found = place.points_uv[0]
+        strayed = np.linalg.norm(found - guess, axis=1) > _STRAYED_PX
+        covariance = np.where(strayed[:, None, None], (4 * _STRAYED_PX) ** 2 * np.eye(2), place.covariance_px2[0])
+        expected = chain.covariance_px2 + (_BENDING * reach_px) ** 2 * np.eye(2)
+        gain = expected @ np.linalg.inv(expected + covariance)
+        points = guess + np.einsum("nij,nj->ni", gain, found - guess)
+        covariance = gain @ covariance
+        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+        if not self._in_field(points).all():
             return None
         snr = response.at(points)
-        if 0 < len(hidden) < len(snr):
-            snr[hidden] = np.median(np.delete(snr, hidden))
+        if hidden.any() and not hidden.all():
+            snr[hidden] = np.median(snr[~hidden])
         score = chain_score(points, evidence(snr), self._variance(snr), self._shafts(response), family)
-        if score < family.floor - _CARRIED_SLACK or place.clearness < _CARRIED_CLEARNESS:
+        if score < family.floor - _CARRIED_SLACK or place.clearness[0] < _CARRIED_CLEARNESS:
             return None
-        return replace(chain, pixels_uv=points, covariance_px2=covariance, scores=snr, manual=False)
+        carried = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=snr, manual=False)
+        return replace(carried, covariance_px2=widened_covariance(carried, taken, self.px_per_mm))
+
+    def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Whether one more catheter of the catalogue's kinds shows clearly beside these chains."""
+        response = self.response(x)
+        points, snr = response.candidates(self.field.candidates, 2)
+        taken = np.concatenate([chain.pixels_uv for chain in chains])
+        free = np.linalg.norm(points[:, None] - taken[None], axis=2).min(axis=1) > _BESIDE_MM * self.px_per_mm
+        points, snr = points[free], snr[free]
+        kinds = families(self.catalogue)
+        shafts = self._shafts(response)
+        linked = link(points, evidence(snr), self._variance(snr), shafts, kinds)
+        placed = place_chains(x, points, linked, shafts, kinds)
+        return any(one.clearness >= _EXTRA_CLEARNESS for one in placed)
+
+    def _in_field(self, points_uv: Array) -> BoolArray:
+        """Which points lie where electrodes may be, (n,)."""
+        rows, columns = self.field.candidates.shape
+        u, v = np.rint(points_uv).astype(np.int64).T
+        within = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+        inside: BoolArray = within & self.field.candidates[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
+        return inside
 
     def _family(self, chain: Chain) -> Family | None:
         """The most probable family whose catheters have exactly this chain's electrodes."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from fluoromap.contracts import Array, BoolArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.homomorphic import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
@@ -71,24 +71,46 @@ class BlobResponse:
         -------
         points_uv : (n, 2) pixels of the frame, sub-pixel. snr : (n,) response over noise, strongest response first.
         """
-        found = np.empty((_FOUND, 4))
+        found = np.empty((_FOUND, 3), np.int64)
         count = _maxima(self.stack, _CLEAR_SNR * self.noise, allowed, self.reduction, found)
-        rows = found[:count]
-        rows = rows[np.argsort(-rows[:, 2], kind="stable")][:300]
-        rows = rows[_apart(rows, _APART_MM * self.px_per_mm / self.reduction)][:_MOST]
-        snr = rows[:, 2] / self.noise[rows[:, 3].astype(np.int64)]
+        scale, v, u = found[:count].T
+        strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
+        scale, v, u = scale[strongest], v[strongest], u[strongest]
+        places = self._sub_pixel(scale, v, u)
+        keep = np.empty(len(places), np.bool_)
+        _apart(places, _APART_MM * self.px_per_mm / self.reduction, keep)
+        kept = np.flatnonzero(keep)[:_MOST]
+        scale, places = scale[kept], places[kept]
+        snr = self.stack[scale, v[kept], u[kept]] / self.noise[scale]
         if len(snr) > expected:
             keep = snr >= 0.2 * np.sort(snr)[-expected]
-            rows, snr = rows[keep], snr[keep]
+            places, snr = places[keep], snr[keep]
         shift = 0.5 * (self.reduction - 1)
-        return rows[:, :2] * self.reduction + shift, snr
+        return places * self.reduction + shift, snr
+
+    def _sub_pixel(self, scale: IntArray, v: IntArray, u: IntArray) -> Array:
+        """Tops of the paraboloids through these maxima and their neighbours, (n, 2) pixels of ``stack``."""
+        steps = np.arange(-1, 2)
+        near = self.stack[scale[:, None, None], v[:, None, None] + steps[:, None], u[:, None, None] + steps]
+        near = near.astype(np.float64)
+        gu, gv = 0.5 * (near[:, 1, 2] - near[:, 1, 0]), 0.5 * (near[:, 2, 1] - near[:, 0, 1])
+        uu = near[:, 1, 2] + near[:, 1, 0] - 2.0 * near[:, 1, 1]
+        vv = near[:, 2, 1] + near[:, 0, 1] - 2.0 * near[:, 1, 1]
+        uv = 0.25 * (near[:, 2, 2] + near[:, 0, 0] - near[:, 0, 2] - near[:, 2, 0])
+        determinant = uu * vv - uv * uv
+        moves = np.stack([uv * gv - vv * gu, uv * gu - uu * gv], axis=1)
+        curved = determinant > 0
+        moves[curved] /= determinant[curved, None]
+        moves[~curved] = 0.0
+        tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
+        return tops
 
     def at(self, points_uv: Array) -> Array:
         """Response over noise at points of the frame, the best scale of each, (n,)."""
         rows, columns = self.smooth.shape
         places = (points_uv - 0.5 * (self.reduction - 1)) / self.reduction
-        u = np.clip(np.rint(places[:, 0]).astype(np.int64), 0, columns - 1)
-        v = np.clip(np.rint(places[:, 1]).astype(np.int64), 0, rows - 1)
+        u = np.minimum(np.maximum(np.rint(places[:, 0]), 0), columns - 1).astype(np.int64)
+        v = np.minimum(np.maximum(np.rint(places[:, 1]), 0), rows - 1).astype(np.int64)
         return self.best[v, u].astype(np.float64)
 
 
@@ -113,51 +135,37 @@ def _half_laplacian(x, square, out):  # type: ignore[no-untyped-def]  # pragma: 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _maxima(stack, floor, allowed, reduction, found):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes (u, v, response, scale) of each maximum to ``found``; returns how many."""
+    """Writes (scale, v, u) of each maximum to ``found``; returns how many."""
     scales, rows, columns = stack.shape
     count = 0
     for s in range(scales):
-        r = stack[s]
+        least = floor[s]
         for v in range(1, rows - 1):
             for u in range(1, columns - 1):
-                value = r[v, u]
-                if value <= floor[s] or count == found.shape[0]:
+                value = stack[s, v, u]
+                if value <= least or not allowed[v * reduction, u * reduction]:
                     continue
-                if value <= r[v, u - 1] or value < r[v, u + 1] or value <= r[v - 1, u] or value < r[v + 1, u]:
-                    continue
-                if not allowed[v * reduction, u * reduction]:
-                    continue
-                best = True
-                for t in range(scales):
-                    for dv in range(-1, 2):
-                        for du in range(-1, 2):
-                            if stack[t, v + dv, u + du] > value:
-                                best = False
-                if not best:
-                    continue
-                gu, gv = 0.5 * (r[v, u + 1] - r[v, u - 1]), 0.5 * (r[v + 1, u] - r[v - 1, u])
-                uu = r[v, u + 1] + r[v, u - 1] - 2 * value
-                vv = r[v + 1, u] + r[v - 1, u] - 2 * value
-                uv = 0.25 * (r[v + 1, u + 1] + r[v - 1, u - 1] - r[v - 1, u + 1] - r[v + 1, u - 1])
-                determinant = uu * vv - uv * uv
-                du_fine = dv_fine = 0.0
-                if determinant > 0:
-                    du_fine = min(max((uv * gv - vv * gu) / determinant, -1.0), 1.0)
-                    dv_fine = min(max((uv * gu - uu * gv) / determinant, -1.0), 1.0)
-                found[count, 0], found[count, 1] = u + du_fine, v + dv_fine
-                found[count, 2], found[count, 3] = value, s
-                count += 1
+                highest = True
+                for k in range(9 * scales):
+                    t, dv, du = k // 9, k // 3 % 3 - 1, k % 3 - 1
+                    other = stack[t, v + dv, u + du]
+                    # Of equal neighbours in one scale, the first counts.
+                    if other > value or (other == value and t == s and (dv, du) < (0, 0)):
+                        highest = False
+                        break
+                if highest and count < found.shape[0]:
+                    found[count, 0], found[count, 1], found[count, 2] = s, v, u
+                    count += 1
     return count
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _apart(rows, distance):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Which of these, in order, lie farther than ``distance`` from all kept before."""
-    keep = np.zeros(rows.shape[0], np.bool_)
-    for i in range(rows.shape[0]):
+def _apart(places, distance, keep):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Says in ``keep`` which of these, in order, lie farther than ``distance`` from all kept before."""
+    for i in range(places.shape[0]):
         keep[i] = True
         for j in range(i):
-            if keep[j] and (rows[i, 0] - rows[j, 0]) ** 2 + (rows[i, 1] - rows[j, 1]) ** 2 < distance**2:
+            du, dv = places[i, 0] - places[j, 0], places[i, 1] - places[j, 1]
+            if keep[j] and du * du + dv * dv < distance * distance:
                 keep[i] = False
                 break
-    return keep

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray, frozen
 from fluoromap.segmenter.log_image import Image
 
 _BINS = 1024
-_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +64,31 @@ def find_blobs(x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: 
     smallest_px, largest_px : float
         Limits of a component's area.
     """
-    above = (x >= np.float32(otsu_threshold(x, inside))) & (x > 0) & inside
-    foreground = float(np.count_nonzero(above)) / max(int(np.count_nonzero(inside)), 1)
-    labels, count = ndimage.label(above, structure=_EIGHT_NEIGHBOURS)
-    flat = np.flatnonzero(labels)
-    of_pixel = labels.ravel()[flat]
-    v, u = np.divmod(flat, x.shape[1])
-    areas = np.bincount(of_pixel, minlength=count + 1)[1:].astype(np.float64)
-    sums = np.stack([np.bincount(of_pixel, weights=w, minlength=count + 1)[1:] for w in (u, v)], axis=1)
-    centroids = sums / np.maximum(areas, 1)[:, None]
+    threshold = max(otsu_threshold(x, inside), float(np.finfo(np.float32).tiny))
+    areas, centroids = components(x, inside, threshold)
+    foreground = float(areas.sum()) / max(int(np.count_nonzero(inside)), 1)
     columns, rows = np.rint(centroids).astype(np.int64).T
     keep = (areas >= smallest_px) & (areas <= largest_px) & candidates[rows, columns]
     return Blobs(centroids[keep], areas[keep], foreground)
+
+
+def components(x: Image, inside: BoolArray, threshold: float) -> tuple[Array, Array]:
+    """8-connected components of what reaches ``threshold`` inside the mask, in the order of their first pixels.
+
+    Returns
+    -------
+    areas_px : (n,). centroids_uv : (n, 2) pixels.
+    """
+    rows, columns = x.shape
+    most = rows * ((columns + 1) // 2)
+    spans = np.empty((most, 2), np.int32)
+    parents = np.empty(most, np.int32)
+    sums = np.empty((most, 3))
+    count = _label(x, inside, np.float32(threshold), spans, parents, sums)
+    of_component = sums[:count][parents[:count] == np.arange(count)]
+    areas: Array = of_component[:, 0].copy()
+    centroids: Array = of_component[:, 1:] / areas[:, None]
+    return areas, centroids
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -86,3 +97,51 @@ def _count(x, inside, scale, counts):  # type: ignore[no-untyped-def]  # pragma:
         for u in range(x.shape[1]):
             if inside[v, u]:
                 counts[int(x[v, u] * scale)] += 1
+
+
+@njit(inline="always")
+def _root(parents, node):  # type: ignore[no-untyped-def]  # pragma: no cover
+    while parents[node] != node:
+        parents[node] = parents[parents[node]]
+        node = parents[node]
+    return node
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _label(x, inside, threshold, spans, parents, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Union of the horizontal spans that touch, over their order. A component is the root of its spans, its first one;
+    there ``sums`` holds its area and the sums of u and v. Returns the number of spans."""
+    rows, columns = x.shape
+    count = above = above_end = 0
+    for v in range(rows):
+        line, allowed = x[v], inside[v]
+        first = count
+        candidate = above
+        u = 0
+        while u < columns:
+            if line[u] < threshold or not allowed[u]:
+                u += 1
+                continue
+            start = u
+            while u < columns and line[u] >= threshold and allowed[u]:
+                u += 1
+            spans[count, 0], spans[count, 1], parents[count] = start, u, count
+            length = u - start
+            sums[count, 0] = length
+            sums[count, 1] = 0.5 * length * (start + u - 1)
+            sums[count, 2] = length * v
+            while candidate < above_end and spans[candidate, 1] < start:
+                candidate += 1
+            touching = candidate
+            while touching < above_end and spans[touching, 0] <= u:
+                one, other = _root(parents, touching), _root(parents, count)
+                parents[max(one, other)] = min(one, other)
+                touching += 1
+            count += 1
+        above, above_end = first, count
+    for span in range(count):
+        root = _root(parents, span)
+        if root != span:
+            for k in range(3):
+                sums[root, k] += sums[span, k]
+    return count

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.homomorphic import gaussian, reduce_by
@@ -55,10 +54,10 @@ class Contrast:
         half = reduce_by(self.image, 2)
         narrow, wide = (max(0.5, 0.5 * size * self.px_per_mm) for size in _PEAK_MM)
         response = gaussian(half, wide) - gaussian(half, narrow)
-        highest = (response == ndimage.maximum_filter(response, size=5)) & (response > 0)
-        v, u = np.nonzero(highest)
-        order = np.argsort(-response[v, u])[:_MOST_PEAKS]
-        places = np.stack([2.0 * u[order] + 0.5, 2.0 * v[order] + 0.5], axis=1)
+        found = np.empty((response.size // 4, 3))
+        peaks = found[: _local_maxima(response, found)]
+        peaks = peaks[np.argsort(-peaks[:, 2], kind="stable")][:_MOST_PEAKS]
+        places = 2.0 * peaks[:, :2] + 0.5
         rows, columns = self.image.shape
         allowed = candidates[
             np.minimum(places[:, 1].astype(int), rows - 1), np.minimum(places[:, 0].astype(int), columns - 1)
@@ -70,6 +69,30 @@ class Contrast:
 
 def _radii(px_per_mm: float) -> tuple[float, float, float]:
     return max(1.0, _CORE_MM * px_per_mm), max(3.0, _RING_MM[0] * px_per_mm), max(4.5, _RING_MM[1] * px_per_mm)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _local_maxima(x, found):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Writes (u, v, value) of each positive pixel that none within two pixels exceeds; returns how many."""
+    rows, columns = x.shape
+    count = 0
+    for v in range(rows):
+        line, up, down = x[v], x[max(v - 1, 0)], x[min(v + 1, rows - 1)]
+        for u in range(columns):
+            value = line[u]
+            if value <= 0 or value < line[max(u - 1, 0)] or value < line[min(u + 1, columns - 1)]:
+                continue
+            if value < up[u] or value < down[u]:
+                continue
+            highest = True
+            for near in range(max(v - 2, 0), min(v + 3, rows)):
+                for across in range(max(u - 2, 0), min(u + 3, columns)):
+                    if x[near, across] > value:
+                        highest = False
+            if highest and count < found.shape[0]:
+                found[count, 0], found[count, 1], found[count, 2] = u, v, value
+                count += 1
+    return count
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

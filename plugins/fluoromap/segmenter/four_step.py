@@ -20,7 +20,7 @@ class FourStep:
     """
 
     name: ClassVar[str] = "four-step"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "3"
     Params: ClassVar[type[BaseModel]] = FourStepParams
 
     def __init__(self, params: FourStepParams | None = None) -> None:

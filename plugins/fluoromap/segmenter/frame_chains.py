@@ -109,6 +109,10 @@ class FourStepDetector:
         """Always None: the paper looks at whole frames."""
         return None
 
+    def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Always False: what the threshold leaves beside the chains may be anything."""
+        return False
+
 
 def _with_lost(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:
     """Blobs, then the peaks that are not one of them: steeply foreshortened rings are narrower than the opening disk, and

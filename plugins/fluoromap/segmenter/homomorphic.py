@@ -11,7 +11,7 @@ from fluoromap.segmenter.log_image import Image
 
 
 def homomorphic(x: Image, low: float = 0.5, high: float = 2.0, slope: float = 1.0, cutoff: float = 8.0) -> Image:
-    """Homomorphic filter of a log image, equation (4): slow shading is damped, detail is raised.
+    """Homomorphic filter of a log image, eq. (4) of the paper: slow shading is damped, detail is raised.
 
     The transfer function H(D) = (high - low)(1 - exp(-slope D^2 / cutoff^2)) + low, with D in cycles per image width, is
     ``high`` minus a Gaussian, so that no Fourier transform is needed:
@@ -31,8 +31,10 @@ def homomorphic(x: Image, low: float = 0.5, high: float = 2.0, slope: float = 1.
     (rows, columns) float32, log units.
     """
     background = gaussian(x, equivalent_sigma(x.shape[1], slope, cutoff))
-    level = np.float32((1.0 - low) * float(x.mean(dtype=np.float64)))
-    filtered: Image = np.float32(high) * x - np.float32(high - low) * background + level
+    filtered: Image = x * np.float32(high)
+    background *= np.float32(high - low)
+    filtered -= background
+    filtered += np.float32((1.0 - low) * float(x.mean()))
     return filtered
 
 
@@ -42,7 +44,7 @@ def equivalent_sigma(width: int, slope: float, cutoff: float) -> float:
 
 
 def gaussian(x: Image, sigma: float) -> Image:
-    """Gaussian blur with reflected edges, one pass along columns and one along rows; large sigmas on a reduced image.
+    """Gaussian blur with reflected edges; large sigmas on a reduced image.
 
     The reduction by area means and the linear enlargement add variance of their own, which is taken off the sigma; what
     remains is an error of about 1e-3 of the range.
@@ -80,12 +82,9 @@ def _taps(sigma: float) -> Image:
 
 
 def _blur(x: Image, taps: Image) -> Image:
-    reach = taps.size - 1
-    down = np.empty_like(x)
-    _blur_down(np.pad(x, ((reach, reach), (0, 0)), mode="symmetric"), taps, down)
-    across = np.empty_like(x)
-    _blur_across(np.pad(down, ((0, 0), (reach, reach)), mode="symmetric"), taps, across)
-    return across
+    out = np.empty(x.shape, np.float32)
+    _blur_rows(np.ascontiguousarray(x, dtype=np.float32), taps, out)
+    return out
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -94,30 +93,33 @@ def _add_pair(out, first, second, weight):  # type: ignore[no-untyped-def]  # pr
         out[u] += weight * (first[u] + second[u])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blur_down(padded, taps, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    reach = taps.size - 1
-    for v in range(out.shape[0]):
-        row = out[v]
-        middle = padded[v + reach]
-        for u in range(row.size):
-            row[u] = taps[0] * middle[u]
-        for k in range(1, taps.size):
-            _add_pair(row, padded[v + reach - k], padded[v + reach + k], taps[k])
+@njit(inline="always")
+def _reflected(index, size):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Where an index beyond an edge falls when the image is mirrored there, as often as it takes."""
+    index %= 2 * size
+    return index if index < size else 2 * size - 1 - index
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blur_across(padded, taps, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _blur_rows(x, taps, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Both passes row by row: across the rows into a line with mirrored ends, and along it."""
+    rows, columns = x.shape
     reach = taps.size - 1
-    width = out.shape[1]
-    for v in range(out.shape[0]):
-        row = out[v]
-        source = padded[v]
-        middle = source[reach : reach + width]
-        for u in range(width):
-            row[u] = taps[0] * middle[u]
+    line = np.empty(columns + 2 * reach, np.float32)
+    middle = line[reach : reach + columns]
+    for v in range(rows):
+        row, result = x[v], out[v]
+        for u in range(columns):
+            middle[u] = taps[0] * row[u]
         for k in range(1, taps.size):
-            _add_pair(row, source[reach - k : reach - k + width], source[reach + k : reach + k + width], taps[k])
+            _add_pair(middle, x[_reflected(v - k, rows)], x[_reflected(v + k, rows)], taps[k])
+        for k in range(1, taps.size):
+            line[reach - k] = middle[_reflected(-k, columns)]
+            line[reach + columns - 1 + k] = middle[_reflected(columns - 1 + k, columns)]
+        for u in range(columns):
+            result[u] = taps[0] * middle[u]
+        for k in range(1, taps.size):
+            _add_pair(result, line[reach - k :], line[reach + k :], taps[k])
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -126,9 +128,13 @@ def _area_means(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no c
     scale = np.float32(1.0 / (factor * factor))
     sums = np.empty(x.shape[1], np.float32)
     for v in range(rows):
-        sums[:] = x[v * factor]
+        # Whole-array arithmetic in a kernel would bring its error messages along: two seconds of compiling.
+        for u in range(sums.size):
+            sums[u] = x[v * factor, u]
         for k in range(1, factor):
-            sums += x[v * factor + k]
+            row = x[v * factor + k]
+            for u in range(sums.size):
+                sums[u] += row[u]
         for u in range(columns):
             total = np.float32(0)
             for k in range(factor):
@@ -138,23 +144,20 @@ def _area_means(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _enlarge(small, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Linear interpolation between the centres of the reduced pixels."""
+    """Linear interpolation between the centres of the reduced pixels, along the rows and then between them."""
     rows, columns = small.shape
-    left = np.empty(out.shape[1], np.int64)
-    share = np.empty(out.shape[1], np.float32)
+    wide = np.empty((rows, out.shape[1]), np.float32)
     for u in range(out.shape[1]):
         place = min(max((u + 0.5) / factor - 0.5, 0.0), columns - 1.0)
-        left[u] = min(int(place), columns - 2) if columns > 1 else 0
-        share[u] = place - left[u]
-    step = 1 if columns > 1 else 0
-    line = np.empty(columns, np.float32)
+        left = int(place)
+        right = min(left + 1, columns - 1)
+        share = np.float32(place - left)
+        for v in range(rows):
+            wide[v, u] = small[v, left] + share * (small[v, right] - small[v, left])
     for v in range(out.shape[0]):
         place = min(max((v + 0.5) / factor - 0.5, 0.0), rows - 1.0)
-        top = min(int(place), rows - 2) if rows > 1 else 0
-        below = top + 1 if rows > 1 else top
-        lower = np.float32(place - top)
-        for u in range(columns):
-            line[u] = small[top, u] + lower * (small[below, u] - small[top, u])
-        for u in range(out.shape[1]):
-            first = line[left[u]]
-            out[v, u] = first + share[u] * (line[left[u] + step] - first)
+        top = int(place)
+        share = np.float32(place - top)
+        upper, lower, row = wide[top], wide[min(top + 1, rows - 1)], out[v]
+        for u in range(row.size):
+            row[u] = upper[u] + share * (lower[u] - upper[u])

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array
-from fluoromap.segmenter import chain_search
+from fluoromap.contracts import Array, IntArray
+from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.log_image import Image
 
 _EVIDENCE_FROM, _EVIDENCE_MOST = 4.0, 2.2
@@ -20,6 +20,7 @@ _LOST = 2.0
 _WORTH = 6.0
 _BEST = 80
 _SIDE_MM = 1.75
+_SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,14 +91,16 @@ def link(
     kinds: Sequence[Family],
     sure: int | None = None,
     slack: float = 0.0,
+    completed: Sequence[IntArray] = (),
 ) -> tuple[Linked, ...]:
     """The best set of chains: ordered from the tip, at most as many of a family as the catalogue has.
 
-    A chain's score is the sum of its candidates' weights, less penalties for spacings that are not foreshortened
-    alike (0.10 SD), for bends (0.40 rad SD; S-bends count half more), for strong foreshortening and for rings of
-    unlike weight, plus evidence of a dark shaft between the electrodes and behind the last but not before the tip.
+    A chain's score is the sum of its candidates' weights, less penalties for spacings whose foreshortening differs by more
+    than a bend in depth explains (0.06 SD), for bends (0.36 rad SD across the rays, more where foreshortened; S-bends count
+    half more), for strong foreshortening and for rings of unlike weight,
+    plus evidence of a dark shaft between the electrodes and behind the last but not before the tip.
     A set is worth its scores and 6 for each chain, so that a third, weaker catheter is not dropped; crossing catheters may
-    share one candidate, at a price.
+    share one candidate, at a price, but not stand in the same places.
 
     Parameters
     ----------
@@ -113,6 +116,8 @@ def link(
         The first so many candidates are sound; others may make up half of a chain at most, at a price. All by default.
     slack : float
         How far below its family's floor a chain may lie.
+    completed : sequence of (n, electrodes) int
+        More chains of each family, as indices from the tip on; then the others are made of the sound candidates only.
 
     Returns
     -------
@@ -126,8 +131,11 @@ def link(
         if len(points) < family.catheter.electrodes:
             continue
         spacing_px = _spacing_px(family.catheter, shafts.px_per_mm)
-        paths = chain_search.paths(points, weights, spacing_px)
-        scores = chain_search.scores(
+        searched = sure if completed else len(points)
+        paths = chain_search.paths(points[:searched], weights[:searched], spacing_px)
+        if completed:
+            paths = np.concatenate([paths, completed[index]])
+        scores = chain_scores.scores(
             paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
             shafts.reduction, shafts.clear, shafts.side_px, _SHAFT_WEIGHT, family.floor - slack,
         )  # fmt: skip
@@ -138,12 +146,12 @@ def link(
     if not found:
         return ()
     found = sorted(found, key=lambda chain: -chain.score)[:_BEST]
-    within = np.zeros((len(found), len(points)), np.int64)
+    within = np.full((len(found), max(len(chain.candidates) for chain in found)), -1, np.int64)
     for row, chain in enumerate(found):
-        within[row, list(chain.candidates)] = 1
+        within[row, : len(chain.candidates)] = chain.candidates
     chosen = chain_search.best_set(
         np.array([chain.score + _WORTH for chain in found]),
-        within @ within.T,
+        chain_search.shared(within, points, _SAME_PLACE_MM * shafts.px_per_mm, _SAME_PLACES),
         np.array([chain.family for chain in found]),
         np.array([len(family.names) for family in kinds]),
         _SHARED,
@@ -154,7 +162,7 @@ def link(
 def chain_score(points_uv: Array, weights: Array, variance_px2: Array, shafts: Shafts, family: Family) -> float:
     """Score of the chain that the points make in this order, as in :func:`link`."""
     return float(
-        chain_search.scores(
+        chain_scores.scores(
             np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,
             _spacing_px(family.catheter, shafts.px_per_mm), family.catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
             shafts.reduction, shafts.clear, shafts.side_px, _SHAFT_WEIGHT, -np.inf,
@@ -162,18 +170,18 @@ def chain_score(points_uv: Array, weights: Array, variance_px2: Array, shafts: S
     )  # fmt: skip
 
 
-def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> float:
-    """Log-likelihood, up to a constant, of the points' spacings as those of this catheter, one foreshortening free."""
-    return float(chain_search.spacing_fit(points_uv, _spacing_px(catheter, px_per_mm), variance_px2))
+def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> Array:
+    """Log-likelihood, up to a constant, of each chain's spacings (n, electrodes, 2) as those of this catheter, one
+    foreshortening free; (n,)."""
+    return chain_scores.spacing_fit(points_uv, _spacing_px(catheter, px_per_mm), variance_px2, px_per_mm)
 
 
-def shaft_evidence(points_uv: Array, catheter: Catheter, shafts: Shafts) -> float:
-    """Dark between the electrodes of the widest gap and behind the last electrode, not before the tip: -3 to 3."""
-    return float(
-        chain_search.shaft_evidence(
-            points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
-            shafts.reduction, shafts.clear, shafts.side_px,
-        )
+def shaft_evidence(points_uv: Array, catheter: Catheter, shafts: Shafts) -> Array:
+    """Of each chain (n, electrodes, 2), dark between the electrodes of the widest gap and behind the last electrode, not
+    before the tip: -3 to 3, (n,)."""
+    return chain_scores.shaft_evidence(
+        points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shafts.px_per_mm, shafts.smooth, shafts.reduction,
+        shafts.clear, shafts.side_px,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fluoromap.contracts import PixelFacts
+from fluoromap.contracts import BoolArray, PixelFacts
 
 Image = NDArray[np.float32]
 
@@ -22,6 +22,17 @@ def _look_up(pixels, table, out):  # type: ignore[no-untyped-def]  # pragma: no 
     for v in range(pixels.shape[0]):
         for u in range(pixels.shape[1]):
             out[v, u] = table[min(np.int64(pixels[v, u]), last)]
+
+
+def central_range(x: Image, inside: BoolArray) -> tuple[float, float] | None:
+    """0.5th and 99.5th percentile (nearest rank) of every fourth row and column inside the mask; None where there is
+    nothing, or nothing but one value."""
+    values = x[::4, ::4][inside[::4, ::4]]
+    if values.size < 2:
+        return None
+    ranks = [round(share * (values.size - 1)) for share in (0.005, 0.995)]
+    low, high = np.partition(values, ranks)[ranks].tolist()
+    return (low, high) if high > low else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

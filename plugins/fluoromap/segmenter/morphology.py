@@ -50,9 +50,9 @@ def dilate(x: Levels, radius: int) -> Levels:
     """Largest value under an exact disk; what lies outside the image does not count."""
     if radius < 1:
         return x.copy()
-    out = np.zeros((x.shape[0] + 2 * radius, x.shape[1]), np.uint16)
-    _dilate(np.pad(x, ((0, 0), (radius, radius))), _half_widths(radius), out)
-    return out[radius:-radius]
+    out = np.empty(x.shape, np.uint16)
+    _dilate(x, _half_widths(radius), out)
+    return out
 
 
 def erode(x: Levels, radius: int) -> Levels:
@@ -66,48 +66,63 @@ def _half_widths(radius: int) -> IntArray:
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _larger(out, first, second):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for u in range(out.size):
+def _larger(first, second, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for u in range(min(second.size, out.size)):
         out[u] = max(first[u], second[u])
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _raise(out, other):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _raise(out, rows, first, second, outer_rows, outer_first, outer_second):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Raise a row to two windows each of four other rows: those that begin at ``first`` and ``second`` in the row above and
+    the row below, and likewise in a pair of rows farther off. Four at once, for each call costs as much as a row does."""
+    above, below = rows
+    outer_above, outer_below = outer_rows
+    a, b, c, d = above[first:], above[second:], below[first:], below[second:]
+    e, f, g, h = (
+        outer_above[outer_first:], outer_above[outer_second:], outer_below[outer_first:], outer_below[outer_second:],
+    )  # fmt: skip
     for u in range(out.size):
-        out[u] = max(out[u], other[u])
+        inner = max(max(a[u], b[u]), max(c[u], d[u]))
+        outer = max(max(e[u], f[u]), max(g[u], h[u]))
+        out[u] = max(out[u], max(inner, outer))
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _dilate(padded, half_widths, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Each row is widened to every width of the disk, by windows of 1, 2, 4, ... pixels overlapped in pairs, and raises the
-    rows above and below that the disk reaches with that width. ``out`` has ``radius`` spare rows at both ends."""
-    rows, width = padded.shape
+def _dilate(x, half_widths, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Each row is widened once by windows of 1, 2, 4, ... pixels and kept while it is in reach. A row of the answer is the
+    largest of the rows round it, each widened to its row of the disk: by two windows of one size that overlap."""
+    rows, columns = x.shape
     radius = half_widths.size - 1
-    columns = width - 2 * radius
-    levels = 1
-    while (1 << levels) <= 2 * radius + 1:
-        levels += 1
-    windows = np.empty((levels, width), np.uint16)
-    wide = np.empty(columns, np.uint16)
-    for v in range(rows):
-        windows[0] = padded[v]
-        for level in range(1, levels):
-            shift = 1 << (level - 1)
-            source = windows[level - 1]
-            _larger(windows[level][: width - shift], source[: width - shift], source[shift:])
-        done = -1
-        for k in range(radius, -1, -1):
-            half = half_widths[k]
-            if half != done:
-                span = 2 * half + 1
-                level = 0
-                while (2 << level) <= span:
-                    level += 1
-                source = windows[level]
-                first = radius - half
-                second = radius + half + 1 - (1 << level)
-                _larger(wide, source[first : first + columns], source[second : second + columns])
-                done = half
-            _raise(out[v + radius - k], wide)
-            if k > 0:
-                _raise(out[v + radius + k], wide)
+    depth, width = 2 * radius + 1, columns + 2 * radius
+    level_of = np.empty(radius + 1, np.int64)
+    for k in range(radius + 1):
+        level_of[k] = 0
+        while (2 << level_of[k]) <= 2 * half_widths[k] + 1:
+            level_of[k] += 1
+    windows = np.empty((depth, level_of[0] + 1, width), np.uint16)
+    windows[:] = 0
+    for front in range(rows + radius):
+        newest = windows[front % depth]
+        if front < rows:
+            pixels, middle = x[front], newest[0, radius:]
+            for u in range(columns):
+                middle[u] = pixels[u]
+            for level in range(1, level_of[0] + 1):
+                _larger(newest[level - 1], newest[level - 1, 1 << (level - 1) :], newest[level])
+        else:
+            newest[:] = 0
+        v = front - radius
+        if v >= 0:
+            widest = windows[v % depth, level_of[0]]
+            _larger(widest, widest[2 * radius + 1 - (1 << level_of[0]) :], out[v])
+            for k in range(1, radius + 1, 2):
+                m = min(k + 1, radius)
+                _raise(
+                    out[v],
+                    (windows[(v - k) % depth, level_of[k]], windows[(v + k) % depth, level_of[k]]),
+                    radius - half_widths[k],
+                    radius + half_widths[k] + 1 - (1 << level_of[k]),
+                    (windows[(v - m) % depth, level_of[m]], windows[(v + m) % depth, level_of[m]]),
+                    radius - half_widths[m],
+                    radius + half_widths[m] + 1 - (1 << level_of[m]),
+                )

@@ -13,6 +13,7 @@ from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.refinement import Refined, on_curve, refine
 
 _SHAFT_WEIGHT = 1.0
+_NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,12 @@ class Placed:
 
 
 def place_chains(
-    x: Image, candidates_uv: Array, linked: Sequence[Linked], shafts: Shafts, kinds: tuple[Family, ...]
+    x: Image,
+    candidates_uv: Array,
+    linked: Sequence[Linked],
+    shafts: Shafts,
+    kinds: tuple[Family, ...],
+    sound: int | None = None,
 ) -> tuple[Placed, ...]:
     """Place, order and kind of each chain: whichever catheter of as many electrodes, tip first or last, fits best.
 
@@ -38,6 +44,8 @@ def place_chains(
     linked : sequence of Linked
     shafts : Shafts
     kinds : tuple of Family
+    sound : int
+        Candidates from this one on were not seen by themselves. All are by default.
 
     Returns
     -------
@@ -46,42 +54,52 @@ def place_chains(
     """
     likelihood = np.full((len(linked), len(kinds)), -np.inf)
     lost = _lost_to_others(candidates_uv, linked, kinds)
-    places: list[list[Refined | None]] = [[None] * len(kinds) for _ in linked]
-    for row, chain in enumerate(linked):
-        for order in (chain.candidates, chain.candidates[::-1]):
-            hidden = [place for place, candidate in enumerate(order) if candidate in lost[row]]
-            points = candidates_uv[list(order)]
-            settled = np.zeros(len(points))
-            for column, family in enumerate(kinds):
-                if family.catheter.electrodes != len(points):
-                    continue
-                place = refine(x, points, family.catheter, shafts.px_per_mm, hidden)
-                fit = place.log_likelihood + spacing_fit(place.points_uv, settled, family.catheter, shafts.px_per_mm)
-                fit += _SHAFT_WEIGHT * shaft_evidence(place.points_uv, family.catheter, shafts)
-                if fit > likelihood[row, column]:
-                    likelihood[row, column] = fit
-                    places[row][column] = place
+    places: dict[tuple[int, int], tuple[Refined, int]] = {}
+    for column, family in enumerate(kinds):
+        rows = [row for row, chain in enumerate(linked) if len(chain.candidates) == family.catheter.electrodes]
+        if not rows:
+            continue
+        order = np.array([linked[row].candidates for row in rows])
+        hidden = np.array([[candidate in lost[row] for candidate in linked[row].candidates] for row in rows])
+        order, hidden = (np.concatenate([forth, forth[:, ::-1]]) for forth in (order, hidden))
+        unseen = np.zeros_like(hidden) if sound is None else order >= sound
+        refined = refine(x, candidates_uv[order], family.catheter, shafts.px_per_mm, hidden, unseen)
+        settled = np.zeros(order.shape)
+        fit = refined.log_likelihood + spacing_fit(refined.points_uv, settled, family.catheter, shafts.px_per_mm)
+        fit += _SHAFT_WEIGHT * shaft_evidence(refined.points_uv, family.catheter, shafts)
+        for index, row in enumerate(rows):
+            best = index if fit[index] >= fit[index + len(rows)] else index + len(rows)
+            likelihood[row, column] = fit[best]
+            places[row, column] = refined, best
     probabilities = kind_probabilities(likelihood, kinds)
     chains = []
     for row, chain in enumerate(linked):
         of_family = [
             sum(probability for name, probability in probabilities[row] if name in family.names) for family in kinds
         ]
-        best = places[row][int(np.argmax(of_family))] or places[row][chain.family]
-        assert best is not None
+        refined, best = places.get((row, int(np.argmax(of_family)))) or places[row, chain.family]
         chains.append(
             Placed(
                 Chain(
                     electrodes=tuple(range(1, len(chain.candidates) + 1)),
-                    pixels_uv=best.points_uv,
-                    covariance_px2=best.covariance_px2,
+                    pixels_uv=refined.points_uv[best],
+                    covariance_px2=refined.covariance_px2[best],
                     scores=np.full(len(chain.candidates), chain.score),
                     kinds=probabilities[row],
                 ),
-                best.clearness,
+                float(refined.clearness[best]),
             )
         )
     return tuple(chains)
+
+
+def widened_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) -> Array:
+    """The chain's covariances, larger where electrodes of other chains stand so near that their bands disturb each other."""
+    if not others:
+        return chain.covariance_px2
+    beside = np.concatenate([other.pixels_uv for other in others])
+    near = np.linalg.norm(chain.pixels_uv[:, None] - beside[None], axis=2).min(axis=1) < _NEAR_MM * px_per_mm
+    return np.where(near[:, None, None], _NEAR_FACTOR, 1.0) * chain.covariance_px2
 
 
 def _lost_to_others(

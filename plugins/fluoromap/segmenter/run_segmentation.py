@@ -18,6 +18,7 @@ from fluoromap.segmenter.tracking import Carry, chain_distance, follow
 
 _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
+_EDGE_PX = 12
 
 
 class Detector(Protocol):
@@ -29,6 +30,9 @@ class Detector(Protocol):
     def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
         """A chain seen before, moved by about ``shift`` and at most ``reach_px`` farther, beside those that are taken; None
         where it does not show, or from a detector that only sees whole frames."""
+
+    def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Whether one more catheter shows clearly beside these chains."""
 
 
 def segment_run(
@@ -83,13 +87,17 @@ def segment_run(
     catheters = len(catalogue.catheters)
     carrying = _carry(detector, log_image, context) if carry else None
     entries = follow(found, run.frame_times_ms, catheters, carrying, mean if len(averaged) > 1 else None)
+    entries = _told_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
     if carry:
         chains = _with_carried(mean_image, chains, detector, averaged, entries, catheters)
     chains, averaged = _with_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _on_tracks(chains, averaged, entries)
-    diastole = FrameChains(averaged[len(averaged) // 2], chains, None if chains else Reason.MANUAL_NEEDED)
+    reason = None if chains else Reason.MANUAL_NEEDED
+    if len(chains) >= catheters and detector.extra(mean_image, chains):
+        reason = Reason.EXTRA_CATHETER
+    diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
     return Segmentation(
         frames=entries,
@@ -133,6 +141,39 @@ def _with_carried(
                 carried = detector.carried(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
                 chains += [] if carried is None else [replace(carried, track=-1)]
     return tuple(chains)
+
+
+def _told_out_of_field(entries: Sequence[FrameChains], field: FieldMask) -> tuple[FrameChains, ...]:
+    """Say OUT_OF_FIELD where a track is interrupted because its catheter stood at the field's edge when it was seen last."""
+    seen: dict[int, list[tuple[int, Chain]]] = {}
+    for entry in entries:
+        for chain in entry.chains:
+            seen.setdefault(chain.track, []).append((entry.frame, chain))
+    usual = {track: known for track, known in seen.items() if len(known) > len(entries) / 2}
+    told = []
+    for entry in entries:
+        if entry.manual_needed is Reason.TRACK_INTERRUPTED:
+            here = {chain.track for chain in entry.chains}
+            last = [
+                min(known, key=lambda one: abs(one[0] - entry.frame))[1]
+                for track, known in usual.items()
+                if track not in here
+            ]
+            if last and all(_at_edge(chain, field) for chain in last):
+                entry = replace(entry, manual_needed=Reason.OUT_OF_FIELD)
+        told.append(entry)
+    return tuple(told)
+
+
+def _at_edge(chain: Chain, field: FieldMask) -> bool:
+    rows, columns = field.candidates.shape
+    for u, v in np.rint(chain.pixels_uv).astype(np.int64):
+        left, top = max(u - _EDGE_PX, 0), max(v - _EDGE_PX, 0)
+        if u + _EDGE_PX >= columns or v + _EDGE_PX >= rows or min(u, v) < _EDGE_PX:
+            return True
+        if not field.candidates[top : v + _EDGE_PX + 1, left : u + _EDGE_PX + 1].all():
+            return True
+    return False
 
 
 def _same(one: Chain, other: Chain, px_per_mm: float) -> bool:

@@ -25,7 +25,9 @@ _CONFIRMED_PX = 18.0
 _CONFIRMERS = 60
 _SAME_PLACE_PX = 4.0
 _SEEN_AT_LEAST = 0.2
+_CARRIED_AT_LEAST = 0.5
 _LONG_RUN = 5
+_REVERSED_PX = 4.0
 
 Carry = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain last seen, shift expected, reach in pixels, chains that stand in the frame) -> the chain in that frame."""
@@ -33,12 +35,15 @@ Carry = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 
 @dataclass(slots=True)
 class _Track:
-    """Where a catheter was met last; ``velocity`` in pixels a millisecond, forwards in time. detected : in how many frames."""
+    """Where a catheter was met last; ``velocity`` in pixels a millisecond, forwards in time. detected : in how many frames,
+    of which in ``reversed`` with the tip at the other end. seeded : stands in the seed."""
 
     chain: Chain
     time_ms: float
     velocity: Array
     detected: int = 1
+    reversed: int = 0
+    seeded: bool = False
     manual: bool = False
     chains: dict[int, Chain] = field(default_factory=dict)
 
@@ -105,7 +110,7 @@ def follow(
     if seed is not None and seed.chains and not marked:
         start = seed.frame
         at = float(frame_times_ms[start])
-        tracks = [_Track(chain, at, np.zeros(2), detected=0) for chain in seed.chains]
+        tracks = [_Track(chain, at, np.zeros(2), detected=0, seeded=True) for chain in seed.chains]
     else:
         start = marked[0] if marked else _start(found, catheters)
     for frames in (range(start, len(found)), range(start - 1, -1, -1)):
@@ -119,8 +124,17 @@ def follow(
         for frame in frames:
             _step(tracks, found[frame], float(frame_times_ms[frame]), catheters, carry)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
-    lasting = [track for track in tracks if track.manual or track.detected >= least]
+    lasting = [
+        track
+        for track in tracks
+        if track.manual
+        or track.detected >= least
+        or (track.seeded and len(track.chains) >= max(least, _CARRIED_AT_LEAST * len(found)))
+    ]
     lasting.sort(key=lambda track: -track.detected)
+    for track in lasting:
+        if 2 * track.reversed > track.detected and not track.manual:
+            track.chains = {frame: _turned(chain) for frame, chain in track.chains.items()}
     usual = [track for track in lasting if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
@@ -195,15 +209,18 @@ def _covered(chain: Chain, others: Sequence[Chain]) -> bool:
 
 
 def _step(tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, carry: Carry | None) -> None:
-    numbers = _assign(tracks, entry.chains, time_ms)
+    numbers, turned = _assign(tracks, entry.chains, time_ms)
     by_hand = any(chain.manual for chain in entry.chains)
     standing: list[Chain] = []
     bent: list[tuple[int, Chain]] = []
-    for chain, number in zip(entry.chains, numbers, strict=True):
+    for chain, number, other_way in zip(entry.chains, numbers, turned, strict=True):
         if number < 0:
             continue
         tracks[number].detected += 1
-        if carry is not None and not by_hand and _is_bent(tracks[number], chain, time_ms):
+        if other_way:
+            tracks[number].reversed += 1
+            chain = _turned(chain)
+        if carry is not None and not by_hand and (other_way or _is_bent(tracks[number], chain, time_ms)):
             bent.append((number, chain))
         else:
             _meet(tracks[number], chain, entry.frame, time_ms)
@@ -256,22 +273,40 @@ def _expected(track: _Track, time_ms: float) -> tuple[Array, float]:
     return shift, min(max(_NEAREST_PX, _SPEED_PX_PER_MS * abs(elapsed)), _FARTHEST_PX)
 
 
-def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -> list[int]:
-    """Track number of each chain, -1 where none fits."""
+def _turned(chain: Chain) -> Chain:
+    """The same chain with its tip at the other end."""
+    return replace(
+        chain, pixels_uv=chain.pixels_uv[::-1], covariance_px2=chain.covariance_px2[::-1], scores=chain.scores[::-1]
+    )
+
+
+def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -> tuple[list[int], list[bool]]:
+    """Track number of each chain, -1 where none fits, and whether it fits with its tip at the other end."""
     if not chains or not tracks:
-        return [-1] * len(chains)
+        return [-1] * len(chains), [False] * len(chains)
     cost = np.full((len(chains), len(tracks)), _IMPOSSIBLE)
+    turned = np.zeros(cost.shape, dtype=np.bool_)
+    others: dict[int, Chain] = {}
     for column, track in enumerate(tracks):
         shift, gate = _expected(track, time_ms)
         for row, chain in enumerate(chains):
-            away, bent = chain_distance(track.chain, chain, shift)
-            if away > gate or bent > _BEND_PX:
-                continue
             overlap = kind_overlap(track.chain, chain)
-            if overlap > 0:
-                cost[row, column] = away + 2.0 * bent + _OTHER_KIND * (1.0 - min(overlap, 1.0))
-    numbers = [-1] * len(chains)
+            if overlap <= 0:
+                continue
+            unlike = _OTHER_KIND * (1.0 - min(overlap, 1.0))
+            away, bent = chain_distance(track.chain, chain, shift)
+            if away <= gate and bent <= _BEND_PX:
+                cost[row, column] = away + 2.0 * bent + unlike
+            elif not chain.manual:
+                if row not in others:
+                    others[row] = _turned(chain)
+                away, bent = chain_distance(track.chain, others[row], shift)
+                if away <= gate and bent <= _BEND_PX:
+                    cost[row, column] = away + 2.0 * bent + unlike + _REVERSED_PX
+                    turned[row, column] = True
+    numbers, other_way = [-1] * len(chains), [False] * len(chains)
     for taken_row, taken_column in zip(*linear_sum_assignment(cost), strict=True):
         if cost[taken_row, taken_column] < _IMPOSSIBLE:
             numbers[int(taken_row)] = int(taken_column)
-    return numbers
+            other_way[int(taken_row)] = bool(turned[taken_row, taken_column])
+    return numbers, other_way

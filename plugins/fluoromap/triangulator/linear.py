@@ -7,9 +7,9 @@ from typing import ClassVar
 from pydantic import BaseModel
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Context, MatchedSite, Triangulation
-from fluoromap.matching.two_view import triangulate_linear
-from fluoromap.triangulator.two_view import Cameras, TwoViewPixels, locate_study
+from fluoromap.contracts import Context, MatchedSite, Triangulation
+from fluoromap.triangulator.estimate import EachAlone
+from fluoromap.triangulator.study import locate_study
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 
@@ -17,15 +17,11 @@ class Linear:
     """Triangulator ``linear``: every electrode on its own, algebraic least squares of equations (8) in both views."""
 
     name: ClassVar[str] = "linear"
-    version: ClassVar[str] = "1"
+    version: ClassVar[str] = "2"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:
         self._params = params
 
     def triangulate(self, sites: tuple[MatchedSite, ...], catalogue: Catalogue, context: Context) -> Triangulation:
-        return locate_study(sites, catalogue, context, self._params, _locate, None)
-
-
-def _locate(cameras: Cameras, pixels: TwoViewPixels) -> Array:
-    return triangulate_linear(*cameras, *pixels.pixels)
+        return locate_study(sites, catalogue, context, self._params, EachAlone())

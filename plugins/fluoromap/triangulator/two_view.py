@@ -2,175 +2,204 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import (
-    Array,
-    Context,
-    ElectrodePoint,
-    LocatedSite,
-    MatchedSite,
-    NamedChain,
-    PhasePair,
-    RejectedSite,
-    SiteCycle,
-    Triangulation,
-)
-from fluoromap.geometry import Camera, ray_angle_deg
-from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
+from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair
 from fluoromap.reasons import Reason
-from fluoromap.triangulator.uncertainty import UncertaintyParams, joint_covariance, relative_covariance_mm2
+from fluoromap.triangulator.alternatives import with_alternative
+from fluoromap.triangulator.cycle import CycleMoments, cycle_moments, locate_cycle
+from fluoromap.triangulator.estimate import Estimate, Method
+from fluoromap.triangulator.seen import Cameras, TwoViewPixels, seen_in_both
+from fluoromap.triangulator.self_calibration import GantryBelief
+from fluoromap.triangulator.spacing import spacing_mismatches
+from fluoromap.triangulator.strays import strays_doubted
+from fluoromap.triangulator.table_motion import Jump
+from fluoromap.triangulator.uncertainty import (
+    ErrorSource,
+    UncertaintyParams,
+    effect_px,
+    error_sources,
+    jacobians,
+    pixel_noise_px2,
+    relative_covariance_mm2,
+    seen_breathing,
+)
 
-IN_MOST_PAIRS = 0.8
-"""An electrode belongs to the site's cycle when both views show it at this share of the moments."""
-FEWEST_MOMENTS = 4
+FAR_MM = 500.0
+"""No electrode is this far from the isocentre: two views that say so do not belong together."""
+DOUBTFUL_BELOW = 1e-5
+"""Chance of a misfit as large as a site's below which its geometry is doubted."""
 
 
 @dataclass(frozen=True, eq=False)
-class TwoViewPixels:
-    """The N electrodes that both views show at one moment.
+class Locator:
+    """Locates the sites of one study.
 
-    labels : (catheter, electrode). pixels : (N, 2) in view a, view b. covariances : (N, 2, 2) in view a, view b.
+    wrong_spacings : catheters whose catalogue entry does not fit the study.
     """
 
-    labels: tuple[tuple[str, int], ...]
-    pixels: tuple[Array, Array]
-    covariances: tuple[Array, Array]
+    method: Method
+    params: UncertaintyParams
+    catalogue: Catalogue
+    gantry: GantryBelief
+    wrong_spacings: frozenset[str] = frozenset()
 
-    def only(self, labels: Sequence[tuple[str, int]]) -> TwoViewPixels:
-        """The same moment with these electrodes, in this order."""
-        rows = [self.labels.index(label) for label in labels]
-        (pa, pb), (ca, cb) = self.pixels, self.covariances
-        return TwoViewPixels(tuple(labels), (pa[rows], pb[rows]), (ca[rows], cb[rows]))
+    def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
+        """A site in 3D; None where its two views contradict each other altogether.
 
-
-Cameras = tuple[Camera, Camera]
-Locate = Callable[[Cameras, TwoViewPixels], Array]
-"""Cameras and pixels of N electrodes -> their points (N, 3) in the world, mm."""
-EstimateShift = Callable[[Cameras, TwoViewPixels], Array]
-"""Cameras and pixels -> the displacement (2, 3), in the world in mm, that all electrodes share in view a and in view b."""
-
-
-def seen_in_both(pair: PhasePair) -> TwoViewPixels:
-    """The electrodes that both views of a pair show, paired by catheter and number."""
-    first, second = _by_label(pair.a.chains), _by_label(pair.b.chains)
-    labels = tuple(label for label in first if label in second)
-
-    def stack(of: dict[tuple[str, int], tuple[Array, Array]], part: int, shape: tuple[int, ...]) -> Array:
-        return np.array([of[label][part] for label in labels]).reshape(len(labels), *shape)
-
-    return TwoViewPixels(
-        labels,
-        (stack(first, 0, (2,)), stack(second, 0, (2,))),
-        (stack(first, 1, (2, 2)), stack(second, 1, (2, 2))),
-    )
-
-
-def _by_label(chains: Sequence[NamedChain]) -> dict[tuple[str, int], tuple[Array, Array]]:
-    return {
-        (chain.catheter, electrode): (pixel, covariance)
-        for chain in chains
-        for electrode, pixel, covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True)
-    }
-
-
-def locate_study(
-    sites: Sequence[MatchedSite],
-    catalogue: Catalogue,
-    context: Context,
-    params: UncertaintyParams,
-    locate: Locate,
-    estimate_shift: EstimateShift | None,
-) -> Triangulation:
-    """Locate every site; those whose views are too close or whose mapping catheter is missing are rejected."""
-    located, rejected, notes = [], [], []
-    for index, site in enumerate(sites):
-        context.check()
-        angle = ray_angle_deg(site.camera_a, site.camera_b)
-        pixels = seen_in_both(site.diastole)
-        if angle < PARALLEL_BELOW_DEG:
-            rejected.append(RejectedSite(site.site, (Reason.VIEWS_PARALLEL,)))
-            notes.append(f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed.")
-        elif catalogue.mapping not in {catheter for catheter, _ in pixels.labels}:
-            rejected.append(RejectedSite(site.site, (Reason.CATHETER_NOT_FOUND,)))
-        else:
-            answer, note = _locate_site(site, pixels, catalogue, params, locate, estimate_shift)
-            located.append(answer)
-            notes.extend(note)
-        context.progress((index + 1) / len(sites))
-    return Triangulation(tuple(located), tuple(rejected), tuple(notes))
-
-
-def _locate_site(
-    site: MatchedSite,
-    pixels: TwoViewPixels,
-    catalogue: Catalogue,
-    params: UncertaintyParams,
-    locate: Locate,
-    estimate_shift: EstimateShift | None,
-) -> tuple[LocatedSite, list[str]]:
-    nominal = (site.camera_a, site.camera_b)
-    cameras, notes = nominal, []
-    if estimate_shift is not None:
-        shift_a, shift_b = estimate_shift(nominal, pixels)
-        cameras = (site.camera_a.translated(shift_a), site.camera_b.translated(shift_b))
-        apart_mm = float(np.linalg.norm(shift_b - shift_a))
-        if apart_mm > 2.0:
-            notes.append(
-                f"{site.site}: between its two runs the whole heart stands {apart_mm:.0f} mm apart (breathing, a moved "
-                "table or the gantry's angles); positions relative to the reference catheter hardly suffer from it."
+        Returns
+        -------
+        tuple
+            The site, its diastole for the error budget, and sentences for the report.
+        """
+        cameras = self.gantry.cameras((site.camera_a, site.camera_b))
+        rest = site.diastole.a.phase if site.diastole.a.phase is not None else site.diastole.b.phase
+        moments = cycle_moments(site.cycle, cameras, self.method) if rest is not None else None
+        moment = self._moment(site.diastole, cameras, moments, jump)
+        if moment is None:
+            return None
+        points, reference_mm = self._points(site, moment, cameras)
+        if site.alternative is not None:
+            other = self._moment(site.alternative.diastole, cameras, moments, jump)
+            if other is not None:
+                others, other_mm = self._points(site, other, cameras)
+                shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
+                by_label = {(point.catheter, point.electrode): point for point in others}
+                points = with_alternative(points, by_label, shift, site.alternative.probability)
+        cycle = None
+        if moments is not None and rest is not None:
+            cycle = locate_cycle(
+                moments, rest, cameras, self.catalogue, self.params, self.method, self.gantry.covariance
             )
-    points = locate(cameras, pixels)
-    catheters = tuple(catheter for catheter, _ in pixels.labels)
-    joint = joint_covariance(
-        cameras, points, pixels.covariances, catheters, params, params.catheter_sd_mm(), estimate_shift is not None
-    )
-    residuals = [
-        np.linalg.norm(camera.project(points) - seen, axis=1)
-        for camera, seen in zip(cameras, pixels.pixels, strict=True)
-    ]
-    angles = _ray_angles_deg(nominal, pixels)
-    reference = [index for index, catheter in enumerate(catheters) if catheter == catalogue.reference]
-    reference_mm = points[reference].mean(axis=0) if reference else None
-    mismatched = _spacing_mismatches(points, pixels.labels, catalogue, params.spacing_limit_mm)
-    doubts: dict[str, list[Reason]] = {}
-    for catheter, reason in site.notes:
-        doubts.setdefault(catheter, []).append(reason)
-    electrode_points = tuple(
-        ElectrodePoint(
-            catheter=catheter,
-            electrode=electrode,
-            position_mm=points[i],
-            covariance_mm2=joint[i, :, i],
-            relative_mm=None if reference_mm is None else points[i] - reference_mm,
-            relative_covariance_mm2=relative_covariance_mm2(joint, i, reference) if reference else None,
-            residual_px=(float(residuals[0][i]), float(residuals[1][i])),
-            ray_angle_deg=float(angles[i]),
-            reasons=(*doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else [])),
+        reasons = [reason for reason, holds in (
+            (Reason.NO_REFERENCE, reference_mm is None),
+            (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
+            (Reason.TABLE_MOVED, jump is not None),
+            (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1),
+        ) if holds]  # fmt: skip
+        answer = LocatedSite(
+            site=site.site,
+            camera_a=cameras[0],
+            camera_b=cameras[1],
+            frame_a=site.diastole.a.frame,
+            frame_b=site.diastole.b.frame,
+            points=points,
+            reference_mm=reference_mm,
+            cycle=cycle,
+            reasons=tuple(reasons),
         )
-        for i, (catheter, electrode) in enumerate(pixels.labels)
-    )
-    reasons = [reason for reason, holds in (
-        (Reason.NO_REFERENCE, reference_mm is None),
-        (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
-    ) if holds]  # fmt: skip
-    answer = LocatedSite(
-        site=site.site,
-        camera_a=site.camera_a,
-        camera_b=site.camera_b,
-        frame_a=site.diastole.a.frame,
-        frame_b=site.diastole.b.frame,
-        points=electrode_points,
-        reference_mm=reference_mm,
-        cycle=locate_cycle(site.cycle, cameras, params, locate, estimate_shift is not None),
-        reasons=tuple(reasons),
-    )
-    return answer, notes
+        return answer, moment, _breathing_note(site.site, moment) if jump is None else []
+
+    def _moment(
+        self, pair: PhasePair, cameras: Cameras, cycle: CycleMoments | None, jump: Jump | None
+    ) -> Moment | None:
+        pixels = seen_in_both(pair)
+        start = self.method.start(cameras, pixels)
+        if not _plausible(start):
+            return None
+        phase = pair.a.phase if pair.a.phase is not None else pair.b.phase
+        motion = cycle.motion(phase, phase, pixels.labels) if cycle is not None and phase is not None else None
+        sources = error_sources(
+            cameras, start, pixels.labels, self.catalogue, self.params, self.gantry.covariance, motion
+        )  # fmt: skip
+        if jump is not None:
+            sources = (*sources, _jumped(cameras, start, jump))
+        if self.method.takes_out_breathing:
+            pixels = strays_doubted(cameras, pixels, start, sources)
+        noise = pixel_noise_px2(pixels.covariances)
+        errors = noise + sum(source.pixels_px2() for source in sources)
+        seen = seen_breathing(cameras, start, self.params)
+        found = self.method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
+        if not _plausible(found.points_mm):
+            return None
+        residuals = pixels.residuals_px(cameras, found.points_mm)
+        breathing_mm, inflation = 0.0, 1.0
+        if self.method.takes_out_breathing:
+            misfit, free = float(residuals @ np.linalg.solve(errors, residuals)), len(start)
+            gain = seen.covariance @ seen.effect_px.T @ np.linalg.inv(noise + seen.pixels_px2())
+            breathing_mm = float((gain @ residuals)[0])
+            residuals = residuals - seen.effect_px[:, 0] * breathing_mm
+            if chi2.sf(misfit, free) < DOUBTFUL_BELOW:
+                inflation = misfit / free
+        return Moment(pixels, found, sources, noise, errors, residuals.reshape(-1, 2, 2), breathing_mm, inflation)
+
+    def _points(
+        self, site: MatchedSite, moment: Moment, cameras: Cameras
+    ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
+        """The electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
+        pixels, points = moment.pixels, moment.found.points_mm
+        joint = moment.inflation * moment.found.covariance_mm2(moment.errors_px2)
+        reference = [i for i, (catheter, _) in enumerate(pixels.labels) if catheter == self.catalogue.reference]
+        reference_mm = points[reference].mean(axis=0) if reference else None
+        mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.params.spacing_limit_mm)
+        doubts: dict[str, list[Reason]] = {name: [Reason.SPACING_MISMATCH] for name in self.wrong_spacings}
+        for catheter, reason in site.notes:
+            doubts.setdefault(catheter, []).append(reason)
+        angles = _ray_angles_deg(cameras, pixels)
+        residuals = np.linalg.norm(moment.residuals_px, axis=2)
+        found = tuple(
+            ElectrodePoint(
+                catheter=catheter,
+                electrode=electrode,
+                position_mm=points[i],
+                covariance_mm2=joint[i, :, i],
+                relative_mm=None if reference_mm is None else points[i] - reference_mm,
+                relative_covariance_mm2=relative_covariance_mm2(joint, i, reference) if reference else None,
+                residual_px=(float(residuals[i, 0]), float(residuals[i, 1])),
+                ray_angle_deg=float(angles[i]),
+                reasons=tuple(
+                    dict.fromkeys((
+                        *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []),
+                    ))
+                ),
+            )
+            for i, (catheter, electrode) in enumerate(pixels.labels)
+        )  # fmt: skip
+        return found, reference_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A site at diastole: N electrodes in 3D and what is unsure about them.
+
+    noise_px2 : (4 N, 4 N) of the pixels alone. errors_px2 : of all there is. residuals_px : (N, 2 views, 2), less a
+    displacement of the heart between the runs. breathing_mm : half of that displacement, as far as the views show it.
+    inflation : how much larger the misfit is than chance allows; 1 where chance allows it.
+    """
+
+    pixels: TwoViewPixels
+    found: Estimate
+    sources: tuple[ErrorSource, ...]
+    noise_px2: Array
+    errors_px2: Array
+    residuals_px: Array
+    breathing_mm: float
+    inflation: float
+
+
+def _plausible(points_mm: Array) -> bool:
+    return bool(np.isfinite(points_mm).all() and np.abs(points_mm).max() < FAR_MM)
+
+
+def _jumped(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
+    """One view displaced by as much as it was seen to be, in either direction: the truth may lie with the other one."""
+    own, none = jump.displacement_mm[:, None], np.zeros((3, 1))
+    effect = effect_px(jacobians(cameras, points_mm), *((own, none) if jump.view == "a" else (none, own)))
+    return ErrorSource(effect, np.eye(1), ("breathing",))
+
+
+def _breathing_note(site: str, moment: Moment) -> list[str]:
+    apart_mm = 2 * abs(moment.breathing_mm)
+    if apart_mm <= 2.0 or moment.inflation > 1:
+        return []
+    return [
+        f"{site}: between its two runs the whole heart stands {apart_mm:.0f} mm apart (breathing, a moved "
+        "table or the gantry's angles); positions relative to the reference catheter hardly suffer from it."
+    ]
 
 
 def _ray_angles_deg(cameras: Cameras, pixels: TwoViewPixels) -> Array:
@@ -179,54 +208,3 @@ def _ray_angles_deg(cameras: Cameras, pixels: TwoViewPixels) -> Array:
     cosine = np.abs((ray_a * ray_b).sum(axis=1))
     angles: Array = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
     return angles
-
-
-def _spacing_mismatches(
-    points: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue, limit_mm: float
-) -> set[int]:
-    """Indices of electrodes whose distance from the next one located on the catheter is not the catalogue's."""
-    found: set[int] = set()
-    for name in catalogue.names:
-        along = catalogue[name].arc_lengths_mm
-        own = sorted(
-            (electrode, i) for i, (catheter, electrode) in enumerate(labels)
-            if catheter == name and electrode <= len(along)
-        )  # fmt: skip
-        for (first, i), (second, j) in itertools.pairwise(own):
-            distance = float(np.linalg.norm(points[i] - points[j]))
-            if abs(distance - (along[second - 1] - along[first - 1])) > limit_mm:
-                found |= {i, j}
-    return found
-
-
-def locate_cycle(
-    pairs: Sequence[PhasePair], cameras: Cameras, params: UncertaintyParams, locate: Locate, shift_estimated: bool
-) -> SiteCycle | None:
-    """The site's electrodes at every matched phase; None where too few moments show them.
-
-    ``cameras`` have the shift between the runs taken out already: it is the same at all phases.
-    """
-    moments = [(pair.phase, seen_in_both(pair)) for pair in pairs if pair.phase is not None]
-    counts: dict[tuple[str, int], int] = {}
-    for _, pixels in moments:
-        for label in pixels.labels:
-            counts[label] = counts.get(label, 0) + 1
-    labels = tuple(label for label, count in counts.items() if count >= IN_MOST_PAIRS * len(moments))
-    whole: dict[float, TwoViewPixels] = {}
-    for phase, pixels in moments:
-        # Beats told by R waves repeat phase 0; one moment of each phase is enough.
-        if phase not in whole and set(labels) <= set(pixels.labels):
-            whole[phase] = pixels.only(labels)
-    if not labels or len(whole) < FEWEST_MOMENTS:
-        return None
-    catheters = tuple(catheter for catheter, _ in labels)
-    phases = np.array(sorted(whole))
-    positions = np.array([locate(cameras, whole[phase]) for phase in phases])
-    # The geometry hardly changes over the cycle: what is unsure at its mean place is so throughout, but for the pixels.
-    mean_pixels = tuple(np.mean([pixels.covariances[v] for pixels in whole.values()], axis=0) for v in (0, 1))
-    joint = joint_covariance(
-        cameras, positions.mean(axis=0), (mean_pixels[0], mean_pixels[1]), catheters, params,
-        params.cycle_beat_sd_mm, shift_estimated,
-    )  # fmt: skip
-    own = np.einsum("iaib->iab", joint)
-    return SiteCycle(phases, labels, positions, np.broadcast_to(own, (len(phases), *own.shape)))

@@ -1,12 +1,25 @@
-"""What can be wrong about a point from two views, and its covariance."""
+"""What can be wrong about electrodes seen in two views: every source of error, and what it does to the pixels."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
 
+from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
+from fluoromap.triangulator.seen import Cameras
+
+Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
+"""Where an error source counts in the :class:`~fluoromap.contracts.ErrorBudget`."""
+
+
+BENDS_OVER_MM = 25.0
+"""Length of shaft over which a catheter's motion falls from its tip's towards half of it."""
 
 
 class UncertaintyParams(BaseModel, extra="forbid"):
@@ -16,109 +29,233 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         0.5, ge=0, le=10, description="Error of each gantry angle in the header, degrees."
     )
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in each view, mm.")
+    magnification_sd: float = Field(
+        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+    )
     respiration_head_feet_sd_mm: float = Field(
         4.0, ge=0, le=30, description="Breathing position of the heart in each run along the patient's long axis, mm."
     )
     respiration_other_sd_mm: float = Field(
         1.0, ge=0, le=30, description="Breathing position of the heart in each run along the other two axes, mm."
     )
-    beat_sd_mm: float = Field(
-        0.25, ge=0, le=10, description="Variation of a catheter's place from beat to beat, mm an axis."
+    respiration_drift_sd_mm: float = Field(
+        0.3, ge=0, le=30, description="Breathing within a run along the patient's long axis, mm."
     )
-    amplitude_sd: float = Field(
+    beat_sd_mm: float = Field(
+        0.25, ge=0, le=10, description="Variation of a catheter tip's place from beat to beat, mm an axis."
+    )
+    bend_sd_mm: float = Field(
+        0.05,
+        ge=0,
+        le=10,
+        description="How far an electrode strays from what its catheter's tip tells of it, mm an axis.",
+    )
+    beat_amplitude_sd: float = Field(
         0.04, ge=0, le=1, description="Variation of the motion's amplitude from beat to beat, as a share of it."
     )
-    amplitude_mm: float = Field(
-        3.0, ge=0, le=30, description="Distance of a catheter at diastole from the middle of its motion, mm."
+    beat_timing_sd: float = Field(
+        0.017, ge=0, le=0.5, description="Variation of the contraction's moment from beat to beat, in cycles."
     )
-    cycle_beat_sd_mm: float = Field(
-        0.45, ge=0, le=10, description="As beat_sd_mm, for moments when the heart moves: mismatch of phase included."
+    phase_pairing_sd: float = Field(
+        0.015, ge=0, le=0.5, description="Error of bringing the two runs to the same cardiac phase, in cycles."
     )
     spacing_limit_mm: float = Field(
         1.5, gt=0, le=20, description="Electrode spacings farther than this from the catalogue's are told, mm."
     )
 
-    def catheter_sd_mm(self) -> float:
-        """Of one catheter's diastolic place in one run, an axis."""
-        return float(np.hypot(self.beat_sd_mm, self.amplitude_sd * self.amplitude_mm / np.sqrt(3.0)))
-
-    def shift_covariance_mm2(self) -> Array:
-        """Covariance (6, 6) of the displacement that all catheters share in view a, then in view b."""
+    def respiration_covariance_mm2(self) -> Array:
+        """Covariance (3, 3) of where breathing holds the heart in one run."""
         other, head = self.respiration_other_sd_mm**2, self.respiration_head_feet_sd_mm**2
-        one_view = np.array([other, other, head]) + self.isocentre_sd_mm**2
-        return np.diag(np.tile(one_view, 2))
+        return np.diag([other, other, head])
+
+    def gantry_covariance(self) -> Array:
+        """Covariance (12, 12) of the gantry's errors, see :func:`gantry_effect_px`; the views' are independent."""
+        angle, offset = np.radians(self.gantry_angle_sd_deg) ** 2, self.isocentre_sd_mm**2
+        return np.diag(np.tile(np.repeat([angle, offset], 3), 2))
 
 
-def joint_covariance(
-    cameras: tuple[Camera, Camera],
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How the electrodes move at one moment of the cycle.
+
+    displaced_mm : (N, 3) from where they are at diastole. velocity_mm : (N, 3), mm a cycle.
+    """
+
+    displaced_mm: Array
+    velocity_mm: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSource:
+    """One cause of error with k unknown parameters.
+
+    effect_px : (4 N, k) what one unit of each parameter does to the pixels, electrode by electrode: u, v in view a, then
+    in view b. covariance : (k, k) of the parameters. shares : (k,) where each counts in the error budget.
+    """
+
+    effect_px: Array
+    covariance: Array
+    shares: tuple[Share, ...]
+
+    def pixels_px2(self) -> Array:
+        """Covariance (4 N, 4 N) of the pixels from this source."""
+        covariance: Array = self.effect_px @ self.covariance @ self.effect_px.T
+        return covariance
+
+
+def jacobians(cameras: Cameras, points_world_mm: Array) -> Array:
+    """d(u, v)/d(X, Y, Z) in view a and b at points (N, 3), shape (N, 2, 2, 3)."""
+    return np.stack([camera.jacobian(points_world_mm) for camera in cameras], axis=1)
+
+
+def effect_px(jacobian: Array, displacement_a: Array, displacement_b: Array) -> Array:
+    """What parameters do to the pixels, (4 N, k), that displace the electrodes as seen by each view.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (N, 2, 2, 3)
+        See :func:`jacobians`.
+    displacement_a, displacement_b : ndarray, shape (N, 3, k) or (3, k)
+        mm in the world for one unit of each parameter.
+    """
+    n = len(jacobian)
+    parts = [jacobian[:, view] @ d for view, d in enumerate((displacement_a, displacement_b))]
+    effect: Array = np.stack(parts, axis=1).reshape(4 * n, -1)
+    return effect
+
+
+def gantry_effect_px(jacobian: Array, points_world_mm: Array) -> Array:
+    """Effect (4 N, 12) of the gantry's errors: rotation vector about the isocentre (radians) and offset (mm) of view a,
+    then of view b. They displace the electrodes as that view sees them: ``X' = R X + t``."""
+    n = len(points_world_mm)
+    x, y, z = points_world_mm.T
+    zero = np.zeros(n)
+    turned = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
+    own = np.concatenate([turned, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
+    none = np.zeros((n, 3, 6))
+    return effect_px(jacobian, np.concatenate([own, none], axis=2), np.concatenate([none, own], axis=2))
+
+
+def breathing_effect_px(jacobian: Array) -> Array:
+    """Effect (4 N, 3) of half the difference (mm) of where breathing held the heart in the two runs.
+
+    A position is told for the middle of the two runs' breaths: nothing says where breathing is at rest.
+    """
+    return effect_px(jacobian, np.eye(3), -np.eye(3))
+
+
+def seen_breathing(cameras: Cameras, points_world_mm: Array, params: UncertaintyParams) -> ErrorSource:
+    """The part of breathing's displacement that the two views show: across the plane of their rays, one parameter.
+
+    In that plane each view shows its own displacement as if the heart stood elsewhere; perspective tells the difference,
+    but so faintly that the gantry's errors drown it.
+    """
+    across = np.cross(cameras[0].axis_world, cameras[1].axis_world)
+    across /= np.linalg.norm(across)
+    variance = float(across @ params.respiration_covariance_mm2() @ across) / 2
+    effect = breathing_effect_px(jacobians(cameras, points_world_mm)) @ across[:, None]
+    return ErrorSource(effect, np.array([[variance]]), ("breathing",))
+
+
+def error_sources(
+    cameras: Cameras,
     points_world_mm: Array,
-    pixel_covariances_px2: tuple[Array, Array],
-    catheters: tuple[str, ...],
+    labels: Sequence[tuple[str, int]],
+    catalogue: Catalogue,
     params: UncertaintyParams,
-    catheter_sd_mm: float,
-    shift_estimated: bool,
-) -> Array:
-    """Covariance between all coordinates of all points of a site, to first order.
+    gantry_covariance: Array,
+    motion: Motion | None,
+) -> tuple[ErrorSource, ...]:
+    """Everything but the pixels' own noise that is wrong at one moment of a site.
 
-    Every point is a weighted least-squares answer from four pixel coordinates. Pixel noise is independent from
-    electrode to electrode. Beat-to-beat variation displaces each catheter as a whole in each run. Breathing displaces
-    all catheters alike in each run, and errors of the gantry angles turn them alike about the isocentre: both are carried
-    along with their correlation, so that they cancel, as far as they do, in positions relative to the reference catheter.
+    Breathing displaces all catheters alike in each run, and errors of the gantry turn and shift them alike: both are
+    carried along with their correlation, so that they cancel, as far as they do, in positions relative to the reference
+    catheter. Beat-to-beat variation displaces each catheter as a whole in each run, strengthens or weakens the motion of
+    all of them and moves it in time; the last two matter where the heart moves.
 
     Parameters
     ----------
     points_world_mm : ndarray, shape (N, 3)
-    pixel_covariances_px2 : pair of ndarray, shape (N, 2, 2)
-        Of each point in view a and b.
-    catheters : tuple of str
+    labels : sequence of (catheter, electrode)
         Of each point.
-    catheter_sd_mm : float
-        Variation of a catheter's place in one run, an axis.
-    shift_estimated : bool
-        The answer took account of the shift between the views, see :func:`common_shift_mm`.
-
-    Returns
-    -------
-    ndarray, shape (N, 3, N, 3)
-        mm^2.
+    gantry_covariance : ndarray, shape (12, 12)
+        As :meth:`UncertaintyParams.gantry_covariance` or what self-calibration left of it.
+    motion : Motion or None
+        None: the moment is one of rest.
     """
     n = len(points_world_mm)
-    names = sorted(set(catheters))
-    unknowns = 3 * n + (6 if shift_estimated else 0)
-    shift = params.shift_covariance_mm2()
-    normal = np.zeros((unknowns, unknowns))
-    if shift_estimated:
-        normal[3 * n :, 3 * n :] = np.linalg.inv(shift + 1e-9 * np.eye(6))
-    width = 6 + 6 + 6 * len(names)
-    coupling = np.zeros((unknowns, width))
-    for view, camera in enumerate(cameras):
-        jacobian = camera.jacobian(points_world_mm)
-        weight = np.linalg.inv(pixel_covariances_px2[view])
-        information = np.einsum("nki,nkl,nlj->nij", jacobian, weight, jacobian)
-        for i in range(n):
-            at, own = slice(3 * i, 3 * i + 3), information[i]
-            turned = own @ -_cross(points_world_mm[i])
-            c = 12 + 6 * names.index(catheters[i]) + 3 * view
-            normal[at, at] += own
-            coupling[at, 3 * view : 3 * view + 3] += own
-            coupling[at, 6 + 3 * view : 9 + 3 * view] += turned
-            coupling[at, c : c + 3] += own
-            if shift_estimated:
-                common = slice(3 * n + 3 * view, 3 * n + 3 * view + 3)
-                normal[at, common] += own
-                normal[common, at] += own
-                normal[common, common] += own
-                coupling[common, 6 + 3 * view : 9 + 3 * view] += turned
-                coupling[common, c : c + 3] += own
-    estimated = np.linalg.inv(normal)
-    angle = np.full(6, np.radians(params.gantry_angle_sd_deg) ** 2)
-    beats = np.full(6 * len(names), catheter_sd_mm**2)
-    # An estimated shift is an unknown with a prior; otherwise it is an error that nobody looked at.
-    considered = np.concatenate([np.zeros(6) if shift_estimated else np.diag(shift), angle, beats])
-    gain = (estimated @ coupling) * np.sqrt(considered)
-    covariance = (estimated + gain @ gain.T)[: 3 * n, : 3 * n]
-    symmetric: Array = ((covariance + covariance.T) / 2).reshape(n, 3, n, 3)
-    return symmetric
+    jacobian = jacobians(cameras, points_world_mm)
+    gantry: tuple[Share, ...] = (*("angles",) * 3, *("source_distances",) * 3) * 2
+    head_feet = np.array([[0.0], [0.0], [1.0]])
+    across = [_across(camera, points_world_mm) for camera in cameras]
+    sources = [
+        ErrorSource(gantry_effect_px(jacobian, points_world_mm), gantry_covariance, gantry),
+        _both_views(jacobian, across[0], across[1], params.magnification_sd, "source_distances"),
+        ErrorSource(breathing_effect_px(jacobian), params.respiration_covariance_mm2() / 2, ("breathing",) * 3),
+        _both_views(jacobian, head_feet, head_feet, params.respiration_drift_sd_mm, "breathing"),
+    ]
+    follows = _follows_tip(points_world_mm, labels, catalogue)
+    for name in sorted({catheter for catheter, _ in labels}):
+        own = follows * np.array([catheter == name for catheter, _ in labels])[:, None, None]
+        sources.append(_both_views(jacobian, own, own, params.beat_sd_mm, "phase_mismatch"))
+    each = np.eye(3 * n).reshape(n, 3, 3 * n)
+    sources.append(_both_views(jacobian, each, each, params.bend_sd_mm, "phase_mismatch"))
+    if motion is not None:
+        displaced, velocity = motion.displaced_mm.reshape(n, 3, 1), motion.velocity_mm.reshape(n, 3, 1)
+        sources.append(_both_views(jacobian, displaced, displaced, params.beat_amplitude_sd, "phase_mismatch"))
+        # The phase is view a's; view b's frame is only the nearest to it.
+        timing = np.diag(np.square([params.beat_timing_sd, np.hypot(params.beat_timing_sd, params.phase_pairing_sd)]))
+        none = np.zeros_like(velocity)
+        late = effect_px(
+            jacobian, np.concatenate([velocity, none], axis=2), np.concatenate([none, velocity], axis=2)
+        )  # fmt: skip
+        sources.append(ErrorSource(late, timing, ("phase_mismatch",) * 2))
+    return tuple(sources)
+
+
+def _follows_tip(points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> Array:
+    """Displacement of each electrode when its catheter's tip is displaced, (N, 3, 3).
+
+    The shaft is not stretched: along it all electrodes go with the tip. It is held in its vessel and bends: across, they
+    follow the less the farther back they are.
+    """
+    follows = np.empty((len(labels), 3, 3))
+    for i, (catheter, electrode) in enumerate(labels):
+        own = [k for k, (name, _) in enumerate(labels) if name == catheter]
+        along = catalogue[catheter].arc_lengths_mm
+        share = 0.5 + 0.5 * np.exp(-along[min(electrode, len(along)) - 1] / BENDS_OVER_MM)
+        chord = points_mm[own[-1]] - points_mm[own[0]]
+        length = max(float(np.linalg.norm(chord)), 1e-9)
+        axis = chord / length
+        follows[i] = share * np.eye(3) + (1 - share) * np.outer(axis, axis)
+    return follows
+
+
+def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Share) -> ErrorSource:
+    """The same parameters drawn anew in each view."""
+    k = in_a.shape[-1]
+    effect = np.concatenate(
+        [effect_px(jacobian, in_a, np.zeros_like(in_b)), effect_px(jacobian, np.zeros_like(in_a), in_b)], axis=1
+    )
+    return ErrorSource(effect, sd**2 * np.eye(2 * k), (share,) * (2 * k))
+
+
+def _across(camera: Camera, points_world_mm: Array) -> Array:
+    """Points less their part along the central ray, (N, 3, 1): what a wrong magnification stretches."""
+    along = camera.axis_world
+    across: Array = (points_world_mm - np.outer(points_world_mm @ along, along))[..., None]
+    return across
+
+
+def pixel_noise_px2(covariances_px2: tuple[Array, Array]) -> Array:
+    """The pixels' own covariances, (N, 2, 2) in view a and b, as one matrix (4 N, 4 N)."""
+    a, b = covariances_px2
+    n = len(a)
+    noise = np.zeros((n, 2, 2, n, 2, 2))
+    rows = np.arange(n)
+    noise[rows, 0, :, rows, 0, :] = a
+    noise[rows, 1, :, rows, 1, :] = b
+    return noise.reshape(4 * n, 4 * n)
 
 
 def relative_covariance_mm2(joint_mm2: Array, index: int, reference: list[int]) -> Array:
@@ -129,8 +266,3 @@ def relative_covariance_mm2(joint_mm2: Array, index: int, reference: list[int]) 
     covariance: Array = np.einsum("i,iajb,j->ab", weights, joint_mm2, weights)
     # The reference's own electrodes can come out with nearly nothing; a covariance stays positive definite.
     return covariance + 1e-9 * np.eye(3)
-
-
-def _cross(vector: Array) -> Array:
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -35,16 +35,19 @@ class Sample:
 @dataclass(frozen=True, eq=False)
 class FrameOrigins:
     """What is subtracted in each frame: positions_mm (n, 3) from the isocentre; known (n,), False where there is none;
-    borrowed (n,), True where it is the mean over the other sites."""
+    borrowed (n,), True where it is the mean over the other sites; same_frame (n,), True where it is the reference
+    catheter's mean in that very frame, which shares its errors with the position it is subtracted from."""
 
     positions_mm: Array
     known: BoolArray
     borrowed: BoolArray
+    same_frame: BoolArray
 
 
 def isocentre(frames: int) -> FrameOrigins:
     """The isocentre in every frame."""
-    return FrameOrigins(np.zeros((frames, 3)), np.ones(frames, dtype=np.bool_), np.zeros(frames, dtype=np.bool_))
+    never = np.zeros(frames, dtype=np.bool_)
+    return FrameOrigins(np.zeros((frames, 3)), ~never, never, never)
 
 
 def reference(track: Track, catheter: str, own_mm: Array | None, others_mm: Array | None) -> FrameOrigins:
@@ -61,9 +64,9 @@ def reference(track: Track, catheter: str, own_mm: Array | None, others_mm: Arra
     seen: BoolArray = count > 0
     fallback = own_mm if own_mm is not None else others_mm
     if fallback is None:
-        return FrameOrigins(mean, seen, np.zeros_like(seen))
+        return FrameOrigins(mean, seen, np.zeros_like(seen), seen)
     mean[~seen] = fallback
-    return FrameOrigins(mean, np.ones_like(seen), ~seen if own_mm is None else np.zeros_like(seen))
+    return FrameOrigins(mean, np.ones_like(seen), ~seen if own_mm is None else np.zeros_like(seen), seen)
 
 
 def camera_of(site: LocatedSite, view: View) -> Camera:
@@ -72,7 +75,11 @@ def camera_of(site: LocatedSite, view: View) -> Camera:
 
 
 def samples(track: Track, index: int, camera: Camera, origins: FrameOrigins) -> Iterator[Sample]:
-    """The samples of the electrode that stands at ``index`` in ``track.labels``, one a frame."""
+    """The samples of the electrode that stands at ``index`` in ``track.labels``, one a frame.
+
+    Where the reference's mean of the same frame is subtracted, the covariance is that of the difference, if the solver
+    tells it: breathing and the gantry's errors cancel. Else it is that of the position from the isocentre.
+    """
     doubts = track.reasons[index]
     source = camera.source_world_mm
     for frame, located in enumerate(track.located[:, index]):
@@ -85,6 +92,8 @@ def samples(track: Track, index: int, camera: Camera, origins: FrameOrigins) -> 
             continue
         reasons = (*doubts, Reason.NO_REFERENCE) if origins.borrowed[frame] else doubts
         position, covariance = track.positions_mm[frame, index], track.covariance_mm2[frame, index]
+        if origins.same_frame[frame] and track.relative_covariance_mm2 is not None:
+            covariance = track.relative_covariance_mm2[frame, index]
         along, lateral = split_along_ray(covariance, position - source)
         origin = origins.positions_mm[frame]
         yield Sample(

@@ -35,7 +35,9 @@ class MapSite(BaseModel):
     surface_mm: Position = Field(description="Where on the surface the site counts.")
     distance_mm: float = Field(description="From the site to that place.")
     lat_ms: float
-    leave_one_out_error_ms: float | None = Field(description="What the other sites predict here minus what was measured.")
+    leave_one_out_error_ms: float | None = Field(
+        description="What the other sites predict here minus what was measured."
+    )
     reasons: list[Reason] = Field(description="For example `lat_outlier`.")
 
 

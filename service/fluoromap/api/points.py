@@ -12,14 +12,16 @@ from sqlalchemy.orm import Session
 
 from fluoromap.api.origins import FrameOfReference, Origin, OriginQuery, Six
 from fluoromap.api.problems import responses
-from fluoromap.api.readiness import done_stage, job_of
+from fluoromap.api.readiness import done_stage, job_of, manifest_of
 from fluoromap.api.security import Reader
 from fluoromap.api.tables import csv_entry, csv_response, csv_text, wants_csv
-from fluoromap.contracts import Grade
+from fluoromap.api.triangulated import StudyGeometry, study_geometry
+from fluoromap.contracts import Grade, Triangulation
 from fluoromap.reasons import Reason
 from fluoromap.store.engine import reading
 from fluoromap.store.models import Job
 from fluoromap.store.models import Point as PointRow
+from fluoromap.store.outcomes import load
 
 router = APIRouter(tags=["results"])
 
@@ -76,10 +78,23 @@ EXAMPLE: dict[str, Any] = {
             "residual_px": {"a": 0.31, "b": 0.27}, "ray_angle_deg": 88.7, "lat_ms": 41.0, "grade": "A", "reasons": [],
         }
     ],
+    "calibration": {
+        "applied": True, "rotation_deg": [0.4, -0.9, 0.2], "offset_mm": [0.3, -1.1, 1.6], "epipolar_before_px": 5.4,
+        "epipolar_after_px": 0.5,
+    },
+    "error_budget": {
+        "pixels_mm": 0.14, "angles_mm": 0.31, "source_distances_mm": 0.52, "phase_mismatch_mm": 0.41, "breathing_mm": 0.94,
+    },
+    "notes": ["S04: the views are 17 degrees apart; at least 20 are needed."],
+    "alternatives": [
+        {
+            "site": "S03", "catheter": "pacing", "electrode": 2, "x_mm": 12.4, "y_mm": -3.1, "z_mm": 7.7, "probability": 0.2,
+        }
+    ],
 }  # fmt: skip
 
 
-class Points(BaseModel):
+class Points(StudyGeometry):
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
 
     frame: FrameOfReference
@@ -152,9 +167,13 @@ def _lines(points: list[Point]) -> Iterator[list[Any]]:
         ]  # fmt: skip
 
 
-def _read(job_id: str, origin: Origin) -> list[Point]:
+def _read(job_id: str, origin: Origin) -> Points:
     with reading() as session:
-        return points_of(session, job_of(session, job_id), origin)
+        job = job_of(session, job_id)
+        points = points_of(session, job, origin)
+        triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
+        study = study_geometry(triangulation, manifest_of(job).reference, origin)
+    return Points(frame=FrameOfReference(origin=origin), points=points, **dict(study))
 
 
 @router.get(
@@ -169,13 +188,14 @@ def get_points(
     """Every electrode of every site, with covariance, residuals and grade; as CSV where `Accept: text/csv` asks for it.
 
     Available as soon as the stage `triangulate` is done; before that 409 `not_ready`. A site without a located
-    reference catheter has positions from the isocentre only.
+    reference catheter has positions from the isocentre only. Beside them what triangulation says of the whole study: the
+    gantry's self-calibration, the error budget, and where electrodes would be if catheters were paired the other way.
     """
     points = _read(job_id, origin)
     if wants_csv(request):
-        return csv_response(points_csv(points), "points.csv")
+        return csv_response(points_csv(points.points), "points.csv")
     response.headers["Vary"] = "Accept"
-    return Points(frame=FrameOfReference(origin=origin), points=points)
+    return points
 
 
 @router.get(
@@ -186,4 +206,4 @@ def get_points(
 )
 def get_points_csv(job_id: JobId, caller: Reader, origin: OriginQuery = Origin.REFERENCE) -> Response:
     """The same as `points`, always as CSV."""
-    return csv_response(points_csv(_read(job_id, origin)), "points.csv")
+    return csv_response(points_csv(_read(job_id, origin).points), "points.csv")

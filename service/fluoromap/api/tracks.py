@@ -40,7 +40,12 @@ class TrackSample(BaseModel):
     z_mm: float | None
     along_ray_sd_mm: float | None = Field(description="Standard deviation along this view's ray: the depth.")
     lateral_sd_mm: float | None = Field(description="Standard deviation across the ray, RMS of both directions.")
-    covariance_mm2: Six | None = Field(description="xx, xy, xz, yy, yz, zz; of the position from the isocentre.")
+    covariance_mm2: Six | None = Field(
+        description=(
+            "xx, xy, xz, yy, yz, zz; with origin `reference` of the position less the reference's of the same frame where the "
+            "solver tells it, else of the position from the isocentre."
+        )
+    )
     baseline_mm: Position | None = Field(description="Plain back-projection at the known depth, for comparison.")
     u_px: float | None
     v_px: float | None
@@ -76,7 +81,7 @@ class Tracks(BaseModel):
                     "frame": {"axes": "LPS", "origin": "reference", "unit": "mm"},
                     "tracks": [
                         {
-                            "site": "S03", "view": "a", "catheter": "mapping", "electrode": 1, "solver": "a-priori-lm",
+                            "site": "S03", "view": "a", "catheter": "mapping", "electrode": 1, "solver": "motion-prior",
                             "samples": [
                                 {
                                     "frame": 1, "x_mm": 31.2, "y_mm": -8.4, "z_mm": 12.9, "along_ray_sd_mm": 1.4,
@@ -110,7 +115,7 @@ COLUMNS = (
 )  # fmt: skip
 CSV_ENTRY = csv_entry(
     "One line an electrode and frame; a rejected view is one line without catheter and frame.",
-    ",".join(COLUMNS) + "\r\nS03,a,mapping,1,a-priori-lm,1,31.2,-8.4,12.9,1.4,0.2,0.1,0.0,0.0,1.9,0.0,0.1,"
+    ",".join(COLUMNS) + "\r\nS03,a,mapping,1,motion-prior,1,31.2,-8.4,12.9,1.4,0.2,0.1,0.0,0.0,1.9,0.0,0.1,"
     "31.3,-8.0,12.9,271.3,240.8,B,\r\n",
 )
 

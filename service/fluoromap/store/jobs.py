@@ -14,6 +14,7 @@ from typing import Any, Literal
 from sqlalchemy import or_, select, update
 from sqlalchemy.orm import Session
 
+from fluoromap import matching
 from fluoromap.settings import settings
 from fluoromap.store.clock import db_now
 from fluoromap.store.manifest import Manifest
@@ -70,7 +71,7 @@ def create(session: Session, study_id: str, manifest: Manifest) -> Job:
     segmenter, triangulator = manifest.segmenter, manifest.triangulator
     used = sorted({uid for site in manifest.sites for uid in (site.view_a, site.view_b)})
     segments = [add("segment", uid, segmenter.name, segmenter.version, []) for uid in used]
-    match = add("match", study_id, "fluoromap", "1", segments)
+    match = add("match", study_id, "fluoromap", matching.VERSION, segments)
     triangulate = add("triangulate", study_id, triangulator.name, triangulator.version, [match])
     add("fuse", study_id, manifest.fuser.name, manifest.fuser.version, [triangulate])
     for site in manifest.sites:

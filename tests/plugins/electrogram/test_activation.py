@@ -34,15 +34,45 @@ def test_uneven_samples():
     assert found.lat_ms == pytest.approx(47.3, abs=0.6)
 
 
-def test_the_standard_deviation_covers_the_scatter():
+def filtered_noise(rng, sd):
+    """Noise as a 200 Hz amplifier leaves it: neighbouring samples err alike."""
+    noise = np.convolve(rng.normal(size=320), np.exp(-0.5 * (np.arange(-6, 7) / 1.5) ** 2), "same")[10:310]
+    return sd * noise / np.std(noise)
+
+
+SPOILT = {
+    "white noise": lambda rng, at: rng.normal(0, 0.03, 300),
+    "filtered noise": lambda rng, at: filtered_noise(rng, 0.03),
+    "mains hum": lambda rng, at: 0.05 * np.sin(0.1 * np.pi * TIMES + rng.uniform(0, 6)),
+    "wander": lambda rng, at: np.sin(TIMES / 60 + rng.uniform(0, 6)) + rng.normal(0, 0.02, 300),
+    "far field": lambda rng, at: deflection(at + rng.uniform(-30, 30), width_ms=18, height=1.5),
+    "late potential": lambda rng, at: (
+        deflection(at + rng.uniform(30, 60), width_ms=2.5, height=0.3) + rng.normal(0, 0.02, 300)
+    ),
+}
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_the_stated_deviation_covers_the_error(what):
     rng = np.random.default_rng(1)
     errors, stated = [], []
-    for shift in rng.uniform(-0.5, 0.5, 60):
-        noisy = [deflection(at) + rng.normal(0, 0.03, 300) for at in (100, 140 + shift)]
-        result = activation_time(TIMES, *noisy)
-        errors.append(result.lat_ms - 40 - shift)
+    for _ in range(60):
+        reference_at, mapping_at = rng.uniform(90, 110), rng.uniform(120, 180)
+        signals = [
+            deflection(at, width_ms=rng.uniform(2.5, 6)) + SPOILT[what](rng, at) for at in (reference_at, mapping_at)
+        ]
+        result = activation_time(TIMES, *signals)
+        errors.append(result.lat_ms - (mapping_at - reference_at))
         stated.append(result.sd_ms)
-    assert 0.5 < np.mean(stated) / np.std(errors) < 2
+    assert np.abs(errors).max() < 1.5
+    assert np.mean(np.abs(errors) < 2 * np.array(stated)) > 0.85
+    assert np.mean(stated) < 2.5 * np.std(errors)
+
+
+def test_a_sharp_near_field_wins_over_a_larger_far_field():
+    far = deflection(190, width_ms=18, height=3)
+    found = activation_time(TIMES, deflection(100), deflection(150, width_ms=3) + far)
+    assert found.lat_ms == pytest.approx(50, abs=1)
 
 
 def test_rivals_are_told():
@@ -58,6 +88,8 @@ def test_rivals_are_told():
         (np.zeros(300), "flat"),
         (np.clip(deflection(100), -0.2, 0.2), "saturated"),
         (np.random.default_rng(0).normal(size=300), "noise"),
+        (filtered_noise(np.random.default_rng(0), 1.0), "noise"),
+        (np.sin(0.1 * np.pi * TIMES), "noise"),
         (np.full(300, np.nan), "not numbers"),
         (np.zeros(299), "one value"),
         (np.linspace(0, 1, 300), "noise"),

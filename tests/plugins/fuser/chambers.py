@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fluoromap.contracts import ChamberMap, MappedSite, Silent
 from fluoromap.fuser.convex_hull import ConvexHull, ConvexHullParams
+from fluoromap.fuser.smooth_surface import SmoothSurface, SmoothSurfaceParams
 
 Array = NDArray[np.float64]
 
@@ -48,3 +49,7 @@ def wave(count: int, seed: int, lat_sd_ms: float = 1.5) -> tuple[tuple[MappedSit
 
 def fused(sites: tuple[MappedSite, ...], **params: object) -> ChamberMap:
     return ConvexHull(ConvexHullParams.model_validate(params)).fuse(sites, Silent())
+
+
+def smooth(sites: tuple[MappedSite, ...], **params: object) -> ChamberMap:
+    return SmoothSurface(SmoothSurfaceParams.model_validate(params)).fuse(sites, Silent())

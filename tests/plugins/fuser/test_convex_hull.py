@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 from chambers import directions, fused, sites_at, sphere, wave
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fluoromap.contracts import Refusal
-from fluoromap.fuser.convex_hull import ConvexHull, ConvexHullParams, earliest_sites
-from fluoromap.fuser.surface_field import LEAST_SD_MS
+from fluoromap.fuser.activation_times import LEAST_SD_MS
+from fluoromap.fuser.convex_hull import ConvexHull, ConvexHullParams
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser
 
@@ -173,32 +170,6 @@ def test_four_sites_are_enough():
     assert times_at_sites(chamber) == pytest.approx([0, 10, 20, 30], abs=1.0)
 
 
-def test_three_sites_are_refused():
-    with pytest.raises(Refusal) as refusal:
-        fused(sites_at(TETRAHEDRON[:3], np.zeros(3)))
-    assert refusal.value.reason is Reason.TOO_FEW_SITES
-
-
-@pytest.mark.parametrize(
-    "tips",
-    [
-        np.column_stack([20 * directions(12)[:, :2], np.zeros(12)]),
-        np.outer(np.arange(6.0), [1, 2, 3]),
-        np.tile([1.0, 2, 3], (5, 1)),
-        np.column_stack([20 * directions(12)[:, :2], 0.1 * np.arange(12) % 0.3]),
-    ],
-    ids=["plane", "line", "point", "nearly a plane"],
-)
-def test_sites_without_volume_are_refused(tips):
-    sites = sites_at(np.vstack([TETRAHEDRON]), np.zeros(4))[:1] * len(tips)
-    flat = tuple(
-        type(sites[0])(f"S{i}", tip, np.eye(3), np.array([0, 0, 1.0]), 4.0, 0.0, 1.0) for i, tip in enumerate(tips)
-    )
-    with pytest.raises(Refusal) as refusal:
-        fused(flat)
-    assert refusal.value.reason is Reason.SITES_COPLANAR
-
-
 def test_same_sites_make_the_same_map():
     first, second = fused(sphere(12)), fused(sphere(12))
     for name in ("vertices_mm", "faces", "lat_ms", "lat_sd_ms", "covered"):
@@ -215,26 +186,3 @@ def test_repeated_places_and_equal_exact_times():
     still = fused(sites_at(np.array([site.tip_mm for site in sites]), np.zeros(12), 0.0))
     assert np.abs(still.lat_ms).max() < 0.1
     assert still.total_activation_time_ms == 0
-
-
-class TestEarliest:
-    def test_two_sites_agree_with_the_normal_distribution(self):
-        answer = dict(earliest_sites(("early", "late"), np.array([0.0, 3.0]), np.array([2.0, 1.0])))
-        expected = 0.5 * (1 + math.erf(3 / math.sqrt(5) / math.sqrt(2)))
-        assert answer["early"] == pytest.approx(expected, abs=1e-3)
-
-    @settings(max_examples=20, deadline=None)
-    @given(st.lists(st.floats(-50, 50), min_size=2, max_size=8), st.integers(0, 1000))
-    def test_agrees_with_drawing_lots(self, times, seed):
-        rng = np.random.default_rng(seed)
-        lat, sd = np.array(times), rng.uniform(0.5, 6, size=len(times))
-        names = tuple(f"S{index}" for index in range(len(times)))
-        answer = dict(earliest_sites(names, lat, sd))
-        winners = (lat + sd * rng.normal(size=(20_000, len(lat)))).argmin(axis=1)
-        drawn = np.bincount(winners, minlength=len(lat)) / 20_000
-        for name, share in zip(names, drawn, strict=True):
-            assert answer.get(name, 0.0) == pytest.approx(share, abs=0.02)
-
-    def test_equal_sites_share(self):
-        answer = earliest_sites(("a", "b", "c"), np.array([5.0, 5.0, 80.0]), np.ones(3))
-        assert dict(answer) == {"a": pytest.approx(0.5), "b": pytest.approx(0.5)}

@@ -1,6 +1,7 @@
 """Overlays, views, isochrones and colours: what is drawn stands where geometry puts it."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,26 @@ def test_raster_shows_the_nearest_face_with_linear_values():
         False,
         True,
     ]
+
+
+def test_early_meets_late_without_running_through_all_bands():
+    cycle = 360.0
+    sites = sphere(20, slope_ms_per_mm=1.0)
+    chamber = fused(sites, edge_mm=4)
+    middle = chamber.vertices_mm.mean(axis=0)
+    turn = np.degrees(np.arctan2(*(chamber.vertices_mm - middle)[:, [1, 0]].T)) % 360
+    reentry = replace(chamber, lat_ms=turn, cycle_length_ms=cycle, covered=np.ones(len(turn), bool))
+    # Looking along the axis of the circuit: every pixel but those at its centre shows its own angle.
+    uv = 250 + 5 * (chamber.vertices_mm - middle)[:, :2]
+    facing = np.ones(len(chamber.faces), bool)
+    raster = rasterise(uv, chamber.vertices_mm[:, 2], chamber.faces, facing, (500, 500))
+    v, u = np.nonzero(raster.shown())
+    sampled = raster.sample(reentry.lat_ms, cycle)
+    angle = np.degrees(np.arctan2(v - 250, u - 250)) % 360
+    off = np.abs((sampled - angle + 180) % 360 - 180)
+    away = np.hypot(v - 250, u - 250) > 50
+    assert off[away].max() < 25
+    assert ((sampled >= turn.min()) & (sampled < turn.min() + cycle)).all()
 
 
 class TestOverlay:

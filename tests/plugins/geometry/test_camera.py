@@ -37,7 +37,7 @@ def pixel_by_hand(g: Gantry, point: np.ndarray) -> tuple[float, float]:
 
 
 @given(angles, tilts, points)
-def test_perspective_projection_agrees_with_turning_the_patient_instead(a: float, b: float, point: np.ndarray) -> None:
+def test_equation_1_agrees_with_turning_the_patient_instead(a: float, b: float, point: np.ndarray) -> None:
     g = gantry(a, b, pixel_spacing_mm=(0.3, 0.4), rows=400, columns=600)
     assert camera_from_gantry(g).project(point) == pytest.approx(pixel_by_hand(g, point), abs=1e-8)
 
@@ -84,7 +84,7 @@ def test_isocentre_scale_is_magnification_over_pixel_spacing() -> None:
 
 
 @given(angles, tilts, points)
-def test_parallel_projection_knows_no_depth(a: float, b: float, point: np.ndarray) -> None:
+def test_equation_2_knows_no_depth(a: float, b: float, point: np.ndarray) -> None:
     camera = camera_from_gantry(gantry(a, b))
     along = camera.axis_world
     pixel = camera.project_parallel(point)
@@ -94,7 +94,7 @@ def test_parallel_projection_knows_no_depth(a: float, b: float, point: np.ndarra
 
 
 @given(angles, tilts, st.lists(points, min_size=2, max_size=6))
-def test_weak_perspective_uses_the_depth_of_the_centroid(a: float, b: float, cloud: list[np.ndarray]) -> None:
+def test_equation_3_uses_the_depth_of_the_centroid(a: float, b: float, cloud: list[np.ndarray]) -> None:
     camera = camera_from_gantry(gantry(a, b))
     array = np.array(cloud)
     weak = camera.project_weak(array)

@@ -23,8 +23,9 @@ def pulses(n: int, cycle_frames: float, start: float = 0.0) -> np.ndarray:
 
 
 def test_r_waves_have_phase_zero_and_the_middle_between_them_one_half() -> None:
-    phases = cardiac_phases(run(np.zeros(100), (20, 60, 90)), ())
-    assert phases is not None
+    rhythm = cardiac_phases(run(np.zeros(100), (20, 60, 90)), ())
+    assert rhythm is not None
+    phases = rhythm.phases
     assert phases[[20, 60, 90]] == pytest.approx(0)
     assert phases[[40, 75]] == pytest.approx(0.5)
     # Beyond the first and last beat the neighbouring cycle goes on.
@@ -33,16 +34,18 @@ def test_r_waves_have_phase_zero_and_the_middle_between_them_one_half() -> None:
 
 
 def test_two_r_waves_are_enough_for_any_run() -> None:
-    phases = cardiac_phases(run(np.zeros(200), (90, 110)), ())
-    assert phases is not None
+    rhythm = cardiac_phases(run(np.zeros(200), (90, 110)), ())
+    assert rhythm is not None
+    phases = rhythm.phases
     assert phase_distance(phases[[10, 30, 190]], np.zeros(3)) == pytest.approx(0, abs=1e-9)
     assert ((phases >= 0) & (phases < 1)).all()
 
 
 @pytest.mark.parametrize("cycle_frames", [27.3, 33.3, 50.0])
 def test_without_r_waves_the_motion_tells_cycle_and_start_of_systole(cycle_frames: float) -> None:
-    phases = cardiac_phases(run(pulses(120, cycle_frames, 0.4)), ())
-    assert phases is not None
+    rhythm = cardiac_phases(run(pulses(120, cycle_frames, 0.4)), ())
+    assert rhythm is not None
+    phases = rhythm.phases
     truth = (np.arange(120) / cycle_frames + 0.4) % 1.0
     assert phase_distance(phases, truth).max() < 0.12
     # The same moment of every beat has the same phase, wherever zero lies.
@@ -51,8 +54,9 @@ def test_without_r_waves_the_motion_tells_cycle_and_start_of_systole(cycle_frame
 
 
 def test_one_r_wave_gives_the_origin_and_motion_the_length() -> None:
-    phases = cardiac_phases(run(pulses(120, 33.3), (40,)), ())
-    assert phases is not None
+    rhythm = cardiac_phases(run(pulses(120, 33.3), (40,)), ())
+    assert rhythm is not None
+    phases = rhythm.phases
     assert phases[40] == 0
     assert phase_distance(phases[73:74], np.array([0.99]))[0] < 0.05
 

@@ -182,6 +182,58 @@ def test_a_catalogue_that_does_not_fit_gets_no_electrodes_that_are_not_there(bea
         assert len(located(entry.chains, uv)) == len(entry.chains)
 
 
+def test_a_catheter_more_than_the_study_has_is_told_and_swaps_with_none(beating):
+    frames, truth, plain = beating
+    assert plain.diastole.manual_needed is None
+    two = Catalogue(DEFAULT_CATALOGUE.catheters[1:], "pacing", "mapping")
+    found = segmented(frames, catalogue=two)
+    assert found.diastole.manual_needed == Reason.EXTRA_CATHETER
+    followed = {}
+    for entry in found.frames:
+        uv = {name: points[entry.frame] for name, points in truth.pixels_uv.items()}
+        for name, chain in located(entry.chains, uv).items():
+            followed.setdefault(chain.track, set()).add(name)
+    assert followed
+    assert all(len(names) == 1 for names in followed.values())
+
+
+def test_a_catheter_that_leaves_the_field_is_missing_and_told(beating):
+    frames, truth, _ = beating
+    uv = {name: points[0] for name, points in truth.pixels_uv.items()}
+    by_side = min(uv, key=lambda name: uv[name][:, 0].min())
+    start = int(uv[by_side][:, 0].min()) - 40
+    shown = []
+    for index in range(30):
+        cut = start + 11 * max(0, index - 17)
+        shown.append(np.concatenate([frames[0][:, cut:], np.tile(frames[0][:, -40:], 13)[:, :cut]], axis=1))
+    found = segmented(shown)
+    assert by_side in located(found.frames[10].chains, {name: points - [start, 0] for name, points in uv.items()})
+    gone = found.frames[29]
+    assert gone.manual_needed in (Reason.OUT_OF_FIELD, Reason.MANUAL_NEEDED)
+    expected = {name: points - [start + 132, 0] for name, points in uv.items()}
+    assert len(located(gone.chains, expected)) == len(gone.chains) < 3
+
+
+def test_foreshortened_and_crossing_catheters_are_found():
+    """Seeds in which a tip points along the ray, or two catheters cross."""
+    whole = 0
+    for seed, site, view in ((4011, 0, 0), (4102, 1, 1), (4106, 1, 0)):
+        spec = (
+            StudySpec(seed, sites=1, frames=8, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA"))
+            if seed < 4100
+            else StudySpec(seed, sites=4, frames=8, contrast=("LAT", "PA"))
+        )
+        simulated = simulate_study(spec).sites[site].runs[view]
+        found = segmented(list(simulated.frames), frame_ms=float(np.diff(simulated.frame_times_ms)[0]))
+        whole += sum(len(entry.chains) == 3 for entry in found.frames)
+        for entry in found.frames:
+            everything = np.concatenate([uv[entry.frame] for uv in simulated.truth.pixels_uv.values()])
+            for chain in entry.chains:
+                away = np.linalg.norm(chain.pixels_uv[:, None] - everything[None], axis=2).min(axis=1)
+                assert np.median(away) < 5
+    assert whole >= 20
+
+
 def manual(points, name="mapping"):
     n = len(points)
     return Chain(tuple(range(1, n + 1)), points, np.tile(np.eye(2), (n, 1, 1)), np.ones(n), ((name, 1.0),), manual=True)

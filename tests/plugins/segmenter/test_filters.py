@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from fluoromap.contracts import PixelFacts
-from fluoromap.segmenter.blobs import find_blobs, otsu_threshold
+from fluoromap.segmenter.blobs import components, find_blobs, otsu_threshold
 from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.homomorphic import equivalent_sigma, gaussian, homomorphic
 from fluoromap.segmenter.log_image import LogTransform
@@ -96,7 +96,7 @@ def test_equation_4_is_a_constant_less_a_gaussian():
     np.testing.assert_allclose(in_space, by_fourier, atol=1e-12)
 
 
-def test_homomorphic_agrees_with_its_plain_twin_and_keeps_the_mean(image):
+def test_equation_4_agrees_with_its_plain_twin_and_keeps_the_mean(image):
     expected = plain_homomorphic(image) + 0.5 * image.mean()
     got = homomorphic(image)
     assert np.abs(got - expected).max() <= 2e-3 * np.ptp(expected)
@@ -139,11 +139,11 @@ def test_edge_scale_has_a_floor_where_quantisation_hides_the_noise_and_none_for_
     assert edge_scale(np.full((64, 64), 3, np.float32), np.ones((64, 64), bool)) is None
 
 
-@pytest.mark.parametrize("tangential", [0.5, 0.3])
-def test_equation_7_agrees_with_its_plain_twin(image, tangential):
+@pytest.mark.parametrize("theta", [math.pi / 1000, 0.01])
+def test_equation_7_agrees_with_its_plain_twin(image, theta):
     grey = to_grey_range(image, np.ones(image.shape, bool))
-    expected = plain_complex_shock(grey, tangential=tangential)
-    assert np.abs(complex_shock(grey, tangential=tangential) - expected).max() <= 1e-3 * np.ptp(expected)
+    expected = plain_complex_shock(grey, theta=theta)
+    assert np.abs(complex_shock(grey, theta=theta) - expected).max() <= 1e-3 * np.ptp(expected)
 
 
 def test_the_minus_sign_of_equation_7_sharpens():
@@ -161,6 +161,11 @@ def test_shock_refuses_an_unstable_step():
         complex_shock(np.zeros((32, 32), np.float32), step=0.6)
 
 
+def test_shock_refuses_a_theta_for_which_it_leaves_out_too_much():
+    with pytest.raises(ValueError, match="theta"):
+        complex_shock(np.zeros((32, 32), np.float32), theta=0.1)
+
+
 def test_disk_morphology_is_exact(image):
     expected = plain_disk_morphology(image.astype(float), 9, 2)
     np.testing.assert_allclose(disk_morphology(image, 9, 2), expected, atol=3e-5 * np.ptp(image))
@@ -173,6 +178,19 @@ def test_otsu_agrees_with_scikit_image():
     x = np.abs(np.where(rng.random((80, 80)) < 0.1, rng.normal(5, 0.5, (80, 80)), rng.normal(1, 0.3, (80, 80))))
     x = x.astype(np.float32)
     assert otsu_threshold(x, np.ones(x.shape, bool)) == pytest.approx(threshold_otsu(x, nbins=1024), abs=0.02)
+
+
+def test_components_agree_with_scikit_image():
+    from skimage.measure import label, regionprops
+
+    rng = np.random.default_rng(3)
+    for share in (0.02, 0.4, 0.6, 0.95):
+        x = rng.random((70, 93)).astype(np.float32)
+        inside = np.hypot(*np.ogrid[-35:35, -46:47]) < 45
+        areas, centroids = components(x, inside, 1.0 - share)
+        expected = regionprops(label((x >= np.float32(1.0 - share)) & inside, connectivity=2))
+        np.testing.assert_array_equal(areas, [region.area for region in expected])
+        np.testing.assert_allclose(centroids[:, ::-1], [region.centroid for region in expected], atol=1e-9)
 
 
 def test_whole_chain_finds_the_same_blobs_as_the_plain_one(image):
@@ -188,6 +206,17 @@ def test_whole_chain_finds_the_same_blobs_as_the_plain_one(image):
     truth = np.array([(40, 50), (60, 55), (150, 90), (120, 100), (90, 120)], float)
     nearest = np.linalg.norm(got.centroids_uv[:, None] - truth[None], axis=2).min(axis=1)
     assert nearest.max() < 0.5
+
+
+def test_labels_of_a_lateral_frame_are_those_of_the_plain_chain(study):
+    x = np.log(study.sites[0].runs[0].frames[3] + 1.0).astype(np.float32)
+    inside = np.ones(x.shape, bool)
+    k = edge_scale(homomorphic(x), inside)
+    fast = disk_morphology(complex_shock(to_grey_range(perona_malik(homomorphic(x), k), inside)))
+    diffused = plain_perona_malik(plain_homomorphic(x) + 0.5 * x.mean(), k)
+    slow = plain_disk_morphology(plain_complex_shock(to_grey_range(diffused.astype(np.float32), inside)), 14, 2)
+    slow = slow.astype(np.float32)
+    np.testing.assert_array_equal(fast >= otsu_threshold(fast, inside), slow >= otsu_threshold(slow, inside))
 
 
 def test_log_transform():

@@ -4,12 +4,23 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
-from fluoromap.contracts import CHI2_95_3D, Array, MatchedSite, NamedChain, Observation, PhasePair, Silent
+from fluoromap.contracts import (
+    CHI2_95_3D,
+    Alternative,
+    Array,
+    Grade,
+    MatchedSite,
+    NamedChain,
+    Observation,
+    PhasePair,
+    Silent,
+    grade_of,
+)
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import BENDS_OVER_MM, UncertaintyParams
 
 NOISE_PX = 0.5
 BOTH = pytest.mark.parametrize("plugin", [Linear, MaximumLikelihood])
@@ -85,31 +96,37 @@ def test_ellipsoids_hold_the_truth_in_as_many_hearts_as_they_say(plugin: type, c
     rng = np.random.default_rng(7)
     inside, inside_relative, errors, relative_errors = [], [], [], []
     params = UncertaintyParams()
-    for _ in range(150):
+    for _ in range(100):
         points = heart(rng)
-        views = []
+        views, breaths = [], []
         for one in cameras:
-            breathing = rng.normal(0, [1, 1, 4]) + rng.normal(0, params.isocentre_sd_mm, 3)
+            breaths.append(rng.normal(0, [1, 1, 4]))
+            offset = rng.normal(0, params.isocentre_sd_mm, 3)
             turn = np.radians(rng.normal(0, params.gantry_angle_sd_deg, 3))
             moved = {
-                name: at + breathing + rng.normal(0, params.catheter_sd_mm(), 3) + np.cross(turn, at)
+                name: at + breaths[-1] + offset + rng.normal(0, params.beat_sd_mm, 3) * bend(name) + np.cross(turn, at)
                 for name, at in points.items()
             }
             views.append(observation(one, moved, rng))
         matched = site(views[0], views[1], cameras)
         (located,) = plugin(params).triangulate((matched,), DEFAULT_CATALOGUE, Silent()).sites
         tip = located.point("mapping", 1)
-        error = tip.position_mm - points["mapping"][0]
+        error = tip.position_mm - points["mapping"][0] - np.mean(breaths, axis=0)
         relative = tip.relative_mm - (points["mapping"][0] - points["reference"].mean(axis=0))
         inside.append(error @ np.linalg.solve(tip.covariance_mm2, error) <= CHI2_95_3D)
         inside_relative.append(relative @ np.linalg.solve(tip.relative_covariance_mm2, relative) <= CHI2_95_3D)
         errors.append(np.linalg.norm(error))
         relative_errors.append(np.linalg.norm(relative))
-    # Of 150 draws at 95 %: 3.5 standard deviations.
-    assert 0.887 <= np.mean(inside) <= 1
-    assert 0.887 <= np.mean(inside_relative) <= 1
-    assert np.mean(inside) < 0.9999
-    assert np.median(relative_errors) < 0.5 * np.median(errors)
+    # Of 100 draws at 95 %: 3.5 standard deviations.
+    assert 0.874 <= np.mean(inside) < 0.9999
+    assert 0.874 <= np.mean(inside_relative) < 0.9999
+    assert np.median(relative_errors) < 0.7 * np.median(errors)
+
+
+def bend(name: str) -> Array:
+    """How far each electrode follows its tip, shape (m, 1)."""
+    along = DEFAULT_CATALOGUE[name].arc_lengths_mm
+    return (0.5 + 0.5 * np.exp(-along / BENDS_OVER_MM))[:, None]
 
 
 def test_breathing_between_the_runs_is_found_and_hardly_reaches_relative_positions() -> None:
@@ -201,3 +218,103 @@ def test_the_cycle_follows_the_beating_heart(plugin: type) -> None:
     assert located.cycle.phases == pytest.approx(np.arange(0, 1, 0.1))
     assert located.cycle.positions_mm == pytest.approx(np.array(truth), abs=1e-7)
     assert located.cycle.labels[0] == ("mapping", 1)
+
+
+def beating_site(rng: np.random.Generator) -> MatchedSite:
+    """A cycle with a pulse of 5 mm in systole and rest in diastole."""
+    points = heart(rng)
+    pairs = []
+    for phase in np.arange(0, 1, 0.05):
+        pulse = 5 * np.exp(-0.5 * ((phase - 0.3) / 0.1) ** 2)
+        moved = {name: at + np.array([pulse, pulse, 0]) for name, at in points.items()}
+        a, b = (observation(one, moved, rng, phase=float(phase)) for one in LATERAL_AND_FRONTAL)
+        pairs.append(PhasePair(float(phase), a, b))
+    rest = pairs[16]
+    return site(rest.a, rest.b, LATERAL_AND_FRONTAL, tuple(pairs))
+
+
+@BOTH
+def test_a_moment_is_less_certain_where_the_heart_moves_fast(plugin: type) -> None:
+    matched = beating_site(np.random.default_rng(2))
+    (located,) = plugin(UncertaintyParams()).triangulate((matched,), DEFAULT_CATALOGUE, Silent()).sites
+    assert located.cycle is not None
+    spread = np.trace(located.cycle.covariance_mm2, axis1=2, axis2=3).mean(axis=1)
+    fast, quiet = spread[[3, 4, 8, 9]], spread[14:19]
+    assert fast.min() > quiet.max() + 0.3
+    assert quiet.max() < 1.1 * quiet.min()
+
+
+@BOTH
+def test_the_budget_adds_up_to_the_covariances(plugin: type) -> None:
+    matched = beating_site(np.random.default_rng(2))
+    answer = plugin(UncertaintyParams()).triangulate((matched,), DEFAULT_CATALOGUE, Silent())
+    budget = answer.budget
+    assert budget is not None
+    shares = (
+        budget.pixels_mm, budget.angles_mm, budget.source_distances_mm, budget.phase_mismatch_mm, budget.breathing_mm
+    )  # fmt: skip
+    assert all(share > 0 for share in shares)
+    stated = np.mean([np.trace(point.covariance_mm2) for point in answer.sites[0].points])
+    assert np.square(shares).sum() == pytest.approx(stated, rel=1e-6)
+    assert budget.pixels_mm == pytest.approx(0.137, rel=0.1)
+
+
+@BOTH
+def test_one_electrode_in_views_twenty_two_degrees_apart_is_located_with_an_honest_depth(plugin: type) -> None:
+    cameras = (camera(22), camera(0))
+    tip = np.array([[12.0, -8.0, 15.0]])
+    a, b = (observation(one, {"mapping": tip}) for one in cameras)
+    (located,) = plugin(UncertaintyParams()).triangulate((site(a, b, cameras),), DEFAULT_CATALOGUE, Silent()).sites
+    (point,) = located.points
+    assert point.position_mm == pytest.approx(tip[0], abs=1e-6)
+    assert point.relative_mm is None
+    assert grade_of(point.covariance_mm2) is Grade.C
+    depth = np.linalg.eigh(point.covariance_mm2)[1][:, -1]
+    middle = cameras[0].axis_world + cameras[1].axis_world
+    assert abs(depth @ middle) / np.linalg.norm(middle) > 0.98
+
+
+@BOTH
+def test_views_that_contradict_each_other_are_told_or_rejected_but_never_without_numbers(plugin: type) -> None:
+    rng = np.random.default_rng(3)
+    points = heart(rng)
+    a = observation(camera(90), points)
+    nonsense = {name: rng.uniform(-40, 40, at.shape) for name, at in points.items()}
+    b = observation(camera(0), nonsense)
+    answer = plugin(UncertaintyParams()).triangulate((site(a, b, LATERAL_AND_FRONTAL),), DEFAULT_CATALOGUE, Silent())
+    if answer.sites:
+        doubts = {reason for point in answer.sites[0].points for reason in point.reasons} | {*answer.sites[0].reasons}
+        assert doubts & {Reason.GEOMETRY_DOUBTFUL, Reason.SPACING_MISMATCH}
+    else:
+        assert answer.rejected[0].reasons == (Reason.PAIRING_FAILED,)
+    if plugin is MaximumLikelihood:
+        assert Reason.GEOMETRY_DOUBTFUL in answer.sites[0].reasons
+        assert grade_of(answer.sites[0].points[0].covariance_mm2) is Grade.C
+
+
+@BOTH
+def test_another_pairing_that_cannot_be_ruled_out_widens_the_ellipsoid_and_lowers_the_grade(plugin: type) -> None:
+    points = heart(np.random.default_rng(1))
+    a, b = (observation(one, points) for one in LATERAL_AND_FRONTAL)
+    exchanged = {"reference": points["pacing"], "pacing": points["reference"], "mapping": points["mapping"]}
+    other = observation(LATERAL_AND_FRONTAL[1], exchanged)
+    plain = site(a, b, LATERAL_AND_FRONTAL)
+    unsure = site(a, b, LATERAL_AND_FRONTAL, alternative=Alternative(PhasePair(0.8, a, other), 0.3))
+    before, after = (
+        plugin(UncertaintyParams()).triangulate((one,), DEFAULT_CATALOGUE, Silent()).sites[0] for one in (plain, unsure)
+    )
+    for name in ("reference", "pacing"):
+        first, second = before.point(name, 2), after.point(name, 2)
+        assert second.position_mm == pytest.approx(first.position_mm)
+        apart = second.alternative_mm - second.position_mm
+        assert second.alternative_probability == 0.3
+        assert np.linalg.norm(apart) > 5
+        assert apart @ second.covariance_mm2 @ apart > 0.3 * (apart @ apart) ** 2
+        assert Reason.IDENTITY_UNCERTAIN in second.reasons
+    tip = after.point("mapping", 1)
+    assert tip.alternative_mm is None
+    assert tip.reasons == ()
+    assert tip.covariance_mm2 == pytest.approx(before.point("mapping", 1).covariance_mm2)
+    # The reference may be the other catheter: then every relative position hangs on it.
+    assert grade_of(before.point("mapping", 1).relative_covariance_mm2) is Grade.A
+    assert grade_of(tip.relative_covariance_mm2) is Grade.C

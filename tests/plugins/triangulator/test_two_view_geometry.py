@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry, ray_angle_deg
 from fluoromap.matching.two_view import fundamental_matrix, signed_epipolar_px, triangulate_linear
-from fluoromap.triangulator.maximum_likelihood import triangulate_maximum_likelihood
+from fluoromap.triangulator.estimate import triangulate_maximum_likelihood
 
 
 def camera(primary: float, secondary: float = 0.0) -> Camera:

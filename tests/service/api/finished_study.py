@@ -53,6 +53,8 @@ DIASTOLE = 1
 TIP_PIXEL = {"a": (70.0, 20.0), "b": (25.0, 30.0)}
 COVARIANCE_A = np.diag([4.0, 0.01, 0.01])
 """Of view a's track: the ray of a lateral view is the patient's left-right axis."""
+RELATIVE_COVARIANCE_A = np.diag([0.49, 0.01, 0.01])
+"""The same less the reference of the same frame, by solvers that tell it."""
 
 
 @dataclass
@@ -104,8 +106,8 @@ class FinishedStudy:
         self.triangulated()
         self.end("fuse", None, outcome or map_outcome())
 
-    def followed(self) -> None:
-        self.end("monoplane", "S01", followed_site())
+    def followed(self, relative: bool = False) -> None:
+        self.end("monoplane", "S01", followed_site(relative))
         refused = FollowedView("a", None, Reason.NO_A_PRIORI, Reason.NO_A_PRIORI.sentence)
         self.end("monoplane", "S02", FollowedSite("S02", (refused,)))
 
@@ -257,7 +259,7 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
     return Triangulation((site,), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
 
 
-def followed_site() -> FollowedSite:
+def followed_site(relative: bool = False) -> FollowedSite:
     """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
     is not seen in frame 2."""
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
@@ -277,6 +279,7 @@ def followed_site() -> FollowedSite:
         covariance_mm2=np.tile(COVARIANCE_A, (FRAMES, 3, 1, 1)),
         pixels_uv=np.full((FRAMES, 3, 2), 40.0),
         reasons=((), (), (Reason.DEPTH_ASSUMED,)),
+        relative_covariance_mm2=np.tile(RELATIVE_COVARIANCE_A, (FRAMES, 3, 1, 1)) if relative else None,
     )
     return FollowedSite("S01", (FollowedView("a", track, None, ""),))
 

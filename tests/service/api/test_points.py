@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from finished_study import REFERENCE_MM, TIP_MM, FinishedStudy
+from finished_study import REFERENCE_MM, TIP_MM, FinishedStudy, triangulation
+
+from fluoromap.contracts import Calibration, ErrorBudget
 
 HEADER = (
     "site,catheter,electrode,x_mm,y_mm,z_mm,cov_xx_mm2,cov_xy_mm2,cov_xz_mm2,cov_yy_mm2,cov_yz_mm2,cov_zz_mm2,"
@@ -37,6 +41,53 @@ def test_points_from_the_isocentre(client: TestClient, study: FinishedStudy) -> 
     located = client.get(f"/v1/jobs/{study.job_id}/points?origin=isocentre").json()["points"][0]
     assert [located[axis] for axis in ("x_mm", "y_mm", "z_mm")] == TIP_MM.tolist()
     assert located["grade"] == "C"
+
+
+OTHER_TIP_MM = TIP_MM + np.array([10.0, 0.0, 0.0])
+
+
+def self_calibrated() -> Any:
+    """S01 with a calibrated gantry, and a tip that could be 10 mm farther to the left."""
+    plain = triangulation()
+    (site,) = plain.sites
+    tip = replace(site.points[0], alternative_mm=OTHER_TIP_MM, alternative_probability=0.25)
+    other = replace(site.points[0], catheter="reference", position_mm=REFERENCE_MM, relative_mm=np.zeros(3))
+    return replace(
+        plain,
+        sites=(replace(site, points=(tip, other)),),
+        notes=("View b was turned.",),
+        calibration=Calibration(True, np.array([0.5, -1.0, 0.0]), np.array([0.0, 1.5, 0.0]), 5.5, 0.5),
+        budget=ErrorBudget(0.125, 0.25, 0.5, 0.375, 1.0),
+    )
+
+
+@pytest.mark.parametrize(("origin", "zero"), [("reference", REFERENCE_MM), ("isocentre", np.zeros(3))])
+def test_points_tell_what_the_study_says_as_a_whole(
+    client: TestClient, study: FinishedStudy, origin: str, zero: np.ndarray
+) -> None:
+    study.matched()
+    study.end("triangulate", None, self_calibrated(), study._points())
+    answer = client.get(f"/v1/jobs/{study.job_id}/points?origin={origin}").json()
+    assert answer["calibration"] == {
+        "applied": True, "rotation_deg": [0.5, -1.0, 0.0], "offset_mm": [0.0, 1.5, 0.0], "epipolar_before_px": 5.5,
+        "epipolar_after_px": 0.5,
+    }  # fmt: skip
+    assert answer["error_budget"] == {
+        "pixels_mm": 0.125, "angles_mm": 0.25, "source_distances_mm": 0.5, "phase_mismatch_mm": 0.375, "breathing_mm": 1.0,
+    }  # fmt: skip
+    assert answer["notes"] == ["View b was turned."]
+    x, y, z = OTHER_TIP_MM - zero
+    assert answer["alternatives"] == [
+        {"site": "S01", "catheter": "mapping", "electrode": 1, "x_mm": x, "y_mm": y, "z_mm": z, "probability": 0.25}
+    ]
+    assert len(answer["points"]) == 2
+
+
+def test_a_study_that_nobody_calibrated_says_so(client: TestClient, study: FinishedStudy) -> None:
+    study.triangulated()
+    answer = client.get(f"/v1/jobs/{study.job_id}/points").json()
+    assert answer["calibration"] is answer["error_budget"] is None
+    assert answer["notes"] == answer["alternatives"] == []
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from finished_study import COVARIANCE_A, REFERENCE_MM, STEP_MM, TIP_MM, FinishedStudy
+from finished_study import COVARIANCE_A, REFERENCE_MM, RELATIVE_COVARIANCE_A, STEP_MM, TIP_MM, FinishedStudy
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -59,6 +59,19 @@ def test_accuracy_is_told_along_and_across_the_ray(client: TestClient, study: Fi
     assert sample["lateral_sd_mm"] == pytest.approx(0.1, rel=0.2)
     assert sample["grade"] == "C"
     assert sample["covariance_mm2"] == COVARIANCE_A[np.triu_indices(3)].tolist()
+
+
+def test_positions_from_the_reference_carry_their_own_uncertainty(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    study.followed(relative=True)
+    upper = np.triu_indices(3)
+    first, _, third = _tip(client, study)
+    assert first["covariance_mm2"] == RELATIVE_COVARIANCE_A[upper].tolist()
+    assert first["along_ray_sd_mm"] == pytest.approx(0.7, rel=2e-3)
+    assert first["grade"] == "A"
+    # In frame 3 the diastolic reference is subtracted: nothing cancels.
+    assert third["covariance_mm2"] == COVARIANCE_A[upper].tolist()
+    assert _tip(client, study, "&origin=isocentre")[0]["covariance_mm2"] == COVARIANCE_A[upper].tolist()
 
 
 @given(hnp.arrays(np.float64, (3, 3), elements=st.floats(-3, 3)), hnp.arrays(np.float64, 3, elements=st.floats(0.1, 3)))

@@ -16,6 +16,7 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from fluoromap import matching as study_matching
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
     Chain,
@@ -44,7 +45,6 @@ from fluoromap.store.models import Base, StageRow, StageState
 from fluoromap.store.results import FollowedSite, FollowedView, MapOutcome
 from fluoromap.workers.points import point_rows
 
-MATCH_VERSION = "1"
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 
@@ -126,7 +126,7 @@ def _match(session: Session, job_id: str, manifest: Manifest) -> Work:
         )
         for site in manifest.sites
     )
-    own = PluginPlan(name="fluoromap", version=MATCH_VERSION, params={})
+    own = PluginPlan(name="fluoromap", version=study_matching.VERSION, params={})
     key = _key("match", own, asdict(catalogue), *(encode(site) for site in sites))
     return Work(key, lambda context: encode(match_study(sites, catalogue, context)))
 
@@ -137,7 +137,7 @@ def _triangulate(job_id: str, manifest: Manifest, matching: Matching) -> Work:
     def compute(context: Context) -> bytes:
         triangulator = build_triangulator(manifest.triangulator.name, manifest.triangulator.params)
         located = triangulator.triangulate(matching.sites, catalogue, context)
-        return encode(Triangulation(located.sites, (*matching.rejected, *located.rejected), located.notes))
+        return encode(replace(located, rejected=(*matching.rejected, *located.rejected)))
 
     def rows(content: bytes) -> Iterable[Base]:
         return point_rows(job_id, manifest, matching, decode(Triangulation, content))

@@ -4,32 +4,12 @@ from __future__ import annotations
 
 import resource
 
-import numpy as np
 import structlog
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
-from fluoromap.contracts import PixelFacts, Run, Silent
-from fluoromap.registry import DEFAULTS, UnknownPlugin, build_segmenter, plugins
+from fluoromap.registry import DEFAULTS, UnknownPlugin, plugin, plugins
 from fluoromap.settings import settings
 
 log = structlog.get_logger(__name__)
-
-
-class _Blank:
-    """Two frames of nothing, to compile the kernels on."""
-
-    shape = (64, 64)
-
-    def __len__(self) -> int:
-        return 2
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        if not 0 <= index < 2:
-            raise IndexError(index)
-        return np.random.default_rng(index).integers(900, 1100, self.shape).astype(np.uint16)
-
-    def __iter__(self):  # type: ignore[no-untyped-def]
-        return (self[index] for index in range(2))
 
 
 def limit_memory() -> None:
@@ -40,12 +20,20 @@ def limit_memory() -> None:
 
 
 def warm_up() -> None:
-    """Load the plugins and let the default segmenter compile its kernels, so that the first run does not wait for it."""
+    """Load the plugins and let the default ones compile their kernels, so that the first run does not wait for it.
+
+    A plugin that has something to prepare has a class method ``warm_up()``; one that fails is told in the log, and its
+    stage will tell the user.
+    """
     for row in plugins():
         if row.error is not None:
             log.warning("plugin_broken", kind=row.kind, plugin=row.name)
-    run = Run(_Blank(), np.array([0.0, 66.7]), 5.75, PixelFacts(False, 12, False))
-    try:
-        build_segmenter(DEFAULTS["segmenter"], {}).segment(run, DEFAULT_CATALOGUE, {}, Silent())
-    except UnknownPlugin:
-        log.warning("plugin_missing", plugin=DEFAULTS["segmenter"])
+    for kind, name in DEFAULTS.items():
+        try:
+            prepare = getattr(plugin(kind, name).stage, "warm_up", None)
+            if prepare is not None:
+                prepare()
+        except UnknownPlugin:
+            log.warning("plugin_missing", kind=kind, plugin=name)
+        except Exception:
+            log.warning("plugin_not_warm", kind=kind, plugin=name, exc_info=True)

@@ -1,0 +1,43 @@
+"""The chamber as a smooth wall through or near the mapping tips, with activation times interpolated along it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from pydantic import BaseModel
+
+from fluoromap.contracts import ChamberMap, Context, MappedSite
+from fluoromap.fuser.chamber_map import MapParams, chamber_map, refuse_without_volume
+from fluoromap.fuser.chamber_shape import wall_surface
+
+
+class SmoothSurfaceParams(MapParams):
+    """Parameters of :class:`SmoothSurface`."""
+
+
+class SmoothSurface:
+    """Fuser ``smooth-surface``: bulges between sites as chambers do, may be concave, and nears each site as closely as its
+    covariance asks."""
+
+    name: ClassVar[str] = "smooth-surface"
+    version: ClassVar[str] = "1"
+    Params: ClassVar[type[BaseModel]] = SmoothSurfaceParams
+
+    def __init__(self, params: SmoothSurfaceParams) -> None:
+        self._params = params
+
+    def fuse(self, sites: tuple[MappedSite, ...], context: Context) -> ChamberMap:
+        """Surface and activation times of the located sites; see :func:`fluoromap.fuser.chamber_map.chamber_map`.
+
+        Raises
+        ------
+        Refusal
+            ``too_few_sites`` below four, ``sites_coincide`` or ``sites_coplanar`` where they enclose no volume.
+        """
+        tips = self._params.tips_mm(sites)
+        refuse_without_volume(tips)
+        covariance = np.array([site.covariance_mm2 for site in sites])
+        surface = wall_surface(tips, covariance, self._params.edge_mm)
+        context.progress(0.2)
+        return chamber_map(*surface, sites, self._params, context)

@@ -1,0 +1,83 @@
+"""Each heart beat of a run marked by the catheters' own motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
+
+from fluoromap.contracts import Array
+
+IRREGULAR_ABOVE = 0.2
+"""Beats are irregular when the longest exceeds the shortest by this share of their mean."""
+SHORTEST_BEAT_MS = 280.0
+SMOOTH_MS = 25.0
+_PROMINENT = 0.4
+_ONSET, _UPSTROKE = 0.15, 0.5
+_UNLIKE_BELOW = 0.4
+
+
+def is_irregular(marks_ms: Array) -> bool:
+    """Whether beats that start at these times differ in length; never with fewer than two whole ones."""
+    lengths = np.diff(marks_ms)
+    return len(lengths) >= 2 and float(np.ptp(lengths)) > IRREGULAR_ABOVE * float(lengths.mean())
+
+
+def systole_starts_ms(places: Array, step_ms: float) -> Array:
+    """Times, from the first place on, at which the systoles of a run start; empty where the motion shows no beats.
+
+    The catheters leave their resting place and come back to it once a beat. Along the direction in which they move most,
+    a beat is timed where it is steepest, half way up, and starts that much earlier than on the average of the beats.
+
+    Parameters
+    ----------
+    places : ndarray, shape (g, k)
+        Coordinates of the catheters on an even time grid.
+    step_ms : float
+        Of that grid.
+    """
+    smooth = gaussian_filter1d(places, max(SMOOTH_MS / step_ms, 0.5), axis=0)
+    away = smooth - np.median(smooth, axis=0)
+    along = away @ np.linalg.svd(away, full_matrices=False)[2][0]
+    # Longer at rest than away from it: the rarer side is systole.
+    along = along if along.mean() >= np.median(along) else -along
+    low, high = np.percentile(along, [10, 95])
+    if high - low <= 0:
+        return np.zeros(0)
+    # A beat that is under way when the run ends has its upstroke all the same: the run goes on at rest.
+    padded = np.append(along, low)
+    peaks, _ = find_peaks(padded, prominence=_PROMINENT * (high - low), distance=max(1.0, SHORTEST_BEAT_MS / step_ms))
+    halfway, lead = [], []
+    for peak in peaks:
+        half = _rise(along, int(peak), low + _UPSTROKE * (along[peak] - low))
+        onset = _rise(along, int(peak), low + _ONSET * (along[peak] - low))
+        if half is not None:
+            halfway.append(half * step_ms)
+            lead.append(np.nan if onset is None else (half - onset) * step_ms)
+    if not np.isfinite(lead).any():
+        return np.zeros(0)
+    marks = np.array(halfway) - float(np.nanmedian(lead))
+    return marks if _alike(along, marks / step_ms) else np.zeros(0)
+
+
+def _rise(signal: Array, peak: int, level: float) -> float | None:
+    """Where, before ``peak``, the signal last rose through ``level``, in steps."""
+    below = np.flatnonzero(signal[:peak] < level)
+    if not len(below):
+        return None
+    last = int(below[-1])
+    return last + float((level - signal[last]) / (signal[last + 1] - signal[last]))
+
+
+def _alike(signal: Array, marks: Array) -> bool:
+    """Whether the signal does the same after each mark, as far as the shortest beat goes; noise does not."""
+    if len(marks) < 2:
+        return False
+    after = np.arange(int(np.diff(marks).min()))
+    steps = np.arange(len(signal))
+    beats = np.array([np.interp(mark + after, steps, signal, left=np.nan, right=np.nan) for mark in marks])
+    beats = beats[np.isfinite(beats).sum(axis=1) > len(after) / 2]
+    if len(beats) < 2 or len(after) < 3:
+        return False
+    unlike = np.nanmean(np.nanvar(beats, axis=0))
+    return bool(unlike < _UNLIKE_BELOW * np.nanvar(beats))

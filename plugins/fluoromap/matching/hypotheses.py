@@ -1,0 +1,120 @@
+"""The ways to pair the catheters of one site across its views, and what each costs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Array, IntArray
+from fluoromap.matching.pairs import GANTRY_SD_RAD, PairTable, student_cost
+
+SHIFT_SD_MM = 6.0
+"""Of the heart's place across the epipolar lines in one run against the other: breathing, or a moved table."""
+MISSING_COST = 18.0
+"""Leaving a catheter of the catalogue unpaired costs this: a pair that fits worse is not one."""
+_KEPT = 300
+_WORTH_KEEPING = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """The h ways to fill the s slots of the catalogue with pairs of chains.
+
+    pairs : (h, s, 2) index of the chain in view a and in view b, -1 where the slot stays empty. fixed_cost : (h,) all that
+    does not hang on the gantry. distance_px, variance_px2 : (h, s), NaN where empty; turn_px : (h, s, 3), as in
+    :class:`~fluoromap.matching.pairs.PairTable`. position_mm : (h, s, 3), NaN where empty. shift_variance_px2 : how far
+    breathing may displace all alike.
+    """
+
+    pairs: IntArray
+    fixed_cost: Array
+    distance_px: Array
+    variance_px2: Array
+    turn_px: Array
+    position_mm: Array
+    shift_variance_px2: float
+
+    def cost(self, turn_rad: Array, turn_covariance: Array) -> Array:
+        """Cost (h,) of each, given how view b is turned against the other: rotation vector (3,), covariance (3, 3)."""
+        chi2, count = self.offset_chi2(turn_rad, turn_covariance)
+        cost: Array = self.fixed_cost + student_cost(chi2, count)
+        return cost
+
+    def offset_chi2(self, turn_rad: Array, turn_covariance: Array) -> tuple[Array, Array]:
+        """What is left of the catheters' epipolar distances beside a displacement common to all: (h,), and how many.
+
+        The displacement, because the heart was breathed elsewhere when the second run was taken, counts by its prior.
+        """
+        filled = self.pairs[:, :, 0] >= 0
+        distance = np.where(filled, self.distance_px - self.turn_px @ turn_rad, 0.0)
+        spread = self.variance_px2 + np.einsum("hsi,ij,hsj->hs", self.turn_px, turn_covariance, self.turn_px)
+        weight = np.where(filled, 1.0 / np.where(filled, spread, 1.0), 0.0)
+        pull = (weight * distance).sum(axis=1)
+        stiffness = 1.0 / self.shift_variance_px2 + weight.sum(axis=1)
+        chi2: Array = (weight * distance**2).sum(axis=1) - pull**2 / stiffness
+        return np.maximum(chi2, 0.0), filled.sum(axis=1)
+
+    def only(self, rows: IntArray) -> Hypotheses:
+        """Some of them."""
+        return Hypotheses(
+            self.pairs[rows], self.fixed_cost[rows], self.distance_px[rows], self.variance_px2[rows],
+            self.turn_px[rows], self.position_mm[rows], self.shift_variance_px2,
+        )  # fmt: skip
+
+
+PRIOR_TURN = (np.zeros(3), GANTRY_SD_RAD**2 * np.eye(3))
+"""How view b is turned against view a before the study has told."""
+
+
+def enumerate_pairings(table: PairTable, slots: Sequence[int], px_per_mm: float) -> Hypotheses:
+    """All likely ways to pair the chains of a site, the cheapest first.
+
+    Parameters
+    ----------
+    table : PairTable
+    slots : sequence of int
+        Group of each catheter of the catalogue, slots of one group next to each other.
+    px_per_mm : float
+        Of view b at the isocentre.
+    """
+    n_b = table.possible.shape[1]
+    cheapest = table.motion_cost.min(axis=2, initial=np.inf) if table.motion_cost.shape[2] else 0.0
+    partial: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
+    for number, group in enumerate(slots):
+        cost = np.where(table.possible, table.shape_cost + table.group_cost[group] + cheapest, np.inf).ravel()
+        fitting = [int(pair) for pair in np.flatnonzero(cost < 2 * MISSING_COST)]
+        again = number > 0 and slots[number - 1] == group
+        grown = []
+        for so_far, chosen in partial:
+            grown.append((so_far + MISSING_COST, (*chosen, -1)))
+            for pair in fitting:
+                # Slots of one group are filled in rising order: which is which is not decided here.
+                if again and pair < chosen[-1]:
+                    continue
+                if any(k >= 0 and (k // n_b == pair // n_b or k % n_b == pair % n_b) for k in chosen):
+                    continue
+                if again and chosen[-1] < 0:
+                    continue
+                grown.append((so_far + float(cost[pair]), (*chosen, pair)))
+        partial = sorted(grown)[:_KEPT]
+    flat = np.array([chosen for _, chosen in partial], dtype=np.int64).reshape(len(partial), len(slots))
+    empty = flat < 0
+    i, j = np.where(empty, 0, flat // max(n_b, 1)), np.where(empty, 0, flat % max(n_b, 1))
+    group_cost = table.group_cost[np.array(slots), i, j]
+    fixed = np.where(empty, MISSING_COST, table.shape_cost[i, j] + group_cost).sum(axis=1)
+    if table.motion_cost.shape[2]:
+        fixed = fixed + np.where(empty[..., None], 0.0, table.motion_cost[i, j]).sum(axis=1).min(axis=1)
+    found = Hypotheses(
+        pairs=np.where(empty[..., None], -1, np.stack([i, j], axis=2)),
+        fixed_cost=fixed,
+        distance_px=np.where(empty, np.nan, table.distance_px[i, j]),
+        variance_px2=np.where(empty, np.nan, table.variance_px2[i, j]),
+        turn_px=np.where(empty[..., None], 0.0, table.turn_px[i, j]),
+        position_mm=np.where(empty[..., None], np.nan, table.position_mm[i, j]),
+        shift_variance_px2=(SHIFT_SD_MM * px_per_mm) ** 2,
+    )
+    cost = found.cost(*PRIOR_TURN)
+    order = np.argsort(cost, kind="stable")
+    return found.only(order[cost[order] <= cost[order[0]] + _WORTH_KEEPING])

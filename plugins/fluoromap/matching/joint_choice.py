@@ -1,0 +1,264 @@
+"""The pairings of all sites of a study chosen together, with the probability of the next best at each."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Array, IntArray
+from fluoromap.matching.hypotheses import PRIOR_TURN, Hypotheses
+from fluoromap.matching.pairs import student_cost
+
+PLACE_SD_MM = 4.0
+"""An axis, of a catheter's diastolic place from site to site, before the study has told."""
+_PLACE_PRIOR_SITES = 3.0
+_NEUTRAL = float(student_cost(np.array(3.0), 3))
+_ANCHORS_PER_SITE = 6
+_ANCHOR_RANGE = 15.0
+_REFINED = 6
+_ROUNDS = 3
+
+Turn = tuple[Array, Array]
+"""Rotation vector (3,) of view b against view a, radians, and its covariance (3, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class SiteChoice:
+    """How one site's catheters are paired.
+
+    pairs : (s, 2) chain of view a and of view b in each slot of the catalogue, -1 where empty; over the study, one slot
+    of a group of look-alikes holds one catheter. alternative : the next best, or None. probability : (0 to 0.5) that it
+    is that instead.
+    """
+
+    pairs: IntArray
+    alternative: IntArray | None
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Study:
+    """All hypotheses of all sites in one row, N of them; site : (N,) index of each one's site."""
+
+    sites: tuple[Hypotheses, ...]
+    gantries: tuple[Hashable, ...]
+    placed: tuple[int, ...]
+    orders: IntArray
+    site: IntArray
+    starts: IntArray
+    position_mm: Array
+
+    def rows(self, site: int) -> slice:
+        return slice(int(self.starts[site]), int(self.starts[site]) + len(self.sites[site].pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class _Configuration:
+    """One way to see the whole study: the row chosen at each site, in which order its slots stand in the places, how the
+    gantry is turned, where the places are and how wide; cost over all."""
+
+    chosen: IntArray
+    order: IntArray
+    own_cost: Array
+    centres_mm: Array
+    variance_mm2: Array
+    cost: float
+
+
+def choose_pairings(
+    sites: Sequence[Hypotheses], slots: Sequence[int], roving: int, gantries: Sequence[Hashable]
+) -> tuple[SiteChoice, ...]:
+    """Choose each site's pairing so that the study as a whole is likeliest.
+
+    All catheters but the roving one hardly move between the sites, and the gantry's angles are wrong by the same at all
+    sites that were taken at the same angles: a pairing that looks well at its own site alone can be ruled out by the others.
+
+    Parameters
+    ----------
+    sites : sequence of Hypotheses
+        At least one hypothesis a site.
+    slots : sequence of int
+        Group of each slot; slots of one group are look-alikes.
+    roving : int
+        The slot of the mapping catheter; -1 where it looks like others and so cannot be told from those that stay.
+    gantries : sequence
+        Equal for sites taken at the same gantry angles.
+    """
+    if not sites:
+        return ()
+    placed = tuple(slot for slot in range(len(slots)) if slot != roving)
+    members = [[k for k, slot in enumerate(placed) if slots[slot] == group] for group in dict.fromkeys(slots)]
+    orders = []
+    for exchanged in itertools.product(*map(itertools.permutations, members)):
+        order = np.empty(len(placed), dtype=np.int64)
+        order[[k for own in members for k in own]] = [k for own in exchanged for k in own]
+        orders.append(order)
+    lengths = [len(one.pairs) for one in sites]
+    study = _Study(
+        tuple(sites), tuple(gantries), placed, np.array(orders),
+        np.repeat(np.arange(len(sites)), lengths), np.cumsum([0, *lengths[:-1]]),
+        np.concatenate([one.position_mm[:, list(placed)] for one in sites]),
+    )  # fmt: skip
+    found = _configurations(study)
+    least = min(one.cost for one in found)
+    weights = np.array([np.exp(least - one.cost) for one in found])
+    probability = sum(w * _probabilities(study, one) for w, one in zip(weights / weights.sum(), found, strict=True))
+    best = min(found, key=lambda one: one.cost)
+    return tuple(_site_choice(study, site, np.asarray(probability), best) for site in range(len(sites)))
+
+
+def _configurations(study: _Study) -> list[_Configuration]:
+    """The likeliest ways to see the study, found from each site's likeliest hypotheses."""
+    turns = dict.fromkeys(study.gantries, PRIOR_TURN)
+    own_cost = _own_cost(study, turns)
+    wide = np.full(len(study.placed), PLACE_SD_MM**2)
+    anchors: list[int] = []
+    for site in range(len(study.sites)):
+        rows = study.rows(site)
+        near = np.flatnonzero(own_cost[rows] <= own_cost[rows].min() + _ANCHOR_RANGE)[:_ANCHORS_PER_SITE]
+        anchors.extend(int(rows.start + row) for row in near)
+    totals = []
+    for anchor in anchors:
+        cost = own_cost + _place_cost(study, study.position_mm[anchor], wide).min(axis=1)
+        totals.append(float(np.minimum.reduceat(cost, study.starts).sum()))
+    found: dict[tuple[int, ...], _Configuration] = {}
+    tried: set[tuple[int, ...]] = set()
+    for index in np.argsort(totals, kind="stable"):
+        if len(tried) >= _REFINED:
+            break
+        start = _choose(study, own_cost, study.position_mm[anchors[index]], wide)
+        key = tuple(start.chosen)
+        if key not in tried:
+            tried.add(key)
+            refined = _refine(study, start)
+            found.setdefault(tuple(refined.chosen), refined)
+    return list(found.values())
+
+
+def _own_cost(study: _Study, turns: dict[Hashable, Turn]) -> Array:
+    return np.concatenate([one.cost(*turns[g]) for one, g in zip(study.sites, study.gantries, strict=True)])
+
+
+def _place_cost(study: _Study, centres_mm: Array, variance_mm2: Array) -> Array:
+    """Cost (N, orders) of where the catheters are, with their places at ``centres_mm`` (p, 3)."""
+    apart = ((study.position_mm[:, :, None] - centres_mm) ** 2).sum(axis=3) / variance_mm2
+    cost = student_cost(apart, 3) + 1.5 * np.log(variance_mm2 / PLACE_SD_MM**2)
+    cost = np.where(np.isfinite(cost), cost, _NEUTRAL)
+    each: Array = cost[:, np.arange(len(study.placed)), study.orders[:, None]].sum(axis=-1).reshape(len(cost), -1)
+    return each
+
+
+def _choose(study: _Study, own_cost: Array, centres_mm: Array, variance_mm2: Array) -> _Configuration:
+    """Each site's best row, given the gantry and the places."""
+    each = own_cost[:, None] + _place_cost(study, centres_mm, variance_mm2)
+    by_row = each.min(axis=1)
+    chosen, cost = [], 0.0
+    for site in range(len(study.sites)):
+        rows = study.rows(site)
+        row = int(np.argmin(by_row[rows])) + rows.start
+        chosen.append(row)
+        least = float(by_row[row])
+        cost += least - float(np.log(np.exp(least - by_row[rows]).sum()))
+    order = np.argmin(each[chosen], axis=1)
+    return _Configuration(np.array(chosen), order, own_cost, centres_mm, variance_mm2, cost)
+
+
+def _refine(study: _Study, configuration: _Configuration) -> _Configuration:
+    """Places and gantry from the chosen rows, rows from places and gantry, a few times over."""
+    for _ in range(_ROUNDS):
+        turns = {gantry: _fit_turn(study, configuration, gantry) for gantry in dict.fromkeys(study.gantries)}
+        prior = sum(float(turn @ np.linalg.solve(PRIOR_TURN[1], turn)) / 2 for turn, _ in turns.values())
+        positions = _in_places(study, configuration)
+        centres, variance = _places(positions, configuration.centres_mm)
+        again = _choose(study, _own_cost(study, turns), centres, variance)
+        configuration = _Configuration(
+            again.chosen, again.order, again.own_cost, centres, variance, again.cost + prior
+        )  # fmt: skip
+    return configuration
+
+
+def _in_places(study: _Study, configuration: _Configuration) -> Array:
+    """Positions (sites, places, 3) of the chosen rows' catheters, NaN where missing."""
+    positions = np.full((len(study.sites), len(study.placed), 3), np.nan)
+    for site, (row, order) in enumerate(zip(configuration.chosen, configuration.order, strict=True)):
+        positions[site, study.orders[order]] = study.position_mm[row]
+    return positions
+
+
+def _places(positions: Array, otherwise: Array) -> tuple[Array, Array]:
+    """Centre (p, 3) and variance an axis (p,) of each place; ``otherwise`` where no site shows it."""
+    known = np.isfinite(positions[..., 0])
+    count = known.sum(axis=0)
+    centres = np.where(
+        count[:, None] > 0, np.nansum(positions, axis=0) / np.maximum(count, 1)[:, None], otherwise
+    )  # fmt: skip
+    # A site far off is one that is paired wrongly; it must not widen the place.
+    squares = np.nansum(np.minimum((positions - centres) ** 2, (2 * PLACE_SD_MM) ** 2), axis=(0, 2))
+    variance = (3 * _PLACE_PRIOR_SITES * PLACE_SD_MM**2 + squares) / (3 * (_PLACE_PRIOR_SITES + count))
+    return centres, variance
+
+
+def _fit_turn(study: _Study, configuration: _Configuration, gantry: Hashable) -> Turn:
+    """How view b is turned against view a at these gantry angles, by ridge regression on the chosen pairs' distances."""
+    normal, pull = np.linalg.inv(PRIOR_TURN[1]), np.zeros(3)
+    for site, (one, at) in enumerate(zip(study.sites, study.gantries, strict=True)):
+        if at != gantry:
+            continue
+        row = int(configuration.chosen[site] - study.starts[site])
+        filled = one.pairs[row, :, 0] >= 0
+        if filled.sum() < 2:
+            continue
+        slopes, distance = one.turn_px[row, filled], one.distance_px[row, filled]
+        spread = np.diag(one.variance_px2[row, filled]) + one.shift_variance_px2
+        weighted = np.linalg.solve(spread, slopes)
+        normal = normal + slopes.T @ weighted
+        pull = pull + weighted.T @ distance
+    covariance = np.linalg.inv(normal)
+    return covariance @ pull, covariance
+
+
+def _probabilities(study: _Study, configuration: _Configuration) -> Array:
+    """Probability (N,) of each row at its site, the places being told by the other sites."""
+    positions = _in_places(study, configuration)
+    probability = np.empty(len(study.site))
+    for site in range(len(study.sites)):
+        rows = study.rows(site)
+        others = np.delete(positions, site, axis=0)
+        nowhere = np.full_like(configuration.centres_mm, np.nan)
+        centres, variance = _places(others, nowhere) if len(others) else (nowhere, configuration.variance_mm2)
+        own = _Study(
+            (study.sites[site],), (), study.placed, study.orders, study.site[rows], np.zeros(1, dtype=np.int64),
+            study.position_mm[rows],
+        )  # fmt: skip
+        cost = configuration.own_cost[rows] + _place_cost(own, centres, variance).min(axis=1)
+        likelihood = np.exp(cost.min() - cost)
+        probability[rows] = likelihood / likelihood.sum()
+    return probability
+
+
+def _site_choice(study: _Study, site: int, probability: Array, best: _Configuration) -> SiteChoice:
+    rows = study.rows(site)
+    one, own = study.sites[site], probability[rows]
+    row = int(np.argmax(own))
+    filled = (one.pairs[:, :, 0] >= 0).sum(axis=1)
+    others = own * (filled == filled[row])
+    others[row] = -1.0
+    second = int(np.argmax(others))
+    cost = _place_cost(study, best.centres_mm, best.variance_mm2)[rows]
+    answer = _in_order(study, one, row, int(np.argmin(cost[row])))
+    if others[second] <= 0:
+        return SiteChoice(answer, None, 0.0)
+    return SiteChoice(
+        answer, _in_order(study, one, second, int(np.argmin(cost[second]))), float(min(others[second], 0.5))
+    )
+
+
+def _in_order(study: _Study, one: Hypotheses, row: int, order: int) -> IntArray:
+    """The pairs of a row with each look-alike in its place."""
+    pairs: IntArray = one.pairs[row].copy()
+    placed = np.array(study.placed, dtype=np.int64)
+    pairs[placed[study.orders[order]]] = one.pairs[row][placed]
+    return pairs

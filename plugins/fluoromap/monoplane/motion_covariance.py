@@ -1,0 +1,214 @@
+"""How far the electrodes may be from where they are expected: the parts of the prior's covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import Array, MonoplaneView
+from fluoromap.monoplane.expected_motion import ExpectedMotion
+from fluoromap.monoplane.gaussian_path import PathPrior
+
+FIXED, OFFSET, TILT, BEND = range(4)
+_READING_SD_FRAMES = 0.29
+"""An R wave, or any moment, is told to the nearest frame: that of an even distribution one frame wide."""
+_SYSTOLE_PHASE = 0.3
+_ALIGNED_SD_CYCLE = 0.01
+_OFFSET_HARMONICS, _SHAPE_HARMONICS = 4, 3
+_LASTING_SHARE = 0.7
+
+
+class MotionParams(BaseModel, extra="forbid"):
+    """How hearts, breaths, catheters and gantries differ from what was expected of them; standard deviations."""
+
+    respiration_head_feet_sd_mm: float = Field(
+        4.0, ge=0, le=30, description="Breathing position of the heart in this run along the patient's long axis, mm."
+    )
+    respiration_other_sd_mm: float = Field(
+        1.0, ge=0, le=30, description="Breathing position of the heart in this run along the other two axes, mm."
+    )
+    respiration_drift_sd_mm: float = Field(
+        0.4, ge=0, le=30, description="Breathing within one beat, in the direction in which it is largest, mm."
+    )
+    beat_amplitude_sd: float = Field(
+        0.04, ge=0, le=1, description="Variation of the motion's amplitude from beat to beat, as a share of it."
+    )
+    beat_timing_sd: float = Field(
+        0.017, ge=0, le=0.5, description="Variation of the contraction's moment from beat to beat, in cycles."
+    )
+    beat_sd_mm: float = Field(
+        0.25, ge=0, le=10, description="Variation of a catheter's place from beat to beat, mm an axis."
+    )
+    mapping_motion_sd_mm: float = Field(
+        2.9, ge=0, le=30, description="Motion of the mapping catheter over the cycle where no cycle is known, mm."
+    )
+    other_motion_sd_mm: float = Field(
+        1.5, ge=0, le=30, description="Motion of the other catheters over the cycle where no cycle is known, mm."
+    )
+    gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of each gantry angle, degrees.")
+    magnification_sd: float = Field(
+        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+    )
+    isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
+
+    def respiration_sd_mm(self) -> Array:
+        """(3,) along the patient's axes."""
+        other, head = self.respiration_other_sd_mm, self.respiration_head_feet_sd_mm
+        return np.array([other, other, head])
+
+
+class MotionCovariance:
+    """The prior of one run, window by window.
+
+    expected : of all its frames. phases : (n,). rays : (n, m, 3) unit directions of the followed view through the mean.
+    """
+
+    def __init__(
+        self, view: MonoplaneView, labels: tuple[tuple[str, int], ...], expected: ExpectedMotion, phases: Array,
+        params: MotionParams,
+    ) -> None:  # fmt: skip
+        self._expected, self._phases, self._params = expected, phases, params
+        self._axis = view.camera.axis_world
+        self._names = np.array([name for name, _ in labels])
+        self._catheters = tuple(dict.fromkeys(self._names))
+        self._mapping = view.catalogue.mapping
+        self._shapes = [_shapes(view.catalogue, labels, name) for name in self._catheters]
+        rays = expected.mean_mm - view.camera.source_world_mm
+        self.rays: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    def window(self, frames: slice) -> PathPrior:
+        """The prior of consecutive frames, about one beat."""
+        columns, parts = [], []
+        for part, block in self._parts(frames):
+            columns.append(block)
+            parts += [part] * block.shape[-1]
+        mean = self._expected.mean_mm[frames]
+        return PathPrior(mean, np.concatenate(columns, axis=-1), np.array(parts), self._white(frames))
+
+    def _parts(self, frames: slice) -> Iterator[tuple[int, Array]]:
+        """Columns (n, m, 3, k) with the part they belong to."""
+        p, expected = self._params, self._expected
+        mean = expected.mean_mm[frames]
+        n, m = mean.shape[:2]
+        breath = p.respiration_sd_mm()
+        everywhere = np.ones((n, m, 1, 1))
+        isocentre = p.isocentre_sd_mm**2 * (np.eye(3) - np.outer(self._axis, self._axis))
+        yield FIXED, everywhere * _root(expected.common_mm2 + np.diag(breath**2) + isocentre)
+        # What two views tell holds for the middle of their runs' breaths. This run's own breath is as far from there as
+        # the other one's, which alone has told the depth: along the ray the error is twice what it is to the middle.
+        depth = min(self._axis @ expected.common_mm2 @ self._axis, self._axis @ np.diag(breath**2) @ self._axis / 2)
+        yield FIXED, everywhere * np.sqrt(depth) * self._axis[:, None]
+        if breath.max() > 0:
+            drift = p.respiration_drift_sd_mm * breath / breath.max()
+            yield FIXED, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
+        # The other view, turned about the isocentre by a wrong angle, has told a depth that is wrong by what it was turned.
+        turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
+        yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
+        yield FIXED, (mean * p.magnification_sd)[..., None]
+        for name in self._catheters:
+            own = expected.own_mm2.get(name)
+            if own is not None and np.trace(own) > 0:
+                yield FIXED, self._of(name) * everywhere * _root(own)
+        yield from self._beats(frames, self.rays[frames])
+        if expected.beats:
+            yield from self._free(frames)
+
+    def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, Array]]:
+        """What differs between this beat and the mean one, and between the mean one of this run and of the other view's."""
+        p, expected = self._params, self._expected
+        if not expected.beats:
+            return
+        moved, velocity = expected.moved_mm[frames, ..., None], expected.velocity_mm[frames, ..., None]
+        reading = _READING_SD_FRAMES / expected.frames_per_cycle
+        timing = np.hypot(p.beat_timing_sd, reading)
+        uneven = _SYSTOLE_PHASE * expected.cycle_spread
+        yield FIXED, moved * p.beat_amplitude_sd
+        yield FIXED, velocity * np.hypot(timing, uneven)
+        averaged = 1 / np.sqrt(expected.beats)
+        for name in self._catheters:
+            yield FIXED, np.ones((len(rays), 1, 1, 1)) * self._of(name) * np.eye(3) * p.beat_sd_mm * averaged
+        if expected.own_cycle:
+            # Depth comes from the other view's run: its beats differ in what this view cannot show.
+            yield FIXED, _along(rays, moved * p.beat_amplitude_sd * averaged)
+            yield FIXED, _along(rays, velocity * np.hypot(timing * averaged, np.hypot(uneven, _ALIGNED_SD_CYCLE)))
+
+    def _free(self, frames: slice) -> Iterator[tuple[int, Array]]:
+        """Each catheter's offset, tilt and bend over the beat, whose sizes the view itself tells."""
+        offset_sd = np.hypot(self._expected.offset_sd_mm[frames], self._params.beat_sd_mm)
+        slow, fast = (_over_cycle(self._phases[frames], k) for k in (_SHAPE_HARMONICS, _OFFSET_HARMONICS))
+        for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
+            own = self._names == name
+            tilt_sd, bend_sd = self._looseness(name)
+            yield OFFSET, _in_time_and_axis(fast, np.where(own, offset_sd, 0.0))
+            yield TILT, _in_time_and_axis(slow, np.broadcast_to(tilt_sd * tilt, offset_sd.shape))
+            yield BEND, _in_time_and_axis(slow, np.broadcast_to(bend_sd * bend, offset_sd.shape))
+
+    def _looseness(self, name: str) -> tuple[float, float]:
+        """Tilt in radians and bend in mm at the ends, between what is expected of a catheter's shape and what it is."""
+        if self._expected.own_cycle:
+            return 0.02, 0.08
+        return (0.045, 0.2) if name == self._mapping else (0.02, 0.05)
+
+    def _white(self, frames: slice) -> Array:
+        """Each frame's own share (n, 3 m, 3 m): small where a cycle is known, all of the motion where none is."""
+        known = bool(self._expected.beats)
+        offset_sd = self._expected.offset_sd_mm[frames]
+        n, m = offset_sd.shape
+        spatial = np.zeros((n, m, m))
+        for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
+            own = (self._names == name).astype(np.float64)
+            tilt_sd, bend_sd = (0.003, 0.02) if known else (0.09, 0.25) if name == self._mapping else (0.04, 0.08)
+            level = own * (np.full_like(offset_sd, 0.05) if known else offset_sd)
+            spatial += level[:, :, None] * level[:, None, :]
+            spatial += tilt_sd**2 * np.outer(tilt, tilt) + bend_sd**2 * np.outer(bend, bend)
+        spatial += 0.03**2 * np.eye(m)
+        white: Array = np.einsum("nab,ij->naibj", spatial, np.eye(3)).reshape(n, 3 * m, 3 * m)
+        return white
+
+    def _of(self, name: str) -> Array:
+        own: Array = (self._names == name).astype(np.float64)[:, None, None]
+        return own
+
+
+def _shapes(catalogue: Catalogue, labels: tuple[tuple[str, int], ...], name: str) -> tuple[Array, Array]:
+    """Patterns (m,) of a catheter's tilt (mm from its middle) and bend (1 at its ends), 0 for other catheters."""
+    own = np.array([catheter == name for catheter, _ in labels])
+    along = np.array(
+        [catalogue[name].arc_lengths_mm[electrode - 1] if catheter == name else 0.0 for catheter, electrode in labels]
+    )
+    middle = along[own].mean()
+    tilt = np.where(own, along - middle, 0.0)
+    half = max(float(np.abs(tilt).max()), 1.0)
+    bowed = (tilt / half) ** 2
+    return tilt, np.where(own, bowed - bowed[own].mean(), 0.0)
+
+
+def _over_cycle(phases: Array, harmonics: int) -> Array:
+    """Unit-variance courses (n, 1 + 2 h) over the cycle: a lasting one and waves whose strength falls as h^-1.5."""
+    order = np.arange(1, harmonics + 1)
+    shares = order**-3.0 / (order**-3.0).sum() * (1 - _LASTING_SHARE)
+    angle = 2 * np.pi * phases[:, None] * order
+    waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1) * np.sqrt(np.tile(shares, 2))
+    return np.concatenate([np.full((len(phases), 1), np.sqrt(_LASTING_SHARE)), waves], axis=1)
+
+
+def _in_time_and_axis(courses: Array, sizes: Array) -> Array:
+    """Columns (n, m, 3, 3 k): each course (n, k) along each axis, of these sizes (n, m)."""
+    n, m = sizes.shape
+    columns: Array = np.einsum("nk,nm,ij->nmijk", courses, sizes, np.eye(3)).reshape(n, m, 3, -1)
+    return columns
+
+
+def _along(rays: Array, columns: Array) -> Array:
+    """The share of columns (n, m, 3, k) along the rays (n, m, 3)."""
+    share: Array = rays[..., None] * np.einsum("nmi,nmik->nmk", rays, columns)[..., None, :]
+    return share
+
+
+def _root(covariance: Array) -> Array:
+    values, axes = np.linalg.eigh(covariance)
+    root: Array = axes * np.sqrt(np.maximum(values, 0.0))
+    return root

@@ -1,0 +1,198 @@
+"""Score of a path through candidates as a catheter: its spacings, its bends, and the dark shaft between and behind them.
+
+Every function works on many chains at once; ``places`` are (n, electrodes, 2) pixels from the tip on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from fluoromap.contracts import Array, IntArray
+from fluoromap.segmenter.log_image import Image
+
+_SPACING_SD = 0.06
+_TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
+_BEND_SD = 0.36
+_S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
+_FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
+_UNLIKE_WEIGHT = 0.6
+_BEHIND_MM = 2.4, 5.9
+_BEFORE_MM = 2.1, 3.5
+
+
+def scores(
+    chosen: IntArray, points: Array, weights: Array, variance_px2: Array, sure: int, lost: float, spacing_px: Array, tip_mm: float,
+    px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float, shaft_weight: float, least: float,
+) -> Array:  # fmt: skip
+    """Score of each path; -inf, without a look at the shaft, where that cannot lift it to ``least``."""
+    places, variances = np.empty((*chosen.shape, 2)), np.empty(chosen.shape)
+    out = np.empty(len(chosen))
+    _score_shapes(chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out)
+    out += spacing_fit(places, spacing_px, variances, px_per_mm)
+    hopeful = out + 3.0 * shaft_weight >= least
+    out[~hopeful] = -np.inf
+    rows = np.flatnonzero(hopeful)
+    if rows.size:
+        widest = int(np.argmax(spacing_px))
+        shafts = shaft_evidence(places[rows], widest, tip_mm, px_per_mm, smooth, reduction, clear, side)
+        out[rows] += shaft_weight * shafts
+        out[out < least] = -np.inf
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
+    chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out
+):  # fmt: skip
+    """Writes the places and variances of each path, and its score but for spacings and shaft."""
+    count, m = chosen.shape
+    total = 0.0
+    for k in range(m - 1):
+        total += spacing_px[k]
+    for row in range(count):
+        unsure = 0
+        score = low = high = 0.0
+        for k in range(m):
+            candidate = chosen[row, k]
+            places[row, k, 0] = points[candidate, 0]
+            places[row, k, 1] = points[candidate, 1]
+            variances[row, k] = variance_px2[candidate]
+            weight = weights[candidate]
+            score += weight
+            if candidate >= sure:
+                unsure += 1
+            if k == 1:
+                low = high = weight
+            elif k > 1:
+                low, high = min(low, weight), max(high, weight)
+        score -= lost * unsure + _UNLIKE_WEIGHT * (high - low)
+        seen = squares = left = right = before_u = before_v = 0.0
+        shortened = 1.0
+        for k in range(m - 1):
+            du, dv = places[row, k + 1, 0] - places[row, k, 0], places[row, k + 1, 1] - places[row, k, 1]
+            length = math.sqrt(du * du + dv * dv)
+            seen += length
+            before, shortened = shortened, min(length / spacing_px[k], 1.0)
+            if k > 0:
+                turn = math.atan2(before_u * dv - before_v * du, before_u * du + before_v * dv)
+                squares += turn * turn * before * shortened
+                left, right = min(left, turn), max(right, turn)
+            before_u, before_v = du, dv
+        if left < -_S_BEND and right > _S_BEND:
+            squares *= _S_BEND_WEIGHT * _S_BEND_WEIGHT
+        score -= 0.5 * squares / (_BEND_SD * _BEND_SD)
+        score -= _FORESHORTENED_WEIGHT * max(0.0, _FORESHORTENED - seen / total)
+        out[row] = score if 2 * unsure <= m else -np.inf
+
+
+def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, px_per_mm: float) -> Array:
+    """Log-likelihood, up to a constant, of the places' spacings as these, one foreshortening free and its change along the
+    catheter as far as catheters bend in depth, (n,).
+
+    ``variance_px2`` (n, electrodes) is each place's own; each ratio of seen to true spacing has that of its two ends and of
+    the bend.
+    """
+    out = np.empty(len(places))
+    _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    n = spacing_px.size
+    reach = -0.5 * (spacing_px[0] + spacing_px[n - 1])
+    for k in range(n):
+        reach += spacing_px[k]
+    for row in range(places.shape[0]):
+        weights = total = squares = along = place_squares = products = arc = 0.0
+        for k in range(n):
+            du, dv = places[row, k + 1, 0] - places[row, k, 0], places[row, k + 1, 1] - places[row, k, 1]
+            spacing = spacing_px[k]
+            seen = math.sqrt(du * du + dv * dv) / spacing
+            weight = 1.0 / (
+                _SPACING_SD * _SPACING_SD + (variance_px2[row, k] + variance_px2[row, k + 1]) / (spacing * spacing)
+            )
+            place = (arc + 0.5 * spacing) / max(reach, 1e-9)
+            arc += spacing
+            weights += weight
+            total += weight * seen
+            squares += weight * seen * seen
+            along += weight * place
+            place_squares += weight * place * place
+            products += weight * place * seen
+        mean = total / weights
+        rest = squares - total * mean
+        # A bend in depth of this size changes the ratio along the catheter by the sine of its slope to the image.
+        slope_sd = min(_TREND_SD_PER_MM * reach / px_per_mm, _MOST_TREND_SD)
+        variance = slope_sd * slope_sd * max(1.0 - mean * mean, 0.0)
+        spread = place_squares - along * along / weights
+        if variance > 0 and n > 1:
+            trend = products - along * mean
+            rest += math.log(1.0 + variance * spread) - trend * trend / (spread + 1.0 / variance)
+        out[row] = -0.5 * rest
+
+
+def shaft_evidence(
+    places: Array, widest: int, tip_mm: float, px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float
+) -> Array:  # fmt: skip
+    """Dark between the electrodes of the widest gap and behind the last electrode, not before the tip: -3 to 3, (n,).
+
+    ``smooth`` is the ``reduction`` times smaller image. ``clear`` is what counts as a clear shaft in it; ``side`` how far
+    beside a shaft, in pixels of the frame, its surroundings are looked at.
+    """
+    last = places.shape[1] - 1
+    before = 0.5 * tip_mm + _BEFORE_MM[0]
+    pieces = np.array([[widest + 1, widest], [last - 1, last], [1, 0]])
+    reach = np.array([[-0.25, -0.75], _BEHIND_MM, [before, before + _BEFORE_MM[1]]])
+    out = np.empty(len(places))
+    _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out)
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Sums over three pieces of (mean of darker of the two sides - middle); what leaves the image does not count.
+
+    A piece runs in the direction from its one electrode to its other, from and to so far beyond that one: in millimetres
+    behind and before the catheter, in parts of the gap between.
+    """
+    rows, columns = smooth.shape
+    shift = 0.5 / reduction - 0.5
+    aside = side / reduction
+    for row in range(places.shape[0]):
+        evidence = 0.0
+        for piece in range(3):
+            start, end = pieces[piece, 0], pieces[piece, 1]
+            u, v = places[row, end, 0], places[row, end, 1]
+            du, dv = u - places[row, start, 0], v - places[row, start, 1]
+            if piece > 0:
+                scale = px_per_mm / max(math.sqrt(du * du + dv * dv), 1e-9)
+                du *= scale
+                dv *= scale
+            u0 = (u + reach[piece, 0] * du) / reduction + shift
+            v0 = (v + reach[piece, 0] * dv) / reduction + shift
+            du *= (reach[piece, 1] - reach[piece, 0]) / reduction
+            dv *= (reach[piece, 1] - reach[piece, 0]) / reduction
+            length = math.sqrt(du * du + dv * dv) + 1e-9
+            across_u, across_v = -dv / length * aside, du / length * aside
+            steps = max(3, int(length * reduction / 2))
+            total = 0.0
+            count = 0
+            for i in range(steps):
+                t = (i + 0.5) / steps
+                cu, cv = u0 + t * du, v0 + t * dv
+                if (
+                    min(cu - abs(across_u), cv - abs(across_v)) >= 0
+                    and cu + abs(across_u) <= columns - 1
+                    and cv + abs(across_v) <= rows - 1
+                ):
+                    one = smooth[int(cv + across_v + 0.5), int(cu + across_u + 0.5)]
+                    other = smooth[int(cv - across_v + 0.5), int(cu - across_u + 0.5)]
+                    total += min(one, other) - smooth[int(cv + 0.5), int(cu + 0.5)]
+                    count += 1
+            mean = min(max(total / max(count, 1) / clear, -1.0), 1.0)
+            evidence += mean if piece < 2 else -mean
+        out[row] = evidence

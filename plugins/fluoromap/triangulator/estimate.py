@@ -1,0 +1,143 @@
+"""Points from the pixels of two views, and how each pixel's error reaches them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fluoromap.contracts import Array
+from fluoromap.geometry import Camera
+from fluoromap.matching.two_view import triangulate_linear
+from fluoromap.triangulator.seen import Cameras, TwoViewPixels
+from fluoromap.triangulator.uncertainty import jacobians
+
+_STEPS = 8
+_SETTLED_MM = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Points (N, 3) in the world, mm, and ``gain`` (3 N, 4 N): their change with each pixel coordinate, to first order."""
+
+    points_mm: Array
+    gain: Array
+
+    def covariance_mm2(self, pixels_px2: Array) -> Array:
+        """Covariance (N, 3, N, 3) between all coordinates of all points, from the pixels' (4 N, 4 N)."""
+        n = len(self.points_mm)
+        covariance = self.gain @ pixels_px2 @ self.gain.T
+        symmetric: Array = ((covariance + covariance.T) / 2).reshape(n, 3, n, 3)
+        return symmetric
+
+
+class Method(Protocol):
+    """How a triangulator finds points."""
+
+    @property
+    def takes_out_breathing(self) -> bool:
+        """Whether a displacement of the whole heart between the runs is estimated."""
+
+    def start(self, cameras: Cameras, pixels: TwoViewPixels) -> Array:
+        """Points (N, 3), each electrode on its own."""
+
+    def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
+        """Points given the covariance (4 N, 4 N) that weights the pixels."""
+
+
+class EachAlone:
+    """The paper's: algebraic least squares of equations (8), electrode by electrode."""
+
+    takes_out_breathing = False
+
+    def start(self, cameras: Cameras, pixels: TwoViewPixels) -> Array:
+        return triangulate_linear(*cameras, *pixels.pixels)
+
+    def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
+        return Estimate(start_mm, alone_gain(cameras, start_mm))
+
+
+class AllTogether:
+    """All electrodes of the moment at once, by generalised least squares.
+
+    Breathing displaces all electrodes alike between the runs: that is told from their common misfit and taken out.
+    """
+
+    takes_out_breathing = True
+
+    def start(self, cameras: Cameras, pixels: TwoViewPixels) -> Array:
+        return triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
+
+    def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
+        weight = np.linalg.inv(errors_px2)
+        points = start_mm
+        for _ in range(_STEPS):
+            design = _design(cameras, points)
+            gain: Array = np.asarray(np.linalg.solve(design.T @ weight @ design, design.T @ weight), dtype=np.float64)
+            step = (gain @ pixels.residuals_px(cameras, points)).reshape(-1, 3)
+            points = points + step
+            if np.abs(step).max() < _SETTLED_MM:
+                break
+        return Estimate(points, gain)
+
+
+def alone_gain(cameras: Cameras, points_mm: Array) -> Array:
+    """Gain (3 N, 4 N) of unweighted least squares, each electrode on its own."""
+    n = len(points_mm)
+    inverse = np.linalg.pinv(jacobians(cameras, points_mm).reshape(n, 4, 3))
+    gain = np.zeros((n, 3, n, 4))
+    rows = np.arange(n)
+    gain[rows, :, rows] = inverse
+    return gain.reshape(3 * n, 4 * n)
+
+
+def _design(cameras: Cameras, points_mm: Array) -> Array:
+    """d pixels/d points, (4 N, 3 N)."""
+    n = len(points_mm)
+    design = np.zeros((n, 4, n, 3))
+    rows = np.arange(n)
+    design[rows, :, rows] = jacobians(cameras, points_mm).reshape(n, 4, 3)
+    return design.reshape(4 * n, 3 * n)
+
+
+def triangulate_maximum_likelihood(
+    camera_a: Camera,
+    camera_b: Camera,
+    pixels_a: Array,
+    pixels_b: Array,
+    covariances_a_px2: Array,
+    covariances_b_px2: Array,
+) -> Array:
+    """Points of least reprojection error by Gauss-Newton, all at once, from the linear solution on.
+
+    Parameters
+    ----------
+    pixels_a, pixels_b : ndarray, shape (N, 2)
+        The same N electrodes (u, v) in the two views.
+    covariances_a_px2, covariances_b_px2 : ndarray, shape (N, 2, 2)
+        Of those pixels.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        World, mm.
+    """
+    points = triangulate_linear(camera_a, camera_b, pixels_a, pixels_b)
+    views = (
+        (camera_a, pixels_a, np.linalg.inv(covariances_a_px2)),
+        (camera_b, pixels_b, np.linalg.inv(covariances_b_px2)),
+    )
+    for _ in range(_STEPS):
+        normal = np.zeros((len(points), 3, 3))
+        gradient = np.zeros((len(points), 3))
+        for camera, pixels, weight in views:
+            jacobian = camera.jacobian(points)
+            weighted = np.einsum("nki,nkl->nil", jacobian, weight)
+            normal += weighted @ jacobian
+            gradient += np.einsum("nil,nl->ni", weighted, pixels - camera.project(points))
+        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
+        points = points + step
+        if len(step) == 0 or np.abs(step).max() < _SETTLED_MM:
+            break
+    return points

@@ -1,0 +1,302 @@
+"""Following the electrodes over the cycle in one view, on the phantom's motion with given pixels."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.contracts import (
+    Array,
+    MonoplaneView,
+    NamedChain,
+    Observation,
+    Reason,
+    Refusal,
+    Silent,
+    SiteCycle,
+    Track,
+)
+from fluoromap.monoplane.motion_prior import MotionPrior
+from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.triangulator.linear import Linear
+from fluoromap.triangulator.uncertainty import UncertaintyParams
+
+EXACT = {
+    "gantry_angle_sd_deg": 0.0, "isocentre_sd_mm": 0.0, "magnification_sd": 0.0,
+    "respiration_head_feet_sd_mm": 0.0, "respiration_other_sd_mm": 0.0,
+}  # fmt: skip
+SITES = 12
+
+
+@functools.cache
+def _study(
+    seed: int, rate_hz: float = 30.0
+) -> tuple[tuple[MonoplaneView, ...], tuple[Array, ...], tuple[SiteCycle, ...]]:
+    """View a and b of the first site with its cycle, their true points (n, m, 3), and the other sites' cycles; breath held."""
+    frames = int(1.6 * rate_hz)
+    study = simulate_study(
+        StudySpec(seed, sites=SITES, frames=frames, frame_rate_hz=rate_hz, heart="dog", breathing_mm=0.0)
+    )
+    matched = matched_sites(study)
+    located = Linear(UncertaintyParams.model_validate(EXACT)).triangulate(matched, DEFAULT_CATALOGUE, Silent()).sites
+    site, seen = located[0], matched[0]
+    views = (
+        MonoplaneView(
+            "S01", "a", site.camera_a, DEFAULT_CATALOGUE, seen.frame_times_a_ms, seen.track_a, site.points, site.frame_a,
+            site.cycle, (),
+        ),
+        MonoplaneView(
+            "S01", "b", site.camera_b, DEFAULT_CATALOGUE, seen.frame_times_b_ms, seen.track_b, site.points, site.frame_b,
+            site.cycle, (),
+        ),
+    )  # fmt: skip
+    truth = tuple(
+        np.stack([run.truth.points_mm[point.catheter][:, point.electrode - 1] for point in site.points], axis=1)
+        for run in study.sites[0].runs
+    )
+    return views, truth, tuple(other.cycle for other in located[1:] if other.cycle is not None)
+
+
+def _follow(view: MonoplaneView, **parameters: float) -> Track:
+    return MotionPrior(MotionPrior.Params.model_validate({**EXACT, **parameters})).follow(view, Silent())
+
+
+def _rms(track: Track, truth: Array, positions: Array | None = None) -> float:
+    error = (track.positions_mm if positions is None else positions) - truth
+    return float(np.sqrt((error[track.located] ** 2).sum(axis=-1).mean()))
+
+
+def _whole(track: Track) -> None:
+    """Every covariance of a located sample is one: finite (by contract), symmetric, positive definite."""
+    assert track.relative_covariance_mm2 is not None
+    for covariances in (track.covariance_mm2, track.relative_covariance_mm2):
+        seen = covariances[track.located]
+        np.testing.assert_allclose(seen, np.swapaxes(seen, -1, -2), atol=1e-12)
+    assert np.linalg.eigvalsh(track.covariance_mm2[track.located]).min() > 0
+
+
+def _without(observation: Observation, *catheters: str) -> Observation:
+    return replace(observation, chains=tuple(c for c in observation.chains if c.catheter not in catheters))
+
+
+def _at_other_pixels(view: MonoplaneView, catheter: str, shift: Array) -> MonoplaneView:
+    """One catheter displaced in the image, frame by frame, by (n, 2) pixels."""
+    changed = tuple(
+        replace(seen, chains=tuple(
+            replace(chain, pixels_uv=chain.pixels_uv + shift[row]) if chain.catheter == catheter else chain
+            for chain in seen.chains
+        ))
+        for row, seen in enumerate(view.observations)
+    )  # fmt: skip
+    return replace(view, observations=changed)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_sites_own_cycle_gives_depth_in_every_frame(seed: int, number: int) -> None:
+    views, truth, _ = _study(seed)
+    track = _follow(views[number])
+    assert track.located.all()
+    assert _rms(track, truth[number]) <= 0.9
+    assert np.sqrt(((track.positions_mm - truth[number]) ** 2).sum(axis=-1).mean(axis=1)).max() < 2.0
+    assert _rms(track, truth[number]) <= 1.05 * _rms(track, truth[number], track.baseline_mm)
+    assert all(reasons == () for reasons in track.reasons)
+    _whole(track)
+
+
+def test_the_other_sites_motion_stands_in_for_an_unknown_cycle() -> None:
+    errors = []
+    for seed in (1, 2, 3):
+        views, truths, others = _study(seed)
+        for view, truth in zip(views, truths, strict=True):
+            track = _follow(replace(view, cycle=None, others=others))
+            assert set(track.reasons) == {(Reason.MOTION_FROM_OTHERS,)}
+            still = _follow(replace(view, cycle=None))
+            assert set(still.reasons) == {(Reason.DEPTH_ASSUMED,)}
+            errors.append((_rms(track, truth), _rms(track, truth, track.baseline_mm), _rms(still, truth)))
+    field, baseline, constant = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert field <= 1.0
+    assert field <= 1.05 * baseline
+    assert field < 0.7 * constant
+
+
+def test_the_baseline_lies_on_the_rays_and_positions_within_the_pixels() -> None:
+    (view, _), _, _ = _study(1)
+    track = _follow(view)
+    np.testing.assert_allclose(view.camera.project(track.baseline_mm), track.pixels_uv, atol=1e-9)
+    assert np.abs(view.camera.project(track.positions_mm) - track.pixels_uv).max() < 4 * 0.5
+
+
+def test_without_phases_the_last_known_depth_is_kept_and_said() -> None:
+    (view, _), truth, others = _study(1)
+    blind = replace(
+        view, observations=tuple(replace(seen, phase=None) for seen in view.observations), cycle=None, others=others
+    )
+    track = _follow(blind)
+    assert all(set(reasons) == {Reason.DEPTH_ASSUMED, Reason.PHASE_UNKNOWN} for reasons in track.reasons)
+    assert _rms(track, truth[0]) < 3.5
+    _whole(track)
+
+
+def test_a_catheter_is_located_only_where_it_is_seen() -> None:
+    (view, _), truth, _ = _study(1)
+    gaps = {3, 4, 20}
+    gone = tuple(_without(s, "mapping") if row in gaps else s for row, s in enumerate(view.observations))
+    track = _follow(replace(view, observations=gone))
+    mapping = np.array([name == "mapping" for name, _ in track.labels])
+    expected = np.ones_like(track.located)
+    expected[np.ix_(sorted(gaps), np.flatnonzero(mapping))] = False
+    np.testing.assert_array_equal(track.located, expected)
+    assert not track.positions_mm[~track.located].any()
+    assert [Reason.TRACK_INTERRUPTED in reasons for reasons in track.reasons] == mapping.tolist()
+    assert _rms(track, truth[0]) <= 0.9
+
+
+def test_one_electrode_in_view_stays_at_the_cycles_depth() -> None:
+    (view, _), truth, _ = _study(1)
+    alone = tuple(
+        replace(seen, chains=tuple(
+            NamedChain("mapping", (1,), chain.pixels_uv[:1], chain.covariance_px2[:1])
+            for chain in seen.chains if chain.catheter == "mapping"
+        ))
+        for seen in view.observations
+    )  # fmt: skip
+    track = _follow(replace(view, observations=alone))
+    assert track.located.sum() == len(view.observations)
+    assert _rms(track, truth[0]) <= 1.2
+    _whole(track)
+    # Nothing to subtract: what is told of the difference is what is told of the position.
+    assert track.relative_covariance_mm2 is not None
+    np.testing.assert_array_equal(track.relative_covariance_mm2, track.covariance_mm2)
+
+
+def test_a_mirrored_view_is_refused() -> None:
+    (view, _), _, _ = _study(1)
+    middle = 2 * view.camera.principal_point_uv[0]
+    mirrored = tuple(
+        replace(seen, chains=tuple(
+            replace(chain, pixels_uv=np.stack([middle - chain.pixels_uv[:, 0], chain.pixels_uv[:, 1]], axis=1))
+            for chain in seen.chains
+        ))
+        for seen in view.observations
+    )  # fmt: skip
+    with pytest.raises(Refusal) as refused:
+        _follow(replace(view, observations=mirrored))
+    assert refused.value.reason == Reason.VIEW_MIRRORED
+
+
+def test_a_catheter_that_jumps_away_does_not_move_the_others() -> None:
+    (view, _), truth, _ = _study(1)
+    shift = np.zeros((len(view.observations), 2))
+    shift[10:13] = (60.0, -35.0)
+    track = _follow(_at_other_pixels(view, "pacing", shift))
+    pacing = np.array([name == "pacing" for name, _ in track.labels])
+    assert [Reason.PRIOR_GATE in reasons for reasons in track.reasons] == pacing.tolist()
+    np.testing.assert_array_equal(track.positions_mm[10:13, pacing], track.baseline_mm[10:13, pacing])
+    # Pixels say one thing, the cycle another: the uncertainty contains both.
+    off = (track.positions_mm - truth[0])[10:13, pacing]
+    distance = np.einsum(
+        "nmi,nmi->nm", off, np.linalg.solve(track.covariance_mm2[10:13, pacing], off[..., None])[..., 0]
+    )
+    assert distance.max() <= 7.815
+    error = (track.positions_mm - truth[0])[:, ~pacing]
+    assert np.sqrt((error**2).sum(axis=-1).mean()) <= 0.9
+
+
+def test_a_catheter_longer_than_its_maker_says_is_not_pulled_in_depth() -> None:
+    (view, _), truth, _ = _study(1)
+    mapping = DEFAULT_CATALOGUE["mapping"]
+    wrong = replace(mapping, spacing_mm=(6.65, 6.3, 3.3))
+    catheters = tuple(wrong if one is mapping else one for one in DEFAULT_CATALOGUE.catheters)
+    track = _follow(replace(view, catalogue=replace(DEFAULT_CATALOGUE, catheters=catheters)))
+    assert _rms(track, truth[0]) <= 1.0
+
+
+def test_less_than_one_beat_is_enough() -> None:
+    (view, _), truth, _ = _study(1)
+    short = slice(view.a_priori_frame, view.a_priori_frame + 5)
+    track = _follow(
+        replace(
+            view, observations=view.observations[short], frame_times_ms=view.frame_times_ms[short], a_priori_frame=0
+        )
+    )
+    assert _rms(track, truth[0][short]) <= 1.2
+    one = slice(view.a_priori_frame, view.a_priori_frame + 1)
+    still = replace(
+        view, observations=view.observations[one], frame_times_ms=view.frame_times_ms[one], a_priori_frame=0
+    )
+    _whole(_follow(still))
+
+
+def test_an_irregular_rhythm_is_told_and_widens_the_depth() -> None:
+    (view, _), _, _ = _study(1)
+    n = len(view.observations)
+    uneven = np.concatenate([np.arange(0, 2, 2 / 12), np.arange(0, 1, 1 / 22), np.arange(0, 1, 1 / 22)])[:n]
+    phases = np.concatenate([uneven, np.linspace(0, 0.5, n)])[:n] % 1.0
+    changed = tuple(replace(seen, phase=float(p)) for seen, p in zip(view.observations, phases, strict=True))
+    track = _follow(replace(view, observations=changed))
+    assert all(Reason.IRREGULAR_RHYTHM in reasons for reasons in track.reasons)
+    _whole(track)
+
+
+def test_nothing_known_from_two_views_is_refused() -> None:
+    (view, _), _, _ = _study(1)
+    with pytest.raises(Refusal) as refused:
+        _follow(replace(view, a_priori=()))
+    assert refused.value.reason == Reason.NO_A_PRIORI
+
+
+def test_an_electrode_that_the_cycle_lacks_moves_with_its_catheter() -> None:
+    (view, _), truth, _ = _study(1)
+    assert view.cycle is not None
+    lost = view.cycle.labels.index(("mapping", 2))
+    keep = [i for i in range(len(view.cycle.labels)) if i != lost]
+    fewer = SiteCycle(
+        view.cycle.phases, tuple(view.cycle.labels[i] for i in keep), view.cycle.positions_mm[:, keep],
+        view.cycle.covariance_mm2[:, keep],
+    )  # fmt: skip
+    track = _follow(replace(view, cycle=fewer))
+    at = track.labels.index(("mapping", 2))
+    assert np.sqrt(((track.positions_mm - truth[0])[:, at] ** 2).sum(axis=-1).mean()) <= 1.5
+
+
+def test_breathing_makes_the_depth_uncertain_but_not_what_is_relative_to_the_reference() -> None:
+    (view, _), _, _ = _study(1)
+    held, breathing = _follow(view), _follow(view, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
+    ray = view.camera.axis_world
+
+    def depth_sd(covariance: Array | None) -> float:
+        assert covariance is not None
+        return float(np.sqrt(np.einsum("i,nmij,j->nm", ray, covariance, ray).mean()))
+
+    assert depth_sd(breathing.covariance_mm2) > depth_sd(held.covariance_mm2) + 0.2
+    relative = [depth_sd(track.relative_covariance_mm2) for track in (held, breathing)]
+    assert relative[1] == pytest.approx(relative[0], rel=0.1)
+
+
+def test_ellipsoids_hold_the_truth_about_as_often_as_they_say() -> None:
+    """A coarse floor over few hearts; the figure itself comes from the benchmark."""
+    inside = []
+    for seed in (1, 2, 3):
+        views, truths, _ = _study(seed)
+        for view, truth in zip(views, truths, strict=True):
+            track = _follow(view)
+            error = track.positions_mm - truth
+            distance = np.einsum("nmi,nmi->nm", error, np.linalg.solve(track.covariance_mm2, error[..., None])[..., 0])
+            inside.append((distance <= 7.815).mean())
+    assert 0.85 <= np.mean(inside) <= 0.998
+
+
+def test_cost_is_linear_in_frames_because_beats_are_solved_one_by_one() -> None:
+    (view, _), _, _ = _study(1)
+    whole = _follow(view)
+    beats = np.flatnonzero(np.diff([seen.phase or 0.0 for seen in view.observations]) < -0.5) + 1
+    cut = int(beats[beats > view.a_priori_frame][0])
+    part = _follow(replace(view, observations=view.observations[:cut], frame_times_ms=view.frame_times_ms[:cut]))
+    # The pixels of later beats do not enter; only the number of beats that were averaged differs.
+    assert np.abs(part.positions_mm - whole.positions_mm[:cut]).max() < 0.3

@@ -1,0 +1,204 @@
+"""What only the whole study shows: a wrong gantry, a wrong catalogue, a moved table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
+from fluoromap.contracts import (
+    Array,
+    Grade,
+    MatchedSite,
+    NamedChain,
+    Observation,
+    PhasePair,
+    Silent,
+    Triangulation,
+    grade_of,
+)
+from fluoromap.geometry import Camera, camera_from_gantry
+from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
+from fluoromap.reasons import Reason
+from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
+from fluoromap.triangulator.uncertainty import UncertaintyParams
+
+NOISE_PX = 0.5
+CAMERAS = camera_from_gantry(LATERAL), camera_from_gantry(FRONTAL)
+Points = dict[str, Array]
+
+
+def turn(angle_deg: float, offset_mm: float, seed: int) -> Array:
+    """A displacement (4, 4) of the world as a wrong header makes it, by so much in a random direction."""
+    rng = np.random.default_rng(seed)
+    axis, along = rng.normal(size=3), rng.normal(size=3)
+    displaced = np.eye(4)
+    displaced[:3, :3] = Rotation.from_rotvec(angle_deg * axis / np.linalg.norm(axis), degrees=True).as_matrix()
+    displaced[:3, 3] = offset_mm * along / np.linalg.norm(along)
+    return displaced
+
+
+def electrodes(seed: int, sites: int = 12) -> list[Points]:
+    """The electrodes of a simulated heart at diastole, site by site."""
+    study = simulate_study(StudySpec(seed, sites=sites, frames=1, breathing_mm=0.0))
+    return [dict(site.truth.diastole_mm) for site in study.sites]
+
+
+def seen(
+    by_site: list[Points],
+    rng: np.random.Generator,
+    displaced: Array | None = None,
+    shifts: dict[int, Array] | None = None,
+) -> tuple[MatchedSite, ...]:
+    """All sites seen at once by both views; view b displaced against its header, and at some sites the heart in it."""
+    true_b = CAMERAS[1] if displaced is None else Camera(CAMERAS[1].matrix @ displaced, 512, 512)
+    sites = []
+    for index, points in enumerate(by_site):
+        moved = {name: at + (shifts or {}).get(index, np.zeros(3)) for name, at in points.items()}
+        a, b = observation(CAMERAS[0], points, rng), observation(true_b, moved, rng)
+        pair = PhasePair(0.8, a, b)
+        sites.append(MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+    return tuple(sites)
+
+
+def observation(by: Camera, points: Points, rng: np.random.Generator) -> Observation:
+    chains = []
+    for name, at in points.items():
+        noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(at), 2, 2))
+        pixels = by.project(at) + rng.normal(0, NOISE_PX, (len(at), 2))
+        chains.append(NamedChain(name, tuple(range(1, len(at) + 1)), pixels, noise))
+    return Observation(0, 0.8, tuple(chains))
+
+
+def located(sites: tuple[MatchedSite, ...], catalogue: Catalogue = DEFAULT_CATALOGUE) -> Triangulation:
+    return MaximumLikelihood(UncertaintyParams()).triangulate(sites, catalogue, Silent())
+
+
+def errors(answer: Triangulation, by_site: list[Points]) -> tuple[Array, Array]:
+    """Points found and true, both (n, 3)."""
+    found = [point.position_mm for site in answer.sites for point in site.points]
+    true = [points[name][k] for points in by_site for name in points for k in range(len(points[name]))]
+    return np.array(found), np.array(true)
+
+
+def rms(apart: Array) -> float:
+    return float(np.sqrt((apart**2).sum(axis=1).mean()))
+
+
+def aligned(found: Array, true: Array) -> Array:
+    middle, centre = found.mean(axis=0), true.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(true - centre, found - middle)
+    return np.asarray(rotation.apply(found - middle) + centre)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_right_header_stands(seed: int) -> None:
+    by_site = electrodes(seed)
+    sites = seen(by_site, np.random.default_rng(seed))
+    answer = located(sites)
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+    assert (answer.calibration.rotation_deg == 0).all()
+    assert (answer.calibration.offset_mm == 0).all()
+    assert answer.calibration.epipolar_after_px == answer.calibration.epipolar_before_px < 0.6
+    assert all((site.camera_b.matrix == CAMERAS[1].matrix).all() for site in answer.sites)
+    assert rms(np.subtract(*errors(answer, by_site))) < 0.15
+    assert answer.notes == ()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_gantry_wrong_by_one_degree_and_two_millimetres_is_found_and_told(seed: int) -> None:
+    by_site = electrodes(seed, sites=20)
+    displaced = turn(1.0, 2.0, seed)
+    answer = located(seen(by_site, np.random.default_rng(seed), displaced))
+    found = answer.calibration
+    assert found is not None
+    assert found.applied
+    assert found.epipolar_before_px > 1.3 * NOISE_PX
+    assert found.epipolar_after_px <= 0.55
+    assert found.rotation_deg == pytest.approx(Rotation.from_matrix(displaced[:3, :3]).as_rotvec(degrees=True), abs=0.6)
+    points, true = errors(answer, by_site)
+    assert rms(points - true) <= 1.0
+    assert rms(aligned(points, true) - true) <= 0.16
+    true_b = Camera(CAMERAS[1].matrix @ displaced, 512, 512)
+    apart = answer.sites[0].camera_b.project(true) - true_b.project(true)
+    assert np.abs(apart).mean() < np.abs(CAMERAS[1].project(true) - true_b.project(true)).mean() / 3
+    (told,) = answer.notes
+    assert "degrees" in told
+    assert "mm" in told
+
+
+def test_breathing_between_the_runs_is_not_taken_for_a_wrong_gantry() -> None:
+    rng = np.random.default_rng(5)
+    by_site = electrodes(5)
+    shifts = {index: rng.normal(0, [1.4, 1.4, 5.0]) for index in range(len(by_site))}
+    answer = located(seen(by_site, rng, shifts=shifts))
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+    assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
+
+
+def test_what_no_gantry_can_do_is_not_corrected_but_doubted() -> None:
+    by_site = electrodes(6)
+    upside_down = np.diag([1.0, 1.0, -1.0, 1.0])
+    answer = located(seen(by_site, np.random.default_rng(6), upside_down))
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+    assert all(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in answer.sites)
+
+
+@pytest.mark.parametrize("error", [0.0, 1.0])
+def test_a_catalogue_two_millimetres_off_is_told_and_not_believed(error: float) -> None:
+    by_site = electrodes(7, sites=20)
+    sites = seen(by_site, np.random.default_rng(7), turn(error, 2 * error, 7))
+    mapping = DEFAULT_CATALOGUE["mapping"]
+    first, second, third = mapping.spacing_mm
+    wrong = replace(mapping, spacing_mm=(first, second + 2.0, third))
+    catalogue = replace(DEFAULT_CATALOGUE, catheters=(*DEFAULT_CATALOGUE.catheters[:2], wrong))
+    answer = located(sites, catalogue)
+    assert answer.calibration is not None
+    assert answer.calibration.applied == (error > 0)
+    points, true = errors(answer, by_site)
+    assert rms(aligned(points, true) - true) <= 0.2
+    for site in answer.sites:
+        for point in site.points:
+            assert (Reason.SPACING_MISMATCH in point.reasons) == (point.catheter == "mapping")
+    assert "'mapping'" in answer.notes[0]
+    assert "2 to 3: 6.3 mm instead of 8.3" in answer.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("shift", "at", "words"),
+    [
+        ((12.0, 0.0, 0.0), [4], "At S05"),
+        ((0.0, 0.0, 30.0), [4], "At S05"),
+        ((12.0, 0.0, 0.0), [7, 8, 9], "From S08 on"),
+    ],
+)
+def test_a_table_that_moved_between_the_views_is_found(
+    shift: tuple[float, float, float], at: list[int], words: str
+) -> None:
+    by_site = electrodes(8, sites=10)
+    sites = seen(by_site, np.random.default_rng(8), shifts=dict.fromkeys(at, np.array(shift)))
+    answer = located(sites)
+    assert [index for index, site in enumerate(answer.sites) if Reason.TABLE_MOVED in site.reasons] == at
+    assert answer.notes[0].startswith(words)
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+    for index, site in enumerate(answer.sites):
+        tip = site.point("mapping", 1)
+        assert tip is not None
+        apart = tip.position_mm - by_site[index]["mapping"][0] - np.array(shift) / 2 * (index in at)
+        assert apart @ np.linalg.solve(tip.covariance_mm2, apart) < 7.8
+        if index in at:
+            assert grade_of(tip.covariance_mm2) is Grade.C
+
+
+def test_a_heart_that_stands_elsewhere_in_both_views_is_no_moved_table() -> None:
+    by_site = electrodes(9, sites=8)
+    by_site[3] = {name: at + np.array([12.0, -12.0, 5.0]) for name, at in by_site[3].items()}
+    answer = located(seen(by_site, np.random.default_rng(9)))
+    assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
