@@ -4,7 +4,7 @@ Dog hearts at 30 frames/s (14 to 19 frames a cycle), runs of 48 frames, 12 elect
 nothing is rendered. Every table names what the two views of the site, or of 19 other sites, had told before. Errors are 3D
 RMS in mm over all frames and electrodes, lateral ; frontal view; "worst phase" is the RMS over hearts in the worst
 of 15 parts of the cycle. Where a row says so the geometry is exact and the solver is told (its parameters are 0); the
-coverage table draws gantry and breathing as the default parameters say. Seeds below 1000 were used while it was made.
+coverage table draws gantry and breathing as the default parameters say. Seeds below 5000 were used while it was made.
 """
 
 from __future__ import annotations

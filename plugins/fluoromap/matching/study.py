@@ -240,8 +240,12 @@ def _named_site(
     groups: tuple[tuple[str, ...], ...],
     slots: Sequence[int],
 ) -> _NamedSite:
+    # In the catalogue's order whichever way they were named: naming one by hand must not change the other sites' answers.
+    order = [name for group in groups for name in group]
+
     def by_name(pairs: IntArray) -> dict[str, tuple[int, int]]:
-        return {name: (int(i), int(j)) for name, (i, j) in zip(names, pairs, strict=True) if i >= 0}
+        found = {name: (int(i), int(j)) for name, (i, j) in zip(names, pairs, strict=True) if i >= 0}
+        return {name: found[name] for name in order if name in found}
 
     pairs = by_name(choice.pairs)
     notes = []

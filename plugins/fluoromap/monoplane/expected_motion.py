@@ -10,7 +10,7 @@ from fluoromap.contracts import Array, MonoplaneView, SiteCycle
 from fluoromap.monoplane.a_priori_lm import moved_share
 from fluoromap.monoplane.cycle_prior import CycleCurve, fit_cycle
 from fluoromap.monoplane.motion_field import displacements
-from fluoromap.monoplane.observed import ObservedView
+from fluoromap.monoplane.observed import ObservedView, turned_covariance_mm2
 from fluoromap.reasons import Reason
 
 
@@ -60,7 +60,12 @@ def pace_of(phases: Array) -> Pace:
 
 
 def expect(
-    view: MonoplaneView, observed: ObservedView, mapping_sd_mm: float, other_sd_mm: float, beat_sd_mm: float
+    view: MonoplaneView,
+    observed: ObservedView,
+    mapping_sd_mm: float,
+    other_sd_mm: float,
+    beat_sd_mm: float,
+    gantry_angle_sd_deg: float,
 ) -> ExpectedMotion:
     """The best knowledge there is of the motion: the site's own cycle, the other sites' cycles, or none.
 
@@ -70,13 +75,18 @@ def expect(
         How far the mapping catheter and the others may move over the cycle, an axis, where nothing tells.
     beat_sd_mm : float
         How far a catheter's place varies from beat to beat, an axis; contained in the points' own covariances.
+    gantry_angle_sd_deg : float
+        Error of each gantry angle; contained in the points' own covariances as well.
     """
     known = bool(np.isfinite(observed.phases).all())
     pace = pace_of(observed.phases) if known else Pace(0.0, 1.0, 0.0)
     if known and view.cycle is not None:
-        return _from_own_cycle(view, observed, view.cycle, pace, mapping_sd_mm, other_sd_mm, beat_sd_mm)
+        return _from_own_cycle(
+            view, observed, view.cycle, pace, mapping_sd_mm, other_sd_mm, beat_sd_mm, gantry_angle_sd_deg
+        )
     n, m = observed.seen.shape
     points = np.array([point.covariance_mm2 for point in observed.a_priori])
+    points = points - turned_covariance_mm2(observed.a_priori_mm, gantry_angle_sd_deg)
     common, own = split_covariance(points, observed.catheters, beat_sd_mm)
     sd = np.array([mapping_sd_mm if name == view.catalogue.mapping else other_sd_mm for name in observed.catheters])
     unknown_sd = np.sqrt(moved_share(observed.phases, view.a_priori_frame))[:, None] * sd
@@ -107,6 +117,7 @@ def _from_own_cycle(
     mapping_sd_mm: float,
     other_sd_mm: float,
     beat_sd_mm: float,
+    gantry_angle_sd_deg: float,
 ) -> ExpectedMotion:
     curve = fit_cycle(cycle)
     start = observed.phases[view.a_priori_frame : view.a_priori_frame + 1]
@@ -128,7 +139,8 @@ def _from_own_cycle(
         known = curve.labels[row] == label
         mean[:, index] = places[:, row] if known else observed.a_priori_mm[index] + moved[:, index]
         offset[:, index] = unsure
-    covariances = cycle.covariance_mm2.reshape(-1, 3, 3)
+    covariances = cycle.covariance_mm2 - turned_covariance_mm2(cycle.positions_mm, gantry_angle_sd_deg)
+    covariances = covariances.reshape(-1, 3, 3)
     catheters = tuple(name for name, _ in cycle.labels) * len(cycle.phases)
     common, own = split_covariance(covariances, catheters, beat_sd_mm)
     return ExpectedMotion(
@@ -147,8 +159,9 @@ def split_covariance(
 ) -> tuple[Array, dict[str, Array]]:
     """What covariances (k, 3, 3) of electrodes have in common, and what each catheter has on top of it.
 
-    Breathing and the gantry displace all electrodes alike and are what the most certain electrode has as well, less the
-    variation between beats, which is each catheter's own. Directions are the principal ones of the mean covariance.
+    Breathing and the isocentre displace all electrodes alike and are what the most certain electrode has as well, less the
+    variation between beats, which is each catheter's own; what wrong gantry angles do must be taken off before.
+    Directions are the principal ones of the mean covariance.
     """
     _, axes = np.linalg.eigh(covariances_mm2.mean(axis=0))
     along = np.einsum("ik,nij,jk->nk", axes, covariances_mm2, axes)

@@ -52,7 +52,7 @@ class MotionPrior:
         )
 
     name: ClassVar[str] = "motion-prior"
-    version: ClassVar[str] = "1"
+    version: ClassVar[str] = "2"
 
     def __init__(self, params: MotionPrior.Params) -> None:
         self._params = params
@@ -67,7 +67,9 @@ class MotionPrior:
         """
         observed = observe(view)
         p = self._params
-        expected = expect(view, observed, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm)
+        expected = expect(
+            view, observed, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg
+        )
         covariance = MotionCovariance(view, observed.labels, expected, observed.phases, p)
         baseline = view.camera.back_project(observed.pixels_uv, view.camera.depth_mm(expected.mean_mm))
         baseline = np.where(observed.seen[..., None], baseline, expected.mean_mm)

@@ -111,7 +111,8 @@ class BlobResponse:
         places = (points_uv - 0.5 * (self.reduction - 1)) / self.reduction
         u = np.minimum(np.maximum(np.rint(places[:, 0]), 0), columns - 1).astype(np.int64)
         v = np.minimum(np.maximum(np.rint(places[:, 1]), 0), rows - 1).astype(np.int64)
-        return self.best[v, u].astype(np.float64)
+        over_noise: Array = self.best[v, u].astype(np.float64)
+        return over_noise
 
 
 def _spread(values: Image) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from numba import njit
 
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.blob_response import BlobResponse
+from fluoromap.segmenter.log_image import Image
 
 _TURNS_RAD = np.deg2rad([0.0, -4.0, 4.0, -8.0, 8.0])
 _MOST_SNR = 12.0
@@ -46,14 +48,17 @@ def rigid_search(
     return turned
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _dim(best, places, radius):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _dim(best: Image, places: Array, radius: float) -> None:
+    """Lower the response within ``radius`` of the places, (n, 2), in place."""
     rows, columns = best.shape
-    for k in range(places.shape[0]):
-        for v in range(max(0, int(places[k, 1] - radius)), min(rows, int(places[k, 1] + radius) + 2)):
-            for u in range(max(0, int(places[k, 0] - radius)), min(columns, int(places[k, 0] + radius) + 2)):
-                if (u - places[k, 0]) ** 2 + (v - places[k, 1]) ** 2 <= radius * radius:
-                    best[v, u] = min(best[v, u], np.float32(_TAKEN_SNR))
+    steps = np.arange(-math.ceil(radius), math.ceil(radius) + 2)
+    middle = np.floor(places).astype(np.int64)
+    u = middle[:, 0, None, None] + steps
+    v = middle[:, 1, None, None] + steps[:, None]
+    near = (u - places[:, 0, None, None]) ** 2 + (v - places[:, 1, None, None]) ** 2 <= radius * radius
+    near = near & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    u, v = (np.broadcast_to(axis, near.shape)[near] for axis in (u, v))
+    best[v, u] = np.minimum(best[v, u], np.float32(_TAKEN_SNR))
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
