@@ -23,13 +23,15 @@ _SMOOTHNESS = 1e-3
 class CycleMoments:
     """The moments of the cycle at which both views show the same electrodes, and how those move.
 
-    labels : (catheter, electrode). phases : (p,), rising. moments : what is seen at each.
+    labels : (catheter, electrode). phases : (p,), rising. moments : what is seen at each. positions_mm : (p, m, 3), each
+    electrode located on its own.
     """
 
     def __init__(self, phases: Array, moments: Sequence[TwoViewPixels], positions_mm: Array) -> None:
         self.labels = moments[0].labels
         self.phases = phases
         self.moments = tuple(moments)
+        self.positions_mm = positions_mm
         self._coefficients = _fit(phases, positions_mm)
 
     def motion(self, phase: float, diastolic_phase: float, labels: Sequence[tuple[str, int]]) -> Motion:
@@ -57,7 +59,16 @@ def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) 
         return None
     phases = np.array(sorted(whole))
     seen = [whole[phase] for phase in phases]
-    return CycleMoments(phases, seen, np.array([method.start(cameras, pixels) for pixels in seen]))
+    positions = method.start(cameras, _all_in_one(seen)).reshape(len(seen), len(labels), 3)
+    return CycleMoments(phases, seen, positions)
+
+
+def _all_in_one(moments: Sequence[TwoViewPixels]) -> TwoViewPixels:
+    """The electrodes of all moments as if seen at one: located each on its own, that is many times faster."""
+    pixels = [np.concatenate([moment.pixels[view] for moment in moments]) for view in (0, 1)]
+    covariances = [np.concatenate([moment.covariances[view] for moment in moments]) for view in (0, 1)]
+    labels = tuple(label for moment in moments for label in moment.labels)
+    return TwoViewPixels(labels, (pixels[0], pixels[1]), (covariances[0], covariances[1]))
 
 
 def locate_cycle(
@@ -71,8 +82,7 @@ def locate_cycle(
 ) -> SiteCycle:
     """The electrodes at every moment, with a covariance that grows where the heart moves fast."""
     positions, covariances = [], []
-    for phase, pixels in zip(moments.phases, moments.moments, strict=True):
-        start = method.start(cameras, pixels)
+    for phase, pixels, start in zip(moments.phases, moments.moments, moments.positions_mm, strict=True):
         motion = moments.motion(float(phase), diastolic_phase, moments.labels)
         sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
         noise = pixel_noise_px2(pixels.covariances)

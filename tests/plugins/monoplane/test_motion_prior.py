@@ -14,15 +14,18 @@ from fluoromap.contracts import (
     MonoplaneView,
     NamedChain,
     Observation,
-    Reason,
     Refusal,
     Silent,
     SiteCycle,
     Track,
 )
+from fluoromap.monoplane.expected_motion import expect
+from fluoromap.monoplane.motion_covariance import FIXED, MotionCovariance, MotionParams
 from fluoromap.monoplane.motion_prior import MotionPrior
+from fluoromap.monoplane.observed import observe
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
@@ -150,7 +153,7 @@ def test_a_catheter_is_located_only_where_it_is_seen() -> None:
     track = _follow(replace(view, observations=gone))
     mapping = np.array([name == "mapping" for name, _ in track.labels])
     expected = np.ones_like(track.located)
-    expected[np.ix_(sorted(gaps), np.flatnonzero(mapping))] = False
+    expected[np.ix_(np.array(sorted(gaps)), np.flatnonzero(mapping))] = False
     np.testing.assert_array_equal(track.located, expected)
     assert not track.positions_mm[~track.located].any()
     assert [Reason.TRACK_INTERRUPTED in reasons for reasons in track.reasons] == mapping.tolist()
@@ -277,6 +280,33 @@ def test_breathing_makes_the_depth_uncertain_but_not_what_is_relative_to_the_ref
     assert depth_sd(breathing.covariance_mm2) > depth_sd(held.covariance_mm2) + 0.2
     relative = [depth_sd(track.relative_covariance_mm2) for track in (held, breathing)]
     assert relative[1] == pytest.approx(relative[0], rel=0.1)
+
+
+def test_depth_told_by_another_run_is_off_by_both_runs_breaths() -> None:
+    (view, _), _, _ = _study(1)
+    assert view.cycle is not None
+    breath = np.diag([1.0, 1.0, 16.0])
+    still = np.broadcast_to(0.25**2 * np.eye(3), view.cycle.covariance_mm2.shape)
+
+    def depth_variance(covariance: Array, **breathing: float) -> Array:
+        assert view.cycle is not None
+        told = replace(view, cycle=replace(view.cycle, covariance_mm2=covariance))
+        p = MotionParams.model_validate({**EXACT, "respiration_drift_sd_mm": 0.0, **breathing})
+        seen = observe(told)
+        expected = expect(told, seen, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg)
+        prior = MotionCovariance(told, seen.labels, expected, seen.phases, p).window(slice(0, 10))
+        return prior.variance_mm2(np.ones(4), (FIXED,), np.broadcast_to(view.camera.axis_world, prior.mean_mm.shape))
+
+    # The cycle stands for the middle of two breaths: half of one breath's variance.
+    middle = depth_variance(still + breath / 2, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
+    np.testing.assert_allclose(
+        middle - depth_variance(still), 2 * view.camera.axis_world @ breath @ view.camera.axis_world, rtol=1e-6
+    )
+    # A cycle recorded with the breath held tells the depth of that breath; only this run's own is left.
+    held = depth_variance(still, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
+    np.testing.assert_allclose(
+        held - depth_variance(still), view.camera.axis_world @ breath @ view.camera.axis_world, rtol=1e-6
+    )
 
 
 def test_ellipsoids_hold_the_truth_about_as_often_as_they_say() -> None:
