@@ -208,8 +208,8 @@ def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -
     counts.frames += 1
     for chain in chains:
         for uv in truth.values():
-            error = chain.pixels_uv - uv
-            if len(chain.electrodes) == len(uv) and np.linalg.norm(error, axis=1).max() < TRACK_PX:
+            error = chain.pixels_uv - uv[[number - 1 for number in chain.electrodes]]
+            if np.linalg.norm(error, axis=1).max() < TRACK_PX:
                 squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(chain.covariance_px2), error)
                 counts.inside += int((squared <= CHI2_95_2D).sum())
                 counts.ellipses += len(error)
@@ -231,8 +231,8 @@ def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array
     for entry in found.frames:
         for chain in entry.chains:
             for name, uv in truth.items():
-                error = chain.pixels_uv - uv[entry.frame] if len(chain.electrodes) == uv.shape[1] else np.inf
-                if np.max(np.linalg.norm(error, axis=-1)) < TRACK_PX:
+                error = chain.pixels_uv - uv[entry.frame][[number - 1 for number in chain.electrodes]]
+                if np.linalg.norm(error, axis=1).max() < TRACK_PX:
                     of_track.setdefault(chain.track, {}).setdefault(name, []).append(entry.frame)
     named: set[str] = set()
     for names in sorted(of_track.values(), key=lambda names: -max(map(len, names.values()))):

@@ -139,6 +139,6 @@ def _refuse_if_wrong(errors: Errors) -> None:
         raise Problem(
             422,
             "invalid_table",
-            f"The table has {len(errors)} mistakes; nothing of it was taken.",
+            f"The table has {len(errors)} mistake{'s' if len(errors) > 1 else ''}; nothing of it was taken.",
             errors[:_MOST_ERRORS],
         )

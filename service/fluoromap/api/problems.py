@@ -124,7 +124,10 @@ def install(app: FastAPI) -> None:
             return Problem(415, "unsupported_media_type", "Send the body as application/json.").response()
         if bodiless and not await request.body():
             return Problem(400, "malformed", "The request has no body.").response()
-        places = [(".".join(str(part) for part in item["loc"]), item["msg"]) for item in error.errors()]
+        places = [
+            (".".join(str(part) for part in item["loc"]), item["msg"].removeprefix("Value error, "))
+            for item in error.errors()
+        ]
         if malformed:
             return Problem(400, "malformed", "The request body is not valid JSON.", places).response()
         return Problem(422, "invalid", "Some fields of the request are wrong.", places).response()

@@ -64,7 +64,8 @@ def get_report(job_id: Annotated[str, Path(description="The job's id.")], reques
         job = job_of(session, job_id)
         if job.state not in ENDED_JOB:
             raise Problem(409, "not_ready", "The report is made when the job has ended; follow the job and ask again.")
-        asked = {"report": _template_hash(), "job": job.version}
+        study = session.get(Study, job.study_id)
+        asked = {"report": _template_hash(), "job": job.version, "label": study.label if study else None}
     page = rendered(job_id, asked, "text/html", lambda: report_page(job_id).encode())
     return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)
 

@@ -82,6 +82,19 @@ def test_a_label_is_text(client: TestClient, study: FinishedStudy) -> None:
     assert "&lt;script&gt;alert(1)" in page
 
 
+def test_a_new_label_is_on_the_page(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    before = _page(client, study)
+    assert client.patch(f"/v1/studies/{study.study_id}", json={"label": "Second rhythm"}).status_code == 200
+    assert "Second rhythm" not in before
+    assert "Second rhythm" in _page(client, study)
+
+
+def test_a_parameter_without_a_value_is_not_set(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    assert "= None" not in _page(client, study)
+
+
 def test_without_a_map_it_says_why(client: TestClient, study: FinishedStudy) -> None:
     study.finish(no_map())
     page = _page(client, study)

@@ -65,6 +65,13 @@ def test_studies_that_cannot_be(service: TestClient, body: dict[str, Any], where
     assert service.get("/v1/studies").json() == {"items": [], "next": None}
 
 
+def test_a_mistake_is_told_in_plain_words(service: TestClient) -> None:
+    catheter = {"name": "mapping", "electrodes": 4, "spacing_mm": [4.65, 6.3], "tip_mm": 4, "ring_mm": 1.3}
+    answer = service.post("/v1/studies", json={"label": "one spacing short", "catheters": [catheter]})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["message"] == "catheter 'mapping': 4 electrodes need 3 spacings"
+
+
 def test_broken_json_is_malformed(service: TestClient) -> None:
     answer = service.post("/v1/studies", content=b"{", headers={"Content-Type": "application/json"})
     assert (answer.status_code, answer.json()["code"]) == (400, "malformed")
