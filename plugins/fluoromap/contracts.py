@@ -528,6 +528,7 @@ class MappedSite:
 
     tip_mm, covariance_mm2 : the mapping tip relative to the reference catheter. axis : (3,) unit vector along the
     catheter from electrode 2 to the tip. tip_length_mm : of the tip electrode. lat_ms, lat_sd_ms : activation time.
+    reasons : what speaks against its place.
     """
 
     site: str
@@ -537,6 +538,7 @@ class MappedSite:
     tip_length_mm: float
     lat_ms: float
     lat_sd_ms: float
+    reasons: tuple[Reason, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tip_mm", frozen(self.tip_mm, (3,), "tip_mm"))

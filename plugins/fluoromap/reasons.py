@@ -30,6 +30,7 @@ class Reason(StrEnum):
     LAT_OUTLIER = "lat_outlier"
     TOO_FEW_SITES = "too_few_sites"
     SITES_COPLANAR = "sites_coplanar"
+    MARK_NOT_USED = "mark_not_used"
     EXTRA_CATHETER = "extra_catheter"
     OUT_OF_FIELD = "out_of_field"
     PRIOR_GATE = "prior_gate"
@@ -69,6 +70,7 @@ _SENTENCES: dict[Reason, str] = {
     Reason.LAT_OUTLIER: "The activation time does not agree with its neighbours; check the annotation.",
     Reason.TOO_FEW_SITES: "Fewer than four sites could be located; a chamber surface needs at least four.",
     Reason.SITES_COPLANAR: "All located sites lie in one plane; a chamber surface needs sites on several walls.",
+    Reason.MARK_NOT_USED: "Electrodes set by hand contradict the other view or the other frames and were not used; check them.",
     Reason.EXTRA_CATHETER: "More catheters were found than the study describes; add the missing one to its catheters.",
     Reason.OUT_OF_FIELD: "This catheter leaves the field of view in some frames; those frames hold no position.",
     Reason.PRIOR_GATE: "The image contradicts the expected motion of this catheter; its depth is the expected one.",

@@ -174,6 +174,7 @@ def chamber_map(
                 lat_ms=float(lat[index]),
                 leave_one_out_error_ms=float(errors[index]),
                 reasons=(
+                    *site.reasons,
                     *(() if used[index] else (Reason.LAT_OUTLIER,)),
                     *((Reason.OUTSIDE_WINDOW,) if outside[index] else ()),
                 ),

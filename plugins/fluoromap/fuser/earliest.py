@@ -7,6 +7,9 @@ from scipy.special import log_ndtr
 
 from fluoromap.contracts import Array
 
+LEAST_TOLD = 0.01
+"""Sites less probable than this are left out, their probability given to the others."""
+
 
 def earliest_sites(names: tuple[str, ...], lat_ms: Array, lat_sd_ms: Array) -> tuple[tuple[str, float], ...]:
     """Sites that may be the earliest with the probability of each, most probable first, down to 1 %.
@@ -25,6 +28,7 @@ def earliest_sites(names: tuple[str, ...], lat_ms: Array, lat_sd_ms: Array) -> t
     log_later = log_ndtr(-z)
     others = log_later.sum(axis=0) - log_later
     share = np.exp(-0.5 * z**2 - np.log(sd) + others).sum(axis=1)
+    share = np.where(share >= LEAST_TOLD * share.sum(), share, 0.0)
     share /= share.sum()
     order = np.argsort(-share, kind="stable")
-    return tuple((str(names[index]), float(share[index])) for index in order if share[index] >= 0.01)
+    return tuple((str(names[index]), float(share[index])) for index in order if share[index] > 0)

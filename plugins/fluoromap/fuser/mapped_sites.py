@@ -8,6 +8,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, LocatedSite, MappedSite, Triangulation
+from fluoromap.reasons import Reason
 
 
 def map_origin(triangulation: Triangulation) -> tuple[float, float, float] | None:
@@ -45,17 +46,21 @@ def mapped_sites(
     origin = references.mean(axis=0) if len(references) else np.zeros(3)
     spread = np.cov(references.T) if len(references) > 1 else np.zeros((3, 3))
     sites = []
+    reasons: tuple[Reason, ...]
     for site in triangulation.sites:
         tip = site.point(mapping.name, 1)
         if tip is None or site.site not in times_ms:
             continue
         if tip.relative_mm is not None and tip.relative_covariance_mm2 is not None:
-            position, covariance = tip.relative_mm, tip.relative_covariance_mm2
+            position, covariance, reasons = tip.relative_mm, tip.relative_covariance_mm2, ()
         else:
             position, covariance = tip.position_mm - origin, tip.covariance_mm2 + spread
+            reasons = (Reason.NO_REFERENCE,)
         lat_ms, lat_sd_ms = times_ms[site.site]
         sites.append(
-            MappedSite(site.site, position, covariance, _axis(site, mapping.name), mapping.tip_mm, lat_ms, lat_sd_ms)
+            MappedSite(
+                site.site, position, covariance, _axis(site, mapping.name), mapping.tip_mm, lat_ms, lat_sd_ms, reasons
+            )
         )
     return tuple(sites)
 

@@ -253,6 +253,9 @@ def _named_site(
         by_hand = site.a.catheters[i].manual_name or site.b.catheters[j].manual_name
         if name in doubts and by_hand is None:
             notes.append((name, doubts[name]))
+    for catheters, used in zip((site.a.catheters, site.b.catheters), zip(*pairs.values(), strict=True), strict=False):
+        unused = [one.manual_name for index, one in enumerate(catheters) if index not in used]
+        notes.extend((name, Reason.MARK_NOT_USED) for name in unused if name is not None)
     alternative = None
     if choice.alternative is not None and choice.probability >= LEAST_PROBABILITY:
         alternative = by_name(choice.alternative)

@@ -53,6 +53,11 @@ def calibrate_and_locate(
     notes += table_notes([site.site for site in usable], jumps)
     wrong = wrong_spacings([(pixels, points, joint) for _, pixels, points, joint in first], catalogue)
     notes += _spacing_notes(wrong, catalogue)
+    if set(wrong) == set(catalogue.names):
+        # Names and scale both rest on the spacings: nothing that was located can be trusted.
+        reasons = (Reason.SPACING_MISMATCH, Reason.GEOMETRY_DOUBTFUL)
+        refused = [RejectedSite(site.site, reasons) for site in usable]
+        return Triangulation((), (*rejected, *refused), tuple(notes))
     alike = _same_gantry(usable)
     asked = [first[i][:2] for i in alike if jumps[i] is None]
     calibration, gantry = calibrate(asked, catalogue, frozenset(catalogue.names) - set(wrong), params)

@@ -177,6 +177,7 @@ def _check(study: Study, run: StudyRun, body: list[ElectrodeIn]) -> None:
     catalogue = studies.catalogue_of(study)
     errors: list[tuple[str, str]] = []
     seen: set[tuple[str, int]] = set()
+    places: set[tuple[str, float, float]] = set()
     for index, item in enumerate(body):
         where = f"body.{index}"
         if item.catheter not in catalogue.names:
@@ -186,6 +187,9 @@ def _check(study: Study, run: StudyRun, body: list[ElectrodeIn]) -> None:
             errors.append((f"{where}.electrode", f"this catheter has {count} electrodes"))
         if (item.catheter, item.electrode) in seen:
             errors.append((f"{where}.electrode", "this electrode is set twice"))
+        elif (item.catheter, item.u_px, item.v_px) in places:
+            errors.append((where, "another electrode of this catheter is set on the same pixel"))
+        places.add((item.catheter, item.u_px, item.v_px))
         seen.add((item.catheter, item.electrode))
         for name, value, size in (("u_px", item.u_px, run.facts.columns), ("v_px", item.v_px, run.facts.rows)):
             if not -0.5 <= value <= size - 0.5:

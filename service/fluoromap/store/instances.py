@@ -17,7 +17,7 @@ from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap.store import files
 from fluoromap.store.engine import writing
 from fluoromap.store.manifest import GantryPlan
-from fluoromap.store.models import ENDED_JOB, File, Instance, Job, Mark, Site, StudyInstance
+from fluoromap.store.models import ENDED_JOB, File, Instance, Job, Mark, Rendering, Site, StudyInstance
 from fluoromap.store.refused import Refused
 
 GANTRY_KEYWORDS = {
@@ -212,8 +212,12 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
         site.explicit_b = None if site.explicit_b == uid else site.explicit_b
         if uid in (site.paired_a, site.paired_b):
             site.paired_a = site.paired_b = None
+    # Pictures show the run itself: those that were kept go with it.
+    ended = select(Job.id).where(Job.study_id == study_id)
+    kept = list(session.scalars(select(Rendering.sha256).where(Rendering.job_id.in_(ended))))
+    session.execute(delete(Rendering).where(Rendering.job_id.in_(ended)))
     session.flush()
-    return forget_instances(session, [uid])
+    return forget_instances(session, [uid], also=kept)
 
 
 def forget_instances(session: Session, uids: Iterable[str], also: Iterable[str] = ()) -> list[str]:

@@ -145,9 +145,20 @@ def test_what_no_gantry_can_do_is_not_corrected_but_doubted() -> None:
     by_site = electrodes(6)
     upside_down = np.diag([1.0, 1.0, -1.0, 1.0])
     answer = located(seen(by_site, np.random.default_rng(6), upside_down))
-    assert answer.calibration is not None
-    assert not answer.calibration.applied
-    assert all(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in answer.sites)
+    assert answer.calibration is None or not answer.calibration.applied
+    assert all(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in (*answer.sites, *answer.rejected))
+
+
+def test_a_study_whose_catheters_are_all_described_wrongly_is_refused_with_the_cause() -> None:
+    by_site = electrodes(7, sites=6)
+    wider = tuple(
+        replace(catheter, spacing_mm=tuple(gap + 2.0 for gap in catheter.spacing_mm))
+        for catheter in DEFAULT_CATALOGUE.catheters
+    )
+    answer = located(seen(by_site, np.random.default_rng(7), np.eye(4)), replace(DEFAULT_CATALOGUE, catheters=wider))
+    assert answer.sites == ()
+    assert {site.reasons for site in answer.rejected} == {(Reason.SPACING_MISMATCH, Reason.GEOMETRY_DOUBTFUL)}
+    assert any("spaced otherwise than described" in note for note in answer.notes)
 
 
 @pytest.mark.parametrize("error", [0.0, 1.0])

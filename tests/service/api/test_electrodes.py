@@ -117,6 +117,12 @@ def test_an_electrode_stands_once(service: TestClient, frame: str) -> None:
     assert [error["where"] for error in answer.json()["errors"]] == ["body.1.electrode"]
 
 
+def test_two_electrodes_do_not_share_a_pixel(service: TestClient, frame: str) -> None:
+    answer = service.put(frame, json=[TIP, {**TIP, "electrode": 2}])
+    assert [error["where"] for error in answer.json()["errors"]] == ["body.1"]
+    assert service.put(frame, json=[TIP, {**TIP, "electrode": 2, "u_px": TIP["u_px"] + 0.5}]).status_code == 200
+
+
 def test_a_marked_catheter_stays_in_the_study(service: TestClient, frame: str, study_path: str) -> None:
     service.put(frame, json=[{**TIP, "catheter": "pacing"}])
     catheters = [row for row in service.get(study_path).json()["catheters"] if row["name"] != "pacing"]
