@@ -248,3 +248,20 @@ def test_views_that_do_not_belong_together_are_refused(heart) -> None:  # type: 
 
 def test_an_empty_study_is_empty() -> None:
     assert match_study((), DEFAULT_CATALOGUE, Silent()).sites == ()
+
+
+def test_a_mark_that_contradicts_everything_else_is_told_not_dropped_silently(heart) -> None:  # type: ignore[no-untyped-def]
+    study = heart(seed=3)
+    sites = [study.site(f"S{i:02d}") for i in range(4)]
+    segmentation = sites[1].segmentation_a
+    entry = segmentation.frames[5]
+    mapping = max(entry.chains, key=lambda chain: chain.probability("mapping"))
+    astray = replace(
+        mapping, pixels_uv=mapping.pixels_uv + np.array([60.0, -45.0]), kinds=(("mapping", 1.0),), manual=True, track=99
+    )
+    others = tuple(chain for chain in entry.chains if chain is not mapping)
+    frames = tuple(FrameChains(5, (*others, astray)) if one.frame == 5 else one for one in segmentation.frames)
+    sites[1] = replace(sites[1], segmentation_a=replace(segmentation, frames=frames))
+    matching = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent())
+    told = {site.site for site in matching.sites if ("mapping", Reason.MARK_NOT_USED) in site.notes}
+    assert told == {"S01"}

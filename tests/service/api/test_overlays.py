@@ -17,8 +17,8 @@ from fluoromap.api import overlays as overlay_routes
 from fluoromap.api.overlays import fusion_of
 from fluoromap.fuser.animation import PICTURES
 from fluoromap.store import files
-from fluoromap.store.engine import reading
-from fluoromap.store.models import Job, Rendering
+from fluoromap.store.engine import reading, writing
+from fluoromap.store.models import Job, Rendering, StudyInstance
 
 pytestmark = pytest.mark.usefixtures("drawing_processes")
 
@@ -133,6 +133,22 @@ def test_a_deleted_runs_overlay_stays_when_it_was_drawn(client: TestClient, stud
     assert client.get(path).content == kept
     answer = client.get(f"{path}?frame=1")
     assert (answer.status_code, answer.json()["code"]) == (409, "run_deleted")
+
+
+def test_a_deleted_run_takes_the_pictures_of_it_along(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    uid = study.uids["S01", "a"]
+    with writing() as session:
+        session.add(StudyInstance(study_id=study.study_id, sop_instance_uid=uid))
+    path = f"/v1/jobs/{study.job_id}/overlays/{uid}.png"
+    assert client.get(path).status_code == 200
+    assert client.delete(f"/v1/studies/{study.study_id}/instances/{uid}").status_code == 204
+    with reading() as session:
+        assert session.scalars(select(Rendering)).all() == []
+    answer = client.get(path)
+    assert (answer.status_code, answer.json()["code"]) == (409, "run_deleted")
+    # Other runs' pictures are drawn again.
+    assert client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png").status_code == 200
 
 
 def test_a_run_that_does_not_decode(client: TestClient, study: FinishedStudy) -> None:
