@@ -92,9 +92,10 @@ def main(sites: int, frames: int, seed: int) -> None:
     longest = max(LENGTHS)
     spec = StudySpec(seed, sites=1, frames=longest, frame_rate_hz=60.0, heart="dog", contrast=VIEWS)
     runs = simulate_study(spec).sites[0].runs
+    # Before hundreds of frames are kept: beside those every new array costs page faults, which no worker has.
+    for view, run in zip(VIEWS, runs, strict=True):
+        filters(view, run.frames[0], camera_from_gantry(run.gantry).px_per_mm)
     kept = [list(run.frames) for run in runs]
-    for view, run, pictures in zip(VIEWS, runs, kept, strict=True):
-        filters(view, pictures[0], camera_from_gantry(run.gantry).px_per_mm)
     lengths(runs, kept)
     decoding()
     starting()
