@@ -23,6 +23,7 @@ from fluoromap.simulation import simulate
 from fluoromap.supervisor import private_service
 
 PATIENCE_S = 600.0
+POLL_SECONDS = 0.05
 
 
 def main(corrections: int) -> None:
@@ -38,8 +39,9 @@ def main(corrections: int) -> None:
             taken = []
             for number in range(corrections):
                 site = sites[number % len(sites)]
+                path, marks = _moved_tip(http, study, site["view_a"], frame=1 + number)
                 start = time.perf_counter()
-                _move_tip(http, study, site["view_a"], frame=1 + number)
+                http.put(path, json=marks).raise_for_status()
                 _, job = _until_map(http, study)
                 taken.append(time.perf_counter() - start)
                 stages = Counter(stage["name"] for stage in _ended(http, job["id"])["stages"] if not stage["reused"])
@@ -48,7 +50,8 @@ def main(corrections: int) -> None:
             print(f"median {sorted(taken)[len(taken) // 2]:.2f} s, longest {max(taken):.2f} s")
 
 
-def _move_tip(http: httpx.Client, study: str, uid: str, frame: int) -> None:
+def _moved_tip(http: httpx.Client, study: str, uid: str, frame: int) -> tuple[str, list[dict[str, Any]]]:
+    """Where the electrodes of a frame are put, and the mapping catheter's with the first of them moved."""
     path = f"/v1/studies/{study}/instances/{uid}/frames/{frame}/electrodes"
     found = http.get(path).json()
     chosen = [entry for entry in found if entry["catheter"] == "mapping"] or found
@@ -56,7 +59,7 @@ def _move_tip(http: httpx.Client, study: str, uid: str, frame: int) -> None:
         raise SystemExit(f"no electrode was found in frame {frame}; ask for fewer corrections")
     marks = [{name: entry[name] for name in ("catheter", "electrode", "u_px", "v_px")} for entry in chosen]
     marks[0]["u_px"] += 2.0
-    http.put(path, json=marks).raise_for_status()
+    return path, marks
 
 
 def _until_map(http: httpx.Client, study: str) -> tuple[float, dict[str, Any]]:
@@ -65,7 +68,7 @@ def _until_map(http: httpx.Client, study: str) -> tuple[float, dict[str, Any]]:
     while time.perf_counter() - start < PATIENCE_S:
         if http.get(f"/v1/jobs/{job['id']}/map").status_code == 200:
             return time.perf_counter() - start, job
-        time.sleep(0.02)
+        time.sleep(POLL_SECONDS)
     raise SystemExit(f"no map after {PATIENCE_S:.0f} s")
 
 

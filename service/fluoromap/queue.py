@@ -15,6 +15,9 @@ from fluoromap.store.engine import writing
 RUN_STAGE = "fluoromap.run_stage"
 """Name of the registered task that runs a stage by its id."""
 
+STAYS_SECONDS = 10
+"""How long a worker takes one stage of a job after the other before others have their turn."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -46,7 +49,8 @@ def _make_app() -> Celery:
         task_acks_late=False,
         task_serializer="json",
         accept_content=["json"],
-        task_time_limit=configured.stage_seconds,
+        # Of the last stage, which is begun before the worker's stay with the job is over.
+        task_time_limit=configured.stage_seconds + STAYS_SECONDS,
         worker_prefetch_multiplier=1,
         # A child that replaces a dead one compiles its kernels first; by default it would be killed after 4 s, again and again.
         worker_proc_alive_timeout=180,

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select
 
+from fluoromap import queue
 from fluoromap.contracts import Context
 from fluoromap.store import files
 from fluoromap.store.engine import reading, writing
 from fluoromap.store.models import Job, JobState, StageRow, StageState, Study
-from fluoromap.workers import runner
+from fluoromap.workers import runner, tasks
 from fluoromap.workers.bridge import Work
 
 
@@ -54,6 +56,31 @@ def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.Mon
     assert files.path_of(row.result).read_bytes() == b'{"answer": 42}'
     with reading() as session:
         assert session.get_one(Job, "j").state == JobState.SUCCEEDED
+
+
+def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    with writing() as session:
+        session.add(Job(id="other", study_id="s", state=JobState.QUEUED, manifest={}))
+        session.flush()
+        for job, depends_on in (("j", [stage]), ("other", [])):
+            state = StageState.PENDING if depends_on else StageState.READY
+            row = StageRow(
+                job_id=job,
+                name="match",
+                subject="s",
+                plugin="p",
+                plugin_version="1",
+                depends_on=depends_on,
+                state=state,
+            )
+            session.add(row)
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, lambda context: b"{}"))
+    # Nobody else hears of what got ready.
+    monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
+    tasks.run_stage(stage)
+    with reading() as session:
+        states = {job.id: job.state for job in session.scalars(select(Job))}
+    assert states == {"j": JobState.SUCCEEDED, "other": JobState.QUEUED}
 
 
 @pytest.mark.parametrize("error", [ValueError("no electrode"), OSError("the plugin's own file")])

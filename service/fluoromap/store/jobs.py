@@ -100,6 +100,12 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
     return ids
 
 
+def first_ready(session: Session, job_id: str) -> int | None:
+    """The job's first stage that may be claimed."""
+    query = select(StageRow.id).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
+    return session.scalar(query.order_by(StageRow.id).limit(1))
+
+
 def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
     """Take a ready stage; None when the announcement was stale or doubled."""
     job_id = session.scalar(select(StageRow.job_id).where(StageRow.id == stage_id, StageRow.state == StageState.READY))

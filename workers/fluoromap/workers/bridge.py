@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from fluoromap import matching as study_matching
@@ -41,7 +40,8 @@ from fluoromap.store import files
 from fluoromap.store.codec import decode, encode
 from fluoromap.store.jobs import Claim
 from fluoromap.store.manifest import Manifest, MarkPlan, PluginPlan
-from fluoromap.store.models import Base, StageRow, StageState
+from fluoromap.store.models import Base, StageRow
+from fluoromap.store.outcomes import load, stage_of, stages_of
 from fluoromap.store.results import FollowedSite, FollowedView, MapOutcome
 from fluoromap.workers.points import point_rows
 
@@ -66,16 +66,17 @@ def prepare(session: Session, held: Claim, manifest: Manifest) -> Work:
     if held.name == "segment":
         return _segment(manifest, held.subject)
     if held.name == "match":
-        return _match(session, held.job_id, manifest)
-    matching = _result(session, held.job_id, "match", None, Matching)
-    assert matching is not None, "a stage runs only after the stages it depends on are done"
+        return _match(manifest, {row.subject: row for row in stages_of(session, held.job_id, "segment")})
+    match = stage_of(session, held.job_id, "match")
+    assert match is not None, "every job has one"
     if held.name == "triangulate":
-        return _triangulate(held.job_id, manifest, matching)
-    triangulation = _result(session, held.job_id, "triangulate", None, Triangulation)
-    assert triangulation is not None, "a stage runs only after the stages it depends on are done"
+        return _triangulate(held.job_id, manifest, match)
+    triangulate = stage_of(session, held.job_id, "triangulate")
+    assert triangulate is not None, "every job has one"
+    triangulation = load(Triangulation, triangulate)
     if held.name == "fuse":
         return _fuse(manifest, triangulation)
-    return _monoplane(manifest, held.subject, matching, triangulation)
+    return _monoplane(manifest, held.subject, load(Matching, match), triangulation)
 
 
 def _segment(manifest: Manifest, uid: str) -> Work:
@@ -114,35 +115,40 @@ def _chains(marks: tuple[MarkPlan, ...]) -> tuple[Chain, ...]:
     return tuple(chains)
 
 
-def _match(session: Session, job_id: str, manifest: Manifest) -> Work:
+def _match(manifest: Manifest, segments: Mapping[str, StageRow]) -> Work:
     catalogue = manifest.catalogue()
-    sites = tuple(
-        SiteRuns(
-            site.site,
-            manifest.runs[site.view_a].gantry.camera(),
-            manifest.runs[site.view_b].gantry.camera(),
-            _result(session, job_id, "segment", site.view_a, Segmentation),
-            _result(session, job_id, "segment", site.view_b, Segmentation),
-        )
-        for site in manifest.sites
-    )
+    cameras = {uid: manifest.runs[uid].gantry.camera() for uid in segments}
     own = PluginPlan(name="fluoromap", version=study_matching.VERSION, params={})
-    key = _key("match", own, asdict(catalogue), *(encode(site) for site in sites))
-    return Work(key, lambda context: encode(match_study(sites, catalogue, context)))
+    views = [(site.site, uid) for site in manifest.sites for uid in (site.view_a, site.view_b)]
+    # A stored result is named by its hash: what it says need not be read to tell whether it changed.
+    key = _key(
+        "match", own, asdict(catalogue), *([s, encode(cameras[uid]).decode(), segments[uid].result] for s, uid in views)
+    )
+
+    def compute(context: Context) -> bytes:
+        seen = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
+        sites = tuple(
+            SiteRuns(site.site, cameras[site.view_a], cameras[site.view_b], seen[site.view_a], seen[site.view_b])
+            for site in manifest.sites
+        )
+        return encode(match_study(sites, catalogue, context))
+
+    return Work(key, compute)
 
 
-def _triangulate(job_id: str, manifest: Manifest, matching: Matching) -> Work:
+def _triangulate(job_id: str, manifest: Manifest, match: StageRow) -> Work:
     catalogue = manifest.catalogue()
 
     def compute(context: Context) -> bytes:
+        matching = load(Matching, match)
         triangulator = build_triangulator(manifest.triangulator.name, manifest.triangulator.params)
         located = triangulator.triangulate(matching.sites, catalogue, context)
         return encode(replace(located, rejected=(*matching.rejected, *located.rejected)))
 
     def rows(content: bytes) -> Iterable[Base]:
-        return point_rows(job_id, manifest, matching, decode(Triangulation, content))
+        return point_rows(job_id, manifest, load(Matching, match), decode(Triangulation, content))
 
-    return Work(_key("triangulate", manifest.triangulator, asdict(catalogue), encode(matching)), compute, rows)
+    return Work(_key("triangulate", manifest.triangulator, asdict(catalogue), match.result), compute, rows)
 
 
 def _fuse(manifest: Manifest, triangulation: Triangulation) -> Work:
@@ -212,17 +218,6 @@ def _rejected_view(view: View, name: str, triangulation: Triangulation) -> Follo
     reasons = next((site.reasons for site in triangulation.rejected if site.site == name), ())
     sentences = " ".join(reason.sentence for reason in reasons)
     return FollowedView(view, None, Reason.NO_A_PRIORI, f"{Reason.NO_A_PRIORI.sentence} {sentences}".strip())
-
-
-def _result(session: Session, job_id: str, name: str, subject: str | None, kind: type[Any]) -> Any:
-    """The decoded result of another stage of the job; None when that stage failed."""
-    query = select(StageRow.result).where(
-        StageRow.job_id == job_id, StageRow.name == name, StageRow.state == StageState.DONE
-    )
-    if subject is not None:
-        query = query.where(StageRow.subject == subject)
-    sha256 = session.scalar(query)
-    return None if sha256 is None else decode(kind, files.path_of(sha256).read_bytes())
 
 
 def _key(stage: str, plan: PluginPlan, *inputs: Any) -> str:

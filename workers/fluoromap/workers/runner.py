@@ -24,12 +24,12 @@ class PluginFailed(Exception):
 log = structlog.get_logger(__name__)
 
 
-def run(stage_id: int, worker: str) -> None:
-    """Claim a stage, run its plugin, store the result; do nothing when the claim is not to be had."""
+def run(stage_id: int, worker: str) -> str | None:
+    """Claim a stage, run its plugin, store the result; returns its job, or None when the claim is not to be had."""
     with writing() as session:
         held = jobs.claim(session, stage_id, worker)
     if held is None:
-        return
+        return None
     bound = log.bind(job=held.job_id, stage=held.name, attempt=held.attempt)
     bound.info("stage_started")
     with Heartbeat(held) as heartbeat:
@@ -52,12 +52,14 @@ def run(stage_id: int, worker: str) -> None:
             detail = "The service could not prepare or store this stage's work; its log tells more."
             with writing() as session:
                 jobs.fail(session, held, {"code": "internal", "detail": detail})
+    return held.job_id
 
 
 def _run(held: jobs.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
     work = _prepare(held)
     kept = _kept_result(work.key)
     content = files.path_of(kept).read_bytes() if kept else _computed(held, work, heartbeat)
+    rows = list(work.rows(content))
     heartbeat.check()
     # Kept again even when it was kept before: then nobody can have removed it since.
     with files.incoming() as path, writing() as session:
@@ -65,7 +67,7 @@ def _run(held: jobs.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
         sha256 = files.keep(session, path, "application/json")
         if session.get(StageResult, work.key) is None:
             session.add(StageResult(key=work.key, sha256=sha256))
-        if not jobs.finish(session, held, sha256, reused=kept is not None, rows=work.rows(content)):
+        if not jobs.finish(session, held, sha256, reused=kept is not None, rows=rows):
             raise StageStopped("the claim was lost while the result was stored")
     bound.info("stage_done", reused=kept is not None)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import time
 from typing import Any
 
 import structlog
@@ -14,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap import queue
 from fluoromap.store import jobs
-from fluoromap.store.engine import forget_connections, writing
+from fluoromap.store.engine import forget_connections, reading, writing
 from fluoromap.workers.process import limit_memory, warm_up
 from fluoromap.workers.runner import run
 
@@ -25,9 +26,20 @@ log = structlog.get_logger(__name__)
 
 @queue.app.task(name=queue.RUN_STAGE)
 def run_stage(stage_id: int) -> None:
-    """Run the stage of that row, if it is still to be had."""
-    run(stage_id, worker=f"{socket.gethostname()}:{os.getpid()}")
-    queue.publish_due()
+    """Run the stage of that row, if it is still to be had, and for a while what is ready of the same job.
+
+    So a chain of short stages does not wait for a message each; the messages find their stages taken.
+    """
+    worker = f"{socket.gethostname()}:{os.getpid()}"
+    end = time.monotonic() + queue.STAYS_SECONDS
+    upcoming: int | None = stage_id
+    while upcoming is not None:
+        job = run(upcoming, worker)
+        queue.publish_due()
+        if job is None or time.monotonic() > end:
+            return
+        with reading() as session:
+            upcoming = jobs.first_ready(session, job)
 
 
 @worker_process_init.connect
