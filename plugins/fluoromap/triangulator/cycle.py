@@ -23,23 +23,28 @@ _SMOOTHNESS = 1e-3
 class CycleMoments:
     """The moments of the cycle at which both views show the same electrodes, and how those move.
 
-    labels : (catheter, electrode). phases : (p,), rising. moments : what is seen at each. positions_mm : (p, m, 3), each
-    electrode located on its own.
+    phases : (p,), rising. pixels : what is seen of m electrodes at all of them. positions_mm : (p, m, 3), each electrode
+    located on its own.
     """
 
-    def __init__(self, phases: Array, moments: Sequence[TwoViewPixels], positions_mm: Array) -> None:
-        self.labels = moments[0].labels
+    def __init__(self, phases: Array, pixels: TwoViewPixels, positions_mm: Array) -> None:
+        self.labels = pixels.labels
         self.phases = phases
-        self.moments = tuple(moments)
+        self.pixels = pixels
         self.positions_mm = positions_mm
         self._coefficients = _fit(phases, positions_mm)
 
-    def motion(self, phase: float, diastolic_phase: float, labels: Sequence[tuple[str, int]]) -> Motion:
-        """How these electrodes move at ``phase``; one that the cycle does not know moves as the others do on average."""
-        displaced = np.einsum("k,kmc->mc", (_waves([phase]) - _waves([diastolic_phase]))[0], self._coefficients)
-        velocity = np.einsum("k,kmc->mc", _waves([phase], derivative=True)[0], self._coefficients)
+    def motion(self, phases: Array, diastolic_phase: float, labels: Sequence[tuple[str, int]]) -> Motion:
+        """How these electrodes move at phases (...); one that the cycle does not know moves as the others on average."""
+        displaced = np.einsum("...k,kmc->...mc", _waves(phases) - _waves(diastolic_phase), self._coefficients)
+        velocity = np.einsum("...k,kmc->...mc", _waves(phases, derivative=True), self._coefficients)
         known = [self.labels.index(label) if label in self.labels else -1 for label in labels]
-        return Motion(*(np.vstack([of, of.mean(axis=0)])[known] for of in (displaced, velocity)))
+        return Motion(
+            *(
+                np.concatenate([of, of.mean(axis=-2, keepdims=True)], axis=-2)[..., known, :]
+                for of in (displaced, velocity)
+            )
+        )
 
 
 def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) -> CycleMoments | None:
@@ -59,16 +64,22 @@ def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) 
         return None
     phases = np.array(sorted(whole))
     seen = [whole[phase] for phase in phases]
-    positions = method.start(cameras, _all_in_one(seen)).reshape(len(seen), len(labels), 3)
-    return CycleMoments(phases, seen, positions)
+    pixels = _stacked(seen)
+    # As if all electrodes of all moments were seen at one: each is located on its own.
+    positions = method.start(cameras, _flat(pixels)).reshape(len(seen), len(labels), 3)
+    return CycleMoments(phases, pixels, positions)
 
 
-def _all_in_one(moments: Sequence[TwoViewPixels]) -> TwoViewPixels:
-    """The electrodes of all moments as if seen at one: located each on its own, that is many times faster."""
-    pixels = [np.concatenate([moment.pixels[view] for moment in moments]) for view in (0, 1)]
-    covariances = [np.concatenate([moment.covariances[view] for moment in moments]) for view in (0, 1)]
-    labels = tuple(label for moment in moments for label in moment.labels)
-    return TwoViewPixels(labels, (pixels[0], pixels[1]), (covariances[0], covariances[1]))
+def _stacked(moments: Sequence[TwoViewPixels]) -> TwoViewPixels:
+    a, b = (np.stack([moment.pixels[view] for moment in moments]) for view in (0, 1))
+    sa, sb = (np.stack([moment.covariances[view] for moment in moments]) for view in (0, 1))
+    return TwoViewPixels(moments[0].labels, (a, b), (sa, sb))
+
+
+def _flat(pixels: TwoViewPixels) -> TwoViewPixels:
+    (a, b), (sa, sb) = pixels.pixels, pixels.covariances
+    flat = (a.reshape(-1, 2), b.reshape(-1, 2)), (sa.reshape(-1, 2, 2), sb.reshape(-1, 2, 2))
+    return TwoViewPixels(pixels.labels * len(a), *flat)
 
 
 def locate_cycle(
@@ -81,17 +92,15 @@ def locate_cycle(
     gantry_covariance: Array,
 ) -> SiteCycle:
     """The electrodes at every moment, with a covariance that grows where the heart moves fast."""
-    positions, covariances = [], []
-    for phase, pixels, start in zip(moments.phases, moments.moments, moments.positions_mm, strict=True):
-        motion = moments.motion(float(phase), diastolic_phase, moments.labels)
-        sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
-        noise = pixel_noise_px2(pixels.covariances)
-        errors = noise + sum(source.pixels_px2() for source in sources)
-        seen = seen_breathing(cameras, start, params)
-        found = method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
-        positions.append(found.points_mm)
-        covariances.append(np.einsum("iaib->iab", found.covariance_mm2(errors)))
-    return SiteCycle(moments.phases, moments.labels, np.array(positions), np.array(covariances))
+    start, pixels = moments.positions_mm, moments.pixels
+    motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
+    sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
+    noise = pixel_noise_px2(pixels.covariances)
+    errors = noise + sum(source.pixels_px2() for source in sources)
+    seen = seen_breathing(cameras, start, params)
+    found = method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
+    covariances = np.einsum("piaib->piab", found.covariance_mm2(errors))
+    return SiteCycle(moments.phases, moments.labels, found.points_mm, covariances)
 
 
 def _fit(phases: Array, positions_mm: Array) -> Array:
@@ -106,10 +115,11 @@ def _fit(phases: Array, positions_mm: Array) -> Array:
 
 
 def _waves(phases: ArrayLike, derivative: bool = False) -> Array:
-    """1, cos and sin of the harmonics at phases (p,), or their derivatives by phase, shape (p, k)."""
-    angle = 2 * np.pi * np.asarray(phases, dtype=np.float64)[:, None] * np.arange(1, _HARMONICS + 1)
+    """1, cos and sin of the harmonics at phases (...), or their derivatives by phase, shape (..., k)."""
+    angle = 2 * np.pi * np.asarray(phases, dtype=np.float64)[..., None] * np.arange(1, _HARMONICS + 1)
     rate = 2 * np.pi * np.arange(1, _HARMONICS + 1)
     pairs = (-rate * np.sin(angle), rate * np.cos(angle)) if derivative else (np.cos(angle), np.sin(angle))
-    first = np.full((len(angle), 1), 0.0 if derivative else 1.0)
-    waves: Array = np.concatenate([first, np.stack(pairs, axis=2).reshape(len(angle), -1)], axis=1)
+    first = np.full((*angle.shape[:-1], 1), 0.0 if derivative else 1.0)
+    harmonics = np.stack(pairs, axis=-1).reshape(*angle.shape[:-1], -1)
+    waves: Array = np.concatenate([first, harmonics], axis=-1)
     return waves

@@ -19,16 +19,17 @@ _SETTLED_MM = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Points (N, 3) in the world, mm, and ``gain`` (3 N, 4 N): their change with each pixel coordinate, to first order."""
+    """Points (..., N, 3) in the world, mm, and ``gain`` (..., 3 N, 4 N): their change with each pixel coordinate, to first
+    order; leading axes where several moments were asked about together."""
 
     points_mm: Array
     gain: Array
 
     def covariance_mm2(self, pixels_px2: Array) -> Array:
-        """Covariance (N, 3, N, 3) between all coordinates of all points, from the pixels' (4 N, 4 N)."""
-        n = len(self.points_mm)
-        covariance = self.gain @ pixels_px2 @ self.gain.T
-        symmetric: Array = ((covariance + covariance.T) / 2).reshape(n, 3, n, 3)
+        """Covariance (..., N, 3, N, 3) between all coordinates of all points, from the pixels' (..., 4 N, 4 N)."""
+        covariance = self.gain @ pixels_px2 @ _transposed(self.gain)
+        shape = self.points_mm.shape
+        symmetric: Array = ((covariance + _transposed(covariance)) / 2).reshape(*shape, *shape[-2:])
         return symmetric
 
 
@@ -43,7 +44,7 @@ class Method(Protocol):
         """Points (N, 3), each electrode on its own."""
 
     def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
-        """Points given the covariance (4 N, 4 N) that weights the pixels."""
+        """Points given the covariance (..., 4 N, 4 N) that weights the pixels."""
 
 
 class EachAlone:
@@ -74,8 +75,9 @@ class AllTogether:
         points = start_mm
         for _ in range(_STEPS):
             design = _design(cameras, points)
-            gain: Array = np.asarray(np.linalg.solve(design.T @ weight @ design, design.T @ weight), dtype=np.float64)
-            step = (gain @ pixels.residuals_px(cameras, points)).reshape(-1, 3)
+            weighted = _transposed(design) @ weight
+            gain: Array = np.asarray(np.linalg.solve(weighted @ design, weighted), dtype=np.float64)
+            step = (gain @ pixels.residuals_px(cameras, points)[..., None]).reshape(points.shape)
             points = points + step
             if np.abs(step).max() < _SETTLED_MM:
                 break
@@ -83,22 +85,28 @@ class AllTogether:
 
 
 def alone_gain(cameras: Cameras, points_mm: Array) -> Array:
-    """Gain (3 N, 4 N) of unweighted least squares, each electrode on its own."""
-    n = len(points_mm)
-    inverse = np.linalg.pinv(jacobians(cameras, points_mm).reshape(n, 4, 3))
-    gain = np.zeros((n, 3, n, 4))
-    rows = np.arange(n)
-    gain[rows, :, rows] = inverse
-    return gain.reshape(3 * n, 4 * n)
+    """Gain (..., 3 N, 4 N) of unweighted least squares, each electrode on its own."""
+    *moments, n, _ = points_mm.shape
+    inverse = np.linalg.pinv(jacobians(cameras, points_mm).reshape(*moments, n, 4, 3))
+    gain = np.zeros((*moments, n, 3, n, 4))
+    for row in range(n):
+        gain[..., row, :, row, :] = inverse[..., row, :, :]
+    return gain.reshape(*moments, 3 * n, 4 * n)
 
 
 def _design(cameras: Cameras, points_mm: Array) -> Array:
-    """d pixels/d points, (4 N, 3 N)."""
-    n = len(points_mm)
-    design = np.zeros((n, 4, n, 3))
-    rows = np.arange(n)
-    design[rows, :, rows] = jacobians(cameras, points_mm).reshape(n, 4, 3)
-    return design.reshape(4 * n, 3 * n)
+    """d pixels/d points, (..., 4 N, 3 N)."""
+    *moments, n, _ = points_mm.shape
+    own = jacobians(cameras, points_mm).reshape(*moments, n, 4, 3)
+    design = np.zeros((*moments, n, 4, n, 3))
+    for row in range(n):
+        design[..., row, :, row, :] = own[..., row, :, :]
+    return design.reshape(*moments, 4 * n, 3 * n)
+
+
+def _transposed(matrices: Array) -> Array:
+    swapped: Array = np.swapaxes(matrices, -1, -2)
+    return swapped
 
 
 def triangulate_maximum_likelihood(

@@ -15,9 +15,9 @@ Cameras = tuple[Camera, Camera]
 
 @dataclass(frozen=True, eq=False)
 class TwoViewPixels:
-    """The N electrodes that both views show at one moment.
+    """The N electrodes that both views show at one moment, or at each of several moments: then with a leading axis.
 
-    labels : (catheter, electrode). pixels : (N, 2) in view a, view b. covariances : (N, 2, 2) in view a, view b.
+    labels : (catheter, electrode). pixels : (..., N, 2) in view a, view b. covariances : (..., N, 2, 2) in view a, view b.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -35,9 +35,9 @@ class TwoViewPixels:
         return TwoViewPixels(tuple(labels), (pa[rows], pb[rows]), (ca[rows], cb[rows]))
 
     def residuals_px(self, cameras: Cameras, points_world_mm: Array) -> Array:
-        """Pixels less the projected points (N, 3), shape (4 N,): electrode by electrode u, v in view a, then in view b."""
+        """Pixels less the projected points (..., N, 3), shape (..., 4 N): electrode by electrode u, v in view a, then in b."""
         apart = [seen - camera.project(points_world_mm) for camera, seen in zip(cameras, self.pixels, strict=True)]
-        residuals: Array = np.stack(apart, axis=1).reshape(-1)
+        residuals: Array = np.stack(apart, axis=-2).reshape(*apart[0].shape[:-2], -1)
         return residuals
 
 

@@ -102,7 +102,9 @@ class Locator:
         if not _plausible(start):
             return None
         phase = pair.a.phase if pair.a.phase is not None else pair.b.phase
-        motion = cycle.motion(phase, phase, pixels.labels) if cycle is not None and phase is not None else None
+        motion = (
+            cycle.motion(np.array(phase), phase, pixels.labels) if cycle is not None and phase is not None else None
+        )
         sources = error_sources(
             cameras, start, pixels.labels, self.catalogue, self.params, self.gantry.covariance, motion
         )  # fmt: skip

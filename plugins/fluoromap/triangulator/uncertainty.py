@@ -1,4 +1,8 @@
-"""What can be wrong about electrodes seen in two views: every source of error, and what it does to the pixels."""
+"""What can be wrong about electrodes seen in two views: every source of error, and what it does to the pixels.
+
+Moments with the same electrodes are asked about together: where points are (N, 3), they may be (..., N, 3) for many moments,
+and every answer then has the same leading axes.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +82,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
 class Motion:
     """How the electrodes move at one moment of the cycle.
 
-    displaced_mm : (N, 3) from where they are at diastole. velocity_mm : (N, 3), mm a cycle.
+    displaced_mm : (..., N, 3) from where they are at diastole. velocity_mm : (..., N, 3), mm a cycle.
     """
 
     displaced_mm: Array
@@ -89,7 +93,7 @@ class Motion:
 class ErrorSource:
     """One cause of error with k unknown parameters.
 
-    effect_px : (4 N, k) what one unit of each parameter does to the pixels, electrode by electrode: u, v in view a, then
+    effect_px : (..., 4 N, k) what one unit of each parameter does to the pixels, electrode by electrode: u, v in view a, then
     in view b. covariance : (k, k) of the parameters. shares : (k,) where each counts in the error budget.
     """
 
@@ -98,42 +102,41 @@ class ErrorSource:
     shares: tuple[Share, ...]
 
     def pixels_px2(self) -> Array:
-        """Covariance (4 N, 4 N) of the pixels from this source."""
-        covariance: Array = self.effect_px @ self.covariance @ self.effect_px.T
+        """Covariance (..., 4 N, 4 N) of the pixels from this source."""
+        covariance: Array = self.effect_px @ self.covariance @ np.swapaxes(self.effect_px, -1, -2)
         return covariance
 
 
 def jacobians(cameras: Cameras, points_world_mm: Array) -> Array:
-    """d(u, v)/d(X, Y, Z) in view a and b at points (N, 3), shape (N, 2, 2, 3)."""
-    return np.stack([camera.jacobian(points_world_mm) for camera in cameras], axis=1)
+    """d(u, v)/d(X, Y, Z) in view a and b at points (..., N, 3), shape (..., N, 2, 2, 3)."""
+    return np.stack([camera.jacobian(points_world_mm) for camera in cameras], axis=-3)
 
 
 def effect_px(jacobian: Array, displacement_a: Array, displacement_b: Array) -> Array:
-    """What parameters do to the pixels, (4 N, k), that displace the electrodes as seen by each view.
+    """What parameters do to the pixels, (..., 4 N, k), that displace the electrodes as seen by each view.
 
     Parameters
     ----------
-    jacobian : ndarray, shape (N, 2, 2, 3)
+    jacobian : ndarray, shape (..., N, 2, 2, 3)
         See :func:`jacobians`.
-    displacement_a, displacement_b : ndarray, shape (N, 3, k) or (3, k)
+    displacement_a, displacement_b : ndarray, shape (..., N, 3, k) or (3, k)
         mm in the world for one unit of each parameter.
     """
-    n = len(jacobian)
-    parts = [jacobian[:, view] @ d for view, d in enumerate((displacement_a, displacement_b))]
-    effect: Array = np.stack(parts, axis=1).reshape(4 * n, -1)
+    *moments, n = jacobian.shape[:-3]
+    parts = [jacobian[..., view, :, :] @ d for view, d in enumerate((displacement_a, displacement_b))]
+    effect: Array = np.stack(parts, axis=-3).reshape(*moments, 4 * n, -1)
     return effect
 
 
 def gantry_effect_px(jacobian: Array, points_world_mm: Array) -> Array:
     """Effect (4 N, 12) of the gantry's errors: rotation vector about the isocentre (radians) and offset (mm) of view a,
     then of view b. They displace the electrodes as that view sees them: ``X' = R X + t``."""
-    n = len(points_world_mm)
-    x, y, z = points_world_mm.T
-    zero = np.zeros(n)
-    turned = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
-    own = np.concatenate([turned, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
-    none = np.zeros((n, 3, 6))
-    return effect_px(jacobian, np.concatenate([own, none], axis=2), np.concatenate([none, own], axis=2))
+    x, y, z = np.moveaxis(points_world_mm, -1, 0)
+    zero = np.zeros_like(x)
+    turned = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), (0, 1), (-2, -1))
+    own = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=-1)
+    none = np.zeros_like(own)
+    return effect_px(jacobian, np.concatenate([own, none], axis=-1), np.concatenate([none, own], axis=-1))
 
 
 def breathing_effect_px(jacobian: Array) -> Array:
@@ -175,7 +178,7 @@ def error_sources(
 
     Parameters
     ----------
-    points_world_mm : ndarray, shape (N, 3)
+    points_world_mm : ndarray, shape (..., N, 3)
     labels : sequence of (catheter, electrode)
         Of each point.
     gantry_covariance : ndarray, shape (12, 12)
@@ -183,7 +186,7 @@ def error_sources(
     motion : Motion or None
         None: the moment is one of rest.
     """
-    n = len(points_world_mm)
+    n = len(labels)
     jacobian = jacobians(cameras, points_world_mm)
     gantry: tuple[Share, ...] = (*("angles",) * 3, *("source_distances",) * 3) * 2
     head_feet = np.array([[0.0], [0.0], [1.0]])
@@ -201,33 +204,34 @@ def error_sources(
     each = np.eye(3 * n).reshape(n, 3, 3 * n)
     sources.append(_both_views(jacobian, each, each, params.bend_sd_mm, "phase_mismatch"))
     if motion is not None:
-        displaced, velocity = motion.displaced_mm.reshape(n, 3, 1), motion.velocity_mm.reshape(n, 3, 1)
+        displaced, velocity = motion.displaced_mm[..., None], motion.velocity_mm[..., None]
         sources.append(_both_views(jacobian, displaced, displaced, params.beat_amplitude_sd, "phase_mismatch"))
         # The phase is view a's; view b's frame is only the nearest to it.
         timing = np.diag(np.square([params.beat_timing_sd, np.hypot(params.beat_timing_sd, params.phase_pairing_sd)]))
         none = np.zeros_like(velocity)
         late = effect_px(
-            jacobian, np.concatenate([velocity, none], axis=2), np.concatenate([none, velocity], axis=2)
+            jacobian, np.concatenate([velocity, none], axis=-1), np.concatenate([none, velocity], axis=-1)
         )  # fmt: skip
         sources.append(ErrorSource(late, timing, ("phase_mismatch",) * 2))
     return tuple(sources)
 
 
 def _follows_tip(points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> Array:
-    """Displacement of each electrode when its catheter's tip is displaced, (N, 3, 3).
+    """Displacement of each electrode when its catheter's tip is displaced, (..., N, 3, 3).
 
     The shaft is not stretched: along it all electrodes go with the tip. It is held in its vessel and bends: across, they
     follow the less the farther back they are.
     """
-    follows = np.empty((len(labels), 3, 3))
-    for i, (catheter, electrode) in enumerate(labels):
+    follows = np.empty((*points_mm.shape, 3))
+    for catheter in {name for name, _ in labels}:
         own = [k for k, (name, _) in enumerate(labels) if name == catheter]
-        along = catalogue[catheter].arc_lengths_mm
-        share = 0.5 + 0.5 * np.exp(-along[min(electrode, len(along)) - 1] / BENDS_OVER_MM)
-        chord = points_mm[own[-1]] - points_mm[own[0]]
-        length = max(float(np.linalg.norm(chord)), 1e-9)
-        axis = chord / length
-        follows[i] = share * np.eye(3) + (1 - share) * np.outer(axis, axis)
+        arc = catalogue[catheter].arc_lengths_mm
+        behind = np.array([arc[min(labels[k][1], len(arc)) - 1] for k in own])
+        share = (0.5 + 0.5 * np.exp(-behind / BENDS_OVER_MM))[:, None, None]
+        chord = points_mm[..., own[-1], :] - points_mm[..., own[0], :]
+        axis = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-9)
+        along = (axis[..., :, None] * axis[..., None, :])[..., None, :, :]
+        follows[..., own, :, :] = share * np.eye(3) + (1 - share) * along
     return follows
 
 
@@ -235,27 +239,26 @@ def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Sha
     """The same parameters drawn anew in each view."""
     k = in_a.shape[-1]
     effect = np.concatenate(
-        [effect_px(jacobian, in_a, np.zeros_like(in_b)), effect_px(jacobian, np.zeros_like(in_a), in_b)], axis=1
+        [effect_px(jacobian, in_a, np.zeros_like(in_b)), effect_px(jacobian, np.zeros_like(in_a), in_b)], axis=-1
     )
     return ErrorSource(effect, sd**2 * np.eye(2 * k), (share,) * (2 * k))
 
 
 def _across(camera: Camera, points_world_mm: Array) -> Array:
-    """Points less their part along the central ray, (N, 3, 1): what a wrong magnification stretches."""
+    """Points less their part along the central ray, (..., N, 3, 1): what a wrong magnification stretches."""
     along = camera.axis_world
-    across: Array = (points_world_mm - np.outer(points_world_mm @ along, along))[..., None]
+    across: Array = (points_world_mm - (points_world_mm @ along)[..., None] * along)[..., None]
     return across
 
 
 def pixel_noise_px2(covariances_px2: tuple[Array, Array]) -> Array:
-    """The pixels' own covariances, (N, 2, 2) in view a and b, as one matrix (4 N, 4 N)."""
-    a, b = covariances_px2
-    n = len(a)
-    noise = np.zeros((n, 2, 2, n, 2, 2))
-    rows = np.arange(n)
-    noise[rows, 0, :, rows, 0, :] = a
-    noise[rows, 1, :, rows, 1, :] = b
-    return noise.reshape(4 * n, 4 * n)
+    """The pixels' own covariances, (..., N, 2, 2) in view a and b, as one matrix (..., 4 N, 4 N)."""
+    *moments, n = covariances_px2[0].shape[:-2]
+    noise = np.zeros((*moments, n, 2, 2, n, 2, 2))
+    for row in range(n):
+        for view, covariance in enumerate(covariances_px2):
+            noise[..., row, view, :, row, view, :] = covariance[..., row, :, :]
+    return noise.reshape(*moments, 4 * n, 4 * n)
 
 
 def relative_covariance_mm2(joint_mm2: Array, index: int, reference: list[int]) -> Array:
