@@ -4,5 +4,5 @@ from fluoromap.matching.study import SiteRuns, match_study
 
 __all__ = ["VERSION", "SiteRuns", "match_study"]
 
-VERSION = "2"
+VERSION = "3"
 """Of the answers: raised whenever the same chains are matched otherwise; results are kept by it."""

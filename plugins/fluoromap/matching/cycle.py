@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.contracts import Array, NamedChain, Observation, PhasePair
+from fluoromap.contracts import Array, BoolArray, NamedChain, Observation, PhasePair
 from fluoromap.geometry import Camera
 from fluoromap.matching.phase import phase_distance
 from fluoromap.matching.run_catheters import RunCatheter
@@ -31,14 +31,14 @@ class FoldedRun:
     """The motion of a run's catheters over one cycle, all beats taken together.
 
     paths : for each catheter electrode number -> pixels (MOMENTS, 2) at phases evenly from 0 on.
-    told : the phases count from R waves.
+    unsure : how far from the R wave phase 0 may lie at most, in cycles; 0.5 where nothing tells.
     """
 
     paths: tuple[dict[int, Array], ...]
-    told: bool
+    unsure: float
 
 
-def fold(catheters: Sequence[RunCatheter], phases: Array, told: bool) -> FoldedRun:
+def fold(catheters: Sequence[RunCatheter], phases: Array, unsure: float) -> FoldedRun:
     """Take all beats of a run together; phases (n,) of its frames."""
     paths: list[dict[int, Array]] = []
     for catheter in catheters:
@@ -53,7 +53,7 @@ def fold(catheters: Sequence[RunCatheter], phases: Array, told: bool) -> FoldedR
         weights /= weights.sum(axis=1, keepdims=True)
         smooth = np.einsum("kn,nei->kei", weights, pixels)
         paths.append({number: smooth[:, row] for row, number in enumerate(electrodes)})
-    return FoldedRun(tuple(paths), told)
+    return FoldedRun(tuple(paths), unsure)
 
 
 def _variations(
@@ -89,14 +89,13 @@ def motion_misfit(cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, Folde
     Returns
     -------
     ndarray, shape (n, m, k)
-        For k shifts of view b's phases: one where R waves tell both phases, all round the cycle else; none without phases.
+        For k shifts of view b's phases: as far as they may be apart, 0 always among them; none without phases.
     """
     if folded is None:
         return np.zeros((n, m, 0))
     pairs = [(i, j) for i in range(n) for j in range(m)]
     variation, unlike = _variations(cameras, folded, pairs)
-    if folded[0].told and folded[1].told:
-        variation = variation[:, :1]
+    variation = variation[:, _within(folded)]
     usual = _MOTION_SD_PX**2 + _MOTION_SD_SHARE**2 * unlike[:, None]
     cost = _INDEPENDENT_MOMENTS / 2 * np.log1p(np.nan_to_num(variation / usual, nan=1.0))
     misfit: Array = cost.reshape(n, m, -1)
@@ -108,19 +107,27 @@ def phase_shift(
 ) -> float:
     """What to add to view b's phases so that both views count from the same moment of the cycle, -0.5 to 0.5.
 
-    The shift that leaves the paired catheters' epipolar distances the least variation; 0 where R waves tell the phases of
-    both runs or hardly anything moves across the epipolar lines.
+    The shift that leaves the paired catheters' epipolar distances the least variation, no farther than R waves allow; 0
+    where hardly anything moves across the epipolar lines.
     """
-    if folded[0].told and folded[1].told:
-        return 0.0
+    allowed = _within(folded)
     variation = np.nansum(_variations(cameras, folded, pairs)[0], axis=0) / max(len(pairs), 1)
-    best = int(np.argmin(variation))
+    best = int(np.flatnonzero(allowed)[np.argmin(variation[allowed])])
     if np.sqrt(variation.max()) - np.sqrt(variation[best]) < _LEAST_MOTION_PX:
         return 0.0
     left, middle, right = variation[(best + np.array([-1, 0, 1])) % MOMENTS]
     bend = left - 2 * middle + right
-    between = 0.5 * (left - right) / bend if bend > 0 else 0.0
-    return float(((best + between) / MOMENTS + 0.5) % 1.0 - 0.5)
+    between = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend > 0 else 0.0
+    shift = float(((best + between) / MOMENTS + 0.5) % 1.0 - 0.5)
+    farthest = folded[0].unsure + folded[1].unsure
+    return float(np.clip(shift, -farthest, farthest))
+
+
+def _within(folded: tuple[FoldedRun, FoldedRun]) -> BoolArray:
+    """Which of MOMENTS shifts (MOMENTS,) of view b's phases the two runs allow."""
+    farthest = folded[0].unsure + folded[1].unsure
+    within: BoolArray = phase_distance(np.arange(MOMENTS) / MOMENTS, np.array(0.0)) <= farthest
+    return within
 
 
 def pair_by_phase(track_a: Sequence[Observation], track_b: Sequence[Observation]) -> tuple[PhasePair, ...]:

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from fluoromap.contracts import Array, Segmentation
 from fluoromap.matching.beats import SMOOTH_MS, is_irregular, systole_starts_ms
 from fluoromap.matching.run_catheters import RunCatheter
+from fluoromap.matching.steady_beats import steady_beats_ms
 
 SHORTEST_CYCLE_MS = 300.0
 LONGEST_CYCLE_MS = 1600.0
@@ -27,30 +28,35 @@ class Rhythm:
     """The cardiac cycle in one run.
 
     phases : (n,) of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next. irregular : the beats
-    differ in length.
+    differ in length. unsure : how far from there phase 0 may lie at most, in cycles: R waves are told to the frame, and
+    without them it may be anywhere.
     """
 
     phases: Array
     irregular: bool
+    unsure: float = 0.5
 
 
 def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter]) -> Rhythm | None:
     """Phase of each frame; None where unknown.
 
     With R waves told the time between two of them is one cycle; before the first and after the last the neighbouring
-    cycle's length goes on. Without, the length of the cycle is the time after which the catheters are back where they
-    were, and systole begins where the longest quiet stretch of the cycle ends. Where the catheters show beats that differ
-    in length, each beat counts from its own start of systole.
+    cycle's length goes on. Frames tell them to half a frame; a steady rhythm is known more finely. Without, the length of
+    the cycle is the time after which the catheters are back where they were, and systole begins where the longest quiet
+    stretch of the cycle ends. Where the catheters show beats that differ in length, each beat counts from its own start of
+    systole.
     """
     times = segmentation.frame_times_ms
     beats = times[np.array(sorted(set(segmentation.r_wave_frames)), dtype=np.intp)]
-    if len(beats) >= 2:
-        return Rhythm(_phases_from_beats(times, beats), is_irregular(beats))
-    if len(times) < 8 or np.any(np.diff(times) <= 0):
+    if len(beats) < 2 and (len(times) < 8 or np.any(np.diff(times) <= 0)):
         return None
     step_ms = float(np.median(np.diff(times)))
     grid = np.arange(times[0], times[-1] + step_ms / 2, step_ms)
     places = _places(segmentation, catheters, grid)
+    if len(beats) >= 2:
+        finer = steady_beats_ms(beats, step_ms / 2, grid, places)
+        unsure = step_ms / 2 / float(np.diff(finer).mean())
+        return Rhythm(_phases_from_beats(times, finer), is_irregular(finer), min(unsure, 0.5))
     marks = np.zeros(0) if places is None else times[0] + systole_starts_ms(places, step_ms)
     if is_irregular(marks):
         return Rhythm(_phases_from_beats(times, marks), True)
@@ -64,7 +70,7 @@ def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter])
     if cycle_ms is None:
         return None
     if len(beats) == 1:
-        return Rhythm(np.asarray(((times - beats[0]) / cycle_ms) % 1.0), False)
+        return Rhythm(np.asarray(((times - beats[0]) / cycle_ms) % 1.0), False, min(step_ms / 2 / cycle_ms, 0.5))
     if places is not None:
         smooth = gaussian_filter1d(places, max(SMOOTH_MS / step_ms, 0.5), axis=0)
         speed = np.linalg.norm(np.gradient(smooth, axis=0), axis=1)

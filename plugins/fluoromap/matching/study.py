@@ -61,6 +61,7 @@ class _ViewOfSite:
     segmentation: Segmentation
     phases: Array | None
     irregular: bool
+    unsure: float
     catheters: tuple[RunCatheter, ...]
 
 
@@ -159,8 +160,8 @@ def _compare(
     folded = None
     if a.phases is not None and b.phases is not None:
         folded = (
-            fold(a.catheters, a.phases, len(a.segmentation.r_wave_frames) > 0),
-            fold(b.catheters, b.phases, len(b.segmentation.r_wave_frames) > 0),
+            fold(a.catheters, a.phases, a.unsure),
+            fold(b.catheters, b.phases, b.unsure),
         )
 
     # A mirror hardly changes how catheters move across the epipolar lines.
@@ -187,10 +188,10 @@ def _view(segmentation: Segmentation, camera: Camera) -> _ViewOfSite:
     catheters = gather(segmentation, None, camera.px_per_mm)
     beats = cardiac_phases(segmentation, catheters)
     if beats is None:
-        return _ViewOfSite(segmentation, None, False, catheters)
+        return _ViewOfSite(segmentation, None, False, 0.5, catheters)
     # Knowing the phase, a catheter that is missing at diastole can be taken from the same moment of another beat.
     catheters = gather(segmentation, beats.phases, camera.px_per_mm)
-    return _ViewOfSite(segmentation, beats.phases, beats.irregular, catheters)
+    return _ViewOfSite(segmentation, beats.phases, beats.irregular, beats.unsure, catheters)
 
 
 def _name_all(

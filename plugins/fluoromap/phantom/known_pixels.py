@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fluoromap.contracts import (
+    Array,
+    Chain,
     FrameChains,
     MatchedSite,
     NamedChain,
@@ -12,34 +16,38 @@ from fluoromap.contracts import (
     PhasePair,
     Segmentation,
 )
-from fluoromap.geometry import camera_from_gantry
-from fluoromap.matching.cycle import pair_by_phase
+from fluoromap.geometry import Camera, camera_from_gantry
+from fluoromap.matching.cycle import fold, pair_by_phase, phase_shift
 from fluoromap.matching.phase import cardiac_phases
+from fluoromap.matching.run_catheters import gather
 from fluoromap.phantom.motion import DIASTOLIC_PHASE
 from fluoromap.phantom.study import SimulatedRun, SimulatedStudy
 
 
 def matched_sites(
-    study: SimulatedStudy, noise_px: float = 0.5, seed: int = 0, exact_phases: bool = False
+    study: SimulatedStudy, noise_px: float = 0.5, seed: int = 0, exact_phases: bool = False, r_waves: bool = True
 ) -> tuple[MatchedSite, ...]:
     """All sites as matching would hand them on, had the segmenter found every electrode with ``noise_px`` an axis.
 
-    Phases count from R waves told to the nearest frame, as files do, or with ``exact_phases`` from their true times, as an
-    electrocardiogram does. The diastolic pair is, in each view, the frame nearest to the phase of rest. Cameras are those
-    the files tell.
+    Phases are what matching makes of R waves told to the nearest frame, as files do, or without ``r_waves`` of the motion
+    alone; with ``exact_phases`` they are the true ones, as an electrocardiogram tells them. The diastolic pair is, in each
+    view, the frame nearest to the phase of rest. Cameras are those the files tell.
     """
     sites = []
     for number, site in enumerate(study.sites):
-        tracks = tuple(
-            observations(run, noise_px, np.random.default_rng([study.spec.seed, seed, number, view]), exact_phases)
+        cameras = camera_from_gantry(site.runs[0].gantry), camera_from_gantry(site.runs[1].gantry)
+        seen = [
+            _seen(run, noise_px, np.random.default_rng([study.spec.seed, seed, number, view]))
             for view, run in enumerate(site.runs)
-        )
+        ]
+        phases = [run.truth.phases for run in site.runs] if exact_phases else _phases(site.runs, seen, cameras, r_waves)
+        tracks = tuple(_observations(own, of_run, noise_px) for own, of_run in zip(seen, phases, strict=True))
         a, b = (min(track, key=_from_rest) for track in tracks)
         sites.append(
             MatchedSite(
                 site=site.name,
-                camera_a=camera_from_gantry(site.runs[0].gantry),
-                camera_b=camera_from_gantry(site.runs[1].gantry),
+                camera_a=cameras[0],
+                camera_b=cameras[1],
                 diastole=PhasePair(a.phase, a, b),
                 cycle=pair_by_phase(*tracks),
                 track_a=tracks[0],
@@ -51,16 +59,44 @@ def matched_sites(
     return tuple(sites)
 
 
-def observations(
-    run: SimulatedRun, noise_px: float, rng: np.random.Generator, exact_phases: bool = False
-) -> tuple[Observation, ...]:
-    """Every frame of a run with all its electrodes, displaced by Gaussian noise an axis."""
+def _seen(run: SimulatedRun, noise_px: float, rng: np.random.Generator) -> dict[str, Array]:
+    """Every electrode in every frame, displaced by Gaussian noise an axis: catheter -> (n, electrodes, 2)."""
+    return {name: uv + rng.normal(0, noise_px, uv.shape) for name, uv in run.truth.pixels_uv.items()}
+
+
+def _phases(
+    runs: Sequence[SimulatedRun], seen: Sequence[dict[str, Array]], cameras: tuple[Camera, Camera], r_waves: bool
+) -> list[Array] | list[None]:
+    """What the R waves and the motion of both runs tell of their phases; None where one's is unknown."""
+    phases, folded = [], []
+    for run, own, camera in zip(runs, seen, cameras, strict=True):
+        segmentation = _segmented(run, own, r_waves)
+        catheters = gather(segmentation, None, camera.px_per_mm)
+        rhythm = cardiac_phases(segmentation, catheters)
+        if rhythm is None:
+            return [None, None]
+        phases.append(rhythm.phases)
+        folded.append(fold(catheters, rhythm.phases, rhythm.unsure))
+    alike = [(k, k) for k in range(len(folded[0].paths))]
+    return [phases[0], (phases[1] + phase_shift(cameras, (folded[0], folded[1]), alike)) % 1.0]
+
+
+def _segmented(run: SimulatedRun, seen: dict[str, Array], r_waves: bool) -> Segmentation:
     n = len(run.frame_times_ms)
-    seen = {name: uv + rng.normal(0, noise_px, uv.shape) for name, uv in run.truth.pixels_uv.items()}
-    blank = tuple(FrameChains(frame, ()) for frame in range(n))
-    still = Segmentation(blank, None, (), np.zeros(n), run.frame_times_ms, run.r_wave_frames)
-    rhythm = None if exact_phases else cardiac_phases(still, ())
-    phases = rhythm.phases if rhythm is not None else run.truth.phases if exact_phases else None
+
+    def chain(name: str, track: int, pixels: Array) -> Chain:
+        m = len(pixels)
+        covariance = np.tile(np.eye(2), (m, 1, 1))
+        return Chain(tuple(range(1, m + 1)), pixels, covariance, np.ones(m), ((name, 1.0),), track)
+
+    frames = tuple(
+        FrameChains(frame, tuple(chain(name, k, uv[frame]) for k, (name, uv) in enumerate(seen.items())))
+        for frame in range(n)
+    )
+    return Segmentation(frames, None, (), np.zeros(n), run.frame_times_ms, run.r_wave_frames if r_waves else ())
+
+
+def _observations(seen: dict[str, Array], phases: Array | None, noise_px: float) -> tuple[Observation, ...]:
     covariance = max(noise_px, 1e-3) ** 2 * np.eye(2)
     return tuple(
         Observation(
@@ -71,7 +107,7 @@ def observations(
                 for name, uv in seen.items()
             ),
         )
-        for frame in range(n)
+        for frame in range(len(next(iter(seen.values()))))
     )
 
 

@@ -23,7 +23,7 @@ class MaximumLikelihood:
     """
 
     name: ClassVar[str] = "maximum-likelihood"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "3"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:

@@ -34,6 +34,8 @@ OFFSET_SD_MM = 2.0
 """How far view b's rotation and offset may be from view a's and the header's, an axis, before the electrodes are asked."""
 GANTRY_PRIOR = np.diag(np.tile(np.repeat(np.square([np.radians(ROTATION_SD_DEG), OFFSET_SD_MM]), 3), 2)) / 2
 """Covariance (12, 12) of both views' errors, half of view b's against view a's each."""
+WORSE_SHARE = 0.03
+"""Share of gantries that are as wrong as that; the others are as the parameters say."""
 OPENS_ABOVE = 1.3
 """Epipolar RMS over pixel noise below which the header is believed."""
 OPENS_AT_ODDS = 3.0
@@ -107,6 +109,15 @@ class _Scale:
 _SCALES = tuple(_Scale(breathing, beats) for breathing in (1.0, 0.3, 0.1) for beats in (1.0, 0.3, 0.1))
 
 
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """One kind of gantry: how probable it is, (12, 12) how wrong such are, and what this heart does were it one."""
+
+    weight: float
+    prior: Array
+    scale: _Scale
+
+
 def calibrate(
     sites: Sequence[tuple[Cameras, TwoViewPixels]],
     catalogue: Catalogue,
@@ -134,26 +145,26 @@ def calibrate(
     header = GantryBelief(np.eye(4), params.gantry_covariance())
     if len(sites) < FEWEST_SITES:
         return None, header
-    prior = GANTRY_PRIOR
     rows = _all_rows(sites, np.eye(4), catalogue, trusted, params)
     # How much this heart breathes and varies is judged under either hypothesis before the two are compared.
     right = max(_evidence(rows, None, scale) for scale in _SCALES)
-    wrong, scale = max(((_evidence(rows, prior, scale), scale) for scale in _SCALES), key=lambda one: one[0])
-    covariance, mean = _posterior(rows, prior, np.zeros(12), scale)
-    before = _epipolar_rms_px(rows, mean, params, scale)
+    wrong, scale = max(((_evidence(rows, GANTRY_PRIOR, scale), scale) for scale in _SCALES), key=lambda one: one[0])
+    before = _epipolar_rms_px(rows, _posterior(rows, GANTRY_PRIOR, np.zeros(12), scale)[1], params, scale)
     noise = float(np.sqrt(np.mean(np.concatenate([one.pixel_variance for one in rows]))))
     if before <= OPENS_ABOVE * noise or wrong - right <= OPENS_AT_ODDS:
         return Calibration(False, np.zeros(3), np.zeros(3), before, before), header
+    kinds = _kinds(rows, header.covariance)
+    covariance, mean = _over_kinds(rows, kinds, np.zeros(12))
     found = np.zeros(6)
     for _ in range(_STEPS):
         found = mean[6:] - mean[:6]
         rows = _all_rows(sites, _turn(found), catalogue, trusted, params)
-        covariance, mean = _posterior(rows, prior, np.concatenate([np.zeros(6), found]), scale)
+        covariance, mean = _over_kinds(rows, kinds, np.concatenate([np.zeros(6), found]))
     # View b takes the whole difference: view a's own error, and the same one of view b, are those of the world they share.
     left = np.concatenate([mean[:6], mean[6:] - found])
     belief = GantryBelief(_turn(found), covariance + np.outer(left, left))
     after = _epipolar_rms_px(rows, left, params, scale)
-    if float((found**2 / (2 * np.diagonal(prior)[6:])).sum()) > FARTHEST_CHI2 or _misfit(rows) > STILL_MISFIT:
+    if float((found**2 / (2 * np.diagonal(GANTRY_PRIOR)[6:])).sum()) > FARTHEST_CHI2 or _misfit(rows) > STILL_MISFIT:
         # Something else is wrong: a mirrored image, runs of another study. The sites tell that their geometry is doubtful.
         return Calibration(False, np.zeros(3), np.zeros(3), before, before), header
     return Calibration(True, np.degrees(found[:3]), found[3:], before, after), belief
@@ -232,7 +243,6 @@ def _evidence(rows: Sequence[_Rows], prior: Array | None, scale: _Scale) -> floa
     if prior is not None:
         information, weighted = _normal(rows, np.zeros(12), scale)
         volume = np.linalg.slogdet(np.eye(12) + prior @ information)[1]
-        # prior (1 + information prior)^-1 needs no inverse of a prior that may be 0.
         mean = prior @ np.linalg.solve(np.eye(12) + information @ prior, weighted)
         evidence += 0.5 * float(weighted @ mean) - 0.5 * float(volume)
     return evidence
@@ -241,8 +251,38 @@ def _evidence(rows: Sequence[_Rows], prior: Array | None, scale: _Scale) -> floa
 def _posterior(rows: Sequence[_Rows], prior: Array, linearised_at: Array, scale: _Scale) -> tuple[Array, Array]:
     """Covariance (12, 12) and mean (12,) of the gantry's errors against the header, from rows made at ``linearised_at``."""
     information, weighted = _normal(rows, linearised_at, scale)
-    covariance = np.asarray(np.linalg.inv(information + np.linalg.inv(prior)), dtype=np.float64)
+    # prior (1 + information prior)^-1 needs no inverse of a prior that may be 0.
+    covariance: Array = np.asarray(prior @ np.linalg.inv(np.eye(12) + information @ prior), dtype=np.float64)
     return covariance, covariance @ weighted
+
+
+def _kinds(rows: Sequence[_Rows], assumed: Array) -> tuple[_Kind, ...]:
+    """Gantries as the parameters assume them, (12, 12), and worse ones, as probable as the study makes them.
+
+    What both views have wrong alike no electrode shows: there each kind's own prior remains.
+    """
+    shares = ((1 - WORSE_SHARE, assumed), (WORSE_SHARE, GANTRY_PRIOR))
+    found = [
+        max(
+            ((_evidence(rows, prior, scale) + np.log(share), prior, scale) for scale in _SCALES), key=lambda one: one[0]
+        )
+        for share, prior in shares
+    ]
+    most = max(odds for odds, *_ in found)
+    weights = np.exp([odds - most for odds, *_ in found])
+    weights /= weights.sum()
+    return tuple(_Kind(float(w), prior, scale) for w, (_, prior, scale) in zip(weights, found, strict=True))
+
+
+def _over_kinds(rows: Sequence[_Rows], kinds: Sequence[_Kind], linearised_at: Array) -> tuple[Array, Array]:
+    """Covariance and mean as :func:`_posterior`, over all kinds of gantry."""
+    answers = [_posterior(rows, kind.prior, linearised_at, kind.scale) for kind in kinds]
+    mean = np.sum([kind.weight * own for kind, (_, own) in zip(kinds, answers, strict=True)], axis=0)
+    parts = [
+        kind.weight * (covariance + np.outer(own - mean, own - mean))
+        for kind, (covariance, own) in zip(kinds, answers, strict=True)
+    ]
+    return np.sum(parts, axis=0), mean
 
 
 def _misfit(rows: Sequence[_Rows]) -> float:
