@@ -79,14 +79,19 @@ def grade_of(covariance_mm2: ArrayLike) -> Grade:
 
 
 def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: type = np.float64) -> NDArray[Any]:
-    """A read-only copy of ``value`` after checking its shape (None: any length) and that it is finite.
+    """A read-only copy of ``value`` after checking its shape (None: any length) and that it is finite; what is such a copy
+    already is not copied again.
 
     Raises
     ------
     ValueError
         Naming the field, when shape or numbers are wrong.
     """
-    array: NDArray[Any] = np.array(value, dtype=dtype)
+    array: NDArray[Any]
+    if isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable and value.dtype == dtype:
+        array = value
+    else:
+        array = np.array(value, dtype=dtype)
     if array.ndim != len(shape) or any(
         want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
     ):

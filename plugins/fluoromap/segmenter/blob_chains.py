@@ -29,7 +29,7 @@ _LEAST_SNR = 3.5
 _CARRIED_SLACK = 2.5
 _CARRIED_CLEARNESS = 0.6
 _STRAYED_PX = 5.0
-_HIDING_MM = 1.2
+_HIDING_MM, _LEAST_FREE = 1.2, 2
 _FITS = 2.0
 _BENDING = 0.12
 _BESIDE_MM, _EXTRA_CLEARNESS = 2.0, 1.3
@@ -80,7 +80,9 @@ class BlobDetector:
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         placed = [
-            one for one in place_chains(x, points, linked, shafts, kinds, sound) if one.clearness >= _LEAST_CLEARNESS
+            one
+            for one in place_chains(x, points, linked, shafts, kinds, response.pixel_noise, sound)
+            if one.clearness >= _LEAST_CLEARNESS
         ]
         floor = min(family.floor for family in kinds)
         sure = any(one.clearness >= _SURE_CLEARNESS and one.chain.scores[0] >= floor for one in placed)
@@ -107,7 +109,8 @@ class BlobDetector:
     def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
         """A chain seen before, found again by a rigid search on the blob response and refined; None where the image does
         not support it. What refinement measures is weighed against where the search put it; an electrode that it
-        moves by more than 5 px stays there, less sure; one that another catheter hides is put where the others have it."""
+        moves by more than 5 px stays there, less sure; one that another catheter hides is put where the others have it,
+        of which there must be two."""
         family = self._family(chain)
         if family is None:
             return None
@@ -117,8 +120,16 @@ class BlobDetector:
         for other in taken:
             near = np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
             hidden |= near < _HIDING_MM * self.px_per_mm
+        if np.count_nonzero(~hidden) < _LEAST_FREE:
+            return None
         place = refine(
-            x, guess[None], family.catheter, self.px_per_mm, hidden[None], np.zeros((1, len(guess)), np.bool_)
+            x,
+            guess[None],
+            family.catheter,
+            self.px_per_mm,
+            response.pixel_noise,
+            hidden[None],
+            np.zeros((1, len(guess)), np.bool_),
         )
         found = place.points_uv[0]
         strayed = np.linalg.norm(found - guess, axis=1) > _STRAYED_PX
@@ -131,7 +142,7 @@ class BlobDetector:
         if not self._in_field(points).all():
             return None
         snr = response.at(points)
-        if hidden.any() and not hidden.all():
+        if hidden.any():
             snr[hidden] = np.median(snr[~hidden])
         score = chain_score(points, evidence(snr), self._variance(snr), self._shafts(response), family)
         if score < family.floor - _CARRIED_SLACK or place.clearness[0] < _CARRIED_CLEARNESS:
@@ -149,7 +160,7 @@ class BlobDetector:
         kinds = families(self.catalogue)
         shafts = self._shafts(response)
         linked = link(points, evidence(snr), self._variance(snr), shafts, kinds)
-        placed = place_chains(x, points, linked, shafts, kinds)
+        placed = place_chains(x, points, linked, shafts, kinds, response.pixel_noise)
         return any(one.clearness >= _EXTRA_CLEARNESS for one in placed)
 
     def _in_field(self, points_uv: Array) -> BoolArray:

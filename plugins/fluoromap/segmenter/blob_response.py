@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.homomorphic import gaussian, reduce_by
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
 
 _SCALES_MM = 0.52, 0.73, 1.04
 _SHAFT_SCALE_MM = 0.52
@@ -18,8 +19,6 @@ _LEAST_RING_PX = 5.0
 _CLEAR_SNR = 4.0
 _APART_MM = 0.57
 _MOST = 60
-_FOUND = 4000
-_GAUSSIAN_SD = 1.4826
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,12 +53,17 @@ class BlobResponse:
             before = sigma
             if level == 0:
                 smooth = blurred
-            _half_laplacian(blurred, np.float32(sigma**2), stack[level])
+            _half_laplacian(blurred, sigma, stack[level])
         valid = inside[::reduction, ::reduction][::3, ::3]
-        noise = np.array([_spread(level[::3, ::3][valid]) for level in stack])
-        differences = (small[::4, 1::2] - small[::4, :-1:2])[inside[::reduction, ::reduction][::4, 1::2]]
-        best = (stack / noise.astype(np.float32)[:, None, None]).max(axis=0)
-        return cls(stack, best, noise, smooth, _spread(differences) / math.sqrt(2.0), reduction, px_per_mm)
+        noise = np.array([robust_sd(level[::3, ::3][valid]) for level in stack])
+        best, other = np.empty((2, *small.shape), np.float32)
+        np.multiply(stack[0], np.float32(1.0 / noise[0]), out=best)
+        for level in range(1, len(stack)):
+            np.multiply(stack[level], np.float32(1.0 / noise[level]), out=other)
+            np.maximum(best, other, out=best)
+        return cls(
+            stack, best, noise, smooth, pixel_noise(small, inside[::reduction, ::reduction]), reduction, px_per_mm
+        )
 
     def candidates(self, allowed: BoolArray, expected: int) -> tuple[Array, Array]:
         """Maxima over u, v and scale above 4 robust standard deviations.
@@ -71,15 +75,11 @@ class BlobResponse:
         -------
         points_uv : (n, 2) pixels of the frame, sub-pixel. snr : (n,) response over noise, strongest response first.
         """
-        found = np.empty((_FOUND, 3), np.int64)
-        count = _maxima(self.stack, _CLEAR_SNR * self.noise, allowed, self.reduction, found)
-        scale, v, u = found[:count].T
+        scale, v, u = self._maxima(allowed[:: self.reduction, :: self.reduction])
         strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
         scale, v, u = scale[strongest], v[strongest], u[strongest]
         places = self._sub_pixel(scale, v, u)
-        keep = np.empty(len(places), np.bool_)
-        _apart(places, _APART_MM * self.px_per_mm / self.reduction, keep)
-        kept = np.flatnonzero(keep)[:_MOST]
+        kept = np.flatnonzero(_apart(places, _APART_MM * self.px_per_mm / self.reduction))[:_MOST]
         scale, places = scale[kept], places[kept]
         snr = self.stack[scale, v[kept], u[kept]] / self.noise[scale]
         if len(snr) > expected:
@@ -87,6 +87,19 @@ class BlobResponse:
             places, snr = places[keep], snr[keep]
         shift = 0.5 * (self.reduction - 1)
         return places * self.reduction + shift, snr
+
+    def _maxima(self, allowed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
+        """(scale, v, u) of what no neighbour in any scale exceeds, ``allowed`` being nowhere at the border."""
+        first, second, third = self.stack
+        top = np.maximum(np.maximum(first, second), third).reshape(-1)
+        columns = self.stack.shape[2]
+        clear = np.flatnonzero((top > np.float32(_CLEAR_SNR * self.noise.min())) & allowed.reshape(-1))
+        for step in (1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns):
+            clear = clear[top[clear] >= top[clear + step]]
+        v, u = np.divmod(clear, columns)
+        scale = np.argmax(self.stack[:, v, u], axis=0)
+        clear = top[clear] > _CLEAR_SNR * self.noise[scale]
+        return scale[clear], v[clear], u[clear]
 
     def _sub_pixel(self, scale: IntArray, v: IntArray, u: IntArray) -> Array:
         """Tops of the paraboloids through these maxima and their neighbours, (n, 2) pixels of ``stack``."""
@@ -115,58 +128,30 @@ class BlobResponse:
         return over_noise
 
 
-def _spread(values: Image) -> float:
-    if not values.size:
-        return 1e-6
-    middle = values.size // 2
-    return max(_GAUSSIAN_SD * float(np.partition(np.abs(values), middle)[middle]), 1e-6)
+def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
+    """Write half the Laplacian of ``x`` times sigma squared; nought at the border."""
+    columns = x.shape[1]
+    flat = x.reshape(-1)
+    middle = slice(columns, flat.size - columns)
+    _sum_round(
+        flat[: middle.stop - columns], flat[columns - 1 : middle.stop - 1], flat[middle], flat[columns + 1 : middle.stop + 1],
+        flat[2 * columns :], np.float32(0.5 * sigma**2), out.reshape(-1)[middle],
+    )  # fmt: skip
+    out[:, 0] = out[:, -1] = 0
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _half_laplacian(x, square, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    rows, columns = x.shape
-    half = np.float32(0.5) * square
+def _sum_round(up, left, centre, right, down, weight, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     four = np.float32(4)
-    for v in range(1, rows - 1):
-        up, middle, down, row = x[v - 1, 1:-1], x[v], x[v + 1, 1:-1], out[v, 1:-1]
-        left, centre, right = middle[: columns - 2], middle[1:-1], middle[2:]
-        for u in range(columns - 2):
-            row[u] = half * (up[u] + down[u] + left[u] + right[u] - four * centre[u])
+    for i in range(out.size):
+        out[i] = weight * (up[i] + down[i] + left[i] + right[i] - four * centre[i])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _maxima(stack, floor, allowed, reduction, found):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes (scale, v, u) of each maximum to ``found``; returns how many."""
-    scales, rows, columns = stack.shape
-    count = 0
-    for s in range(scales):
-        least = floor[s]
-        for v in range(1, rows - 1):
-            for u in range(1, columns - 1):
-                value = stack[s, v, u]
-                if value <= least or not allowed[v * reduction, u * reduction]:
-                    continue
-                highest = True
-                for k in range(9 * scales):
-                    t, dv, du = k // 9, k // 3 % 3 - 1, k % 3 - 1
-                    other = stack[t, v + dv, u + du]
-                    # Of equal neighbours in one scale, the first counts.
-                    if other > value or (other == value and t == s and (dv, du) < (0, 0)):
-                        highest = False
-                        break
-                if highest and count < found.shape[0]:
-                    found[count, 0], found[count, 1], found[count, 2] = s, v, u
-                    count += 1
-    return count
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _apart(places, distance, keep):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Says in ``keep`` which of these, in order, lie farther than ``distance`` from all kept before."""
-    for i in range(places.shape[0]):
-        keep[i] = True
-        for j in range(i):
-            du, dv = places[i, 0] - places[j, 0], places[i, 1] - places[j, 1]
-            if keep[j] and du * du + dv * dv < distance * distance:
-                keep[i] = False
-                break
+def _apart(places: Array, distance: float) -> BoolArray:
+    """Which of these, in order, lie farther than ``distance`` from all kept before, (n,)."""
+    keep = np.ones(len(places), np.bool_)
+    if len(places) > 1:
+        pairs = cKDTree(places).query_pairs(distance, output_type="ndarray")
+        for first, second in pairs[np.argsort(pairs[:, 0], kind="stable")].tolist():
+            keep[second] &= not keep[first]
+    return keep

@@ -86,31 +86,17 @@ def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore
 def shared(chosen: IntArray, points: Array, near_px: float, most: int) -> IntArray:
     """How many candidates each two chains have in common, (n, n); ``most`` more where as many of the electrodes of one stand
     within ``near_px`` of the other's: a wide ring may give two candidates. Rows of ``chosen`` are filled up with -1."""
-    out = np.zeros((len(chosen), len(chosen)), np.int64)
-    _count_shared(chosen, points, near_px * near_px, most, out)
-    return np.maximum(out, out.T)
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _count_shared(chosen, points, near_square, most, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    n, m = chosen.shape
-    for one in range(n):
-        for other in range(n):
-            common = 0
-            close = 0
-            for i in range(m):
-                at_place = 0
-                for j in range(m):
-                    mine, theirs = chosen[one, i], chosen[other, j]
-                    if mine >= 0 and theirs >= 0:
-                        if mine == theirs:
-                            common += 1
-                        du = points[mine, 0] - points[theirs, 0]
-                        dv = points[mine, 1] - points[theirs, 1]
-                        if du * du + dv * dv < near_square:
-                            at_place = 1
-                close += at_place
-            out[one, other] = common + most if close >= most else common
+    used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
+    member = np.zeros((len(chosen), len(points) + 1), np.float32)
+    member[np.arange(len(chosen))[:, None], chosen] = 1.0
+    member = member[:, used]
+    u, v = points[used].T
+    square = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
+    near = (member @ (square < near_px * near_px).astype(np.float32) > 0).astype(np.float32)
+    close = member @ near.T >= most
+    common: IntArray = (member @ member.T).astype(np.int64)
+    common[close | close.T] += most
+    return common
 
 
 def best_set(values: Array, shared: IntArray, family: IntArray, capacity: IntArray, price: float) -> IntArray:

@@ -15,9 +15,9 @@ from fluoromap.segmenter.blobs import Blobs, find_blobs
 from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.contrast import Contrast
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.homomorphic import homomorphic
+from fluoromap.segmenter.homomorphic import homomorphic, reduce_by
 from fluoromap.segmenter.linking import Shafts, evidence, families, link
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.log_image import Image, pixel_noise
 from fluoromap.segmenter.morphology import disk_morphology
 from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.placing import place_chains
@@ -71,19 +71,22 @@ class FourStepDetector:
     def blobs(self, x: Image) -> tuple[Blobs, Image, float] | None:
         """Blobs of a log image, the diffused image and K; None for a flat one. Equations (4) to (7), then disks."""
         inside, of = self.field.inside, self.settings
-        filtered = homomorphic(x, of.gamma_low, of.gamma_high, of.slope, of.cutoff)
-        k = edge_scale(filtered, inside, of.edge_factor)
+        # Each image takes the name of the one before, which frees that: memory that grows is given back to the system
+        # after every frame, and costs as much time as a filter to get again.
+        image = homomorphic(x, of.gamma_low, of.gamma_high, of.slope, of.cutoff)
+        k = edge_scale(image, inside, of.edge_factor)
         if k is None:
             return None
-        diffused = perona_malik(filtered, k, of.diffusion_sweeps)
-        sharp = complex_shock(to_grey_range(diffused, inside), of.shock_sweeps)
-        bright = disk_morphology(
-            sharp,
+        diffused = image = perona_malik(image, k, of.diffusion_sweeps)
+        image = to_grey_range(image, inside)
+        image = complex_shock(image, of.shock_sweeps)
+        image = disk_morphology(
+            image,
             min(max(2, round(of.background_mm * self.px_per_mm)), max(2, min(x.shape) // 4)),
             max(1, round(of.opening_mm * self.px_per_mm)),
         )
         smallest, largest = 0.6 * self.px_per_mm**2, 24.0 * self.px_per_mm**2
-        return find_blobs(bright, inside, self.field.candidates, smallest, largest), diffused, k
+        return find_blobs(image, inside, self.field.candidates, smallest, largest), diffused, k
 
     def chains(self, x: Image, frame: int) -> FrameChains:
         """Chains of one log image, or why there are none."""
@@ -102,7 +105,8 @@ class FourStepDetector:
         linked = link(points, evidence(contrast.of(points)), np.zeros(len(points)), shafts, kinds, sure=len(blobs))
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
-        chains = [placed.chain for placed in place_chains(x, points, linked, shafts, kinds)]
+        noise = pixel_noise(reduce_by(x, 2), self.field.inside[::2, ::2])
+        chains = [placed.chain for placed in place_chains(x, points, linked, shafts, kinds, noise)]
         return FrameChains(frame, tuple(replace(chain, scores=contrast.of(chain.pixels_uv)) for chain in chains))
 
     def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:

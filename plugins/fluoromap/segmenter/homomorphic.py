@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 from numba import njit
 
+from fluoromap.contracts import IntArray
 from fluoromap.segmenter.log_image import Image
 
 
@@ -73,6 +75,7 @@ def reduce_by(x: Image, factor: int) -> Image:
     return out
 
 
+@functools.lru_cache(maxsize=64)
 def _taps(sigma: float) -> Image:
     """Half of a normalised Gaussian kernel cut at 4 sigma: weight of the middle, then of distance 1, 2, ..."""
     reach = max(1, math.ceil(4.0 * sigma))
@@ -83,8 +86,16 @@ def _taps(sigma: float) -> Image:
 
 def _blur(x: Image, taps: Image) -> Image:
     out = np.empty(x.shape, np.float32)
-    _blur_rows(np.ascontiguousarray(x, dtype=np.float32), taps, out)
+    rows, columns = (_reflected(size, taps.size - 1) for size in x.shape)
+    _blur_rows(np.ascontiguousarray(x, dtype=np.float32), taps, rows, columns, out)
     return out
+
+
+@functools.lru_cache(maxsize=64)
+def _reflected(size: int, reach: int) -> IntArray:
+    """Where the indices from -reach to size + reach - 1 fall when the image is mirrored at its edges, as often as it takes."""
+    index = np.arange(-reach, size + reach) % (2 * size)
+    return np.minimum(index, 2 * size - 1 - index)
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -93,32 +104,24 @@ def _add_pair(out, first, second, weight):  # type: ignore[no-untyped-def]  # pr
         out[u] += weight * (first[u] + second[u])
 
 
-@njit(inline="always")
-def _reflected(index, size):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Where an index beyond an edge falls when the image is mirrored there, as often as it takes."""
-    index %= 2 * size
-    return index if index < size else 2 * size - 1 - index
-
-
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blur_rows(x, taps, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Both passes row by row: across the rows into a line with mirrored ends, and along it."""
-    rows, columns = x.shape
+def _blur_rows(x, taps, rows, columns, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Both passes row by row: across the rows into a line with mirrored ends, and along it. ``rows`` and ``columns`` : see
+    :func:`_reflected`."""
     reach = taps.size - 1
-    line = np.empty(columns + 2 * reach, np.float32)
-    middle = line[reach : reach + columns]
-    for v in range(rows):
-        row, result = x[v], out[v]
-        for u in range(columns):
-            middle[u] = taps[0] * row[u]
-        for k in range(1, taps.size):
-            _add_pair(middle, x[_reflected(v - k, rows)], x[_reflected(v + k, rows)], taps[k])
-        for k in range(1, taps.size):
-            line[reach - k] = middle[_reflected(-k, columns)]
-            line[reach + columns - 1 + k] = middle[_reflected(columns - 1 + k, columns)]
-        for u in range(columns):
+    middle = np.empty(out.shape[1], np.float32)
+    line = np.empty(columns.size, np.float32)
+    for v in range(out.shape[0]):
+        for u in range(middle.size):
+            middle[u] = taps[0] * x[v, u]
+        for k in range(1, reach + 1):
+            _add_pair(middle, x[rows[v + reach - k]], x[rows[v + reach + k]], taps[k])
+        for u in range(line.size):
+            line[u] = middle[columns[u]]
+        result = out[v]
+        for u in range(middle.size):
             result[u] = taps[0] * middle[u]
-        for k in range(1, taps.size):
+        for k in range(1, reach + 1):
             _add_pair(result, line[reach - k :], line[reach + k :], taps[k])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ Image = NDArray[np.float32]
 
 _FINE_BITS = 10
 _COARSE_OFFSET = 0.02
+_GAUSSIAN_SD = 1.4826
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -33,6 +35,20 @@ def central_range(x: Image, inside: BoolArray) -> tuple[float, float] | None:
     ranks = [round(share * (values.size - 1)) for share in (0.005, 0.995)]
     low, high = np.partition(values, ranks)[ranks].tolist()
     return (low, high) if high > low else None
+
+
+def pixel_noise(half: Image, inside: BoolArray) -> float:
+    """Standard deviation of a pixel of the log image at half its size, from noise: of differences between neighbours."""
+    differences = (half[::4, 1::2] - half[::4, :-1:2])[inside[::4, 1::2]]
+    return robust_sd(differences) / math.sqrt(2.0)
+
+
+def robust_sd(values: Image) -> float:
+    """Standard deviation of values about 0, from the median of their sizes; 1e-6 at least."""
+    if not values.size:
+        return 1e-6
+    middle = values.size // 2
+    return max(_GAUSSIAN_SD * float(np.partition(np.abs(values), middle)[middle]), 1e-6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

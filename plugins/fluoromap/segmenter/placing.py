@@ -31,6 +31,7 @@ def place_chains(
     linked: Sequence[Linked],
     shafts: Shafts,
     kinds: tuple[Family, ...],
+    noise: float,
     sound: int | None = None,
 ) -> tuple[Placed, ...]:
     """Place, order and kind of each chain: whichever catheter of as many electrodes, tip first or last, fits best.
@@ -44,6 +45,8 @@ def place_chains(
     linked : sequence of Linked
     shafts : Shafts
     kinds : tuple of Family
+    noise : float
+        Of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
     sound : int
         Candidates from this one on were not seen by themselves. All are by default.
 
@@ -63,7 +66,7 @@ def place_chains(
         hidden = np.array([[candidate in lost[row] for candidate in linked[row].candidates] for row in rows])
         order, hidden = (np.concatenate([forth, forth[:, ::-1]]) for forth in (order, hidden))
         unseen = np.zeros_like(hidden) if sound is None else order >= sound
-        refined = refine(x, candidates_uv[order], family.catheter, shafts.px_per_mm, hidden, unseen)
+        refined = refine(x, candidates_uv[order], family.catheter, shafts.px_per_mm, noise, hidden, unseen)
         settled = np.zeros(order.shape)
         fit = refined.log_likelihood + spacing_fit(refined.points_uv, settled, family.catheter, shafts.px_per_mm)
         fit += _SHAFT_WEIGHT * shaft_evidence(refined.points_uv, family.catheter, shafts)

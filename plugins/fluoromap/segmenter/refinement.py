@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -19,22 +20,17 @@ _TIP_REACH_PX = 6.0
 _LAST_REACH_PX = 2.0
 _SOFT_PX = 2.0
 _APART_PX = 6.0
-_FLOOR_PX = 0.07
-_TIP_FLOOR_PX = 0.10
-_GAIN = 2.65
-_TIP_GAIN, _LONG_TIP_GAIN = (3.1, 3.1), (3.9, 4.2)
+_GAIN, _TIP_GAIN = (4.6, 5.3), (6.15, 6.35)
+_FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.034, 0.048), (0.09, 0.056), (0.155, 0.056)
 _LONG_TIP_MM = 3.0
+_VAGUE, _USUAL_CLEARNESS = 0.7, 1.8
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
-_ACROSS, _ACROSS_POWER = 1.38, 0.85
-_CLEARER, _USUAL_CLEARNESS, _LEAST_SHARE = 0.46, 1.9, 0.34
-_MOST_SHARE = 1.4
-_MISMATCH_ALONG = 0.03
-_MISMATCH_ACROSS = 0.10
-_LEAST_NOISE = 0.12
 _SPACING_SD = 0.10
 _PROFILE_SAMPLES = 7.0
 _WINDOW_MM = 2.0
 _LEAST_MISFIT = 0.01
+_CLEAR_PX, _LEAST_WINDOW_PX = 2.0, 2.0
+_LEAST_HALF_PX = 0.75
 _COVERED_PX = 30.0
 _HIDDEN_MM = 0.25
 _STIFFNESS = 6.0
@@ -61,8 +57,7 @@ class Refined:
     def clearness(self) -> Array:
         """Mean of -ln(misfit) over the electrodes: 0 where nothing looks like one, above 1 where most of each profile does;
         (n,)."""
-        mean: Array = -np.log(np.maximum(self.misfits, _LEAST_MISFIT)).mean(axis=1)
-        return mean
+        return _clearness(self.misfits)
 
 
 def refine(
@@ -70,6 +65,7 @@ def refine(
     points_uv: Array,
     catheter: Catheter,
     px_per_mm: float,
+    noise: float,
     hidden: BoolArray,
     unseen: BoolArray,
 ) -> Refined:
@@ -85,6 +81,8 @@ def refine(
         Log image.
     points_uv : (n, electrodes, 2)
         First guess of each chain from the tip on, pixels.
+    noise : float
+        Standard deviation of a pixel from noise, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
     hidden : (n, electrodes)
         Electrodes whose image is another catheter's: they are put where the curve through the others has them, and fit as
         well as the others do on average.
@@ -93,28 +91,27 @@ def refine(
     """
     points = np.array(points_uv, dtype=np.float64, order="C")
     arc_mm = catheter.arc_lengths_mm
-    along, across, misfits, local, arc, axis_u, axis_v = np.empty((7, *points.shape[:2]))
-    shortening = np.empty(len(points))
+    misfits, bands, arc = np.empty((3, *points.shape[:2]))
+    axes, unit_sd = np.empty((2, *points.shape))
+    sides = np.empty(misfits.shape, np.int64)
     radius = 0.5 * _diameter_mm(catheter) * px_per_mm
     half = np.full(len(arc_mm), 0.5 * catheter.ring_mm * px_per_mm)
     half[0] = 0.5 * catheter.tip_mm * px_per_mm
-    reach = np.full(misfits.shape, _REACH_PX)
-    reach[:, 0] = _TIP_REACH_PX
-    reach[hidden | unseen] = _LAST_REACH_PX
+    shifts = np.full(misfits.shape, int(_REACH_PX / _STEP_PX))
+    shifts[:, 0] = int(_TIP_REACH_PX / _STEP_PX)
+    shifts[hidden | unseen] = int(_LAST_REACH_PX / _STEP_PX)
     for _ in range(2):
-        _measure(points, arc_mm, px_per_mm, arc, axis_u, axis_v, local, shortening)
-        window = _WINDOW_MM * px_per_mm * shortening + 2.0
-        _fit_bands(
-            image, axis_u, axis_v, np.maximum(half * local, 0.75), radius, reach, window, points, along, across, misfits
-        )
-        reach[:] = _LAST_REACH_PX
-    _measure(points, arc_mm, px_per_mm, arc, axis_u, axis_v, local, shortening)
-    covariance = np.empty((*misfits.shape, 2, 2))
-    gains = _LONG_TIP_GAIN if catheter.tip_mm >= _LONG_TIP_MM else _TIP_GAIN
-    refined = Refined(points, covariance, misfits)
-    _weigh(
-        hidden, arc_mm, px_per_mm, gains[0], gains[1], refined.clearness, arc, axis_u, axis_v, along, across, points, covariance
-    )  # fmt: skip
+        _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
+        longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
+        scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
+        _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, misfits)
+        shifts[:] = int(_LAST_REACH_PX / _STEP_PX)
+    _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
+    sd = _stated_sd(unit_sd * noise, misfits, catheter.tip_mm)
+    if len(arc_mm) >= 3:
+        _draw_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
+    refined = Refined(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
+    covariance = refined.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):
         covered = hidden[row]
         if np.count_nonzero(~covered) >= 2:
@@ -140,9 +137,10 @@ def _diameter_mm(catheter: Catheter) -> float:
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _measure(points, arc_mm, px_per_mm, arc, axis_u, axis_v, local, shortening):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes the arc length seen up to each electrode, pixels, the unit vector along the catheter there, and the
-    foreshortening there, from the gaps beside it and the whole catheter's, and of the whole catheter."""
+def _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Writes the arc length seen up to each electrode, pixels; the unit vector along the catheter there; half the length of
+    its band as foreshortened there, from the gaps beside it and the whole catheter's; and how many steps to each side its
+    profile is compared: the next electrode's band, which would push it away, stays out."""
     last = arc_mm.size - 1
     for row in range(points.shape[0]):
         arc[row, 0] = 0.0
@@ -150,133 +148,77 @@ def _measure(points, arc_mm, px_per_mm, arc, axis_u, axis_v, local, shortening):
             du, dv = points[row, k + 1, 0] - points[row, k, 0], points[row, k + 1, 1] - points[row, k, 1]
             arc[row, k + 1] = arc[row, k] + math.sqrt(du * du + dv * dv)
         whole = min(max(arc[row, last] / (arc_mm[last] * px_per_mm), SHORTEST), LONGEST)
-        shortening[row] = whole
         for k in range(last + 1):
             after, before = min(k + 1, last), max(k - 1, 0)
             ratio = (arc[row, after] - arc[row, before]) / (px_per_mm * (arc_mm[after] - arc_mm[before]))
-            local[row, k] = min(max(_LOCAL * ratio + (1.0 - _LOCAL) * whole, _LEAST_SHORTENING), LONGEST)
+            local = min(max(_LOCAL * ratio + (1.0 - _LOCAL) * whole, _LEAST_SHORTENING), LONGEST)
+            bands[row, k] = max(half[k] * local, _LEAST_HALF_PX)
             du = points[row, after, 0] - points[row, before, 0]
             dv = points[row, after, 1] - points[row, before, 1]
             length = max(math.sqrt(du * du + dv * dv), 1e-9)
-            axis_u[row, k], axis_v[row, k] = du / length, dv / length
+            axes[row, k, 0], axes[row, k, 1] = du / length, dv / length
+        for k in range(last + 1):
+            window = _WINDOW_MM * px_per_mm * whole + 2.0
+            for beside in range(max(k - 1, 0), min(k + 2, last + 1)):
+                if beside != k:
+                    window = min(window, abs(arc[row, beside] - arc[row, k]) - bands[row, beside] - _CLEAR_PX)
+            sides[row, k] = int(max(window, bands[row, k] + _LEAST_WINDOW_PX) / _STEP_PX)
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover
-    covered, arc_mm, px_per_mm, tip_gain_along, tip_gain_across, clearness, arc, axis_u, axis_v, along, across, points, covariance
-):  # fmt: skip
-    """Standard deviations along and across from those of the fits; points drawn to the catalogue's spacing by them; covariances."""
-    n = arc_mm.size
-    for row in range(points.shape[0]):
-        # Where bands fit well, what they leave unexplained is the template's own simplicity rather than noise.
-        trust = min(max(1.0 - _CLEARER * (clearness[row] - _USUAL_CLEARNESS), _LEAST_SHARE), _MOST_SHARE)
-        wider = trust * _ACROSS * min(trust, 1.0) ** _ACROSS_POWER
-        weights = mean_x = mean_y = 0.0
-        for k in range(n):
-            least = _TIP_FLOOR_PX if k == 0 else _FLOOR_PX
-            a = min(trust * (tip_gain_along if k == 0 else _GAIN) * along[row, k], _APART_PX)
-            b = min(wider * (tip_gain_across if k == 0 else _GAIN) * across[row, k], _APART_PX)
-            a = _COVERED_PX if covered[row, k] else math.sqrt(a * a + least * least)
-            along[row, k] = a
-            across[row, k] = math.sqrt(b * b + least * least)
-            weights += 1.0 / (a * a)
-            mean_x += arc_mm[k] / (a * a)
-            mean_y += arc[row, k] / (a * a)
-        if n >= 3:
-            # Measured arc lengths and the catalogue's spacing, combined under one free foreshortening and offset.
-            model_sd = 0.5 * _SPACING_SD * px_per_mm * arc_mm[n - 1] / (n - 1)
-            mean_x /= weights
-            mean_y /= weights
-            products = squares = 0.0
-            for k in range(n):
-                weighted = (arc_mm[k] - mean_x) / (along[row, k] * along[row, k])
-                products += weighted * (arc[row, k] - mean_y)
-                squares += weighted * (arc_mm[k] - mean_x)
-            for k in range(n):
-                share = along[row, k] * along[row, k] / (along[row, k] * along[row, k] + model_sd * model_sd)
-                move = share * (mean_y + products / squares * (arc_mm[k] - mean_x) - arc[row, k])
-                points[row, k, 0] += move * axis_u[row, k]
-                points[row, k, 1] += move * axis_v[row, k]
-                along[row, k] *= math.sqrt(1.0 - 0.5 * share)
-        # A steeply foreshortened tip covers the ring behind it, and its own axis is hard to tell.
-        du, dv = points[row, 1, 0] - points[row, 0, 0], points[row, 1, 1] - points[row, 0, 1]
-        lacking = max(_STEEP - math.sqrt(du * du + dv * dv) / (px_per_mm * (arc_mm[1] - arc_mm[0])), 0.0)
-        steep = _STEEP_MM * px_per_mm * lacking * lacking
-        for k in range(n):
-            more = steep if k == 0 else _STEEP_SECOND * steep if k == 1 else 0.0
-            cu, cv = axis_u[row, k], axis_v[row, k]
-            a = along[row, k] * along[row, k] + more * more
-            b = across[row, k] * across[row, k] + more * more
-            covariance[row, k, 0, 0] = a * cu * cu + b * cv * cv
-            covariance[row, k, 1, 1] = a * cv * cv + b * cu * cu
-            covariance[row, k, 0, 1] = (a - b) * cu * cv
-            covariance[row, k, 1, 0] = covariance[row, k, 0, 1]
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _fit_bands(  # type: ignore[no-untyped-def]  # pragma: no cover
-    x, axis_u, axis_v, half, radius, reach, window, points, along, across, misfits
-):  # fmt: skip
+def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, misfits):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Moves points to the best places near by for bands along these axes; writes the standard deviations of that along and
-    across, and the share of the profile's variance along that stays unexplained.
+    across if the noise were 1 a pixel, and the share of the profile's variance along that stays unexplained.
 
     First along, then across the axis a template is moved over the profile; a tip's far end is a dome of its radius.
+    ``shifts`` and ``sides`` : how far the template is moved and reaches, in steps. ``scratch`` : three lines of work space.
     """
-    rows, columns = x.shape
-    one = np.float32(1)
+    highest_u, highest_v = x.shape[1] - 1.001, x.shape[0] - 1.001
+    template, profile, scores = scratch[0], scratch[1], scratch[2]
     for row in range(points.shape[0]):
         for k in range(points.shape[1]):
+            du, dv, length = axes[row, k, 0], axes[row, k, 1], half[row, k]
+            side, shift, wide = sides[row, k], shifts[row, k], 1.5 * radius
             for way in range(2):
-                du, dv, span, wide, slack, mismatch = (
-                    axis_u[row, k], axis_v[row, k], window[row], 1.5 * radius, reach[row, k], _MISMATCH_ALONG
-                )  # fmt: skip
-                if way == 1:
-                    du, dv, span, wide, slack, mismatch = (
-                        -axis_v[row, k], axis_u[row, k], radius + 4.0, 2.0 * half[row, k], min(reach[row, k], 3.5), _MISMATCH_ACROSS
-                    )  # fmt: skip
-                side, shift, lines = int(span / _STEP_PX), int(slack / _STEP_PX), max(1, int(wide))
                 m = 2 * side + 1
-                template = np.empty(m)
                 mean = 0.0
                 for i in range(m):
                     s = (i - side) * _STEP_PX
-                    if way == 1:
-                        template[i] = math.sqrt(max(1.0 - s * s / (radius * radius), 0.0))
-                    else:
-                        # From 0 to 1 and back; -half is the far end.
-                        template[i] = min(max(0.5 + (half[row, k] - s) / _SOFT_PX, 0.0), 1.0)
-                        if k == 0:
-                            rim = 1.0 - min(max((s + half[row, k]) / radius, 0.0), 1.0)
-                            template[i] *= math.sqrt(1.0 - rim * rim)
-                        else:
-                            template[i] *= min(max(0.5 + (s + half[row, k]) / _SOFT_PX, 0.0), 1.0)
-                    mean += template[i]
+                    value = 1.0
+                    rim = s / radius
+                    if way == 0:
+                        # From 0 to 1 and back; a tip's far end, at -length, is round.
+                        away = s if k == 0 else abs(s)
+                        value = min(max(0.5 + (length - away) / _SOFT_PX, 0.0), 1.0)
+                        rim = min(max(1.0 - rim - length / radius, 0.0), 1.0) if k == 0 else 0.0
+                    value *= math.sqrt(max(1.0 - rim * rim, 0.0))
+                    template[i] = value
+                    mean += value
                 mean /= m
-                strength = edges = before = 0.0
+                strength = edges = 0.0
+                before = template[0] - mean
                 for i in range(m):
-                    template[i] -= mean
-                    strength += template[i] * template[i]
-                    step = template[i] - before if i > 0 else 0.0
-                    edges += step * step
-                    before = template[i]
-                strength = max(strength, 1e-9)
-                profile = np.empty(m + 2 * shift)
-                for i in range(profile.size):
+                    value = template[i] - mean
+                    template[i] = value
+                    strength += value * value
+                    edges += (value - before) * (value - before)
+                    before = value
+                lines = max(1, int(wide))
+                for i in range(m + 2 * shift):
                     s = (i - side - shift) * _STEP_PX
                     total = 0.0
                     for line in range(lines):
                         w = wide * ((line + 0.5) / lines - 0.5)
-                        u = min(max(points[row, k, 0] + s * du - w * dv, 0.0), columns - 1.001)
-                        v = min(max(points[row, k, 1] + s * dv + w * du, 0.0), rows - 1.001)
+                        u = min(max(points[row, k, 0] + s * du - w * dv, 0.0), highest_u)
+                        v = min(max(points[row, k, 1] + s * dv + w * du, 0.0), highest_v)
                         left, top = int(u), int(v)
-                        f, g = np.float32(u - left), np.float32(v - top)
-                        upper = x[top, left] * (one - f) + x[top, left + 1] * f
-                        lower = x[top + 1, left] * (one - f) + x[top + 1, left + 1] * f
-                        total += upper * (one - g) + lower * g
+                        f = np.float32(u - left)
+                        upper = x[top, left] + f * (x[top, left + 1] - x[top, left])
+                        lower = x[top + 1, left] + f * (x[top + 1, left + 1] - x[top + 1, left])
+                        total += upper + np.float32(v - top) * (lower - upper)
                     profile[i] = total / lines
-                scores = np.empty(2 * shift + 1)
                 chosen = 0
-                for place in range(scores.size):
+                for place in range(2 * shift + 1):
                     score = 0.0
                     for i in range(m):
                         score -= template[i] * profile[place + i]
@@ -285,15 +227,15 @@ def _fit_bands(  # type: ignore[no-untyped-def]  # pragma: no cover
                         chosen = place
                 total = squares = 0.0
                 for i in range(m):
-                    total += profile[chosen + i]
-                    squares += profile[chosen + i] * profile[chosen + i]
-                variance = max(squares - total * total / m, 1e-12)
+                    value = profile[chosen + i]
+                    total += value
+                    squares += value * value
                 best = scores[chosen]
-                rest = max(1.0 - max(best, 0.0) ** 2 / (strength * variance), 0.0)
-                # Cramer-Rao bound of a shift in white noise; samples half a pixel apart share theirs. The mismatch is the share
-                # that the template leaves unexplained without any noise.
-                noise = max(rest - mismatch, _LEAST_NOISE * rest)
-                sd = math.sqrt(2.0 * noise * variance / m / max(edges, 1e-9)) / max(best / strength, 1e-9)
+                depth = max(best, 0.0) / max(strength, 1e-9)
+                if way == 0:
+                    misfits[row, k] = max(1.0 - depth * best / max(squares - total * total / m, 1e-12), 0.0)
+                # Cramer-Rao bound of a shift in white noise of 1 a pixel, here averaged over the band's width.
+                unit_sd[row, k, way] = math.sqrt(_STEP_PX / (wide * max(edges, 1e-9))) / max(depth, 1e-6)
                 moved = float(chosen - shift)
                 if 0 < chosen < 2 * shift:
                     curvature = scores[chosen - 1] - 2 * best + scores[chosen + 1]
@@ -301,7 +243,67 @@ def _fit_bands(  # type: ignore[no-untyped-def]  # pragma: no cover
                         moved += 0.5 * (scores[chosen - 1] - scores[chosen + 1]) / curvature
                 points[row, k, 0] += moved * _STEP_PX * du
                 points[row, k, 1] += moved * _STEP_PX * dv
-                if way == 0:
-                    along[row, k], misfits[row, k] = sd * _STEP_PX, rest
-                else:
-                    across[row, k] = sd * _STEP_PX
+                du, dv = -dv, du
+                side, shift, wide = int((radius + 4.0) / _STEP_PX), min(shift, 7), 2.0 * length
+
+
+def _stated_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:
+    """Standard deviations along and across, (n, electrodes, 2) pixels, of places of which noise alone makes up these.
+
+    Noise blurred by the detector weighs more than white noise does; where bands fit badly, errors have long tails; and no
+    noise at all leaves what the templates simplify, a tip's rounded end most.
+    """
+    gain, floor = _gains_and_floors(misfits.shape[1], tip_mm >= _LONG_TIP_MM)
+    vague = 1.0 + _VAGUE * np.maximum(_USUAL_CLEARNESS - _clearness(misfits), 0.0)
+    sd = noise_sd * gain * vague[:, None, None]
+    stated: Array = np.minimum(np.sqrt(sd * sd + floor * floor), _APART_PX)
+    return stated
+
+
+@functools.lru_cache(maxsize=64)
+def _gains_and_floors(electrodes: int, long_tip: bool) -> tuple[Array, Array]:
+    """Of each electrode along and across, (electrodes, 2)."""
+    gain, floor = np.full((electrodes, 2), _GAIN), np.full((electrodes, 2), _FLOOR_PX)
+    gain[0] = _TIP_GAIN
+    floor[0] = _LONG_TIP_FLOOR_PX if long_tip else _TIP_FLOOR_PX
+    return gain, floor
+
+
+def _clearness(misfits: Array) -> Array:
+    mean: Array = -np.log(np.maximum(misfits, _LEAST_MISFIT)).sum(axis=1) / misfits.shape[1]
+    return mean
+
+
+def _draw_to_spacing(
+    points: Array, sd: Array, weighed_sd: Array, arc: Array, axes: Array, arc_mm: Array, px_per_mm: float
+) -> None:
+    """Combine, in place, measured arc lengths and the catalogue's spacing under one free foreshortening and offset."""
+    variance = weighed_sd * weighed_sd
+    model_sd = 0.5 * _SPACING_SD * px_per_mm * arc_mm[-1] / (len(arc_mm) - 1)
+    weights = 1.0 / variance
+    weights /= weights.sum(axis=1, keepdims=True)
+    x = arc_mm - (weights @ arc_mm)[:, None]
+    y = arc - (weights * arc).sum(axis=1, keepdims=True)
+    weights *= x
+    slope = (weights * y).sum(axis=1) / (weights * x).sum(axis=1)
+    share = variance / (variance + model_sd * model_sd)
+    points += (share * (slope[:, None] * x - y))[..., None] * axes
+    sd[..., 0] = weighed_sd * np.sqrt(1.0 - 0.5 * share)
+
+
+def _covariances(points: Array, sd: Array, axes: Array, arc_mm: Array, px_per_mm: float) -> Array:
+    """(n, electrodes, 2, 2) square pixels. A steeply foreshortened tip covers the ring behind it, and its own axis is hard to
+    tell."""
+    variance = sd * sd
+    first = points[:, 1] - points[:, 0]
+    lacking = np.maximum(_STEEP - np.sqrt((first * first).sum(axis=1)) / (px_per_mm * (arc_mm[1] - arc_mm[0])), 0.0)
+    steep = (_STEEP_MM * px_per_mm * lacking * lacking) ** 2
+    variance[:, 0] += steep[:, None]
+    variance[:, 1] += _STEEP_SECOND**2 * steep[:, None]
+    along, across = variance[..., 0], variance[..., 1]
+    u, v = axes[..., 0], axes[..., 1]
+    covariance = np.empty((*along.shape, 2, 2))
+    covariance[..., 0, 0] = along * u * u + across * v * v
+    covariance[..., 1, 1] = along * v * v + across * u * u
+    covariance[..., 0, 1] = covariance[..., 1, 0] = (along - across) * u * v
+    return covariance

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.blob_response import BlobResponse
@@ -33,19 +32,40 @@ def rigid_search(
     for chain in taken:
         _dim(best, (chain.pixels_uv - offset) * factor, _TAKEN_MM * response.px_per_mm * factor)
     middle = points_uv.mean(axis=0)
-    moved = np.empty(3)
-    _search(
-        best,
-        (points_uv - middle) * factor,
-        (middle + shift - offset) * factor,
-        int(reach_px * factor),
-        _TURNS_RAD,
-        moved,
-    )
-    cosine, sine = np.cos(moved[2]), np.sin(moved[2])
-    turned: Array = (points_uv - middle) @ np.array([[cosine, sine], [-sine, cosine]])
-    turned += middle + shift + moved[:2] * response.reduction
-    return turned
+    reach = int(reach_px * factor)
+    steps = np.arange(-reach, reach + 1)
+    squares = steps * steps + steps[:, None] ** 2
+    price = np.where(squares <= reach * reach, _FAR_WEIGHT / max(reach, 1) * squares, np.inf).astype(np.float32)
+    turns = []
+    for turn in _TURNS_RAD:
+        cosine, sine = math.cos(turn), math.sin(turn)
+        turns.append((points_uv - middle) @ np.array([[cosine, sine], [-sine, cosine]]) + (middle + shift))
+    places = np.rint((np.array(turns) - offset) * factor).astype(np.int64) - reach
+    left, top = places.min(axis=(0, 1)).tolist()
+    right, bottom = (places.max(axis=(0, 1)) + len(steps)).tolist()
+    near = _cut_out(best, left, right, top, bottom)
+    highest = -np.inf
+    found: Array = turns[0]
+    for turned, corners in zip(turns, (places - [left, top]).tolist(), strict=True):
+        total = -price
+        for u, v in corners:
+            total += near[v : v + len(steps), u : u + len(steps)]
+        place = int(total.argmax())
+        if total.flat[place] > highest:
+            highest = float(total.flat[place])
+            row, column = divmod(place, len(steps))
+            found = turned + np.array([steps[column], steps[row]]) * response.reduction
+    return found
+
+
+def _cut_out(best: Image, left: int, right: int, top: int, bottom: int) -> Image:
+    """Response in a rectangle, not above 12; what lies outside the image speaks against a place there."""
+    cut: Image = np.full((bottom - top, right - left), _OUTSIDE, np.float32)
+    rows, columns = best.shape
+    u0, u1, v0, v1 = max(left, 0), min(right, columns), max(top, 0), min(bottom, rows)
+    if u0 < u1 and v0 < v1:
+        cut[v0 - top : v1 - top, u0 - left : u1 - left] = np.minimum(best[v0:v1, u0:u1], np.float32(_MOST_SNR))
+    return cut
 
 
 def _dim(best: Image, places: Array, radius: float) -> None:
@@ -59,27 +79,3 @@ def _dim(best: Image, places: Array, radius: float) -> None:
     near = near & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
     u, v = (np.broadcast_to(axis, near.shape)[near] for axis in (u, v))
     best[v, u] = np.minimum(best[v, u], np.float32(_TAKEN_SNR))
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _search(best, shape, middle, reach, turns, moved):  # type: ignore[no-untyped-def]  # pragma: no cover
-    rows, columns = best.shape
-    highest = -np.inf
-    for turn in turns:
-        cosine, sine = np.cos(turn), np.sin(turn)
-        for dv in range(-reach, reach + 1):
-            for du in range(-reach, reach + 1):
-                square = du * du + dv * dv
-                if square > reach * reach:
-                    continue
-                total = -_FAR_WEIGHT * square / max(reach, 1)
-                for k in range(shape.shape[0]):
-                    u = int(middle[0] + du + cosine * shape[k, 0] - sine * shape[k, 1] + 0.5)
-                    v = int(middle[1] + dv + sine * shape[k, 0] + cosine * shape[k, 1] + 0.5)
-                    if 0 <= u < columns and 0 <= v < rows:
-                        total += min(best[v, u], np.float32(_MOST_SNR))
-                    else:
-                        total += _OUTSIDE
-                if total > highest:
-                    highest = total
-                    moved[0], moved[1], moved[2] = du, dv, turn
