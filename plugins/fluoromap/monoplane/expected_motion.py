@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, MonoplaneView, SiteCycle
 from fluoromap.monoplane.a_priori_lm import moved_share
 from fluoromap.monoplane.cycle_prior import CycleCurve, fit_cycle
 from fluoromap.monoplane.motion_field import displacements
 from fluoromap.monoplane.observed import ObservedView, turned_covariance_mm2
 from fluoromap.reasons import Reason
+from fluoromap.triangulator.uncertainty import follows_tip
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +22,9 @@ class ExpectedMotion:
 
     mean_mm : (n, m, 3). moved_mm : (n, m, 3) displacement from diastole, which a stronger beat enlarges. velocity_mm :
     (n, m, 3) by phase, mm a cycle. offset_sd_mm : (n, m) an axis, of a catheter as a whole, beyond beats that differ.
-    common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times. own_mm2 : catheter -> (3, 3), its own
-    on top of that. beats : cardiac cycles over which the mean was averaged; 0 where each frame is on its own.
-    frames_per_cycle : of the run. reasons : what speaks against trusting it fully.
+    common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times. beats : cardiac cycles over which the
+    mean was averaged; 0 where each frame is on its own. frames_per_cycle : of the run. reasons : what speaks against
+    trusting it fully.
     """
 
     mean_mm: Array
@@ -30,7 +32,6 @@ class ExpectedMotion:
     velocity_mm: Array
     offset_sd_mm: Array
     common_mm2: Array
-    own_mm2: dict[str, Array]
     beats: float
     own_cycle: bool
     frames_per_cycle: float
@@ -86,8 +87,8 @@ def expect(
         )
     n, m = observed.seen.shape
     points = np.array([point.covariance_mm2 for point in observed.a_priori])
-    points = points - turned_covariance_mm2(observed.a_priori_mm, gantry_angle_sd_deg)
-    common, own = split_covariance(points, observed.catheters, beat_sd_mm)
+    others = _other_errors_mm2(observed.a_priori_mm, observed.labels, view.catalogue, beat_sd_mm, gantry_angle_sd_deg)
+    common = _common_covariance(points - others)
     sd = np.array([mapping_sd_mm if name == view.catalogue.mapping else other_sd_mm for name in observed.catheters])
     unknown_sd = np.sqrt(moved_share(observed.phases, view.a_priori_frame))[:, None] * sd
     still = np.zeros((n, m, 3))
@@ -99,12 +100,12 @@ def expect(
         )
         offset = np.where(np.isfinite(field.sd_mm), field.sd_mm, unknown_sd)
         return ExpectedMotion(
-            observed.a_priori_mm + field.moved_mm, field.moved_mm, field.velocity_mm, offset, common, own, 1.0, False,
+            observed.a_priori_mm + field.moved_mm, field.moved_mm, field.velocity_mm, offset, common, 1.0, False,
             pace.frames_per_cycle, pace.spread, (Reason.MOTION_FROM_OTHERS,),
         )  # fmt: skip
     reasons = (Reason.DEPTH_ASSUMED,) if known else (Reason.DEPTH_ASSUMED, Reason.PHASE_UNKNOWN)
     return ExpectedMotion(
-        observed.a_priori_mm + still, still, still, unknown_sd, common, own, 0.0, False, pace.frames_per_cycle, 0.0,
+        observed.a_priori_mm + still, still, still, unknown_sd, common, 0.0, False, pace.frames_per_cycle, 0.0,
         reasons,
     )  # fmt: skip
 
@@ -139,12 +140,10 @@ def _from_own_cycle(
         known = curve.labels[row] == label
         mean[:, index] = places[:, row] if known else observed.a_priori_mm[index] + moved[:, index]
         offset[:, index] = unsure
-    covariances = cycle.covariance_mm2 - turned_covariance_mm2(cycle.positions_mm, gantry_angle_sd_deg)
-    covariances = covariances.reshape(-1, 3, 3)
-    catheters = tuple(name for name, _ in cycle.labels) * len(cycle.phases)
-    common, own = split_covariance(covariances, catheters, beat_sd_mm)
+    others = _other_errors_mm2(cycle.positions_mm, cycle.labels, view.catalogue, beat_sd_mm, gantry_angle_sd_deg)
+    common = _common_covariance((cycle.covariance_mm2 - others).reshape(-1, 3, 3))
     return ExpectedMotion(
-        mean, moved, velocity, offset, common, own, pace.cycles, True, pace.frames_per_cycle, pace.spread, ()
+        mean, moved, velocity, offset, common, pace.cycles, True, pace.frames_per_cycle, pace.spread, ()
     )
 
 
@@ -154,20 +153,27 @@ def _nearest(curve: CycleCurve, label: tuple[str, int]) -> int | None:
     return min(rows, key=lambda row: abs(curve.labels[row][1] - label[1]), default=None)
 
 
-def split_covariance(
-    covariances_mm2: Array, catheters: tuple[str, ...], beat_sd_mm: float
-) -> tuple[Array, dict[str, Array]]:
-    """What covariances (k, 3, 3) of electrodes have in common, and what each catheter has on top of it.
+def _other_errors_mm2(
+    positions_mm: Array,
+    labels: tuple[tuple[str, int], ...],
+    catalogue: Catalogue,
+    beat_sd_mm: float,
+    angle_sd_deg: float,
+) -> Array:
+    """What beats that differ and wrong gantry angles add to the covariances (..., m, 3, 3) of positions (..., m, 3)."""
+    follows = follows_tip(positions_mm, labels, catalogue)
+    beats: Array = beat_sd_mm**2 * follows @ np.swapaxes(follows, -1, -2)
+    return beats + turned_covariance_mm2(positions_mm, angle_sd_deg)
 
-    Breathing and the isocentre displace all electrodes alike and are what the most certain electrode has as well, less the
-    variation between beats, which is each catheter's own; what wrong gantry angles do must be taken off before.
-    Directions are the principal ones of the mean covariance.
+
+def _common_covariance(covariances_mm2: Array) -> Array:
+    """What covariances (k, 3, 3) of electrodes have in common, (3, 3).
+
+    Breathing and the isocentre displace all electrodes alike and are what the most certain electrode has as well. What
+    beats that differ and wrong gantry angles do, to each electrode in another way, must be taken off before. Directions are
+    the principal ones of the mean covariance.
     """
     _, axes = np.linalg.eigh(covariances_mm2.mean(axis=0))
     along = np.einsum("ik,nij,jk->nk", axes, covariances_mm2, axes)
-    names = np.array(catheters)
-    least = {name: along[names == name].min(axis=0) for name in dict.fromkeys(catheters)}
-    lowest = np.min(list(least.values()), axis=0)
-    common = (axes * np.maximum(lowest - beat_sd_mm**2, 0.0)) @ axes.T
-    own = {name: (axes * np.maximum(value - lowest, 0.0)) @ axes.T for name, value in least.items()}
-    return common, own
+    common: Array = (axes * np.maximum(along.min(axis=0), 0.0)) @ axes.T
+    return common

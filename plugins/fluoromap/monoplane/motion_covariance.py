@@ -11,6 +11,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, MonoplaneView
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
+from fluoromap.triangulator.uncertainty import follows_tip
 
 FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29
@@ -19,6 +20,8 @@ _SYSTOLE_PHASE = 0.3
 _ALIGNED_SD_CYCLE = 0.01
 _OFFSET_HARMONICS, _SHAPE_HARMONICS = 4, 3
 _LASTING_SHARE = 0.7
+_STRAY_CYCLE_MM, _STRAY_POINT_MM = 0.03, 0.05
+"""An electrode's own error: pixel noise is averaged over a cycle's moments, but whole in a point."""
 
 
 class MotionParams(BaseModel, extra="forbid"):
@@ -76,6 +79,7 @@ class MotionCovariance:
         self._catheters = tuple(dict.fromkeys(self._names))
         self._mapping = view.catalogue.mapping
         self._shapes = [_shapes(view.catalogue, labels, name) for name in self._catheters]
+        self._follows = follows_tip(expected.mean_mm, labels, view.catalogue)
         rays = expected.mean_mm - view.camera.source_world_mm
         self.rays: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
@@ -108,10 +112,6 @@ class MotionCovariance:
         turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
         yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
         yield FIXED, (mean * p.magnification_sd)[..., None]
-        for name in self._catheters:
-            own = expected.own_mm2.get(name)
-            if own is not None and np.trace(own) > 0:
-                yield FIXED, self._of(name) * everywhere * _root(own)
         yield from self._beats(frames, self.rays[frames])
         if expected.beats:
             yield from self._free(frames)
@@ -129,11 +129,14 @@ class MotionCovariance:
         yield FIXED, velocity * np.hypot(timing, uneven)
         averaged = 1 / np.sqrt(expected.beats)
         for name in self._catheters:
-            yield FIXED, np.ones((len(rays), 1, 1, 1)) * self._of(name) * np.eye(3) * p.beat_sd_mm * averaged
+            yield FIXED, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
         if expected.own_cycle:
             # Depth comes from the other view's run: its beats differ in what this view cannot show.
             yield FIXED, _along(rays, moved * p.beat_amplitude_sd * averaged)
-            yield FIXED, _along(rays, velocity * np.hypot(timing * averaged, np.hypot(uneven, _ALIGNED_SD_CYCLE)))
+            yield (
+                FIXED,
+                _along(rays, velocity * np.hypot(p.beat_timing_sd * averaged, np.hypot(uneven, _ALIGNED_SD_CYCLE))),
+            )
 
     def _free(self, frames: slice) -> Iterator[tuple[int, Array]]:
         """Each catheter's offset, tilt and bend over the beat, whose sizes the view itself tells."""
@@ -142,9 +145,9 @@ class MotionCovariance:
         for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
             own = self._names == name
             tilt_sd, bend_sd = self._looseness(name)
-            yield OFFSET, _in_time_and_axis(fast, np.where(own, offset_sd, 0.0))
-            yield TILT, _in_time_and_axis(slow, np.broadcast_to(tilt_sd * tilt, offset_sd.shape))
-            yield BEND, _in_time_and_axis(slow, np.broadcast_to(bend_sd * bend, offset_sd.shape))
+            yield OFFSET, _in_time(fast, np.where(own, offset_sd, 0.0)[..., None, None] * self._follows[frames])
+            yield TILT, _in_time(slow, (tilt_sd * tilt)[:, None, None] * np.eye(3))
+            yield BEND, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
 
     def _looseness(self, name: str) -> tuple[float, float]:
         """Tilt in radians and bend in mm at the ends, between what is expected of a catheter's shape and what it is."""
@@ -164,7 +167,7 @@ class MotionCovariance:
             level = own * (np.full_like(offset_sd, 0.05) if known else offset_sd)
             spatial += level[:, :, None] * level[:, None, :]
             spatial += tilt_sd**2 * np.outer(tilt, tilt) + bend_sd**2 * np.outer(bend, bend)
-        spatial += 0.03**2 * np.eye(m)
+        spatial += (_STRAY_CYCLE_MM if self._expected.own_cycle else _STRAY_POINT_MM) ** 2 * np.eye(m)
         white: Array = np.einsum("nab,ij->naibj", spatial, np.eye(3)).reshape(n, 3 * m, 3 * m)
         return white
 
@@ -195,10 +198,11 @@ def _over_cycle(phases: Array, harmonics: int) -> Array:
     return np.concatenate([np.full((len(phases), 1), np.sqrt(_LASTING_SHARE)), waves], axis=1)
 
 
-def _in_time_and_axis(courses: Array, sizes: Array) -> Array:
-    """Columns (n, m, 3, 3 k): each course (n, k) along each axis, of these sizes (n, m)."""
-    n, m = sizes.shape
-    columns: Array = np.einsum("nk,nm,ij->nmijk", courses, sizes, np.eye(3)).reshape(n, m, 3, -1)
+def _in_time(courses: Array, displacements: Array) -> Array:
+    """Columns (n, m, 3, 3 k): each course (n, k) of each displacement (n, m, 3, 3) or (m, 3, 3)."""
+    n, m = len(courses), displacements.shape[-3]
+    everywhere = np.broadcast_to(displacements, (n, m, 3, 3))
+    columns: Array = np.einsum("nk,nmij->nmijk", courses, everywhere).reshape(n, m, 3, -1)
     return columns
 
 

@@ -197,7 +197,7 @@ def error_sources(
         ErrorSource(breathing_effect_px(jacobian), params.respiration_covariance_mm2() / 2, ("breathing",) * 3),
         _both_views(jacobian, head_feet, head_feet, params.respiration_drift_sd_mm, "breathing"),
     ]
-    follows = _follows_tip(points_world_mm, labels, catalogue)
+    follows = follows_tip(points_world_mm, labels, catalogue)
     for name in sorted({catheter for catheter, _ in labels}):
         own = follows * np.array([catheter == name for catheter, _ in labels])[:, None, None]
         sources.append(_both_views(jacobian, own, own, params.beat_sd_mm, "phase_mismatch"))
@@ -216,7 +216,7 @@ def error_sources(
     return tuple(sources)
 
 
-def _follows_tip(points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> Array:
+def follows_tip(points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> Array:
     """Displacement of each electrode when its catheter's tip is displaced, (..., N, 3, 3).
 
     The shaft is not stretched: along it all electrodes go with the tip. It is held in its vessel and bends: across, they

@@ -27,7 +27,7 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.known_pixels import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import UncertaintyParams, follows_tip
 
 EXACT = {
     "gantry_angle_sd_deg": 0.0, "isocentre_sd_mm": 0.0, "magnification_sd": 0.0,
@@ -286,7 +286,8 @@ def test_depth_told_by_another_run_is_off_by_both_runs_breaths() -> None:
     (view, _), _, _ = _study(1)
     assert view.cycle is not None
     breath = np.diag([1.0, 1.0, 16.0])
-    still = np.broadcast_to(0.25**2 * np.eye(3), view.cycle.covariance_mm2.shape)
+    follows = follows_tip(view.cycle.positions_mm, view.cycle.labels, view.catalogue)
+    still = 0.25**2 * follows @ np.swapaxes(follows, -1, -2)
 
     def depth_variance(covariance: Array, **breathing: float) -> Array:
         assert view.cycle is not None
