@@ -16,7 +16,7 @@ from fluoromap.triangulator.estimate import Estimate, Method
 from fluoromap.triangulator.seen import Cameras, TwoViewPixels, seen_in_both
 from fluoromap.triangulator.self_calibration import GantryBelief
 from fluoromap.triangulator.spacing import spacing_mismatches
-from fluoromap.triangulator.strays import strays_doubted
+from fluoromap.triangulator.strays import epipolar_rows, strays_doubted
 from fluoromap.triangulator.table_motion import Jump
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
@@ -121,7 +121,10 @@ class Locator:
         residuals = pixels.residuals_px(cameras, found.points_mm)
         breathing_mm, inflation = 0.0, 1.0
         if self.method.takes_out_breathing:
-            misfit, free = float(residuals @ np.linalg.solve(errors, residuals)), len(start)
+            # Only what no displacement of the electrodes reaches is misfit; the rest hangs on how the pixels are weighted.
+            rows = epipolar_rows(cameras, found.points_mm)
+            apart, free = rows @ residuals, len(start)
+            misfit = float(apart @ np.linalg.solve(rows @ errors @ rows.T, apart))
             gain = seen.covariance @ seen.effect_px.T @ np.linalg.inv(noise + seen.pixels_px2())
             breathing_mm = float((gain @ residuals)[0])
             residuals = residuals - seen.effect_px[:, 0] * breathing_mm

@@ -152,6 +152,26 @@ def test_what_no_gantry_can_do_is_not_corrected_but_doubted() -> None:
     assert all(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in (*answer.sites, *answer.rejected))
 
 
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_beats_that_displace_catheters_are_no_doubt_where_pixels_are_known_unequally_well(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    by_site, sites = electrodes(seed), []
+    for points, site in zip(by_site, seen(by_site, rng), strict=True):
+        views = []
+        for camera, view in zip(CAMERAS, (site.diastole.a, site.diastole.b), strict=True):
+            chains = []
+            for chain in view.chains:
+                sd_px = rng.choice([0.05, 0.1, 0.6], len(chain.electrodes))
+                beat_px = rng.normal(0, 0.25 * camera.px_per_mm, 2)
+                pixels = camera.project(points[chain.catheter]) + beat_px + rng.normal(size=(4, 2)) * sd_px[:, None]
+                chains.append(replace(chain, pixels_uv=pixels, covariance_px2=sd_px[:, None, None] ** 2 * np.eye(2)))
+            views.append(replace(view, chains=tuple(chains)))
+        sites.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+    answer = located(tuple(sites))
+    assert len(answer.sites) == len(sites)
+    assert not any(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in answer.sites)
+
+
 def test_a_study_whose_catheters_are_all_described_wrongly_is_refused_with_the_cause() -> None:
     by_site = electrodes(7, sites=6)
     wider = tuple(
