@@ -88,10 +88,11 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
         Naming the field, when shape or numbers are wrong.
     """
     array: NDArray[Any]
-    if isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable and value.dtype == dtype:
+    if isinstance(value, np.ndarray) and _is_frozen(value) and value.dtype == dtype:
         array = value
     else:
-        array = np.array(value, dtype=dtype)
+        # Row by row, however it came: what is read back from the store is then the same in memory as well.
+        array = np.array(value, dtype=dtype, order="C")
     if array.ndim != len(shape) or any(
         want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
     ):
@@ -100,6 +101,10 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
         raise ValueError(f"{name} must be finite")
     array.setflags(write=False)
     return array
+
+
+def _is_frozen(array: NDArray[Any]) -> bool:
+    return array.base is None and array.flags.c_contiguous and not array.flags.writeable
 
 
 # --- what a segmenter gets and gives ---------------------------------------------------------------------------------

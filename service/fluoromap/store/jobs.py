@@ -69,7 +69,11 @@ def create(session: Session, study_id: str, manifest: Manifest) -> Job:
         return row.id
 
     segmenter, triangulator = manifest.segmenter, manifest.triangulator
-    used = sorted({uid for site in manifest.sites for uid in (site.view_a, site.view_b)})
+    # Runs with marks first: after a correction they are what is computed again, and everything waits for them.
+    used = sorted(
+        {uid for site in manifest.sites for uid in (site.view_a, site.view_b)},
+        key=lambda uid: (not manifest.runs[uid].marks, uid),
+    )
     segments = [add("segment", uid, segmenter.name, segmenter.version, []) for uid in used]
     match = add("match", study_id, "fluoromap", matching.VERSION, segments)
     triangulate = add("triangulate", study_id, triangulator.name, triangulator.version, [match])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Hashable, Sequence
-from typing import Any, TypeVar, cast
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -38,11 +39,25 @@ def load(kind: type[T], stage: StageRow) -> T:
     """
     if stage.result is None:
         raise ValueError(f"stage {stage.id} has no result")
-    loaded: T = _decoded(cast(Hashable, kind), stage.result)
+    with _lock:
+        known = _known.get(stage.result)
+    # Two kinds of results may have the same bytes.
+    if isinstance(known, kind):
+        return known
+    loaded = decode(kind, files.path_of(stage.result).read_bytes())
+    remember(stage.result, loaded)
     return loaded
 
 
-# Content-addressed and frozen: what was decoded once stays true.
-@functools.lru_cache(maxsize=16)
-def _decoded(kind: Any, sha256: str) -> Any:
-    return decode(kind, files.path_of(sha256).read_bytes())
+def remember(sha256: str, result: Any) -> None:
+    """Keep a result at hand under the hash of its stored form: content-addressed and frozen, it stays true."""
+    with _lock:
+        _known[sha256] = result
+        _known.move_to_end(sha256)
+        if len(_known) > _AT_HAND:
+            _known.popitem(last=False)
+
+
+_AT_HAND = 16
+_known: OrderedDict[str, Any] = OrderedDict()
+_lock = threading.Lock()

@@ -1,4 +1,4 @@
-"""Hands stored inputs to a stage and makes stored bytes of what it returns; stages themselves read no store.
+"""Hands stored inputs to a stage, which itself reads no store.
 
 A result is kept under the hash of plugin, version, parameters and exactly what the stage reads, so that a correction
 redoes only what hangs on it.
@@ -37,7 +37,7 @@ from fluoromap.matching import SiteRuns, match_study
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
 from fluoromap.store import files
-from fluoromap.store.codec import decode, encode
+from fluoromap.store.codec import encode
 from fluoromap.store.jobs import Claim
 from fluoromap.store.manifest import Manifest, MarkPlan, PluginPlan
 from fluoromap.store.models import Base, StageRow
@@ -48,17 +48,14 @@ from fluoromap.workers.points import point_rows
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 
-def _no_rows(content: bytes) -> Iterable[Base]:
-    return ()
-
-
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A stage ready to run: the key of its result, how to compute its bytes, and the rows that belong to them."""
+    """A stage ready to run: the key of its result and its kind, how to compute it, and the rows that belong to it."""
 
     key: str
-    compute: Callable[[Context], bytes]
-    rows: Callable[[bytes], Iterable[Base]] = _no_rows
+    kind: type[Any]
+    compute: Callable[[Context], Any]
+    rows: Callable[[Any], Iterable[Base]] | None = None
 
 
 def prepare(session: Session, held: Claim, manifest: Manifest) -> Work:
@@ -89,13 +86,13 @@ def _segment(manifest: Manifest, uid: str) -> Work:
         px_per_mm, asdict(catalogue), {frame: [mark.model_dump() for mark in plan.marks[frame]] for frame in plan.marks},
     )  # fmt: skip
 
-    def compute(context: Context) -> bytes:
+    def compute(context: Context) -> Segmentation:
         frames = open_frames(files.path_of(plan.sha256), facts)
         run = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
         segmenter = build_segmenter(manifest.segmenter.name, manifest.segmenter.params)
-        return encode(segmenter.segment(run, catalogue, marks, context))
+        return segmenter.segment(run, catalogue, marks, context)
 
-    return Work(key, compute)
+    return Work(key, Segmentation, compute)
 
 
 def _chains(marks: tuple[MarkPlan, ...]) -> tuple[Chain, ...]:
@@ -125,30 +122,32 @@ def _match(manifest: Manifest, segments: Mapping[str, StageRow]) -> Work:
         "match", own, asdict(catalogue), *([s, encode(cameras[uid]).decode(), segments[uid].result] for s, uid in views)
     )
 
-    def compute(context: Context) -> bytes:
+    def compute(context: Context) -> Matching:
         seen = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
             SiteRuns(site.site, cameras[site.view_a], cameras[site.view_b], seen[site.view_a], seen[site.view_b])
             for site in manifest.sites
         )
-        return encode(match_study(sites, catalogue, context))
+        return match_study(sites, catalogue, context)
 
-    return Work(key, compute)
+    return Work(key, Matching, compute)
 
 
 def _triangulate(job_id: str, manifest: Manifest, match: StageRow) -> Work:
     catalogue = manifest.catalogue()
 
-    def compute(context: Context) -> bytes:
+    def compute(context: Context) -> Triangulation:
         matching = load(Matching, match)
         triangulator = build_triangulator(manifest.triangulator.name, manifest.triangulator.params)
         located = triangulator.triangulate(matching.sites, catalogue, context)
-        return encode(replace(located, rejected=(*matching.rejected, *located.rejected)))
+        return replace(located, rejected=(*matching.rejected, *located.rejected))
 
-    def rows(content: bytes) -> Iterable[Base]:
-        return point_rows(job_id, manifest, load(Matching, match), decode(Triangulation, content))
+    def rows(located: Triangulation) -> Iterable[Base]:
+        return point_rows(job_id, manifest, load(Matching, match), located)
 
-    return Work(_key("triangulate", manifest.triangulator, asdict(catalogue), match.result), compute, rows)
+    return Work(
+        _key("triangulate", manifest.triangulator, asdict(catalogue), match.result), Triangulation, compute, rows
+    )
 
 
 def _fuse(manifest: Manifest, triangulation: Triangulation) -> Work:
@@ -157,14 +156,15 @@ def _fuse(manifest: Manifest, triangulation: Triangulation) -> Work:
     sites = mapped_sites(triangulation, catalogue, times)
     origin = map_origin(triangulation)
 
-    def compute(context: Context) -> bytes:
+    def compute(context: Context) -> MapOutcome:
         fuser = build_fuser(manifest.fuser.name, manifest.fuser.params)
         try:
-            return encode(MapOutcome(fuser.fuse(sites, context), None, "", origin))
+            return MapOutcome(fuser.fuse(sites, context), None, "", origin)
         except Refusal as refusal:
-            return encode(MapOutcome(None, refusal.reason, str(refusal), origin))
+            return MapOutcome(None, refusal.reason, str(refusal), origin)
 
-    return Work(_key("fuse", manifest.fuser, list(origin or ()), *(encode(site) for site in sites)), compute)
+    key = _key("fuse", manifest.fuser, list(origin or ()), *(encode(site) for site in sites))
+    return Work(key, MapOutcome, compute)
 
 
 def _monoplane(manifest: Manifest, name: str, matching: Matching, triangulation: Triangulation) -> Work:
@@ -178,7 +178,7 @@ def _monoplane(manifest: Manifest, name: str, matching: Matching, triangulation:
     refused = [] if views else [_rejected_view(view, name, triangulation) for view in manifest.views]
     key = _key("monoplane", manifest.monoplane, name, encode(refused), *(encode(view) for _, view in views))
 
-    def compute(context: Context) -> bytes:
+    def compute(context: Context) -> FollowedSite:
         followed = list(refused)
         for view, seen in views:
             solver = build_monoplane(manifest.monoplane.name, manifest.monoplane.params)
@@ -186,9 +186,9 @@ def _monoplane(manifest: Manifest, name: str, matching: Matching, triangulation:
                 followed.append(FollowedView(view, solver.follow(seen, context), None, ""))
             except Refusal as refusal:
                 followed.append(FollowedView(view, None, refusal.reason, str(refusal)))
-        return encode(FollowedSite(name, tuple(followed)))
+        return FollowedSite(name, tuple(followed))
 
-    return Work(key, compute)
+    return Work(key, FollowedSite, compute)
 
 
 def _monoplane_view(

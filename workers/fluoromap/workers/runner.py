@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import structlog
 from sqlalchemy.exc import OperationalError
 from structlog.typing import FilteringBoundLogger as BoundLogger
 
 from fluoromap.contracts import StageStopped
 from fluoromap.store import files, jobs
+from fluoromap.store.codec import decode, encode
 from fluoromap.store.engine import reading, writing
 from fluoromap.store.manifest import Manifest
 from fluoromap.store.models import Job, StageResult
+from fluoromap.store.outcomes import remember
 from fluoromap.workers.bridge import Work, prepare
 from fluoromap.workers.heartbeat import Heartbeat
 
@@ -58,8 +62,12 @@ def run(stage_id: int, worker: str) -> str | None:
 def _run(held: jobs.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
     work = _prepare(held)
     kept = _kept_result(work.key)
-    content = files.path_of(kept).read_bytes() if kept else _computed(held, work, heartbeat)
-    rows = list(work.rows(content))
+    if kept:
+        content = files.path_of(kept).read_bytes()
+        result = decode(work.kind, content) if work.rows else None
+    else:
+        result, content = _computed(held, work, heartbeat)
+    rows = list(work.rows(result)) if work.rows else []
     heartbeat.check()
     # Kept again even when it was kept before: then nobody can have removed it since.
     with files.incoming() as path, writing() as session:
@@ -69,12 +77,15 @@ def _run(held: jobs.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
             session.add(StageResult(key=work.key, sha256=sha256))
         if not jobs.finish(session, held, sha256, reused=kept is not None, rows=rows):
             raise StageStopped("the claim was lost while the result was stored")
+    if result is not None:
+        remember(sha256, result)
     bound.info("stage_done", reused=kept is not None)
 
 
-def _computed(held: jobs.Claim, work: Work, heartbeat: Heartbeat) -> bytes:
+def _computed(held: jobs.Claim, work: Work, heartbeat: Heartbeat) -> tuple[Any, bytes]:
     try:
-        return work.compute(heartbeat)
+        result = work.compute(heartbeat)
+        return result, encode(result)
     except StageStopped:
         raise
     except Exception as error:
