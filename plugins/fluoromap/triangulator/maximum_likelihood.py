@@ -23,7 +23,7 @@ class MaximumLikelihood:
     """
 
     name: ClassVar[str] = "maximum-likelihood"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:

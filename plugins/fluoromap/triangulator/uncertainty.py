@@ -49,7 +49,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         0.25, ge=0, le=10, description="Variation of a catheter tip's place from beat to beat, mm an axis."
     )
     bend_sd_mm: float = Field(
-        0.05,
+        0.025,
         ge=0,
         le=10,
         description="How far an electrode strays from what its catheter's tip tells of it, mm an axis.",
