@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
+from kept_frames import KeptFrames
 from numpy.typing import NDArray
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
@@ -75,27 +76,10 @@ class Heart:
         return next(one for one in self.matching.sites if one.site == site)
 
 
-class Kept:
-    """The frames of a run in memory."""
-
-    def __init__(self, frames: Iterable[NDArray[np.uint16]]) -> None:
-        self.frames = list(frames)
-        self.shape: tuple[int, int] = (self.frames[0].shape[0], self.frames[0].shape[1])
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> NDArray[np.uint16]:
-        return self.frames[index]
-
-    def __iter__(self) -> Iterator[NDArray[np.uint16]]:
-        return iter(self.frames)
-
-
 def rendered(run: SimulatedRun, seed: int) -> Segmentation:
     """The run as ``catheter-chain`` sees it."""
     camera = camera_from_gantry(run.gantry)
-    kept = Kept(run.frames)
+    kept = KeptFrames(run.frames)
     return CatheterChain().segment(
         Run(kept, run.frame_times_ms, camera.px_per_mm, FACTS), DEFAULT_CATALOGUE, {}, Silent()
     )

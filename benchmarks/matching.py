@@ -13,10 +13,11 @@ from __future__ import annotations
 import itertools
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from kept_frames import KeptFrames
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -35,7 +36,7 @@ from fluoromap.geometry import Camera, camera_from_gantry, ray_angle_deg
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.matching.phase import cardiac_phases
 from fluoromap.matching.run_catheters import gather
-from fluoromap.phantom import FRONTAL, LATERAL, HeartKind, SimulatedRun, StudySpec, simulate_study
+from fluoromap.phantom import FRONTAL, LATERAL, HeartKind, StudySpec, simulate_study
 from fluoromap.phantom.motion import DIASTOLIC_PHASE, Beats, Breathing
 from fluoromap.phantom.placement import Anatomy, draw_anatomy
 from fluoromap.reasons import Reason
@@ -355,23 +356,6 @@ def main(first: int, studies: int, rendered: int) -> None:
         show("through the segmenter", [score(segmented(seed)) for seed in range(first, first + rendered)])
 
 
-class Kept:
-    """The frames of a run in memory."""
-
-    def __init__(self, run: SimulatedRun) -> None:
-        self.frames = [run.frames[index] for index in range(len(run.frames))]
-        self.shape = run.frames.shape
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> NDArray[np.uint16]:
-        return self.frames[index]
-
-    def __iter__(self) -> Iterator[NDArray[np.uint16]]:
-        return iter(self.frames)
-
-
 def segmented(seed: int) -> Study:
     """A rendered study of 8 sites, a lateral and a postero-anterior view of 2 s at 15 frames/s, through the segmenter."""
     spec = StudySpec(seed, sites=8, contrast=("LAT", "PA"), gantry_error_deg=GANTRY_ERROR_DEG)
@@ -382,7 +366,7 @@ def segmented(seed: int) -> Study:
         cameras = [camera_from_gantry(run.gantry) for run in site.runs]
         found = [
             segmenter.segment(
-                Run(Kept(run), run.frame_times_ms, camera.px_per_mm, PixelFacts(False, 12, False)),
+                Run(KeptFrames(run.frames), run.frame_times_ms, camera.px_per_mm, PixelFacts(False, 12, False)),
                 DEFAULT_CATALOGUE, {}, Silent(),
             )
             for run, camera in zip(site.runs, cameras, strict=True)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from kept_frames import KeptFrames
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -35,23 +36,6 @@ FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
 CHI2_95_2D = 5.991464547107979
 SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"four-step": FourStep, "catheter-chain": CatheterChain}
 VIEWS: tuple[Contrast, Contrast] = ("LAT", "PA")
-
-
-class Kept:
-    """The frames of a run in memory, so that rendering is not timed."""
-
-    def __init__(self, frames: Iterable[NDArray[np.uint16]]) -> None:
-        self.frames = list(frames)
-        self.shape: tuple[int, int] = (self.frames[0].shape[0], self.frames[0].shape[1])
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> NDArray[np.uint16]:
-        return self.frames[index]
-
-    def __iter__(self) -> Iterator[NDArray[np.uint16]]:
-        return iter(self.frames)
 
 
 @dataclass
@@ -145,7 +129,7 @@ def _without_catheters(first: int, seeds: int) -> None:
                 behind = torso(gantry, appearance, np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.0)
                 photons = expected_photons(behind, np.ones((gantry.rows, gantry.columns), np.float32), appearance, 1.0)
                 for key in range(3):
-                    kept = Kept([detect(photons, appearance.photons, 10 * seed + key)])
+                    kept = KeptFrames([detect(photons, appearance.photons, 10 * seed + key)])
                     found = segmenter().segment(
                         Run(kept, np.zeros(1), 1024 / 178, FACTS), DEFAULT_CATALOGUE, {}, Silent()
                     )
@@ -167,7 +151,7 @@ def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
 def _score_run(
     table: Table, spent: dict[str, list[float]] | None, view: str, simulated: SimulatedRun, names: tuple[str, ...]
 ) -> None:
-    kept = Kept(simulated.frames)
+    kept = KeptFrames(simulated.frames)
     gantry = simulated.gantry
     px_per_mm = gantry.source_detector_mm / gantry.source_isocentre_mm / gantry.pixel_spacing_mm[0]
     run = Run(kept, simulated.frame_times_ms, px_per_mm, FACTS)

@@ -20,13 +20,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from kept_frames import KeptFrames
 from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
 from skimage.measure import label, regionprops
@@ -64,28 +65,12 @@ import time
 begun = time.process_time()
 from fluoromap.workers.process import warm_up
 from fluoromap.registry import plugins
+from kept_frames import KeptFrames
 plugins()
 imported = time.process_time()
 warm_up()
 print(imported - begun, time.process_time() - imported)
 """
-
-
-class Kept:
-    """The frames of a run in memory, so that rendering is not timed."""
-
-    def __init__(self, frames: list[NDArray[np.uint16]]) -> None:
-        self.frames = frames
-        self.shape: tuple[int, int] = (frames[0].shape[0], frames[0].shape[1])
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> NDArray[np.uint16]:
-        return self.frames[index]
-
-    def __iter__(self) -> Iterator[NDArray[np.uint16]]:
-        return iter(self.frames)
 
 
 def main(sites: int, frames: int, seed: int) -> None:
@@ -115,7 +100,7 @@ def milliseconds(work: Work, repeats: int = 9) -> float:
 
 def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
     plain = _twins()
-    run = Run(Kept([frame]), np.zeros(1), px_per_mm, FACTS)
+    run = Run(KeptFrames([frame]), np.zeros(1), px_per_mm, FACTS)
     mask = find_field(run.frames, run.pixels)
     x: Image = mask.fill(LogTransform.of_run(run.pixels, mask.mean_level)(frame))
     steps = FourStepDetector(DEFAULT_CATALOGUE, mask, px_per_mm, FourStepParams())
@@ -175,7 +160,10 @@ def lengths(runs: tuple[SimulatedRun, SimulatedRun], kept: list[list[NDArray[np.
             cells = []
             for count in counts:
                 part = Run(
-                    Kept(pictures[:count]), run.frame_times_ms[:count], camera_from_gantry(run.gantry).px_per_mm, FACTS
+                    KeptFrames(pictures[:count]),
+                    run.frame_times_ms[:count],
+                    camera_from_gantry(run.gantry).px_per_mm,
+                    FACTS,
                 )
                 cells.append(milliseconds(partial(_segment, segmenter(), part), 1) / count)
             print(f"  {name + ', ' + view:42}" + "".join(f"{cell:15.2f}" for cell in cells))

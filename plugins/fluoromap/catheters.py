@@ -1,8 +1,9 @@
-"""The catheter catalogue of a study: electrodes, spacings, tip."""
+"""The catheter catalogue of a study: electrodes, spacings, tip, and how a shaft follows its tip."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,3 +119,27 @@ DEFAULT_CATALOGUE = Catalogue(
     mapping="mapping",
 )
 """Two 6F diagnostic catheters and a 7F ablation catheter with a 4 mm tip, all 2-5-2 mm edge to edge."""
+
+BENDS_OVER_MM = 25.0
+"""Length of shaft over which a catheter's motion falls from its tip's towards half of it."""
+
+
+def follows_tip(
+    points_mm: NDArray[np.float64], labels: Sequence[tuple[str, int]], catalogue: Catalogue
+) -> NDArray[np.float64]:
+    """Displacement of each electrode when its catheter's tip is displaced, (..., N, 3, 3).
+
+    The shaft is not stretched: along it all electrodes go with the tip. It is held in its vessel and bends: across, they
+    follow the less the farther back they are.
+    """
+    follows = np.empty((*points_mm.shape, 3))
+    for catheter in {name for name, _ in labels}:
+        own = [k for k, (name, _) in enumerate(labels) if name == catheter]
+        arc = catalogue[catheter].arc_lengths_mm
+        behind = np.array([arc[min(labels[k][1], len(arc)) - 1] for k in own])
+        share = (0.5 + 0.5 * np.exp(-behind / BENDS_OVER_MM))[:, None, None]
+        chord = points_mm[..., own[-1], :] - points_mm[..., own[0], :]
+        axis = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-9)
+        along = (axis[..., :, None] * axis[..., None, :])[..., None, :, :]
+        follows[..., own, :, :] = share * np.eye(3) + (1 - share) * along
+    return follows

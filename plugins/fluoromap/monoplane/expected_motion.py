@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.catheters import Catalogue
+from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView, SiteCycle
 from fluoromap.monoplane.a_priori_lm import moved_share
 from fluoromap.monoplane.cycle_prior import CycleCurve, fit_cycle
 from fluoromap.monoplane.motion_field import displacements
 from fluoromap.monoplane.observed import ObservedView, turned_covariance_mm2
 from fluoromap.reasons import Reason
-from fluoromap.triangulator.uncertainty import follows_tip
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import BaseModel, Field
 
-from fluoromap.catheters import Catalogue
+from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
-from fluoromap.triangulator.uncertainty import follows_tip
 
 FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29

@@ -14,7 +14,6 @@ from fluoromap.segmenter.homomorphic import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
 
 _SCALES_MM = 0.52, 0.73, 1.04
-_SHAFT_SCALE_MM = 0.52
 _LEAST_RING_PX = 5.0
 _CLEAR_SNR = 4.0
 _APART_MM = 0.57

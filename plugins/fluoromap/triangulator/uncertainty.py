@@ -13,17 +13,13 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, Field
 
-from fluoromap.catheters import Catalogue
+from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.seen import Cameras
 
 Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
 """Where an error source counts in the :class:`~fluoromap.contracts.ErrorBudget`."""
-
-
-BENDS_OVER_MM = 25.0
-"""Length of shaft over which a catheter's motion falls from its tip's towards half of it."""
 
 
 class UncertaintyParams(BaseModel, extra="forbid"):
@@ -214,25 +210,6 @@ def error_sources(
         )  # fmt: skip
         sources.append(ErrorSource(late, timing, ("phase_mismatch",) * 2))
     return tuple(sources)
-
-
-def follows_tip(points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> Array:
-    """Displacement of each electrode when its catheter's tip is displaced, (..., N, 3, 3).
-
-    The shaft is not stretched: along it all electrodes go with the tip. It is held in its vessel and bends: across, they
-    follow the less the farther back they are.
-    """
-    follows = np.empty((*points_mm.shape, 3))
-    for catheter in {name for name, _ in labels}:
-        own = [k for k, (name, _) in enumerate(labels) if name == catheter]
-        arc = catalogue[catheter].arc_lengths_mm
-        behind = np.array([arc[min(labels[k][1], len(arc)) - 1] for k in own])
-        share = (0.5 + 0.5 * np.exp(-behind / BENDS_OVER_MM))[:, None, None]
-        chord = points_mm[..., own[-1], :] - points_mm[..., own[0], :]
-        axis = chord / np.maximum(np.linalg.norm(chord, axis=-1, keepdims=True), 1e-9)
-        along = (axis[..., :, None] * axis[..., None, :])[..., None, :, :]
-        follows[..., own, :, :] = share * np.eye(3) + (1 - share) * along
-    return follows
 
 
 def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Share) -> ErrorSource:

@@ -16,6 +16,10 @@ from fluoromap.store.models import StageRow
 
 T = TypeVar("T")
 
+_AT_HAND = 16
+_known: OrderedDict[str, Any] = OrderedDict()
+_lock = threading.Lock()
+
 
 def stages_of(session: Session, job_id: str, name: str | None = None) -> Sequence[StageRow]:
     """All stages of a job, or those of one name, in the order they were made."""
@@ -56,8 +60,3 @@ def remember(sha256: str, result: Any) -> None:
         _known.move_to_end(sha256)
         if len(_known) > _AT_HAND:
             _known.popitem(last=False)
-
-
-_AT_HAND = 16
-_known: OrderedDict[str, Any] = OrderedDict()
-_lock = threading.Lock()

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.catheters import DEFAULT_CATALOGUE, follows_tip
 from fluoromap.contracts import (
     Array,
     MonoplaneView,
@@ -27,7 +27,7 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.known_pixels import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
-from fluoromap.triangulator.uncertainty import UncertaintyParams, follows_tip
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 EXACT = {
     "gantry_angle_sd_deg": 0.0, "isocentre_sd_mm": 0.0, "magnification_sd": 0.0,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.catheters import BENDS_OVER_MM, DEFAULT_CATALOGUE
 from fluoromap.contracts import (
     CHI2_95_3D,
     Alternative,
@@ -20,7 +20,7 @@ from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
-from fluoromap.triangulator.uncertainty import BENDS_OVER_MM, UncertaintyParams
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
 BOTH = pytest.mark.parametrize("plugin", [Linear, MaximumLikelihood])
