@@ -44,25 +44,29 @@ def steady_beats_ms(told_ms: Array, half_frame_ms: float, times_ms: Array, place
     if longest <= shortest or not weights.any():
         return told_ms
     if places is not None:
-        evidence = np.array([_evidence(times_ms / length, places) for length in lengths])
+        evidence = _evidence(times_ms / lengths[:, None], places)
         weights *= np.exp(evidence - evidence[weights > 0].max())
     weights /= weights.sum()
     beats: Array = weights @ ((earliest + latest) / 2) + number * float(weights @ lengths)
     return beats
 
 
-def _evidence(cycles: Array, places: Array) -> float:
-    """Log likelihood, but for a constant, that places (g, k) at times counted in cycles (g,) repeat every cycle."""
-    angle = 2 * np.pi * cycles[:, None] * _ORDERS
+def _evidence(cycles: Array, places: Array) -> Array:
+    """Log likelihoods (n,), but for a constant, that places (g, k) at times counted in cycles (n, g) repeat every cycle."""
+    angle = 2 * np.pi * cycles[:, :, None] * _ORDERS
     strength = np.exp(-0.5 * (_FALLING * _ORDERS) ** 2)
-    waves = np.concatenate([np.cos(angle) * strength, np.sin(angle) * strength], axis=1) / np.linalg.norm(strength)
-    left, sizes, _ = np.linalg.svd(waves, full_matrices=False)
-    shares = ((left.T @ places) ** 2).sum(axis=1)
-    outside = max(float((places**2).sum() - shares.sum()), 0.0)
+    strength /= np.linalg.norm(strength)
+    waves = np.concatenate([np.cos(angle) * strength, np.sin(angle) * strength], axis=2)
+    across = waves.transpose(0, 2, 1)
+    sizes, axes = np.linalg.eigh(across @ waves)
+    shares = ((axes.transpose(0, 2, 1) @ (across @ places)) ** 2).sum(axis=2)
+    frames = len(places)
     found = []
     for scatter in _SCATTER:
-        spread = sizes**2 + scatter
-        scale = (float((shares / spread).sum()) + outside / scatter) / places.size
-        log_det = float(np.log(spread).sum()) + (len(cycles) - len(sizes)) * np.log(scatter)
-        found.append(-0.5 * _INDEPENDENT * (len(cycles) * np.log(scale + 1e-12) + log_det))
-    return float(max(found))
+        # Eigenvalues of waves @ waves.T + scatter: these, and the scatter alone for as many as there are more frames.
+        spread = np.maximum(sizes, 0.0) + scatter
+        scale = ((places**2).sum() - (shares / spread).sum(axis=1)) / (scatter * places.size)
+        log_det = np.log(spread).sum(axis=1) + (frames - sizes.shape[1]) * np.log(scatter)
+        found.append(-0.5 * _INDEPENDENT * (frames * np.log(np.maximum(scale, 0.0) + 1e-12) + log_det))
+    likeliest: Array = np.max(found, axis=0)
+    return likeliest

@@ -14,7 +14,7 @@ from fluoromap.triangulator.seen import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import jacobians
 
 _STEPS = 8
-_SETTLED_MM = 1e-12
+_SETTLED_MM = 1e-9
 
 
 @dataclass(frozen=True, eq=False)

@@ -215,9 +215,11 @@ def error_sources(
 def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Share) -> ErrorSource:
     """The same parameters drawn anew in each view."""
     k = in_a.shape[-1]
-    effect = np.concatenate(
-        [effect_px(jacobian, in_a, np.zeros_like(in_b)), effect_px(jacobian, np.zeros_like(in_a), in_b)], axis=-1
-    )
+    *moments, n = jacobian.shape[:-3]
+    effect = np.zeros((*moments, n, 2, 2, 2, k))
+    for view, displacement in enumerate((in_a, in_b)):
+        effect[..., view, :, view, :] = jacobian[..., view, :, :] @ displacement
+    effect = effect.reshape(*moments, 4 * n, 2 * k)
     return ErrorSource(effect, sd**2 * np.eye(2 * k), (share,) * (2 * k))
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import types
 import typing
 from collections.abc import Callable, Hashable
@@ -15,43 +14,39 @@ from enum import Enum
 from typing import Any, cast
 
 import numpy as np
+from pydantic_core import from_json, to_json
 
 T = typing.TypeVar("T")
 Decoder = Callable[[Any], Any]
 
 
 def encode(value: Any) -> bytes:
-    """Encode a dataclass of arrays, numbers, strings, enums, tuples and dataclasses."""
-    return json.dumps(_plain(value), allow_nan=False, separators=(",", ":"), ensure_ascii=False).encode()
+    """Encode a dataclass of arrays, numbers, strings, enums, tuples and dataclasses.
+
+    Raises
+    ------
+    ValueError
+        When it holds a number that is not finite.
+    """
+    content = to_json(value, fallback=_array)
+    if b"NaN" in content or b"Infinity" in content:
+        # As a word it may stand in a text; as a number it is refused.
+        from_json(content, allow_inf_nan=False)
+    return content
 
 
 def decode(kind: type[T], content: bytes) -> T:
     """Decode what :func:`encode` made of a ``kind``; the dataclass checks itself as it is built."""
-    decoded: T = _decoder(cast(Hashable, kind))(json.loads(content))
+    decoded: T = _decoder(cast(Hashable, kind))(from_json(content))
     return decoded
 
 
-def _plain(value: Any) -> Any:
-    names = _field_names(cast(Hashable, type(value)))
-    if names is not None:
-        return {name: _plain(getattr(value, name)) for name in names}
+def _array(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return {"shape": list(value.shape), "values": value.ravel().tolist()}
+        return {"shape": value.shape, "values": value.ravel().tolist()}
     if isinstance(value, np.generic):
         return value.item()
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in sorted(value.items())}
-    return value
-
-
-@functools.cache
-def _field_names(kind: Any) -> tuple[str, ...] | None:
-    """The fields of a dataclass; None for any other type."""
-    return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None
+    raise TypeError(f"a result holds a {type(value).__name__}, which is never stored")
 
 
 @functools.cache

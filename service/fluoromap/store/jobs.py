@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from sqlalchemy import or_, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, defer
 
 from fluoromap import matching
 from fluoromap.settings import settings
@@ -34,6 +34,9 @@ FATAL = frozenset({"match", "triangulate", "fuse"})
 """Stages whose failure fails the job; the others fail their subject only."""
 
 LONGEST_REPUBLISH_SECONDS = 60.0
+_TOLD = (
+    StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +129,7 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
             worker=worker,
             progress=0.0,
         )
-        .returning(StageRow.attempt, StageRow.name, StageRow.subject)
+        .returning(*_TOLD)
     ).first()
     if row is None:
         return None
@@ -134,7 +137,7 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
         job.state = JobState.RUNNING
         job.started = session.scalar(select(db_now()))
         _tell_job(session, job)
-    _tell_stage(session, job_id, stage_id)
+    _tell_stage(session, job_id, row)
     return Claim(stage_id, job_id, row.attempt, row.name, row.subject)
 
 
@@ -144,11 +147,11 @@ def beat(session: Session, held: Claim, progress: float) -> Literal["alive", "ca
         update(StageRow)
         .where(*_held(held))
         .values(lease_until=db_now() + settings().lease_seconds, progress=progress)
-        .returning(StageRow.id)
+        .returning(*_TOLD)
     ).first()
     if alive is None:
         return "lost"
-    session.add(Event(job_id=held.job_id, kind="stage", data=_stage_data(session, held.stage_id)))
+    _tell_stage(session, held.job_id, alive)
     cancelled = session.scalar(select(Job.cancel_requested).where(Job.id == held.job_id))
     return "cancelled" if cancelled else "alive"
 
@@ -224,7 +227,7 @@ def reap(session: Session) -> int:
             stage.state = StageState.READY
         stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
         session.flush()
-        _tell_stage(session, job_id, stage_id)
+        _tell_stage(session, job_id, stage)
         _settle(session, job)
     return len(expired)
 
@@ -248,29 +251,31 @@ def _held(held: Claim) -> tuple[Any, ...]:
 
 
 def _lock(session: Session, job_id: str) -> Job:
-    session.execute(update(Job).where(Job.id == job_id).values(version=Job.version + 1))
-    return session.get_one(Job, job_id, populate_existing=True)
+    locking = update(Job).where(Job.id == job_id).values(version=Job.version + 1).returning(Job)
+    # Without its manifest, which is long and does not change.
+    answer = session.scalars(locking.options(defer(Job.manifest)), execution_options={"populate_existing": True})
+    return answer.one()
 
 
 def _end(session: Session, held: Claim, state: StageState, **values: Any) -> bool:
     ended = session.execute(
-        update(StageRow).where(*_held(held)).values(state=state, lease_until=None, **values).returning(StageRow.id)
+        update(StageRow).where(*_held(held)).values(state=state, lease_until=None, **values).returning(*_TOLD)
     ).first()
     if ended is None:
         return False
-    _tell_stage(session, held.job_id, held.stage_id)
+    _tell_stage(session, held.job_id, ended)
     return True
 
 
 def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState]) -> None:
-    waiting = session.scalars(
+    waiting = session.execute(
         update(StageRow)
         .where(StageRow.job_id == job_id, StageRow.state.in_(list(states)))
         .values(state=StageState.CANCELLED)
-        .returning(StageRow.id)
+        .returning(*_TOLD)
     ).all()
-    for stage_id in waiting:
-        _tell_stage(session, job_id, stage_id)
+    for stage in waiting:
+        _tell_stage(session, job_id, stage)
 
 
 def _settle(session: Session, job: Job) -> None:
@@ -287,8 +292,7 @@ def _settle(session: Session, job: Job) -> None:
     for row in rows:
         if row.state == StageState.PENDING and set(row.depends_on) <= ended:
             row.state = StageState.READY
-            session.flush()
-            _tell_stage(session, job.id, row.id)
+            _tell_stage(session, job.id, row)
     if len(ended) == len(rows):
         if job.cancel_requested:
             job.state = JobState.CANCELLED
@@ -307,17 +311,7 @@ def _tell_job(session: Session, job: Job) -> None:
     session.add(Event(job_id=job.id, kind="job", data={"state": job.state, "error": job.error}))
 
 
-def _tell_stage(session: Session, job_id: str, stage_id: int) -> None:
-    session.add(Event(job_id=job_id, kind="stage", data=_stage_data(session, stage_id)))
-
-
-def _stage_data(session: Session, stage_id: int) -> dict[str, Any]:
-    stage = session.get_one(StageRow, stage_id, populate_existing=True)
-    return {
-        "name": stage.name,
-        "subject": stage.subject,
-        "state": stage.state,
-        "attempt": stage.attempt,
-        "progress": round(stage.progress, 3),
-        "reused": stage.reused,
-    }
+def _tell_stage(session: Session, job_id: str, stage: Any) -> None:
+    """Add the event of a stage's new state; ``stage`` is its row, or a result with the columns of ``_TOLD``."""
+    data = {column.key: getattr(stage, column.key) for column in _TOLD}
+    session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(stage.progress, 3)}))

@@ -16,7 +16,8 @@ from fluoromap.store.models import StageRow
 
 T = TypeVar("T")
 
-_AT_HAND = 16
+_AT_HAND = 64
+"""Results: those of a study of 20 sites, which the stages after them read one after the other, and some of another."""
 _known: OrderedDict[str, Any] = OrderedDict()
 _lock = threading.Lock()
 
@@ -47,6 +48,7 @@ def load(kind: type[T], stage: StageRow) -> T:
         known = _known.get(stage.result)
     # Two kinds of results may have the same bytes.
     if isinstance(known, kind):
+        remember(stage.result, known)
         return known
     loaded = decode(kind, files.path_of(stage.result).read_bytes())
     remember(stage.result, loaded)

@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from fluoromap.contracts import Chain, FrameChains, Segmentation
+from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap.store.codec import decode, encode
@@ -48,6 +50,22 @@ def test_empty_arrays_and_missing_values_keep_their_shape() -> None:
     assert after.r_wave_frames == ()
 
 
-def test_what_is_not_a_number_is_refused() -> None:
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_what_is_not_a_number_is_refused(number: float) -> None:
     with pytest.raises(ValueError):
-        encode((float("nan"),))
+        encode((number,))
+
+
+def test_a_text_may_say_that_something_is_not_a_number() -> None:
+    assert decode(tuple[str, ...], encode(("NaN", "-Infinity"))) == ("NaN", "-Infinity")  # type: ignore[arg-type]
+
+
+def test_what_is_no_result_is_refused() -> None:
+    with pytest.raises(ValueError, match="object"):
+        encode((object(),))
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
+def test_numbers_come_back_bit_for_bit(numbers: list[float]) -> None:
+    before = np.array(numbers)
+    assert decode(Array, encode(before)).tobytes() == before.tobytes()  # type: ignore[arg-type]

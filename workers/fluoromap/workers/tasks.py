@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import socket
 import time
@@ -48,6 +49,8 @@ def prepare_child(**_: Any) -> None:
     forget_connections()
     limit_memory()
     warm_up()
+    # What is loaded now stays: the collector would walk through it again and again while a stage makes its many small objects.
+    gc.freeze()
 
 
 class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
