@@ -26,12 +26,18 @@ class RigidPose:
     """Monoplane solver ``rigid-pose``: rotation and translation of the whole set of electrodes, frame by frame.
 
     Right for a rigid phantom. Catheters in a beating heart are not one rigid body, and one catheter is too small a body to
-    tell its depth: there it refuses, with the figure.
+    tell its depth: there it refuses, with the figure. A body that contracts and one that moves away look alike from one view,
+    so it also refuses where neither the user nor cycles seen in two views say that the body keeps its shape.
     """
 
     class Params(BaseModel, extra="forbid"):
         """When to refuse, and what is known of the body's motion."""
 
+        known_rigid: bool = Field(
+            False,
+            description="The electrodes are one rigid body, a phantom's for example. Otherwise two views of the study must have "
+            "shown that they nearly are.",
+        )
         iterations: int = Field(6, ge=1, le=50, description="Steps of the pose a frame, from the frame before.")
         largest_bound_mm: float = Field(
             5.0,
@@ -62,7 +68,7 @@ class RigidPose:
         )
 
     name: ClassVar[str] = "rigid-pose"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "3"
 
     def __init__(self, params: RigidPose.Params) -> None:
         self._params = params
@@ -74,15 +80,15 @@ class RigidPose:
         ------
         Refusal
             NO_A_PRIORI; DEPTH_UNOBSERVABLE when no frame shows four electrodes off one line, when they do not move as one
-            rigid body, or when the Cramer-Rao bound says that their depth cannot be had; VIEW_MIRRORED when they would be
-            a rigid body if the image were mirrored.
+            rigid body, when the Cramer-Rao bound says that their depth cannot be had, or when nothing tells that they keep
+            their shape; VIEW_MIRRORED when they would be a rigid body if the image were mirrored.
         """
         observed = observe(view)
         context.check()
         usable = np.array([spans(observed.a_priori_mm[row]) for row in observed.seen])
         if not usable.any():
             raise _too_few(view, observed)
-        self._refuse_if_known_to_bend(view, observed)
+        shown_rigid = self._shown_rigid(view, observed)
         usable[view.a_priori_frame] = True
         frames = np.flatnonzero(usable)
         body = self._fit(view, observed, frames)
@@ -90,9 +96,13 @@ class RigidPose:
         context.check()
         if body.misfit > self._params.largest_misfit:
             raise self._not_rigid(view, observed, frames, body)
-        return self._track(view, observed, frames, body)
+        track = self._track(view, observed, frames, body)
+        if not (shown_rigid or self._params.known_rigid):
+            raise _shape_unknown(view, observed)
+        return track
 
-    def _refuse_if_known_to_bend(self, view: MonoplaneView, observed: ObservedView) -> None:
+    def _shown_rigid(self, view: MonoplaneView, observed: ObservedView) -> bool:
+        """Whether cycles seen in two views tell that a rigid pose is good enough; refuses when they tell that it is not."""
         cycles = view.others if view.cycle is None else (view.cycle,)
         told = [rigid_error_mm(view.camera, cycle, observed.labels) for cycle in cycles]
         errors = [error for error in told if error is not None]
@@ -103,6 +113,7 @@ class RigidPose:
                 f"{error:.1f} mm wrong (RMS over the electrodes); {self._params.largest_bound_mm:.1f} mm is the limit. A "
                 "heart's catheters move by themselves; use another solver.",
             )
+        return bool(errors)
 
     def _fit(self, view: MonoplaneView, observed: ObservedView, frames: IntArray) -> AdjustedBody:
         p = self._params
@@ -219,6 +230,16 @@ def _too_few(view: MonoplaneView, observed: ObservedView) -> Refusal:
         Reason.DEPTH_UNOBSERVABLE,
         "A rigid pose needs at least four electrodes that do not lie on one line; no frame of this view shows them. From what "
         f"it shows, {int(shown.sum())} electrodes, their positions cannot be known {told}.",
+    )
+
+
+def _shape_unknown(view: MonoplaneView, observed: ObservedView) -> Refusal:
+    one_percent_mm = 0.01 * float(view.camera.depth_mm(observed.a_priori_mm).mean())
+    return Refusal(
+        Reason.DEPTH_UNOBSERVABLE,
+        "Nothing tells that these electrodes keep their distances: in one view a heart that contracts by one percent looks like "
+        f"one that moves {one_percent_mm:.0f} mm away, and no cycle of this study was seen in two views. Say that they are one "
+        "rigid body (known_rigid), as in a phantom, or use another solver.",
     )
 
 

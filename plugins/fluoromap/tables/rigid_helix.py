@@ -66,7 +66,9 @@ def _row(
 
 
 def _followed(run: MonoplaneView, dz_mm: int) -> Array:
-    return build_monoplane("rigid-pose", {"depth_step_mm": dz_mm}).follow(run, Silent()).positions_mm
+    return (
+        build_monoplane("rigid-pose", {"depth_step_mm": dz_mm, "known_rigid": True}).follow(run, Silent()).positions_mm
+    )
 
 
 def _bound_mm(camera: Camera, truth_mm: Array, noise_px: float) -> float:

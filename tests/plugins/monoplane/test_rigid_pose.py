@@ -71,7 +71,8 @@ def view_of(  # type: ignore[no-untyped-def]
 
 
 def follow(view: MonoplaneView, **params: object) -> Track:
-    return RigidPose(RigidPose.Params.model_validate({"gantry_angle_sd_deg": 0} | params)).follow(view, Silent())
+    known = {"gantry_angle_sd_deg": 0, "known_rigid": True}
+    return RigidPose(RigidPose.Params.model_validate(known | params)).follow(view, Silent())
 
 
 def refusal_of(view: MonoplaneView, **params: object) -> Refusal:
@@ -195,8 +196,11 @@ def test_a_contraction_that_looks_like_depth_is_refused_where_two_views_have_sho
     shares = 1 - 0.02 * np.sin(np.linspace(0, np.pi, 8))
     beating = centre + shares[:, None, None] * (simulation.points_mm[0] - centre)
     pixels = simulation.camera.project(beating)
-    blind = follow(view_of(simulation.camera, beating[0], pixels))
-    assert np.abs(blind.positions_mm - beating).max() > 5
+    blind = view_of(simulation.camera, beating[0], pixels)
+    assert np.abs(follow(blind).positions_mm - beating).max() > 5
+    unknown = refusal_of(blind, known_rigid=False)
+    assert unknown.reason is Reason.DEPTH_UNOBSERVABLE
+    assert "contracts by one percent looks like one that moves 5 mm away" in str(unknown)
     cycle = SiteCycle(np.linspace(0, 0.9, 8), LABELS, beating, np.broadcast_to(0.01 * np.eye(3), (8, 30, 3, 3)))
     known = {"cycle": cycle} if told_by == "cycle" else {"others": (cycle, cycle, cycle)}
     refusal = refusal_of(view_of(simulation.camera, beating[0], pixels, **known))
@@ -205,7 +209,8 @@ def test_a_contraction_that_looks_like_depth_is_refused_where_two_views_have_sho
     rigid = SiteCycle(
         np.linspace(0, 0.9, 8), LABELS, simulation.points_mm, np.broadcast_to(0.01 * np.eye(3), (8, 30, 3, 3))
     )
-    follow(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, cycle=rigid))
+    shown = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, cycle=rigid)
+    follow(shown, known_rigid=False)
 
 
 @pytest.mark.parametrize("seed", [3, 4])
