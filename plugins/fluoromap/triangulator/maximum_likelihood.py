@@ -23,7 +23,7 @@ class MaximumLikelihood:
     """
 
     name: ClassVar[str] = "maximum-likelihood"
-    version: ClassVar[str] = "5"
+    version: ClassVar[str] = "6"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:
