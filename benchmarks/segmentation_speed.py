@@ -65,7 +65,6 @@ import time
 begun = time.process_time()
 from fluoromap.workers.process import warm_up
 from fluoromap.registry import plugins
-from kept_frames import KeptFrames
 plugins()
 imported = time.process_time()
 warm_up()

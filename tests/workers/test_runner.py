@@ -36,7 +36,7 @@ def stage(data_dir: Path) -> int:
 
 
 def _run(stage: int, monkeypatch: pytest.MonkeyPatch, compute: Callable[[Context], Any]) -> StageRow:
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, dict, compute))
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, compute))
     runner.run(stage, "test")
     with reading() as session:
         return session.get_one(StageRow, stage)
@@ -50,10 +50,10 @@ def _raises(error: Exception) -> Callable[[Any], Any]:
 
 
 def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = _run(stage, monkeypatch, lambda context: {"answer": 42})
+    row = _run(stage, monkeypatch, lambda context: ("answer", 42))
     assert row.state == StageState.DONE
     assert row.result is not None
-    assert files.path_of(row.result).read_bytes() == b'{"answer":42}'
+    assert files.path_of(row.result).read_bytes() == b'["answer",42]'
     with reading() as session:
         assert session.get_one(Job, "j").state == JobState.SUCCEEDED
 
@@ -74,7 +74,7 @@ def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monk
                 state=state,
             )
             session.add(row)
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, dict, lambda context: {}))
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, lambda context: ()))
     # Nobody else hears of what got ready.
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
     tasks.run_stage(stage)
@@ -99,7 +99,7 @@ def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files, "keep", full)
-    row = _run(stage, monkeypatch, lambda context: {})
+    row = _run(stage, monkeypatch, lambda context: ())
     assert row.state == StageState.RUNNING
     assert row.lease_until is not None
     assert list((files.path_of("00").parent.parent / "incoming").iterdir()) == []
@@ -110,7 +110,7 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
         raise RuntimeError("a name that must not be told")
 
     monkeypatch.setattr(files, "keep", broken)
-    row = _run(stage, monkeypatch, lambda context: {})
+    row = _run(stage, monkeypatch, lambda context: ())
     assert row.state == StageState.FAILED
     assert row.error is not None
     assert row.error["code"] == "internal"
@@ -121,7 +121,7 @@ def test_a_result_that_comes_late_is_thrown_away(stage: int, monkeypatch: pytest
     def overtaken(context: Context) -> dict[str, bool]:
         with writing() as session:
             session.get_one(StageRow, stage).attempt += 1
-        return {"late": True}
+        return ("late",)
 
     row = _run(stage, monkeypatch, overtaken)
     assert row.state == StageState.RUNNING

@@ -110,6 +110,8 @@ class MotionCovariance:
         # The other view, turned about the isocentre by a wrong angle, has told a depth that is wrong by what it was turned.
         turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
         yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
+        # This view is turned as well: what it shows of the turn must not be taken for another size, which would be depth.
+        yield FIXED, turned * np.radians(p.gantry_angle_sd_deg)
         yield FIXED, (mean * p.magnification_sd)[..., None]
         yield from self._beats(frames, self.rays[frames])
         if expected.beats:

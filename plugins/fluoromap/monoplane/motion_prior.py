@@ -52,7 +52,7 @@ class MotionPrior:
         )
 
     name: ClassVar[str] = "motion-prior"
-    version: ClassVar[str] = "3"
+    version: ClassVar[str] = "4"
 
     def __init__(self, params: MotionPrior.Params) -> None:
         self._params = params

@@ -13,7 +13,7 @@ from fluoromap.contracts import Array, Context, IntArray, MonoplaneView, Refusal
 from fluoromap.monoplane.body_pose import follow_body, pose_covariance_mm2, solve_poses, spans
 from fluoromap.monoplane.bundle import AdjustedBody, BodyView, adjust
 from fluoromap.monoplane.observed import ObservedView, observe, turned_covariance_mm2
-from fluoromap.monoplane.rigidity import rigid_error_mm
+from fluoromap.monoplane.rigidity import rigid_error_mm, tells_of_body
 from fluoromap.reasons import Reason
 
 __all__ = ["RigidPose", "follow_body", "pose_covariance_mm2", "solve_poses"]
@@ -36,7 +36,7 @@ class RigidPose:
         known_rigid: bool = Field(
             False,
             description="The electrodes are one rigid body, a phantom's for example. Otherwise two views of the study must have "
-            "shown that they nearly are.",
+            "shown that they nearly are; what two views have shown to bend is refused all the same.",
         )
         iterations: int = Field(6, ge=1, le=50, description="Steps of the pose a frame, from the frame before.")
         largest_bound_mm: float = Field(
@@ -104,7 +104,8 @@ class RigidPose:
     def _shown_rigid(self, view: MonoplaneView, observed: ObservedView) -> bool:
         """Whether cycles seen in two views tell that a rigid pose is good enough; refuses when they tell that it is not."""
         cycles = view.others if view.cycle is None else (view.cycle,)
-        told = [rigid_error_mm(view.camera, cycle, observed.labels) for cycle in cycles]
+        whole = [cycle for cycle in cycles if tells_of_body(cycle, observed.labels)]
+        told = [rigid_error_mm(view.camera, cycle, observed.labels) for cycle in whole or cycles]
         errors = [error for error in told if error is not None]
         if errors and (error := float(np.median(errors))) > self._params.largest_bound_mm:
             raise Refusal(
@@ -113,7 +114,7 @@ class RigidPose:
                 f"{error:.1f} mm wrong (RMS over the electrodes); {self._params.largest_bound_mm:.1f} mm is the limit. A "
                 "heart's catheters move by themselves; use another solver.",
             )
-        return bool(errors)
+        return bool(whole and errors)
 
     def _fit(self, view: MonoplaneView, observed: ObservedView, frames: IntArray) -> AdjustedBody:
         p = self._params
@@ -238,8 +239,8 @@ def _shape_unknown(view: MonoplaneView, observed: ObservedView) -> Refusal:
     return Refusal(
         Reason.DEPTH_UNOBSERVABLE,
         "Nothing tells that these electrodes keep their distances: in one view a heart that contracts by one percent looks like "
-        f"one that moves {one_percent_mm:.0f} mm away, and no cycle of this study was seen in two views. Say that they are one "
-        "rigid body (known_rigid), as in a phantom, or use another solver.",
+        f"one that moves {one_percent_mm:.0f} mm away, and no whole cycle of all these electrodes was seen in two views. Say that "
+        "they are one rigid body (known_rigid), as in a phantom, or use another solver.",
     )
 
 

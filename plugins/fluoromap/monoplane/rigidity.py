@@ -15,6 +15,8 @@ from fluoromap.geometry import Camera
 from fluoromap.monoplane.body_pose import solve_poses, spans
 
 _ITERATIONS = 20
+_LONGEST_GAP = 0.25
+"""Of the cycle between moments that were seen, above which systole may lie in it."""
 
 
 def rigid_error_mm(camera: Camera, cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> float | None:
@@ -47,3 +49,11 @@ def rigid_error_mm(camera: Camera, cycle: SiteCycle, labels: Collection[tuple[st
     )
     errors = model @ np.swapaxes(rotations, 1, 2) + centres[:, None] - points[1:]
     return float(np.sqrt((errors**2).sum(axis=2).mean()))
+
+
+def tells_of_body(cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> bool:
+    """Whether a cycle can show that electrodes keep their distances: it holds all of them, and no large part of it is missing."""
+    if not len(cycle.phases) or not set(labels) <= set(cycle.labels):
+        return False
+    gaps = np.diff(cycle.phases, append=cycle.phases[0] + 1.0)
+    return bool(gaps.max() <= _LONGEST_GAP)

@@ -39,7 +39,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         1.0, ge=0, le=30, description="Breathing position of the heart in each run along the other two axes, mm."
     )
     respiration_drift_sd_mm: float = Field(
-        0.2, ge=0, le=30, description="Breathing within a run along the patient's long axis, mm."
+        0.2, ge=0, le=30, description="Breathing within a run, about the run's mean, along the patient's long axis, mm."
     )
     beat_sd_mm: float = Field(
         0.25, ge=0, le=10, description="Variation of a catheter tip's place from beat to beat, mm an axis."

@@ -27,11 +27,16 @@ def encode(value: Any) -> bytes:
     ------
     ValueError
         When it holds a number that is not finite.
+    TypeError
+        When it holds anything else, which would not come back as it was.
     """
-    content = to_json(value, fallback=_array)
+    content = to_json(_plain(value))
     if b"NaN" in content or b"Infinity" in content:
-        # As a word it may stand in a text; as a number it is refused.
-        from_json(content, allow_inf_nan=False)
+        # As a word it may stand in a text.
+        try:
+            from_json(content, allow_inf_nan=False)
+        except ValueError:
+            raise ValueError("the result holds a number that is not finite") from None
     return content
 
 
@@ -41,12 +46,32 @@ def decode(kind: type[T], content: bytes) -> T:
     return decoded
 
 
-def _array(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return {"shape": value.shape, "values": value.ravel().tolist()}
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"a result holds a {type(value).__name__}, which is never stored")
+def _plain(value: Any) -> Any:
+    return _encoder(cast(Hashable, type(value)))(value)
+
+
+@functools.cache
+def _encoder(kind: Any) -> Callable[[Any], Any]:
+    if dataclasses.is_dataclass(kind):
+        names = tuple(field.name for field in dataclasses.fields(kind))
+        return lambda value: {name: _plain(getattr(value, name)) for name in names}
+    if issubclass(kind, np.ndarray):
+        return _plain_array
+    if issubclass(kind, np.generic):
+        return lambda value: _plain(value.item())
+    if issubclass(kind, Enum):
+        return lambda value: value.value
+    if issubclass(kind, tuple | list):
+        return lambda value: [_plain(item) for item in value]
+    if issubclass(kind, str | int | float | types.NoneType):
+        return lambda value: value
+    raise TypeError(f"a result holds a {kind.__name__}, which is never stored")
+
+
+def _plain_array(value: np.ndarray[Any, np.dtype[Any]]) -> dict[str, Any]:
+    if value.dtype.kind not in "biuf":
+        raise TypeError(f"a result holds an array of {value.dtype}, which is never stored")
+    return {"shape": value.shape, "values": value.ravel().tolist()}
 
 
 @functools.cache

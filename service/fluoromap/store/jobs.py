@@ -226,7 +226,6 @@ def reap(session: Session) -> int:
         else:
             stage.state = StageState.READY
         stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
-        session.flush()
         _tell_stage(session, job_id, stage)
         _settle(session, job)
     return len(expired)
@@ -314,4 +313,4 @@ def _tell_job(session: Session, job: Job) -> None:
 def _tell_stage(session: Session, job_id: str, stage: Any) -> None:
     """Add the event of a stage's new state; ``stage`` is its row, or a result with the columns of ``_TOLD``."""
     data = {column.key: getattr(stage, column.key) for column in _TOLD}
-    session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(stage.progress, 3)}))
+    session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(float(stage.progress), 3)}))

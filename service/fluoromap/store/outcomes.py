@@ -16,9 +16,9 @@ from fluoromap.store.models import StageRow
 
 T = TypeVar("T")
 
-_AT_HAND = 64
-"""Results: those of a study of 20 sites, which the stages after them read one after the other, and some of another."""
-_known: OrderedDict[str, Any] = OrderedDict()
+_AT_HAND_BYTES = 32 << 20
+"""As stored: the results of a study of 20 sites, which the stages after them read one after the other."""
+_known: OrderedDict[str, tuple[Any, int]] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -45,20 +45,19 @@ def load(kind: type[T], stage: StageRow) -> T:
     if stage.result is None:
         raise ValueError(f"stage {stage.id} has no result")
     with _lock:
-        known = _known.get(stage.result)
+        known, size = _known.get(stage.result, (None, 0))
     # Two kinds of results may have the same bytes.
-    if isinstance(known, kind):
-        remember(stage.result, known)
-        return known
-    loaded = decode(kind, files.path_of(stage.result).read_bytes())
-    remember(stage.result, loaded)
-    return loaded
+    if not isinstance(known, kind):
+        content = files.path_of(stage.result).read_bytes()
+        known, size = decode(kind, content), len(content)
+    remember(stage.result, known, size)
+    return known
 
 
-def remember(sha256: str, result: Any) -> None:
-    """Keep a result at hand under the hash of its stored form: content-addressed and frozen, it stays true."""
+def remember(sha256: str, result: Any, size: int) -> None:
+    """Keep a result at hand under hash and size of its stored form: content-addressed and frozen, it stays true."""
     with _lock:
-        _known[sha256] = result
+        _known[sha256] = result, size
         _known.move_to_end(sha256)
-        if len(_known) > _AT_HAND:
+        while sum(kept for _, kept in _known.values()) > _AT_HAND_BYTES:
             _known.popitem(last=False)

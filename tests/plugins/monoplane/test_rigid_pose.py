@@ -213,6 +213,30 @@ def test_a_contraction_that_looks_like_depth_is_refused_where_two_views_have_sho
     follow(shown, known_rigid=False)
 
 
+@pytest.mark.parametrize("told_by", ["cycle", "others"])
+@pytest.mark.parametrize("told", ["of one catheter at rest", "of all in diastole", "of three electrodes"])
+def test_a_cycle_that_shows_too_little_does_not_pass_for_proof_of_a_rigid_body(
+    simulate, told: str, told_by: str
+) -> None:  # type: ignore[no-untyped-def]
+    simulation = simulate("H18", "AP", 8)
+    centre = simulation.points_mm[0].mean(axis=0)
+    shares = 1 - 0.02 * np.sin(np.linspace(0, np.pi, 8))
+    beating = centre + shares[:, None, None] * (simulation.points_mm[0] - centre)
+    phases, rows = np.linspace(0, 0.9, 8), slice(None)
+    if told == "of all in diastole":
+        phases = np.linspace(0, 0.06, 4)
+    else:
+        rows = slice(20, 30) if told == "of one catheter at rest" else slice(0, 3)
+    n, labels = len(phases), LABELS[rows]
+    still = np.repeat(beating[:1, rows], n, axis=0)
+    cycle = SiteCycle(phases, labels, still, np.broadcast_to(0.01 * np.eye(3), (n, len(labels), 3, 3)))
+    known = {"cycle": cycle} if told_by == "cycle" else {"others": (cycle, cycle, cycle)}
+    view = view_of(simulation.camera, beating[0], simulation.camera.project(beating), **known)
+    refusal = refusal_of(view, known_rigid=False)
+    assert refusal.reason is Reason.DEPTH_UNOBSERVABLE
+    assert "no whole cycle of all these electrodes" in str(refusal)
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_three_catheters_in_a_beating_heart_are_refused_by_the_cycles_of_other_sites(seed: int, share: float) -> None:

@@ -78,7 +78,7 @@ def _run(held: jobs.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
         if not jobs.finish(session, held, sha256, reused=kept is not None, rows=rows):
             raise StageStopped("the claim was lost while the result was stored")
     if result is not None:
-        remember(sha256, result)
+        remember(sha256, result, len(content))
     bound.info("stage_done", reused=kept is not None)
 
 
