@@ -151,7 +151,9 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
         f"{'smooth path':>13}{'bound':>8}{'in 95 %':>9}"
     )
     solvers = [
-        RigidPose(RigidPose.Params(known_rigid=True, gantry_angle_sd_deg=0, acceleration_sd_mm=smooth))
+        RigidPose(
+            RigidPose.Params(known_rigid=True, gantry_angle_sd_deg=0, isocentre_sd_mm=0, acceleration_sd_mm=smooth)
+        )
         for smooth in (None, 0.05)
     ]
     for wrong_mm in (0.0, 2.0):
@@ -293,9 +295,9 @@ def beating_hearts(rng: np.random.Generator) -> Iterator[str]:
                     points = points[:1] + share * (points - points[:1])
                     view = heart_view(study.catalogue, run.truth.camera, names, points, known, rng)
                     try:
-                        track = RigidPose(RigidPose.Params(known_rigid=not known, gantry_angle_sd_deg=0)).follow(
-                            view, Silent()
-                        )
+                        track = RigidPose(
+                            RigidPose.Params(known_rigid=not known, gantry_angle_sd_deg=0, isocentre_sd_mm=0)
+                        ).follow(view, Silent())
                     except Refusal:
                         refused += 1
                     else:

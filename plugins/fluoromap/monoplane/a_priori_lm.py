@@ -15,6 +15,7 @@ from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Track
 from fluoromap.geometry import Camera
 from fluoromap.monoplane.observed import (
     ObservedView,
+    isocentre_covariance_mm2,
     lateral_covariance_mm2,
     observe,
     outwards,
@@ -53,9 +54,10 @@ class APrioriLM:
             1.0, ge=0, le=30, description="Breathing since the a-priori position, along the other two axes, mm."
         )
         gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of the gantry angles, degrees.")
+        isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
 
     name: ClassVar[str] = "a-priori-lm"
-    version: ClassVar[str] = "1"
+    version: ClassVar[str] = "2"
 
     def __init__(self, params: APrioriLM.Params) -> None:
         self._params = params
@@ -110,6 +112,7 @@ class APrioriLM:
             lateral_covariance_mm2(jacobians, observed.covariance_px2)
             + along[..., None, None] * rays[..., :, None] * rays[..., None, :]
             + turned_covariance_mm2(positions, p.gantry_angle_sd_deg)
+            + isocentre_covariance_mm2(view.camera, p.isocentre_sd_mm)
         )
         return covariance
 

@@ -11,6 +11,7 @@ from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
+from fluoromap.monoplane.observed import isocentre_covariance_mm2
 
 FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29
@@ -73,7 +74,7 @@ class MotionCovariance:
         params: MotionParams,
     ) -> None:  # fmt: skip
         self._expected, self._phases, self._params = expected, phases, params
-        self._axis = view.camera.axis_world
+        self._camera, self._axis = view.camera, view.camera.axis_world
         self._names = np.array([name for name, _ in labels])
         self._catheters = tuple(dict.fromkeys(self._names))
         self._mapping = view.catalogue.mapping
@@ -98,7 +99,7 @@ class MotionCovariance:
         n, m = mean.shape[:2]
         breath = p.respiration_sd_mm()
         everywhere = np.ones((n, m, 1, 1))
-        isocentre = p.isocentre_sd_mm**2 * (np.eye(3) - np.outer(self._axis, self._axis))
+        isocentre = isocentre_covariance_mm2(self._camera, p.isocentre_sd_mm)
         yield FIXED, everywhere * _root(expected.common_mm2 + np.diag(breath**2) + isocentre)
         # What two views tell holds for the middle of their runs' breaths. This run's own breath is as far from there as
         # the other one's, which alone has told the depth: along the ray the error is twice what it is to the middle.

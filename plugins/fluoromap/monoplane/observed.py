@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray, ElectrodePoint, MonoplaneView, Refusal
+from fluoromap.geometry import Camera
 from fluoromap.reasons import Reason
 
 
@@ -82,6 +83,12 @@ def turned_covariance_mm2(points_world_mm: Array, angle_sd_deg: float) -> Array:
     squares = (points_world_mm**2).sum(axis=-1)[..., None, None] * np.eye(3)
     outer = points_world_mm[..., :, None] * points_world_mm[..., None, :]
     covariance: Array = np.radians(angle_sd_deg) ** 2 * (squares - outer)
+    return covariance
+
+
+def isocentre_covariance_mm2(camera: Camera, sd_mm: float) -> Array:
+    """Covariance (3, 3) of what a view shows when its isocentre stands elsewhere by this in any direction across the view."""
+    covariance: Array = sd_mm**2 * (np.eye(3) - np.outer(camera.axis_world, camera.axis_world))
     return covariance
 
 

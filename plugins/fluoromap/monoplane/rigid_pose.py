@@ -12,7 +12,7 @@ from scipy.special import gammaincc
 from fluoromap.contracts import Array, Context, IntArray, MonoplaneView, Refusal, Track
 from fluoromap.monoplane.body_pose import follow_body, pose_covariance_mm2, solve_poses, spans
 from fluoromap.monoplane.bundle import AdjustedBody, BodyView, adjust
-from fluoromap.monoplane.observed import ObservedView, observe, turned_covariance_mm2
+from fluoromap.monoplane.observed import ObservedView, isocentre_covariance_mm2, observe, turned_covariance_mm2
 from fluoromap.monoplane.rigidity import rigid_error_mm, tells_of_body
 from fluoromap.reasons import Reason
 
@@ -59,6 +59,7 @@ class RigidPose:
             description="Start value of each frame's displacement along the ray; the answer has none of it.",
         )
         gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of the gantry angles, degrees.")
+        isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
         acceleration_sd_mm: float | None = Field(
             None,
             gt=0,
@@ -188,6 +189,7 @@ class RigidPose:
                 joint = joint - joint[:, :, origin].mean(axis=2)[:, :, None]
                 relative[frame] = _of_each(joint) + turned_covariance_mm2(apart, turn_sd_deg)
         covariance[frames] += turned_covariance_mm2(positions[frames], turn_sd_deg)
+        covariance[frames] += isocentre_covariance_mm2(view.camera, self._params.isocentre_sd_mm)
         vague = bounds > self._params.largest_bound_mm
         followed = np.setdiff1d(frames, [view.a_priori_frame])
         if len(followed) and vague[followed].all():

@@ -71,7 +71,7 @@ def view_of(  # type: ignore[no-untyped-def]
 
 
 def follow(view: MonoplaneView, **params: object) -> Track:
-    known = {"gantry_angle_sd_deg": 0, "known_rigid": True}
+    known = {"gantry_angle_sd_deg": 0, "isocentre_sd_mm": 0, "known_rigid": True}
     return RigidPose(RigidPose.Params.model_validate(known | params)).follow(view, Silent())
 
 
@@ -114,6 +114,17 @@ def test_covariances_hold_the_truth_from_the_isocentre_and_from_the_reference(si
         assert (along @ track.relative_covariance_mm2[1:] @ along < along @ track.covariance_mm2[1:] @ along).all()
     assert 0.92 <= np.mean(absolute) <= 0.98
     assert 0.92 <= np.mean(relative) <= 0.98
+
+
+def test_an_isocentre_that_stands_elsewhere_counts_across_the_view_and_not_between_electrodes(simulate) -> None:  # type: ignore[no-untyped-def]
+    simulation = simulate("H18", "AP", 5)
+    seen = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv)
+    known, unknown = (follow(seen, isocentre_sd_mm=sd) for sd in (0.0, 0.7))
+    assert unknown.covariance_mm2[4, 0] - known.covariance_mm2[4, 0] == pytest.approx(
+        np.diag([0.49, 0.49, 0.0]), abs=1e-9
+    )
+    assert known.relative_covariance_mm2 is not None
+    assert unknown.relative_covariance_mm2 == pytest.approx(known.relative_covariance_mm2)
 
 
 def test_without_the_reference_in_the_body_nothing_is_told_relative_to_it(simulate) -> None:  # type: ignore[no-untyped-def]
