@@ -13,7 +13,8 @@ from fluoromap import queue
 from fluoromap.contracts import Context
 from fluoromap.store import files
 from fluoromap.store.engine import reading, writing
-from fluoromap.store.models import Job, JobState, StageRow, StageState, Study
+from fluoromap.store.jobs import Claim
+from fluoromap.store.models import Event, Job, JobState, StageRow, StageState, Study
 from fluoromap.workers import runner, tasks
 from fluoromap.workers.bridge import Work
 
@@ -81,6 +82,70 @@ def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monk
     with reading() as session:
         states = {job.id: job.state for job in session.scalars(select(Job))}
     assert states == {"j": JobState.SUCCEEDED, "other": JobState.QUEUED}
+
+
+def _more_stages(count: int) -> list[int]:
+    rows = [
+        StageRow(
+            job_id="j", name="segment", subject=f"1.2.{k}", plugin="p", plugin_version="1", depends_on=[],
+            state=StageState.READY,
+        )
+        for k in range(10, 10 + count)
+    ]  # fmt: skip
+    with writing() as session:
+        session.add_all(rows)
+        session.flush()
+        return [row.id for row in rows]
+
+
+def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    known, removed, new = _more_stages(3)
+    keys = {stage: "a", known: "a", removed: "b", new: "c"}
+    computed = []
+
+    def work(held: Claim) -> Work:
+        return Work(keys[held.stage_id] * 64, tuple, lambda context: (computed.append(held.stage_id), held.stage_id))
+
+    monkeypatch.setattr(runner, "_prepare", work)
+    runner.run(stage, "test")
+    runner.run(removed, "test")
+    with writing() as session:
+        row = session.get_one(StageRow, removed)
+        files.path_of(str(row.result)).unlink()
+        row.state, row.result, row.reused = StageState.READY, None, False
+    runner.finish_known("j")
+    assert computed == [stage, removed]
+    with reading() as session:
+        rows = {number: session.get_one(StageRow, number) for number in keys}
+        told = [
+            (event.data["subject"], event.data["state"])
+            for event in session.scalars(select(Event))
+            if event.data.get("reused")
+        ]
+    assert rows[known].state == StageState.DONE
+    assert rows[known].result == rows[stage].result
+    assert rows[known].reused
+    assert told == [("1.2.10", "done")]
+    assert rows[removed].state == StageState.READY
+    assert rows[new].state == StageState.READY
+
+
+def test_a_stage_that_cannot_be_prepared_does_not_keep_the_worker_from_the_others(
+    stage: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (broken,) = _more_stages(1)
+
+    def work(held: Claim) -> Work:
+        if held.stage_id == broken:
+            raise ValueError("a stored result is damaged")
+        return Work("0" * 64, tuple, lambda context: ())
+
+    monkeypatch.setattr(runner, "_prepare", work)
+    monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
+    tasks.run_stage(stage)
+    with reading() as session:
+        assert session.get_one(StageRow, stage).state == StageState.DONE
+        assert session.get_one(StageRow, broken).state == StageState.FAILED
 
 
 @pytest.mark.parametrize("error", [ValueError("no electrode"), OSError("the plugin's own file")])

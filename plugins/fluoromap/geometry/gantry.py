@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -69,8 +70,9 @@ class Gantry:
             raise ValueError("image_axes must be a flip, a quarter turn or both")
 
 
+@functools.lru_cache(maxsize=256)
 def camera_from_gantry(gantry: Gantry) -> Camera:
-    """Perspective camera of a gantry position, for stored pixels.
+    """Perspective camera of a gantry position, for stored pixels; the same object for the same position.
 
     The displayed image looks at the patient from the detector: a frontal view shows the patient's left on the image's
     right. With a the primary and b the secondary angle, n = (sin a cos b, -cos a cos b, sin b) points from the

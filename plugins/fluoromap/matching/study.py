@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -43,7 +44,7 @@ LEAST_PROBABILITY = 0.02
 """Another pairing that is less probable counts as ruled out."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SiteRuns:
     """The two runs of one site as the segmenter left them; None where it failed."""
 
@@ -144,10 +145,14 @@ def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Contex
     return Matching(tuple(matched), tuple(rejected))
 
 
+@functools.lru_cache(maxsize=64)
 def _compare(
     runs: SiteRuns, catalogue: Catalogue, groups: tuple[tuple[str, ...], ...]
 ) -> _ComparedSite | tuple[Reason, ...]:
-    """The site with its chains compared, or why they cannot be."""
+    """The site with its chains compared, or why they cannot be.
+
+    A correction changes one site: the same runs, the very objects, are compared once.
+    """
     if runs.segmentation_a is None or runs.segmentation_b is None:
         return (Reason.PLUGIN_FAILED,)
     if ray_angle_deg(runs.camera_a, runs.camera_b) < PARALLEL_BELOW_DEG:

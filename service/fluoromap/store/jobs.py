@@ -7,7 +7,7 @@ see each other and nobody deadlocks.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -111,6 +111,28 @@ def first_ready(session: Session, job_id: str) -> int | None:
     """The job's first stage that may be claimed."""
     query = select(StageRow.id).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
     return session.scalar(query.order_by(StageRow.id).limit(1))
+
+
+def ready(session: Session, job_id: str) -> list[Claim]:
+    """The job's stages that may be claimed, as the claims they would give."""
+    columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
+    query = select(*columns).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
+    return [Claim(*row) for row in session.execute(query.order_by(StageRow.id))]
+
+
+def finish_ready(session: Session, job_id: str, results: Mapping[int, str]) -> None:
+    """End stages whose results are known already, stage id -> result, as far as nobody has claimed them."""
+    job = _lock(session, job_id)
+    for stage_id, result in results.items():
+        ended = session.execute(
+            update(StageRow)
+            .where(StageRow.id == stage_id, StageRow.state == StageState.READY)
+            .values(state=StageState.DONE, attempt=StageRow.attempt + 1, result=result, reused=True, progress=1.0)
+            .returning(*_TOLD)
+        ).first()
+        if ended is not None:
+            _tell_stage(session, job_id, ended)
+    _settle(session, job)
 
 
 def claim(session: Session, stage_id: int, worker: str) -> Claim | None:

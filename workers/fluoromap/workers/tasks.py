@@ -18,7 +18,7 @@ from fluoromap import queue
 from fluoromap.store import jobs
 from fluoromap.store.engine import forget_connections, reading, writing
 from fluoromap.workers.process import limit_memory, warm_up
-from fluoromap.workers.runner import run
+from fluoromap.workers.runner import finish_known, run
 
 SWEEP_SECONDS = 1.0
 
@@ -33,14 +33,17 @@ def run_stage(stage_id: int) -> None:
     """
     worker = f"{socket.gethostname()}:{os.getpid()}"
     end = time.monotonic() + queue.STAYS_SECONDS
-    upcoming: int | None = stage_id
-    while upcoming is not None:
-        job = run(upcoming, worker)
-        queue.publish_due()
-        if job is None or time.monotonic() > end:
-            return
+    job = run(stage_id, worker)
+    if job is None:
+        return
+    finish_known(job)
+    queue.publish_due()
+    while time.monotonic() <= end:
         with reading() as session:
             upcoming = jobs.first_ready(session, job)
+        if upcoming is None or run(upcoming, worker) is None:
+            return
+        queue.publish_due()
 
 
 @worker_process_init.connect
