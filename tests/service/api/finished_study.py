@@ -92,7 +92,7 @@ class FinishedStudy:
 
     def segmented(self) -> None:
         for uid in self.uids.values():
-            self.end("segment", uid, {"of": uid})
+            self.end("segment", uid, ("of", uid))
 
     def matched(self) -> None:
         self.segmented()
