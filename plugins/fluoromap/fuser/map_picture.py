@@ -114,7 +114,7 @@ class _Panel:
         raster = rasterise(uv, nearness, chamber.faces, facing, (side, side))
         pixels = np.full((side, side, 3), BACKGROUND, dtype=np.uint8)
         colours, _, _ = pixel_colours(raster, chamber, times, SMOOTH)
-        shown = raster.shown()
+        shown = raster.pixels
         # Light from the viewer, weak enough that a colour is still found again on the bar.
         light = 0.78 + 0.22 * np.clip(towards[raster.face[shown]], 0, 1)
         pixels[shown] = (colours * light[:, None]).round().astype(np.uint8)

@@ -31,8 +31,8 @@ LEAST_DEPTH_MM = 10.0
 OUT_OF_SIGHT_PX = -1e6
 CHI2_95_2D = 5.991464547107979
 ELLIPSE_RGB = (255, 255, 120)
-PNG_LEVEL = 3
-"""Noise does not compress: more effort takes twice as long and saves 2 %."""
+PNG_LEVEL = 2
+"""Noise does not compress: more effort takes up to twice as long and saves a tenth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,10 +172,13 @@ class _Canvas:
 
 def _tint(rgb: Picture, raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None) -> None:
     colours, covered, hatched = pixel_colours(raster, chamber, times, unit, until_ms)
-    share = np.where(covered, TINT, np.where(hatched, HATCH_TINT, 0.0)).astype(np.float32)[:, None]
-    shown = raster.shown()
-    under = rgb[shown].astype(np.float32)
-    rgb[shown] = (under + share * (colours - under)).round().astype(np.uint8)
+    share = np.where(covered, np.float32(TINT), np.where(hatched, np.float32(HATCH_TINT), np.float32(0.0)))[:, None]
+    v, u = raster.pixels
+    under = rgb[v, u].astype(np.float32)
+    colours -= under
+    colours *= share
+    colours += under
+    rgb[v, u] = colours.round(out=colours).astype(np.uint8)
 
 
 def _draw_lines(

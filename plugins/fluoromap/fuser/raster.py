@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +26,11 @@ class Raster:
     faces: IntArray
     nearness: Array
 
-    def shown(self) -> BoolArray:
-        """Pixels (rows, columns) that show the surface."""
-        return self.face >= 0
+    @functools.cached_property
+    def pixels(self) -> tuple[IntArray, IntArray]:
+        """Rows (p,) and columns (p,) of the pixels that show the surface, in row-major order."""
+        rows, columns = np.divmod(np.flatnonzero(self.face >= 0), self.face.shape[1])
+        return rows, columns
 
     def sample(self, values: Array, cycle: float | None = None) -> Array:
         """Values (n,) of the vertices at the shown pixels, linear within each face; (p,) in row-major order.
@@ -35,7 +38,7 @@ class Raster:
         Values that repeat after ``cycle`` are taken by the shorter way round from corner to corner, and answered from the
         least of them on.
         """
-        v, u = np.nonzero(self.shown())
+        v, u = self.pixels
         sampled = self._inside(self.face[v, u], np.stack([u, v], axis=1).astype(np.float64), values, cycle)
         return sampled if cycle is None else values.min() + (sampled - values.min()) % cycle
 

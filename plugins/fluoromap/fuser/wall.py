@@ -21,7 +21,7 @@ def pixel_colours(
     covered = raster.sample(chamber.covered.astype(np.float64)) > 0.5
     lat = raster.sample(_times_past_rim(chamber), chamber.cycle_length_ms)
     colours = times.band_colours()[times.band(lat)].astype(np.float32)
-    v, u = np.nonzero(raster.shown())
+    v, u = raster.pixels
     hatched = ~covered & ((u + v) % max(4, round(7 * unit)) < max(1, round(unit)))
     colours[~covered] = NO_DATA_RGB
     colours[hatched] = NO_DATA_HATCH_RGB

@@ -96,8 +96,8 @@ def test_raster_shows_the_nearest_face_with_linear_values():
     faces = np.array([[0, 1, 2], [3, 4, 5]])
     for order in (faces, faces[::-1]):
         raster = rasterise(uv, nearness, order, np.ones(2, dtype=bool), (50, 50))
-        assert (order[raster.face[raster.shown()]] == [3, 4, 5]).all()
-        v, u = np.nonzero(raster.shown())
+        assert (order[raster.face[raster.pixels]] == [3, 4, 5]).all()
+        v, u = raster.pixels
         np.testing.assert_allclose(raster.sample(2 * uv[:, 0] - uv[:, 1]), 2.0 * u - v, atol=1.5)
     assert raster.visible(np.array([[5.0, 5.0], [5.0, 5.0], [45.0, 45.0]]), np.array([5.0, 1.0, 1.0])).tolist() == [
         True,
@@ -117,7 +117,7 @@ def test_early_meets_late_without_running_through_all_bands():
     uv = 250 + 5 * (chamber.vertices_mm - middle)[:, :2]
     facing = np.ones(len(chamber.faces), bool)
     raster = rasterise(uv, chamber.vertices_mm[:, 2], chamber.faces, facing, (500, 500))
-    v, u = np.nonzero(raster.shown())
+    v, u = raster.pixels
     sampled = raster.sample(reentry.lat_ms, cycle)
     angle = np.degrees(np.arctan2(v - 250, u - 250)) % 360
     off = np.abs((sampled - angle + 180) % 360 - 180)
