@@ -183,7 +183,7 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
 
 
 def test_a_result_that_comes_late_is_thrown_away(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def overtaken(context: Context) -> dict[str, bool]:
+    def overtaken(context: Context) -> tuple[str]:
         with writing() as session:
             session.get_one(StageRow, stage).attempt += 1
         return ("late",)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import or_, select, update
+from sqlalchemy import Row, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap import matching
@@ -107,14 +107,8 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
     return ids
 
 
-def first_ready(session: Session, job_id: str) -> int | None:
-    """The job's first stage that may be claimed."""
-    query = select(StageRow.id).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
-    return session.scalar(query.order_by(StageRow.id).limit(1))
-
-
 def ready(session: Session, job_id: str) -> list[Claim]:
-    """The job's stages that may be claimed, as the claims they would give."""
+    """The job's stages that may be claimed, in the order they were made, as the claims they would give."""
     columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
     query = select(*columns).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
     return [Claim(*row) for row in session.execute(query.order_by(StageRow.id))]
@@ -332,7 +326,7 @@ def _tell_job(session: Session, job: Job) -> None:
     session.add(Event(job_id=job.id, kind="job", data={"state": job.state, "error": job.error}))
 
 
-def _tell_stage(session: Session, job_id: str, stage: Any) -> None:
+def _tell_stage(session: Session, job_id: str, stage: StageRow | Row[*tuple[Any, ...]]) -> None:
     """Add the event of a stage's new state; ``stage`` is its row, or a result with the columns of ``_TOLD``."""
     data = {column.key: getattr(stage, column.key) for column in _TOLD}
     session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(float(stage.progress), 3)}))

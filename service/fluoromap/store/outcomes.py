@@ -17,7 +17,7 @@ from fluoromap.store.models import StageRow
 T = TypeVar("T")
 
 _AT_HAND_BYTES = 32 << 20
-"""As stored: the results of a study of 20 sites, which the stages after them read one after the other."""
+"""Most of what is at hand, as stored: a study's results are read again by each stage after them, and after a correction."""
 _known: OrderedDict[str, tuple[Any, int]] = OrderedDict()
 _lock = threading.Lock()
 

@@ -37,6 +37,22 @@ def test_all_sites_are_all_named_and_paired_right(heart, angles: tuple[float, fl
         assert all(len(seen.chains) == 3 for seen in site.track_b)
 
 
+def test_sites_that_were_matched_before_get_the_same_answer_beside_others(heart) -> None:  # type: ignore[no-untyped-def]
+    study, again = heart(seed=4), heart(seed=4)
+
+    def answer(sites: list[SiteRuns]) -> list[object]:
+        matched = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent()).sites
+        return [
+            (site.notes, [(c.catheter, c.pixels_uv.tolist()) for seen in site.track_a for c in seen.chains])
+            for site in matched
+        ]
+
+    known = [study.site(f"S{i}") for i in range(3)]
+    answer(known)
+    fresh = [again.site(f"S{i}") for i in range(4)]
+    assert answer([*known, study.site("S3")]) == answer(fresh)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_mapping_catheter_is_told_by_its_tip_in_every_site(heart, seed: int) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=seed, wrong_kinds=0.2, noise_px=1.0, breathing_mm=5.0)

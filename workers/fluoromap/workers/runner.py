@@ -63,7 +63,8 @@ def finish_known(job_id: str) -> None:
     """End at once what is ready of a job and was computed before: after a correction nearly all of its runs."""
     try:
         with reading() as session:
-            works = [(stage.stage_id, _prepare(stage)) for stage in jobs.ready(session, job_id)]
+            ready = jobs.ready(session, job_id)
+        works = [(stage.stage_id, _prepare(stage)) for stage in ready]
         kept = [(stage_id, _kept_result(work.key)) for stage_id, work in works if work.rows is None]
         known = {stage_id: sha256 for stage_id, sha256 in kept if sha256 is not None}
         if known:

@@ -40,8 +40,8 @@ def run_stage(stage_id: int) -> None:
     queue.publish_due()
     while time.monotonic() <= end:
         with reading() as session:
-            upcoming = jobs.first_ready(session, job)
-        if upcoming is None or run(upcoming, worker) is None:
+            waiting = jobs.ready(session, job)
+        if not waiting or run(waiting[0].stage_id, worker) is None:
             return
         queue.publish_due()
 
