@@ -69,9 +69,10 @@ def with_servers(environment: dict[str, str], port: int) -> Iterator[Kill]:
         worker = stack.enter_context(process("worker", environment=environment))
 
         def kill() -> None:
+            nonlocal worker
             kill_group(worker.pid)
             worker.wait()
-            stack.enter_context(process("worker", environment=environment))
+            worker = stack.enter_context(process("worker", environment=environment))
 
         yield kill
 
