@@ -26,7 +26,8 @@ from scipy.spatial import ConvexHull as Hull
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import ChamberMap, Fuser, MappedSite, Silent
-from fluoromap.fuser.overlay import Look, draw_overlay, encode_png
+from fluoromap.fuser.overlay import Look, draw_overlay
+from fluoromap.fuser.png import encode_png
 from fluoromap.fuser.surface import face_areas_mm2, hull_surface, volume_mm3
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.phantom import StudySpec, simulate_study
@@ -222,11 +223,12 @@ def _overlays(seed: int) -> None:
     chamber = build_fuser("smooth-surface", {}).fuse(sites, Silent())
     run = simulate_study(StudySpec(seed, sites=1, frames=1)).sites[0].runs[0]
     camera, frame = camera_from_gantry(run.gantry), (run.frames[0] >> 4).astype(np.uint8)
+    to_isocentre = -chamber.vertices_mm.mean(axis=0)
     for scale in (1, 2):
         spent = []
         for _ in range(12):
             start = time.process_time()
-            picture = draw_overlay(frame, camera, chamber, np.zeros(3), sites[0].site, None, Look(scale=scale))
+            picture = draw_overlay(frame, camera, chamber, to_isocentre, sites[0].site, None, Look(scale=scale))
             drawn = time.process_time()
             encode_png(picture)
             spent.append((drawn - start, time.process_time() - drawn))

@@ -12,7 +12,8 @@ from fluoromap.contracts import Context
 from fluoromap.figures.differences import MapDifference, SiteDifference, map_difference, site_differences
 from fluoromap.figures.moment import NOISE_PX, MomentInView, PhantomView, farthest_phase, moment_in_views
 from fluoromap.figures.pictures import figure, in_space, on_frame
-from fluoromap.fuser.overlay import Picture, encode_png
+from fluoromap.fuser.overlay import Picture
+from fluoromap.fuser.png import encode_png
 from fluoromap.phantom import SimulatedRun, SimulatedStudy, StudySpec, simulate_study
 from fluoromap.registry import DEFAULTS
 

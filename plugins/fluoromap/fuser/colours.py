@@ -61,7 +61,9 @@ class Scale:
 
     def band(self, lat_ms: Array) -> NDArray[np.int64]:
         """Band of each time; times outside the scale count to the first or last one."""
-        return np.clip(np.floor((lat_ms - self.start_ms) / self.step_ms), 0, self.bands - 1).astype(np.int64)
+        bands = (lat_ms - self.start_ms) / self.step_ms
+        # Clipped first, so that cutting the fraction off rounds down.
+        return np.clip(bands, 0, self.bands - 1).astype(np.int64)
 
     def band_colours(self) -> Colours:
         """RGB of each band, (bands, 3)."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 
+import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from fluoromap.contracts import Array
 from fluoromap.fuser.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale, milliseconds
 
 Point = tuple[float, float]
@@ -35,39 +37,34 @@ def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, in
     draw.text(middle, text, fill=ink, font=font(size), anchor="mm", stroke_width=stroke, stroke_fill=halo)
 
 
-_NEAR = ((1, 0), (-1, 0), (0, -1), (0, 1), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (-0.8, 0.8))
-_DIRECTIONS = (*_NEAR, *((1.7 * right, 1.7 * down) for right, down in _NEAR))
+_NEAR = np.array([(1, 0), (-1, 0), (0, -1), (0, 1), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (-0.8, 0.8)])
+_DIRECTIONS = np.concatenate([_NEAR, 1.7 * _NEAR])
 
 
 class Labels:
     """Places labels beside their points, close where there is room, without covering one another where that can be had."""
 
     def __init__(self, width: int, height: int, taken: Iterable[Box] = ()) -> None:
-        self._field = (0.0, 0.0, float(width), float(height))
-        self._taken = list(taken)
+        self._field = np.array([[0.0, 0.0, width, height]])
+        self._taken = np.array(list(taken), dtype=np.float64).reshape(-1, 4)
 
     def place(self, point: Point, text: str, size: int, distance: float) -> Point:
-        """Middle of the label, in the direction where it overlaps least."""
-        width, height = text_size(text, size)
-        width, height = width + size // 3, height + size // 3
-        best, cost_of_best, box_of_best = point, float("inf"), (0.0, 0.0, 0.0, 0.0)
-        side, up = distance + width / 2, distance + height / 2
-        for rank, (right, down) in enumerate(_DIRECTIONS):
-            middle = (point[0] + right * side, point[1] + down * up)
-            box = (middle[0] - width / 2, middle[1] - height / 2, middle[0] + width / 2, middle[1] + height / 2)
-            outside = width * height - _overlap(box, self._field)
-            cost = rank + 2 * outside + sum(_overlap(box, other) for other in self._taken)
-            if cost < cost_of_best:
-                best, cost_of_best, box_of_best = middle, cost, box
-            if cost_of_best <= rank:
-                break
-        self._taken.append(box_of_best)
-        return best
+        """Middle of the label, in the direction where it overlaps least, the first of those that are as good."""
+        box = np.array(text_size(text, size)) + size // 3
+        middles = point + _DIRECTIONS * (distance + box / 2)
+        boxes = np.concatenate([middles - box / 2, middles + box / 2], axis=1)
+        outside = box.prod() - _overlaps(boxes, self._field)[:, 0]
+        best = int((np.arange(len(boxes)) + 2 * outside + _overlaps(boxes, self._taken).sum(axis=1)).argmin())
+        self._taken = np.concatenate([self._taken, boxes[best : best + 1]])
+        u, v = middles[best].tolist()
+        return u, v
 
 
-def _overlap(a: Box, b: Box) -> float:
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    return max(width, 0.0) * max(height, 0.0)
+def _overlaps(a: Array, b: Array) -> Array:
+    """Areas (j, k) that boxes (j, 4) share with boxes (k, 4)."""
+    low, high = np.maximum(a[:, None, :2], b[:, :2]), np.minimum(a[:, None, 2:], b[:, 2:])
+    areas: Array = np.maximum(high - low, 0.0).prod(axis=2)
+    return areas
 
 
 def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:

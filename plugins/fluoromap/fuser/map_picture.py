@@ -16,7 +16,7 @@ from fluoromap.fuser.lettering import Labels, Point, draw_colour_bar, font
 from fluoromap.fuser.raster import rasterise
 from fluoromap.fuser.surface import face_normals
 from fluoromap.fuser.symbols import draw_dot, draw_time, is_outlier
-from fluoromap.fuser.wall import outline_edges, pixel_colours, runs
+from fluoromap.fuser.wall import bands_shown, colour_table, outline_edges, runs
 
 Direction = tuple[str, float, float, tuple[str, str, str, str]]
 
@@ -112,12 +112,10 @@ class _Panel:
         uv, nearness = self.project(chamber.vertices_mm, SMOOTH)
         side = PANEL_PX * SMOOTH
         raster = rasterise(uv, nearness, chamber.faces, facing, (side, side))
-        pixels = np.full((side, side, 3), BACKGROUND, dtype=np.uint8)
-        colours, _, _ = pixel_colours(raster, chamber, times, SMOOTH)
-        shown = raster.pixels
-        # Light from the viewer, weak enough that a colour is still found again on the bar.
-        light = 0.78 + 0.22 * np.clip(towards[raster.face[shown]], 0, 1)
-        pixels[shown] = (colours * light[:, None]).round().astype(np.uint8)
+        colours = colour_table(times, BACKGROUND)[bands_shown(raster, chamber, times, SMOOTH)]
+        # Light from the viewer, weak enough that a colour is still found again on the bar; none on the background.
+        light = np.append(0.78 + 0.22 * np.clip(towards, 0, 1), 1.0).astype(np.float32)
+        pixels = (colours * light[raster.face][..., None]).round().astype(np.uint8)
 
         image = Image.fromarray(pixels)
         draw = ImageDraw.Draw(image)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.fuser.cycle import around
@@ -26,20 +24,14 @@ class Raster:
     faces: IntArray
     nearness: Array
 
-    @functools.cached_property
-    def pixels(self) -> tuple[IntArray, IntArray]:
-        """Rows (p,) and columns (p,) of the pixels that show the surface, in row-major order."""
-        rows, columns = np.divmod(np.flatnonzero(self.face >= 0), self.face.shape[1])
-        return rows, columns
-
-    def sample(self, values: Array, cycle: float | None = None) -> Array:
-        """Values (n,) of the vertices at the shown pixels, linear within each face; (p,) in row-major order.
+    def sample(self, pixels: IntArray, values: Array, cycle: float | None = None) -> Array:
+        """Values (n,) of the vertices at pixels (p,), counted in row-major order, linear within each face; (p,).
 
         Values that repeat after ``cycle`` are taken by the shorter way round from corner to corner, and answered from the
-        least of them on.
+        least of them on. Each pixel must show a face.
         """
-        v, u = self.pixels
-        sampled = self._inside(self.face[v, u], np.stack([u, v], axis=1).astype(np.float64), values, cycle)
+        uv = np.stack(np.divmod(pixels, self.face.shape[1])[::-1], axis=1).astype(np.float64)
+        sampled = self._inside(self.face.ravel()[pixels], uv, values, cycle)
         return sampled if cycle is None else values.min() + (sampled - values.min()) % cycle
 
     def visible(self, uv: Array, nearness: Array, tolerance_mm: float = 1.5) -> BoolArray:
@@ -73,7 +65,7 @@ class Raster:
 
 
 def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, shape: tuple[int, int]) -> Raster:
-    """Paint the facing faces from the farthest to the nearest (painter's algorithm).
+    """Paint the facing faces from the farthest to the nearest (painter's algorithm), each the pixels whose centre it holds.
 
     Parameters
     ----------
@@ -84,13 +76,37 @@ def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, sh
     shape : (rows, columns)
     """
     rows, columns = shape
-    picture = Image.new("I", (columns, rows), -1)
-    draw = ImageDraw.Draw(picture)
     corners = uv[faces]
     in_field = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) <= [columns - 1, rows - 1]).all(axis=1)
     painted = np.flatnonzero(facing & in_field)
-    order = painted[np.argsort(nearness[faces[painted]].mean(axis=1), kind="stable")]
-    # Pillow cuts coordinates to whole numbers; half a pixel more rounds them.
-    for face, triangle in zip(order.tolist(), (corners[order] + 0.5).reshape(-1, 6).tolist(), strict=True):
-        draw.polygon(triangle, fill=face)
-    return Raster(np.array(picture, dtype=np.int32), uv, faces, nearness)
+    painted = painted[np.argsort(nearness[faces[painted]].mean(axis=1), kind="stable")]
+    # From the top corner down. An edge gives the same number to both its faces: no pixel between them is missed or shared.
+    order = np.argsort(corners[painted, :, 1], axis=1, kind="stable")
+    top, middle, bottom = np.take_along_axis(corners[painted], order[..., None], axis=1).transpose(1, 0, 2)
+    of_triangle, row = _ranges(top[:, 1], bottom[:, 1], rows)
+    top, middle, bottom = (np.repeat(corner, of_triangle, axis=0) for corner in (top, middle, bottom))
+    below = (row >= middle[:, 1])[:, None]
+    long = _crossing(top, bottom, row)
+    short = _crossing(np.where(below, middle, top), np.where(below, bottom, middle), row)
+    of_row, column = _ranges(np.minimum(long, short), np.maximum(long, short), columns)
+    face = np.full(rows * columns, -1, dtype=np.int32)
+    # Of values for the same pixel the last one stays.
+    face[np.repeat(row * columns, of_row) + column] = np.repeat(
+        np.repeat(painted.astype(np.int32), of_triangle), of_row
+    )
+    return Raster(face.reshape(shape), uv, faces, nearness)
+
+
+def _ranges(first: Array, last: Array, end: int) -> tuple[IntArray, IntArray]:
+    """The whole numbers from ``first`` (k,) to before ``last`` (k,) within 0 to ``end``: how many of each (k,), and all."""
+    start, stop = (np.ceil(np.clip(bound, 0, end)).astype(np.int64) for bound in (first, last))
+    count = stop - start
+    past = np.cumsum(count)
+    return count, np.arange(count.sum()) + np.repeat(stop - past, count)
+
+
+def _crossing(upper: Array, lower: Array, row: IntArray) -> Array:
+    """Columns (k,) where the lines from ``upper`` to ``lower`` (k, 2) cross rows (k,)."""
+    along = (row - upper[:, 1]) / np.maximum(lower[:, 1] - upper[:, 1], 1e-12)
+    column: Array = upper[:, 0] + along * (lower[:, 0] - upper[:, 0])
+    return column

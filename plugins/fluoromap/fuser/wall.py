@@ -9,25 +9,51 @@ from fluoromap.contracts import Array, BoolArray, ChamberMap, IntArray
 from fluoromap.fuser.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale
 from fluoromap.fuser.raster import Raster
 
+NO_DATA, HATCH, NOTHING = -1, -2, -3
+"""Where there is no band: no site is near, the hatch that says so, no wall or one that is not to be coloured yet."""
 
-def pixel_colours(
+_WITHIN = -4
+
+
+def bands_shown(
     raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None = None
-) -> tuple[NDArray[np.float32], BoolArray, BoolArray]:
-    """Of the p pixels that show the wall, in row-major order: RGB (p, 3), coloured (p,), on the "no data" hatch (p,).
+) -> NDArray[np.int16]:
+    """Band of ``times`` that each pixel (rows, columns) shows; ``NO_DATA``, ``HATCH`` or ``NOTHING`` where none.
 
-    Coloured is what is covered and, where ``until_ms`` is given, activated by then. ``unit`` is the size of the picture's
-    details, 1 for a picture of 512 pixels.
+    Only what is activated by ``until_ms``, where given, has a band. ``unit`` is the size of the picture's details, 1 for a
+    picture of 512 pixels. The negative values count a colour table, as :func:`colour_table` makes it, from its end.
     """
-    covered = raster.sample(chamber.covered.astype(np.float64)) > 0.5
-    lat = raster.sample(_times_past_rim(chamber), chamber.cycle_length_ms)
-    colours = times.band_colours()[times.band(lat)].astype(np.float32)
-    v, u = raster.pixels
-    hatched = ~covered & ((u + v) % max(4, round(7 * unit)) < max(1, round(unit)))
-    colours[~covered] = NO_DATA_RGB
-    colours[hatched] = NO_DATA_HATCH_RGB
-    if until_ms is not None:
-        covered &= lat <= until_ms
-    return colours, covered, hatched
+    lat, cycle = _times_past_rim(chamber), chamber.cycle_length_ms
+
+    def band(lat_ms: Array) -> NDArray[np.int64]:
+        return times.band(lat_ms) if until_ms is None else np.where(lat_ms <= until_ms, times.band(lat_ms), NOTHING)
+
+    covered, at_corners = chamber.covered[chamber.faces], band(lat)[chamber.faces]
+    corners_covered: IntArray = covered.sum(axis=1)
+    # Faces that cross no limit need no look at their pixels; round a cycle equal corners may lie on either side of it.
+    one_band = (corners_covered == 3) & (np.ptp(at_corners, axis=1) == 0)
+    if cycle is not None:
+        one_band &= np.ptp(lat[chamber.faces], axis=1) < cycle / 2
+    of_face = np.where(one_band, at_corners[:, 0], np.where(corners_covered > 0, _WITHIN, NO_DATA))
+    shown = np.append(of_face, NOTHING).astype(np.int16)[raster.face]
+
+    flat = shown.ravel()
+    within = np.flatnonzero(flat == _WITHIN)
+    flat[within] = band(raster.sample(within, lat, cycle))
+    rim = within[corners_covered[raster.face.ravel()[within]] < 3]
+    flat[rim[raster.sample(rim, chamber.covered.astype(np.float64)) <= 0.5]] = NO_DATA
+    far = np.flatnonzero(flat == NO_DATA)
+    v, u = np.divmod(far, shown.shape[1])
+    flat[far[(u + v) % max(4, round(7 * unit)) < max(1, round(unit))]] = HATCH
+    return shown
+
+
+def colour_table(times: Scale, nothing: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """RGB (bands + 3, 3) that :func:`bands_shown` counts."""
+    table: NDArray[np.uint8] = np.concatenate(
+        [times.band_colours(), np.array([nothing, NO_DATA_HATCH_RGB, NO_DATA_RGB], dtype=np.uint8)]
+    )
+    return table
 
 
 def _times_past_rim(chamber: ChamberMap) -> Array:

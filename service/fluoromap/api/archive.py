@@ -25,7 +25,8 @@ from fluoromap.api.report import report_page
 from fluoromap.api.security import Reader
 from fluoromap.api.tracks import tracks_csv, tracks_of
 from fluoromap.fuser.map_picture import draw_map_views
-from fluoromap.fuser.overlay import Look, encode_png
+from fluoromap.fuser.overlay import Look
+from fluoromap.fuser.png import encode_png
 from fluoromap.settings import settings
 from fluoromap.store.engine import reading
 from fluoromap.store.files import CHUNK_BYTES

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path as FilePath
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from PIL import Image
 
 from fluoromap.api.drawing import drawn
 from fluoromap.api.etags import known, not_modified
@@ -17,6 +15,7 @@ from fluoromap.api.problems import Problem, not_found, responses
 from fluoromap.api.security import Reader
 from fluoromap.api.studies import StudyId
 from fluoromap.dicom import InstanceFacts, frame_to_8bit, open_frames
+from fluoromap.fuser.png import encode_png
 from fluoromap.store import files, instances
 from fluoromap.store.engine import reading
 
@@ -27,10 +26,7 @@ FrameNumber = Annotated[int, Path(ge=1, description="Counted from 1.")]
 
 def frame_png(path: FilePath, facts: InstanceFacts, frame: int, window: tuple[float, float] | None) -> bytes:
     """Frame ``frame`` (from 0) as an 8-bit greyscale PNG of the stored size and orientation."""
-    pixels = frame_to_8bit(open_frames(path, facts)[frame], facts, window)
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG", compress_level=1)
-    return stream.getvalue()
+    return encode_png(frame_to_8bit(open_frames(path, facts)[frame], facts, window))
 
 
 @router.get(

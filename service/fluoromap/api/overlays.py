@@ -24,7 +24,8 @@ from fluoromap.contracts import Array, ChamberMap, LocatedSite, Matching, Triang
 from fluoromap.dicom import InstanceFacts, frame_to_8bit, open_frames
 from fluoromap.fuser.animation import draw_propagation
 from fluoromap.fuser.colours import Palette
-from fluoromap.fuser.overlay import Look, draw_overlay, encode_png
+from fluoromap.fuser.overlay import Look, draw_overlay
+from fluoromap.fuser.png import encode_png
 from fluoromap.geometry import Camera
 from fluoromap.store import files
 from fluoromap.store.engine import reading

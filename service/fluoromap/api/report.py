@@ -32,7 +32,8 @@ from fluoromap.api.tracks import tracks_of
 from fluoromap.contracts import ChamberMap, Triangulation
 from fluoromap.fuser.colours import vertex_colours
 from fluoromap.fuser.map_picture import draw_map_views
-from fluoromap.fuser.overlay import Look, encode_png
+from fluoromap.fuser.overlay import Look
+from fluoromap.fuser.png import encode_png
 from fluoromap.store.engine import reading
 from fluoromap.store.models import ENDED_JOB, Study
 from fluoromap.store.outcomes import load, stage_of, stages_of

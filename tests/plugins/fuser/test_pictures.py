@@ -7,14 +7,19 @@ import numpy as np
 import pytest
 from chambers import fused, sites_at, sphere
 from PIL import Image
+from scipy.spatial import Delaunay
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkIOImage import vtkPNGReader
 
 from fluoromap.fuser.animation import PICTURES, draw_propagation
 from fluoromap.fuser.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
 from fluoromap.fuser.isochrones import isochrones
 from fluoromap.fuser.lettering import bar_box
 from fluoromap.fuser.map_picture import draw_map_views
-from fluoromap.fuser.overlay import Look, draw_overlay, encode_png
+from fluoromap.fuser.overlay import Look, draw_overlay
+from fluoromap.fuser.png import encode_png
 from fluoromap.fuser.raster import rasterise
+from fluoromap.fuser.wall import HATCH, NO_DATA, NOTHING, bands_shown
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 
 SHIFT = np.array([-10.0, 20.0, -5.0])
@@ -96,14 +101,60 @@ def test_raster_shows_the_nearest_face_with_linear_values():
     faces = np.array([[0, 1, 2], [3, 4, 5]])
     for order in (faces, faces[::-1]):
         raster = rasterise(uv, nearness, order, np.ones(2, dtype=bool), (50, 50))
-        assert (order[raster.face[raster.pixels]] == [3, 4, 5]).all()
-        v, u = raster.pixels
-        np.testing.assert_allclose(raster.sample(2 * uv[:, 0] - uv[:, 1]), 2.0 * u - v, atol=1.5)
+        shown = np.flatnonzero(raster.face >= 0)
+        v, u = np.divmod(shown, 50)
+        assert (order[raster.face[v, u]] == [3, 4, 5]).all()
+        np.testing.assert_allclose(raster.sample(shown, 2 * uv[:, 0] - uv[:, 1]), 2.0 * u - v, atol=1e-9)
     assert raster.visible(np.array([[5.0, 5.0], [5.0, 5.0], [45.0, 45.0]]), np.array([5.0, 1.0, 1.0])).tolist() == [
         True,
         False,
         True,
     ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faces_side_by_side_share_no_pixel_and_miss_none(seed):
+    rng = np.random.default_rng(seed)
+    # Beyond the picture on all sides; some corners exactly on pixel centres.
+    uv = np.concatenate([rng.uniform(-30, 110, (150, 2)), rng.integers(-5, 85, (50, 2))])
+    uv = np.unique(np.concatenate([uv, [[-99, -99], [199, -99], [-99, 199], [199, 199]]]), axis=0)
+    faces = Delaunay(uv).simplices
+    painted = np.zeros((60, 80), dtype=int)
+    for one in range(len(faces)):
+        alone = rasterise(uv, np.ones(len(uv)), faces, np.arange(len(faces)) == one, (60, 80)).face
+        assert set(np.unique(alone)) <= {-1, one}
+        painted += alone >= 0
+    assert (painted == 1).all()
+    together = rasterise(uv, np.ones(len(uv)), faces, np.ones(len(faces), bool), (60, 80)).face
+    v, u = np.mgrid[:60, :80]
+    corners = uv[faces[together]]
+    edges = np.roll(corners, -1, axis=2) - corners
+    to_pixel = np.stack([u, v], axis=2)[:, :, None] - corners
+    side = edges[..., 0] * to_pixel[..., 1] - edges[..., 1] * to_pixel[..., 0]
+    assert ((side >= -1e-6).all(axis=2) | (side <= 1e-6).all(axis=2)).all()
+
+
+@pytest.mark.parametrize("cycle", [None, 60.0])
+@pytest.mark.parametrize("until", [None, 5.0])
+@pytest.mark.parametrize("scale", [1, 3])
+def test_each_pixel_shows_the_band_of_its_own_time(ball, sparse_ball, cycle, until, scale):
+    for chamber in (ball, sparse_ball):
+        chamber = replace(chamber, cycle_length_ms=cycle)
+        uv = (250 + 4 * chamber.vertices_mm[:, :2]) * scale
+        raster = rasterise(
+            uv, chamber.vertices_mm[:, 2], chamber.faces, np.ones(len(chamber.faces), bool), (500 * scale, 500 * scale)
+        )
+        times = scale_of(chamber)
+        shown = bands_shown(raster, chamber, times, 1.0, until).ravel()
+        assert ((shown == NOTHING) >= (raster.face.ravel() < 0)).all()
+        pixels = np.flatnonzero(raster.face >= 0)
+        covered = raster.sample(pixels, chamber.covered.astype(float)) > 0.5
+        assert (np.isin(shown[pixels], (NO_DATA, HATCH)) == ~covered).all()
+        # On the rim of what is covered the times of the vertices beyond count, which are not the map's.
+        inside = chamber.covered[chamber.faces].all(axis=1)[raster.face.ravel()[pixels]]
+        lat = raster.sample(pixels[inside], chamber.lat_ms, cycle)
+        wanted = times.band(lat) if until is None else np.where(lat <= until, times.band(lat), NOTHING)
+        np.testing.assert_array_equal(shown[pixels[inside]], wanted)
 
 
 def test_early_meets_late_without_running_through_all_bands():
@@ -117,8 +168,9 @@ def test_early_meets_late_without_running_through_all_bands():
     uv = 250 + 5 * (chamber.vertices_mm - middle)[:, :2]
     facing = np.ones(len(chamber.faces), bool)
     raster = rasterise(uv, chamber.vertices_mm[:, 2], chamber.faces, facing, (500, 500))
-    v, u = raster.pixels
-    sampled = raster.sample(reentry.lat_ms, cycle)
+    shown = np.flatnonzero(raster.face >= 0)
+    v, u = np.divmod(shown, 500)
+    sampled = raster.sample(shown, reentry.lat_ms, cycle)
     angle = np.degrees(np.arctan2(v - 250, u - 250)) % 360
     off = np.abs((sampled - angle + 180) % 360 - 180)
     away = np.hypot(v - 250, u - 250) > 50
@@ -266,12 +318,28 @@ class TestOverlay:
         with pytest.raises(ValueError, match="scale"):
             draw_overlay(grey(view), view, ball, SHIFT, "S05", None, Look(scale=0))
 
-    def test_png_is_the_picture_and_always_the_same(self, ball):
+    def test_the_same_overlay_has_the_same_bytes(self, ball):
         view = camera()
         picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None)
         again = draw_overlay(grey(view), view, ball, SHIFT, "S05", None)
         assert encode_png(picture) == encode_png(again)
-        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(encode_png(picture)))), picture)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 7), (200, 301), (1, 5, 3), (64, 65, 3)])
+def test_png_is_the_picture(shape, tmp_path):
+    rng = np.random.default_rng(3)
+    for picture in (rng.integers(0, 256, shape, dtype=np.uint8), np.full(shape, 250, dtype=np.uint8)):
+        content = encode_png(picture)
+        read = Image.open(io.BytesIO(content))
+        assert read.mode == ("L" if len(shape) == 2 else "RGB")
+        np.testing.assert_array_equal(np.asarray(read), picture)
+        # libpng, which checks every sum; its rows count from the bottom.
+        (tmp_path / "picture.png").write_bytes(content)
+        reader = vtkPNGReader()
+        reader.SetFileName(str(tmp_path / "picture.png"))
+        reader.Update()
+        scalars = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
+        np.testing.assert_array_equal(scalars.reshape(shape)[::-1], picture)
 
 
 def test_views_show_each_side_in_its_colours():

@@ -1,0 +1,39 @@
+"""PNG files of pictures (ISO/IEC 15948).
+
+Written here because what Pillow spends on choosing a filter for each line is longer than all the drawing may take: a line of a
+fluoroscopy frame is like the one above it, so that one filter does for all, in half the time and to a smaller file.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+COLOUR_TYPES = {2: 0, 3: 2}
+"""Grey for a picture of two axes, RGB for one of three."""
+
+UP = 2
+"""The filter that keeps of each byte the difference to the one above it."""
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """PNG of a picture (rows, columns) grey or (rows, columns, 3) RGB; the same picture gives the same bytes."""
+    rows, columns = picture.shape[:2]
+    flat = picture.reshape(rows, -1)
+    lines = np.empty((rows, 1 + flat.shape[1]), dtype=np.uint8)
+    lines[:, 0] = UP
+    lines[0, 1:] = flat[0]
+    np.subtract(flat[1:], flat[:-1], out=lines[1:, 1:])
+    # What noise leaves of repetitions are runs: looking for more takes twice as long and finds nothing.
+    deflate = zlib.compressobj(level=1, strategy=zlib.Z_RLE)
+    header = struct.pack(">2I5B", columns, rows, 8, COLOUR_TYPES[picture.ndim], 0, 0, 0)
+    content = deflate.compress(lines.tobytes()) + deflate.flush()
+    return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", content) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(content, zlib.crc32(kind)))
