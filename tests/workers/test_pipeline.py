@@ -14,8 +14,11 @@ import pydicom
 import pytest
 from fastapi.testclient import TestClient
 
+from fluoromap.api.overlays import fusion_of
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.catheter_chain import CatheterChain
+from fluoromap.store.engine import reading
+from fluoromap.store.models import Job
 
 
 def _send(service: TestClient, study_path: str, folder: Path) -> None:
@@ -80,6 +83,13 @@ def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sen
     assert overlays
     picture = service.get(overlays[0]["href"])
     assert picture.headers["content-type"] == "image/png"
+    with reading() as session:
+        job_row = session.get_one(Job, job["id"])
+        fusions = [fusion_of(session, job_row, overlay["sop_instance_uid"], None) for overlay in overlays]
+    for fusion in fusions:
+        # The heart stood elsewhere in each of a site's runs; on the frame the site must stand where its tip is seen.
+        drawn = next(site.position_mm for site in fusion.chamber.sites if site.site == fusion.site) + fusion.shift_mm
+        assert np.linalg.norm(fusion.camera.project(drawn) - fusion.tip_uv) < 3
     tracks = service.get(f"{base}/tracks", params={"site": tips[0]["site"], "view": "a"}).json()["tracks"]
     assert {track["solver"] for track in tracks} == {"motion-prior"}
     assert all(len(track["samples"]) == 24 for track in tracks)

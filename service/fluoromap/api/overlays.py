@@ -20,7 +20,7 @@ from fluoromap.api.maps import chamber_of
 from fluoromap.api.problems import Problem, not_found, responses
 from fluoromap.api.readiness import done_stage, job_of, manifest_of, map_of
 from fluoromap.api.security import Reader
-from fluoromap.contracts import Array, ChamberMap, LocatedSite, Matching, Triangulation, View
+from fluoromap.contracts import Array, ChamberMap, LocatedSite, Matching, NamedChain, Triangulation, View
 from fluoromap.dicom import InstanceFacts, frame_to_8bit, open_frames
 from fluoromap.fuser.animation import draw_propagation
 from fluoromap.fuser.colours import Palette
@@ -208,8 +208,9 @@ def _shift(
 ) -> Array:
     """Where the reference catheter stood in this frame: the map hangs on it.
 
-    In the diastolic frame as two views located it; in others as the view was followed; where neither tells, the site's
-    diastolic position, and last the mean over the sites.
+    As the view was followed; in the diastolic frame, and where it was not, as two views located it at diastole, moved across
+    the rays to where this frame shows it, since the heart breathes between the two runs; where no reference was located,
+    the mean over the sites.
     """
     if frame != _diastolic_frame(located, view):
         stage = stage_of(session, job.id, "monoplane", located.site)
@@ -217,9 +218,24 @@ def _shift(
             followed = _followed_reference(load(FollowedSite, stage), view, frame, manifest.reference)
             if followed is not None:
                 return followed
-    if located.reference_mm is not None:
+    if located.reference_mm is None:
+        return np.array(outcome.reference_mm or (0.0, 0.0, 0.0))
+    seen = _seen(session, job, located, view, frame, manifest.reference)
+    if seen is None:
         return located.reference_mm
-    return np.array(outcome.reference_mm or (0.0, 0.0, 0.0))
+    pairs = [
+        (point.position_mm, pixel)
+        for electrode, pixel in zip(seen.electrodes, seen.pixels_uv, strict=True)
+        if (point := located.point(manifest.reference, electrode)) is not None
+    ]
+    if not pairs:
+        return located.reference_mm
+    positions, pixels = (np.array(column) for column in zip(*pairs, strict=True))
+    camera = camera_of(located, view)
+    off_px = (pixels - camera.project(positions)).mean(axis=0)
+    # The least displacement that brings it there: what is along the rays a single view cannot tell.
+    moved: Array = located.reference_mm + np.linalg.pinv(camera.jacobian(located.reference_mm)) @ off_px
+    return moved
 
 
 def _followed_reference(site: FollowedSite, view: View, frame: int, catheter: str) -> Array | None:
@@ -239,24 +255,28 @@ def _tip(
     session: Session, job: Job, manifest: Manifest, located: LocatedSite, view: View, frame: int, shift: Array
 ) -> Array | None:
     """The mapping tip as seen in this frame, else its diastolic position projected."""
-    matching = load(Matching, done_stage(session, job, "match"))
-    matched = next((site for site in matching.sites if site.site == located.site), None)
-    if matched is not None:
-        diastole = matched.diastole.a if view == "a" else matched.diastole.b
-        track = matched.track_a if view == "a" else matched.track_b
-        for observation in (diastole, *track):
-            if observation.frame != frame:
-                continue
-            for chain in observation.chains:
-                if chain.catheter == manifest.mapping and 1 in chain.electrodes:
-                    seen: Array = chain.pixels_uv[chain.electrodes.index(1)]
-                    return seen
+    seen = _seen(session, job, located, view, frame, manifest.mapping)
+    if seen is not None and 1 in seen.electrodes:
+        uv: Array = seen.pixels_uv[seen.electrodes.index(1)]
+        return uv
     tip = located.point(manifest.mapping, 1)
     if tip is None:
         return None
     if tip.relative_mm is None:
         return camera_of(located, view).project(tip.position_mm)
     return camera_of(located, view).project(tip.relative_mm + shift)
+
+
+def _seen(session: Session, job: Job, located: LocatedSite, view: View, frame: int, catheter: str) -> NamedChain | None:
+    """A catheter's electrodes as this frame shows them."""
+    matching = load(Matching, done_stage(session, job, "match"))
+    matched = next((site for site in matching.sites if site.site == located.site), None)
+    if matched is None:
+        return None
+    diastole = matched.diastole.a if view == "a" else matched.diastole.b
+    track = matched.track_a if view == "a" else matched.track_b
+    chains = (chain for shown in (diastole, *track) if shown.frame == frame for chain in shown.chains)
+    return next((chain for chain in chains if chain.catheter == catheter), None)
 
 
 @router.get(

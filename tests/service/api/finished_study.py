@@ -48,6 +48,9 @@ GANTRIES = {
 REFERENCE_MM = np.array([5.0, -4.0, 3.0])
 STEP_MM = np.array([1.0, 0.0, 0.0])
 TIP_MM = np.array([12.0, 6.0, 9.0])
+BREATH_MM = {"a": np.array([0.0, 0.0, 3.0]), "b": np.array([0.0, 0.0, -3.0])}
+"""How much higher the heart stands in each run than where two views locate it."""
+REFERENCE_ELECTRODES_MM = REFERENCE_MM + np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
 DIASTOLE = 1
 """Index of the diastolic frame in every run."""
 TIP_PIXEL = {"a": (70.0, 20.0), "b": (25.0, 30.0)}
@@ -230,7 +233,11 @@ def camera(view: str) -> Camera:
 def _observation(view: str, frame: int) -> Observation:
     chains: tuple[NamedChain, ...] = ()
     if frame != 2:
-        chains = (NamedChain("mapping", (1,), np.array([TIP_PIXEL[view]]), np.eye(2)[None]),)
+        reference = camera(view).project(REFERENCE_ELECTRODES_MM + BREATH_MM[view])
+        chains = (
+            NamedChain("mapping", (1,), np.array([TIP_PIXEL[view]]), np.eye(2)[None]),
+            NamedChain("reference", (1, 2), reference, np.tile(np.eye(2), (2, 1, 1))),
+        )
     return Observation(frame, None, chains)
 
 
@@ -255,7 +262,12 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
     tip = ElectrodePoint(
         "mapping", 1, TIP_MM, 0.1 * np.eye(3), relative, None if relative is None else 0.1 * np.eye(3), (0.2, 0.3), 90.0
     )  # fmt: skip
-    site = LocatedSite("S01", camera("a"), camera("b"), DIASTOLE, DIASTOLE, (tip,), reference_mm, None)
+    rings = tuple(
+        ElectrodePoint("reference", number, at, 0.1 * np.eye(3), at - REFERENCE_MM, 0.1 * np.eye(3), (0.2, 0.3), 90.0)
+        for number, at in enumerate(REFERENCE_ELECTRODES_MM, start=1)
+    )
+    points = (tip,) if reference_mm is None else (tip, *rings)
+    site = LocatedSite("S01", camera("a"), camera("b"), DIASTOLE, DIASTOLE, points, reference_mm, None)
     return Triangulation((site,), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
 
 

@@ -9,7 +9,19 @@ import zipfile
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from finished_study import DIASTOLE, REFERENCE_MM, SIZE, STEP_MM, TIP_MM, TIP_PIXEL, FinishedStudy, camera, no_map
+from finished_study import (
+    BREATH_MM,
+    DIASTOLE,
+    REFERENCE_MM,
+    SIZE,
+    STEP_MM,
+    TIP_MM,
+    TIP_PIXEL,
+    FinishedStudy,
+    camera,
+    no_map,
+)
+from numpy.typing import NDArray
 from PIL import Image
 from sqlalchemy import select
 
@@ -108,14 +120,24 @@ def test_runs_without_overlay(client: TestClient, study: FinishedStudy) -> None:
         assert client.get(f"/v1/jobs/{study.job_id}/overlays/{uid}.png").status_code == 404
 
 
-def test_the_map_hangs_on_the_reference_of_the_frame(client: TestClient, study: FinishedStudy) -> None:
+def _stands_at(fusion: overlay_routes.Fusion, view: str, place_mm: NDArray[np.float64]) -> None:
+    """The map hangs on a place that this view shows where it shows ``place_mm``, at its depth."""
+    np.testing.assert_allclose(fusion.camera.project(fusion.shift_mm), camera(view).project(place_mm), atol=0.01)
+    assert abs(fusion.camera.depth_mm(fusion.shift_mm) - camera(view).depth_mm(place_mm)) < 0.1
+
+
+def test_the_map_hangs_on_the_reference_as_the_frame_shows_it(client: TestClient, study: FinishedStudy) -> None:
     study.mapped()
-    np.testing.assert_allclose(_fusion(study, "a", 1).shift_mm, REFERENCE_MM)
+    for view in ("a", "b"):
+        for frame in (None, 1):
+            _stands_at(_fusion(study, view, frame), view, REFERENCE_MM + BREATH_MM[view])
+    # Frame 3 does not show the reference.
+    np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
     study.followed()
     np.testing.assert_allclose(_fusion(study, "a", 1).shift_mm, REFERENCE_MM + STEP_MM)
-    np.testing.assert_allclose(_fusion(study, "a", None).shift_mm, REFERENCE_MM)
+    _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + BREATH_MM["a"])
     np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
-    np.testing.assert_allclose(_fusion(study, "b", 1).shift_mm, REFERENCE_MM)
+    _stands_at(_fusion(study, "b", 1), "b", REFERENCE_MM + BREATH_MM["b"])
 
 
 def test_the_star_stands_where_the_tip_was_seen(client: TestClient, study: FinishedStudy) -> None:
