@@ -1,8 +1,9 @@
-"""How long a correction by hand takes: ``python benchmarks/correction.py [corrections]``.
+"""How long one waits after a correction by hand: ``python benchmarks/correction.py [corrections]``.
 
 Runs the demonstration's study (8 sites, 2 views, 30 frames, simulated) through the real service once, then moves one electrode
 of one frame by 2 px, asks for a new job and waits for its map; again and again at another site. Prints the seconds from the
-PUT of the electrode to the map in hand, beside the seconds of the first job up to its map, and what was computed again.
+PUT of the electrode to the map in hand, beside the seconds of the first job up to its map, and what was computed again. Last
+the milliseconds from asking for each overlay of the last map, not drawn before, to having it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import httpx
@@ -47,7 +49,14 @@ def main(corrections: int) -> None:
                 stages = Counter(stage["name"] for stage in _ended(http, job["id"])["stages"] if not stage["reused"])
                 again = ", ".join(f"{count} {name}" for name, count in stages.items())
                 print(f"correction at {site['site']}: {taken[-1]:.2f} s to the new map; computed again: {again}")
-            print(f"median {sorted(taken)[len(taken) // 2]:.2f} s, longest {max(taken):.2f} s")
+            print(f"median {median(taken):.2f} s, longest {max(taken):.2f} s")
+            overlays = http.get(f"/v1/jobs/{job['id']}/overlays").json()["overlays"]
+            for scale in (1, 2):
+                waits = [1000 * _seconds(http, f"{overlay['href']}?scale={scale}") for overlay in overlays]
+                print(
+                    f"{len(waits)} overlays at {scale} x the frame's size: median {median(waits):.0f} ms, "
+                    f"longest {max(waits):.0f} ms"
+                )
 
 
 def _moved_tip(http: httpx.Client, study: str, uid: str, frame: int) -> tuple[str, list[dict[str, Any]]]:
@@ -70,6 +79,12 @@ def _until_map(http: httpx.Client, study: str) -> tuple[float, dict[str, Any]]:
             return time.perf_counter() - start, job
         time.sleep(POLL_SECONDS)
     raise SystemExit(f"no map after {PATIENCE_S:.0f} s")
+
+
+def _seconds(http: httpx.Client, href: str) -> float:
+    start = time.perf_counter()
+    http.get(href).raise_for_status()
+    return time.perf_counter() - start
 
 
 def _ended(http: httpx.Client, job: str) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from fluoromap.triangulator.seen import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import jacobians
 
 _STEPS = 8
-_SETTLED_MM = 1e-9
+_SETTLED_MM = 1e-6
+"""Steps square their error: after one of a nanometre nothing is left."""
 
 
 @dataclass(frozen=True, eq=False)

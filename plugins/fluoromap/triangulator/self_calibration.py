@@ -20,6 +20,7 @@ from fluoromap.triangulator.seen import Cameras, TwoViewPixels
 from fluoromap.triangulator.spacing import neighbours
 from fluoromap.triangulator.strays import epipolar_rows
 from fluoromap.triangulator.uncertainty import (
+    ErrorSource,
     Share,
     UncertaintyParams,
     breathing_effect_px,
@@ -211,15 +212,16 @@ def _rows(
         residual = np.concatenate([residual, length - [gap for *_, gap in known]])
     sources = error_sources(cameras, points, pixels.labels, catalogue, params, np.zeros((12, 12)), None)
     noise = pixel_noise_px2(pixels.covariances)
-    parts = {share: sum((one.pixels_px2() for one in sources if share in one.shares), 0 * noise) for share in _SCALED}
-    # The gantry's own sources are the unknowns; a wrong source distance acts as an offset along the ray, which is one.
     fixed = combine @ noise @ combine.T
+    pixel_variance = np.diagonal(fixed)[:n].copy()
     fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
+    # The gantry's own sources are the unknowns; a wrong source distance acts as an offset along the ray, which is one.
+    told = [ErrorSource(combine @ one.effect_px, one.covariance, one.shares) for one in sources]
+    parts = {share: sum((one.pixels_px2() for one in told if share in one.shares), 0 * fixed) for share in _SCALED}
     jacobian = jacobians(cameras, points)
     return _Rows(
-        residual, combine @ gantry_effect_px(jacobian, points), fixed, combine @ parts["breathing"] @ combine.T,
-        combine @ parts["phase_mismatch"] @ combine.T, combine @ breathing_effect_px(jacobian), n,
-        np.diagonal(combine @ noise @ combine.T)[:n],
+        residual, combine @ gantry_effect_px(jacobian, points), fixed, parts["breathing"], parts["phase_mismatch"],
+        combine @ breathing_effect_px(jacobian), n, pixel_variance,
     )  # fmt: skip
 
 
