@@ -62,13 +62,13 @@ def _lines(chamber: ChamberMap, covered: IntArray, of_face: IntArray, ends: IntA
 
 
 def _chains(segments: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Join segments (s, 2) end to end; each node lies in at most two. Returns (nodes, segments) of each chain."""
+    """Join segments (s, 2) end to end where two meet in a node. Returns (nodes, segments) of each chain."""
     ends, nodes = np.unique(segments, return_inverse=True)
     nodes = nodes.reshape(-1, 2)
     numbers = np.arange(1, len(segments) + 1)
-    degree = np.bincount(nodes.ravel())
-    # A node's segments, counted from 1, and a segment's nodes as sums: coming from one, the rest is the other; 0 is none.
+    # A node's two segments, counted from 1, and a segment's nodes as sums: coming from one, the rest is the other.
     at = np.bincount(nodes.ravel(), np.repeat(numbers, 2)).astype(np.int64).tolist()
+    passable = (np.bincount(nodes.ravel()) == 2).tolist()
     across = [0, *nodes.sum(axis=1).tolist()]
     left = [False, *([True] * len(segments))]
     chains = []
@@ -80,14 +80,13 @@ def _chains(segments: IntArray) -> list[tuple[IntArray, IntArray]]:
             passed.append(segment)
             node = across[segment] - node
             walked.append(node)
-            segment = at[node] - segment
+            segment = at[node] - segment if passable[node] else 0
         chains.append((ends[walked], np.array(passed) - 1))
 
-    for node in np.flatnonzero(degree == 1).tolist():
-        if left[at[node]]:
-            walk(node, at[node])
-    # What remains is closed.
-    for segment in numbers.tolist():
-        if left[segment]:
-            walk(int(nodes[segment - 1, 0]), segment)
+    # Open chains from their ends first; what remains is closed.
+    pairs = list(zip(numbers.tolist(), nodes.tolist(), strict=True))
+    starts = [(node, number) for number, pair in pairs for node in pair if not passable[node]]
+    for node, number in [*starts, *((pair[0], number) for number, pair in pairs)]:
+        if left[number]:
+            walk(node, number)
     return chains

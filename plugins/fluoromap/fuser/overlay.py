@@ -160,7 +160,7 @@ class _Canvas:
         return outward
 
 
-def _tint(image: Image.Image, shown: NDArray[np.int16], times: Scale) -> None:
+def _tint(image: Image.Image, shown: NDArray[np.int32], times: Scale) -> None:
     shares = np.full(times.bands + 3, TINT)
     shares[[NOTHING, HATCH, NO_DATA]] = 0.0, HATCH_TINT, 0.0
     table = np.column_stack([colour_table(times, BLACK), (255 * shares).round().astype(np.uint8)])

@@ -13,11 +13,12 @@ NO_DATA, HATCH, NOTHING = -1, -2, -3
 """Where there is no band: no site is near, the hatch that says so, no wall or one that is not to be coloured yet."""
 
 _WITHIN = -4
+"""Of a face that crosses a limit, until its pixels were looked at."""
 
 
 def bands_shown(
     raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None = None
-) -> NDArray[np.int16]:
+) -> NDArray[np.int32]:
     """Band of ``times`` that each pixel (rows, columns) shows; ``NO_DATA``, ``HATCH`` or ``NOTHING`` where none.
 
     Only what is activated by ``until_ms``, where given, has a band. ``unit`` is the size of the picture's details, 1 for a
@@ -35,7 +36,7 @@ def bands_shown(
     if cycle is not None:
         one_band &= np.ptp(lat[chamber.faces], axis=1) < cycle / 2
     of_face = np.where(one_band, at_corners[:, 0], np.where(corners_covered > 0, _WITHIN, NO_DATA))
-    shown = np.append(of_face, NOTHING).astype(np.int16)[raster.face]
+    shown = np.append(of_face, NOTHING).astype(np.int32)[raster.face]
 
     flat = shown.ravel()
     within = np.flatnonzero(flat == _WITHIN)
@@ -57,12 +58,14 @@ def colour_table(times: Scale, nothing: tuple[int, int, int]) -> NDArray[np.uint
 
 
 def _times_past_rim(chamber: ChamberMap) -> Array:
-    """Times at the vertices, those just past the covered part taking the mean of their covered neighbours: else a face on
-    the rim would run through all bands down to 0."""
+    """Times at the vertices within one cycle, those just past the covered part taking the mean of their covered
+    neighbours: else a face on the rim would run through all bands down to 0."""
     lat, faces, cycle = chamber.lat_ms.copy(), chamber.faces, chamber.cycle_length_ms
     if not chamber.covered.any():
         return lat
     lat[~chamber.covered] = low = float(lat[chamber.covered].min())
+    if cycle is not None:
+        lat = low + (lat - low) % cycle
     known = chamber.covered[faces].astype(np.float64)
     # Round a cycle times have no mean but their directions on a circle have.
     turns = lat[faces].astype(np.complex128) if cycle is None else np.exp(2j * np.pi * (lat[faces] - low) / cycle)

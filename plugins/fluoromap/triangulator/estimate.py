@@ -15,7 +15,7 @@ from fluoromap.triangulator.uncertainty import jacobians
 
 _STEPS = 8
 _SETTLED_MM = 1e-6
-"""Steps square their error: after one of a nanometre nothing is left."""
+"""What is left after a step is a small part of it."""
 
 
 @dataclass(frozen=True, eq=False)

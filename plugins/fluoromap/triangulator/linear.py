@@ -17,7 +17,7 @@ class Linear:
     """Triangulator ``linear``: every electrode on its own, algebraic least squares of equations (8) in both views."""
 
     name: ClassVar[str] = "linear"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:

@@ -20,7 +20,6 @@ from fluoromap.triangulator.seen import Cameras, TwoViewPixels
 from fluoromap.triangulator.spacing import neighbours
 from fluoromap.triangulator.strays import epipolar_rows
 from fluoromap.triangulator.uncertainty import (
-    ErrorSource,
     Share,
     UncertaintyParams,
     breathing_effect_px,
@@ -216,8 +215,11 @@ def _rows(
     pixel_variance = np.diagonal(fixed)[:n].copy()
     fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
     # The gantry's own sources are the unknowns; a wrong source distance acts as an offset along the ray, which is one.
-    told = [ErrorSource(combine @ one.effect_px, one.covariance, one.shares) for one in sources]
-    parts = {share: sum((one.pixels_px2() for one in told if share in one.shares), 0 * fixed) for share in _SCALED}
+    parts = {share: np.zeros_like(fixed) for share in _SCALED}
+    for source in sources:
+        for share in parts.keys() & source.shares:
+            effect = combine @ source.effect_px
+            parts[share] += effect @ source.covariance @ effect.T
     jacobian = jacobians(cameras, points)
     return _Rows(
         residual, combine @ gantry_effect_px(jacobian, points), fixed, parts["breathing"], parts["phase_mismatch"],

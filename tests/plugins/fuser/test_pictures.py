@@ -19,6 +19,7 @@ from fluoromap.fuser.map_picture import draw_map_views
 from fluoromap.fuser.overlay import Look, draw_overlay
 from fluoromap.fuser.png import encode_png
 from fluoromap.fuser.raster import rasterise
+from fluoromap.fuser.surface import face_normals
 from fluoromap.fuser.wall import HATCH, NO_DATA, NOTHING, bands_shown
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 
@@ -51,6 +52,25 @@ class TestIsochrones:
         (level,) = ball.lat_ms[[17]]
         lines = isochrones(ball, np.array([level]))
         assert all((line.points_mm[0] == line.points_mm[-1]).all() for line in lines)
+
+    def test_each_segment_lies_in_its_face(self, ball):
+        for line in isochrones(ball, np.arange(-20.0, 25.0, 5.0)):
+            corners = ball.vertices_mm[ball.faces[line.faces]]
+            for ends in (line.points_mm[:-1], line.points_mm[1:]):
+                # On one of its edges: the shortest way over two corners is as long as the edge.
+                to_corner = np.linalg.norm(corners - ends[:, None], axis=2)
+                edge = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+                assert ((to_corner + np.roll(to_corner, -1, axis=1) - edge).min(axis=1) < 1e-9).all()
+
+    def test_a_surface_whose_faces_meet_in_threes_is_drawn(self, ball):
+        fin = np.vstack(
+            [ball.faces, [[*ball.faces[5][:2], ball.faces[-1][0]]], [[*ball.faces[9][:2], ball.faces[5][2]]]]
+        )
+        joined = replace(ball, faces=fin)
+        for level in np.arange(-20.0, 20.0, 0.25):
+            segments = sum(len(line.faces) for line in isochrones(joined, np.array([level])))
+            later = joined.lat_ms >= level
+            assert segments == (np.ptp(later[fin].astype(int), axis=1) > 0).sum()
 
     def test_nothing_runs_through_what_is_not_covered(self, sparse_ball):
         for line in isochrones(sparse_ball, np.arange(-20.0, 25.0, 5.0)):
@@ -134,48 +154,83 @@ def test_faces_side_by_side_share_no_pixel_and_miss_none(seed):
     assert ((side >= -1e-6).all(axis=2) | (side <= 1e-6).all(axis=2)).all()
 
 
-@pytest.mark.parametrize("cycle", [None, 60.0])
+def _bands_pixel_by_pixel(raster, chamber, times, until):
+    """What every pixel shows, from its own time; -9 where a vertex past the covered part has a say in it."""
+    pixels = np.flatnonzero(raster.face >= 0)
+    lat = raster.sample(pixels, chamber.lat_ms, chamber.cycle_length_ms)
+    wanted = np.full(raster.face.size, NOTHING)
+    wanted[pixels] = times.band(lat) if until is None else np.where(lat <= until, times.band(lat), NOTHING)
+    known = chamber.covered[chamber.faces].all(axis=1)[raster.face.ravel()[pixels]]
+    wanted[pixels[~known]] = -9
+    wanted[pixels[raster.sample(pixels, chamber.covered.astype(float)) <= 0.5]] = NO_DATA
+    return wanted
+
+
+def _same_where_known(shown, wanted):
+    got = np.where(shown == HATCH, NO_DATA, shown).ravel()
+    np.testing.assert_array_equal(got[wanted != -9], wanted[wanted != -9])
+    # On the rim the times are the neighbours', but a band there is.
+    assert (got[wanted == -9] != NO_DATA).all()
+
+
 @pytest.mark.parametrize("until", [None, 5.0])
 @pytest.mark.parametrize("scale", [1, 3])
-def test_each_pixel_shows_the_band_of_its_own_time(ball, sparse_ball, cycle, until, scale):
+def test_each_pixel_shows_the_band_of_its_own_time(ball, sparse_ball, until, scale):
     for chamber in (ball, sparse_ball):
-        chamber = replace(chamber, cycle_length_ms=cycle)
         uv = (250 + 4 * chamber.vertices_mm[:, :2]) * scale
-        raster = rasterise(
-            uv, chamber.vertices_mm[:, 2], chamber.faces, np.ones(len(chamber.faces), bool), (500 * scale, 500 * scale)
-        )
-        times = scale_of(chamber)
-        shown = bands_shown(raster, chamber, times, 1.0, until).ravel()
-        assert ((shown == NOTHING) >= (raster.face.ravel() < 0)).all()
-        pixels = np.flatnonzero(raster.face >= 0)
-        covered = raster.sample(pixels, chamber.covered.astype(float)) > 0.5
-        assert (np.isin(shown[pixels], (NO_DATA, HATCH)) == ~covered).all()
-        # On the rim of what is covered the times of the vertices beyond count, which are not the map's.
-        inside = chamber.covered[chamber.faces].all(axis=1)[raster.face.ravel()[pixels]]
-        lat = raster.sample(pixels[inside], chamber.lat_ms, cycle)
-        wanted = times.band(lat) if until is None else np.where(lat <= until, times.band(lat), NOTHING)
-        np.testing.assert_array_equal(shown[pixels[inside]], wanted)
+        facing = np.ones(len(chamber.faces), bool)
+        raster = rasterise(uv, chamber.vertices_mm[:, 2], chamber.faces, facing, (500 * scale, 500 * scale))
+        shown = bands_shown(raster, chamber, scale_of(chamber), 1.0, until)
+        _same_where_known(shown, _bands_pixel_by_pixel(raster, chamber, scale_of(chamber), until))
+
+
+@pytest.mark.parametrize("until", [None, 100.0, 200.0])
+@pytest.mark.parametrize("step", [20.0, 360.0, 0.01])
+def test_each_pixel_of_a_reentry_shows_the_band_of_its_own_time(until, step):
+    reentry, uv = circling(360.0)
+    raster = rasterise(uv, reentry.vertices_mm[:, 2], reentry.faces, np.ones(len(reentry.faces), bool), (500, 500))
+    times = scale_of(reentry, step)
+    shown = bands_shown(raster, reentry, times, 1.0, until)
+    _same_where_known(shown, _bands_pixel_by_pixel(raster, reentry, times, until))
+    # Whole cycles more say the same.
+    later = replace(reentry, lat_ms=reentry.lat_ms + 360.0 * (np.arange(len(uv)) % 3 == 0) * (uv[:, 0] > 250))
+    # Where the cycle closes a rounding error decides.
+    assert (bands_shown(raster, later, times, 1.0, until) != shown).mean() < 5e-4
+
+
+def test_the_rim_takes_the_times_of_its_neighbours(sparse_ball):
+    raster = rasterise(
+        250 + 4 * sparse_ball.vertices_mm[:, :2], sparse_ball.vertices_mm[:, 2], sparse_ball.faces,
+        np.ones(len(sparse_ball.faces), bool), (500, 500),
+    )  # fmt: skip
+    late = replace(sparse_ball, lat_ms=np.where(sparse_ball.covered, 100.0, 0.0))
+    shown = bands_shown(raster, late, Scale(0.0, 5.0, 30), 1.0)
+    assert set(np.unique(shown)) == {NOTHING, HATCH, NO_DATA, 20}
+
+
+def circling(cycle):
+    """A re-entry whose times go round once, and its vertices seen along the axis of the circuit: each its own angle."""
+    chamber = fused(sphere(20, slope_ms_per_mm=1.0), edge_mm=4)
+    middle = chamber.vertices_mm.mean(axis=0)
+    turn = np.degrees(np.arctan2(*(chamber.vertices_mm - middle)[:, [1, 0]].T)) % 360 * cycle / 360
+    reentry = replace(chamber, lat_ms=turn, cycle_length_ms=cycle, covered=np.ones(len(turn), bool))
+    return reentry, 250 + 5 * (chamber.vertices_mm - middle)[:, :2]
 
 
 def test_early_meets_late_without_running_through_all_bands():
     cycle = 360.0
-    sites = sphere(20, slope_ms_per_mm=1.0)
-    chamber = fused(sites, edge_mm=4)
-    middle = chamber.vertices_mm.mean(axis=0)
-    turn = np.degrees(np.arctan2(*(chamber.vertices_mm - middle)[:, [1, 0]].T)) % 360
-    reentry = replace(chamber, lat_ms=turn, cycle_length_ms=cycle, covered=np.ones(len(turn), bool))
-    # Looking along the axis of the circuit: every pixel but those at its centre shows its own angle.
-    uv = 250 + 5 * (chamber.vertices_mm - middle)[:, :2]
-    facing = np.ones(len(chamber.faces), bool)
-    raster = rasterise(uv, chamber.vertices_mm[:, 2], chamber.faces, facing, (500, 500))
+    reentry, uv = circling(cycle)
+    facing = np.ones(len(reentry.faces), bool)
+    raster = rasterise(uv, reentry.vertices_mm[:, 2], reentry.faces, facing, (500, 500))
     shown = np.flatnonzero(raster.face >= 0)
     v, u = np.divmod(shown, 500)
     sampled = raster.sample(shown, reentry.lat_ms, cycle)
     angle = np.degrees(np.arctan2(v - 250, u - 250)) % 360
     off = np.abs((sampled - angle + 180) % 360 - 180)
     away = np.hypot(v - 250, u - 250) > 50
+    # Every pixel but those at its centre shows its own angle.
     assert off[away].max() < 25
-    assert ((sampled >= turn.min()) & (sampled < turn.min() + cycle)).all()
+    assert ((sampled >= reentry.lat_ms.min()) & (sampled < reentry.lat_ms.min() + cycle)).all()
 
 
 class TestOverlay:
@@ -280,6 +335,36 @@ class TestOverlay:
             wanted = expected / np.linalg.norm(expected.astype(float))
             assert direction @ wanted > 0.97
 
+    def test_isochrones_are_drawn_where_they_project(self, ball):
+        # Seen from the front the times, linear in X, make upright lines: the faces towards the viewer alone are crossed.
+        view = camera(0.0)
+        edges = scale_of(ball).edges_ms[1:-1]
+        black = np.zeros((512, 512), np.uint8)
+        with_lines = draw_overlay(black, view, ball, SHIFT, "none", None).astype(int).min(axis=2)
+        facing = face_normals(ball.vertices_mm, ball.faces)[:, 1] < -0.3
+        drawn = []
+        for line in isochrones(ball, edges):
+            middles = ((line.points_mm[1:] + line.points_mm[:-1]) / 2)[facing[line.faces]]
+            for u, v in np.rint(view.project(middles + SHIFT)).astype(int):
+                if u < 430:
+                    row = with_lines[v, u - 9 : u + 10]
+                    drawn.append(row[8:11].max() > np.median(row) + 25)
+        # Dots and letters hide some.
+        assert len(drawn) > 50
+        assert np.mean(drawn) > 0.75
+
+    def test_the_front_of_a_propagation_is_drawn_and_nothing_beyond_it(self, ball):
+        view = camera(0.0)
+        black = np.zeros((512, 512), np.uint8)
+        until = 7.0
+        picture = draw_overlay(black, view, ball, SHIFT, "none", None, Look(until_ms=until)).astype(int).min(axis=2)
+        middle = ball.vertices_mm.mean(axis=0)
+        # The next isochrones would be at 10 and 15 ms.
+        for lat, least, most in ((until, 200, 255), (10.0, 0, 40), (15.0, 0, 40)):
+            u, v = np.rint(view.project(np.array([10 + lat, *middle[1:]]) + SHIFT)).astype(int)
+            strip = picture[v - 20 : v + 21, u - 4 : u + 5]
+            assert least <= np.median(strip.max(axis=1)) <= most
+
     def test_colour_bar_shows_every_band_in_order(self, ball):
         view = camera()
         picture = draw_overlay(grey(view), view, ball, SHIFT, "none", None)
@@ -303,11 +388,15 @@ class TestOverlay:
 
     def test_what_is_not_covered_gets_no_colour_but_a_hatch(self, sparse_ball):
         view = camera()
-        picture = draw_overlay(grey(view), view, sparse_ball, SHIFT, "none", None).astype(int)
-        assert not (np.ptp(picture, axis=2) > 0).all()
-        hatch = (np.ptp(picture, axis=2) == 0) & (picture[..., 0] > 130) & (picture[..., 0] < 190)
-        u, v = np.rint(view.project(np.array([10.0, -20.0, 5.0]) + SHIFT)).astype(int)
-        assert hatch[v - 130 : v + 131, u - 130 : u + 131].sum() > 100
+        wall = draw_overlay(grey(view), view, replace(sparse_ball, covered=np.zeros_like(sparse_ball.covered)), SHIFT,
+                            "none", None, Look(times=scale_of(sparse_ball))).astype(int)  # fmt: skip
+        u, v = np.rint(view.project(sparse_ball.vertices_mm.mean(axis=0) + SHIFT)).astype(int)
+        patch = wall[v - 60 : v + 61, u - 60 : u + 61]
+        patch = patch[np.ptp(patch, axis=2) == 0][:, 0]
+        hatched = patch == round(120 + 0.4 * (205 - 120))
+        assert 0.08 < hatched.mean() < 0.3
+        # Between the lines of the hatch the image is as it was.
+        assert (patch[~hatched] == 120).mean() > 0.9
 
     def test_unknown_site_far_map_and_wrong_frame(self, ball):
         view = camera()
@@ -323,6 +412,15 @@ class TestOverlay:
         picture = draw_overlay(grey(view), view, ball, SHIFT, "S05", None)
         again = draw_overlay(grey(view), view, ball, SHIFT, "S05", None)
         assert encode_png(picture) == encode_png(again)
+
+
+@pytest.mark.parametrize(
+    "picture", [np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4, 1), np.uint8), np.zeros((4, 4), np.uint16),
+                np.zeros((0, 4), np.uint8)],
+)  # fmt: skip
+def test_only_grey_and_rgb_pictures_become_png(picture):
+    with pytest.raises(ValueError, match="picture"):
+        encode_png(picture)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 7), (200, 301), (1, 5, 3), (64, 65, 3)])
