@@ -50,23 +50,31 @@ def isocentre(frames: int) -> FrameOrigins:
     return FrameOrigins(np.zeros((frames, 3)), ~never, never, never)
 
 
-def reference(track: Track, catheter: str, own_mm: Array | None, others_mm: Array | None) -> FrameOrigins:
-    """Mean of the reference catheter's located electrodes in each frame.
+def reference(track: Track, site: LocatedSite, catheter: str, others_mm: Array | None) -> FrameOrigins:
+    """Mean of the reference catheter's electrodes in each frame.
 
-    Frames in which none is located take the site's own diastolic reference ``own_mm``, or where the site has none the
-    mean over the other sites ``others_mm``.
+    Where only some are located, each tells of the mean by where it stands from it at diastole. Frames in which none is
+    located take the site's own diastolic mean, or where the site has none that over the other sites ``others_mm``.
     """
     electrodes = [index for index, (name, _) in enumerate(track.labels) if name == catheter]
-    located = track.located[:, electrodes]
+    from_mean, told = np.zeros((len(electrodes), 3)), np.ones(len(electrodes), dtype=np.bool_)
+    if site.reference_mm is not None:
+        for row, index in enumerate(electrodes):
+            point = site.point(*track.labels[index])
+            told[row] = point is not None
+            if point is not None:
+                from_mean[row] = point.position_mm - site.reference_mm
+    located = track.located[:, electrodes] & told
     count = located.sum(axis=1)
-    total = np.where(located[..., None], track.positions_mm[:, electrodes], 0.0).sum(axis=1)
+    total = np.where(located[..., None], track.positions_mm[:, electrodes] - from_mean, 0.0).sum(axis=1)
     mean: Array = total / np.maximum(count, 1)[:, None]
     seen: BoolArray = count > 0
-    fallback = own_mm if own_mm is not None else others_mm
+    fallback = site.reference_mm if site.reference_mm is not None else others_mm
     if fallback is None:
         return FrameOrigins(mean, seen, np.zeros_like(seen), seen)
     mean[~seen] = fallback
-    return FrameOrigins(mean, np.ones_like(seen), ~seen if own_mm is None else np.zeros_like(seen), seen)
+    borrowed = ~seen if site.reference_mm is None else np.zeros_like(seen)
+    return FrameOrigins(mean, np.ones_like(seen), borrowed, seen)
 
 
 def camera_of(site: LocatedSite, view: View) -> Camera:

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from fluoromap.api.drawing import drawn
 from fluoromap.api.etags import file_response
 from fluoromap.api.file_names import plain
-from fluoromap.api.followed import camera_of
+from fluoromap.api.followed import camera_of, reference
 from fluoromap.api.maps import chamber_of
 from fluoromap.api.problems import Problem, not_found, responses
 from fluoromap.api.readiness import done_stage, job_of, manifest_of, map_of
@@ -215,9 +215,12 @@ def _shift(
     if frame != _diastolic_frame(located, view):
         stage = stage_of(session, job.id, "monoplane", located.site)
         if stage is not None and stage.state == StageState.DONE:
-            followed = _followed_reference(load(FollowedSite, stage), view, frame, manifest.reference)
-            if followed is not None:
-                return followed
+            track = next((own.track for own in load(FollowedSite, stage).views if own.view == view), None)
+            if track is not None and frame < len(track.located):
+                origins = reference(track, located, manifest.reference, None)
+                if origins.same_frame[frame]:
+                    followed: Array = origins.positions_mm[frame]
+                    return followed
     if located.reference_mm is None:
         return np.array(outcome.reference_mm or (0.0, 0.0, 0.0))
     seen = _seen(session, job, located, view, frame, manifest.reference)
@@ -238,23 +241,10 @@ def _shift(
     return moved
 
 
-def _followed_reference(site: FollowedSite, view: View, frame: int, catheter: str) -> Array | None:
-    track = next((followed.track for followed in site.views if followed.view == view), None)
-    if track is None or frame >= len(track.located):
-        return None
-    seen = [
-        index for index, (name, _) in enumerate(track.labels) if name == catheter and track.located[frame, index]
-    ]  # fmt: skip
-    if not seen:
-        return None
-    mean: Array = track.positions_mm[frame, seen].mean(axis=0)
-    return mean
-
-
 def _tip(
     session: Session, job: Job, manifest: Manifest, located: LocatedSite, view: View, frame: int, shift: Array
 ) -> Array | None:
-    """The mapping tip as seen in this frame, else its diastolic position projected."""
+    """The mapping tip as seen in this frame, else where it stands on the map at diastole."""
     seen = _seen(session, job, located, view, frame, manifest.mapping)
     if seen is not None and 1 in seen.electrodes:
         uv: Array = seen.pixels_uv[seen.electrodes.index(1)]

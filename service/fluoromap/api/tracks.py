@@ -178,7 +178,7 @@ def _add_site(
         track, camera = followed.track, camera_of(located, followed.view)
         if origin is Origin.REFERENCE:
             mean = None if others is None else np.array(others)
-            origins = reference(track, manifest.reference, located.reference_mm, mean)
+            origins = reference(track, located, manifest.reference, mean)
         else:
             origins = isocentre(len(track.located))
         for index, (catheter, electrode) in enumerate(track.labels):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from fastapi.testclient import TestClient
 from finished_study import (
     BREATH_MM,
     DIASTOLE,
+    REFERENCE_ELECTRODES_MM,
     REFERENCE_MM,
     SIZE,
     STEP_MM,
@@ -19,7 +21,10 @@ from finished_study import (
     TIP_PIXEL,
     FinishedStudy,
     camera,
+    map_outcome,
+    matching,
     no_map,
+    triangulation,
 )
 from numpy.typing import NDArray
 from PIL import Image
@@ -27,6 +32,7 @@ from sqlalchemy import select
 
 from fluoromap.api import overlays as overlay_routes
 from fluoromap.api.overlays import fusion_of
+from fluoromap.contracts import NamedChain
 from fluoromap.fuser.animation import PICTURES
 from fluoromap.store import files
 from fluoromap.store.engine import reading, writing
@@ -138,6 +144,24 @@ def test_the_map_hangs_on_the_reference_as_the_frame_shows_it(client: TestClient
     _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + BREATH_MM["a"])
     np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
     _stands_at(_fusion(study, "b", 1), "b", REFERENCE_MM + BREATH_MM["b"])
+
+
+@pytest.mark.parametrize("shown", [(1,), (2,), (1, 2, 3), (3,)])
+def test_the_reference_may_be_shown_in_part(study: FinishedStudy, shown: tuple[int, ...]) -> None:
+    study.segmented()
+    whole = matching()
+    third = np.array([[7.0, 7.0]])
+    pixels = np.concatenate([camera("a").project(REFERENCE_ELECTRODES_MM + BREATH_MM["a"]), third])
+    chosen = [number - 1 for number in shown]
+    chain = NamedChain("reference", shown, pixels[chosen], np.tile(np.eye(2), (len(shown), 1, 1)))
+    site = whole.sites[0]
+    diastole = replace(site.diastole, a=replace(site.diastole.a, chains=(chain,)))
+    study.end("match", None, replace(whole, sites=(replace(site, diastole=diastole),)))
+    study.end("triangulate", None, triangulation())
+    study.end("fuse", None, map_outcome())
+    # The third was not located: it tells nothing of where the catheter is.
+    breath = BREATH_MM["a"] if shown != (3,) else 0.0
+    _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + breath)
 
 
 def test_the_star_stands_where_the_tip_was_seen(client: TestClient, study: FinishedStudy) -> None:

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from finished_study import COVARIANCE_A, REFERENCE_MM, RELATIVE_COVARIANCE_A, STEP_MM, TIP_MM, FinishedStudy
+from finished_study import (
+    COVARIANCE_A,
+    REFERENCE_MM,
+    RELATIVE_COVARIANCE_A,
+    STEP_MM,
+    TIP_MM,
+    FinishedStudy,
+    followed_site,
+    triangulation,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fluoromap.api.followed import split_along_ray
+from fluoromap.api.followed import reference, split_along_ray
 
 
 def _tip(client: TestClient, study: FinishedStudy, query: str = "") -> list[dict[str, Any]]:
@@ -44,6 +54,19 @@ def test_reference_of_the_same_frame_is_subtracted_where_it_was_located(
     assert second["grade"] == "rejected"
     assert second["reasons"] == ["depth_assumed", "track_interrupted"]
     assert second["x_mm"] is second["u_px"] is second["covariance_mm2"] is None
+
+
+@pytest.mark.parametrize("hidden", [(), (0,), (1,)])
+def test_the_reference_stays_in_place_when_some_of_it_is_hidden(hidden: tuple[int, ...]) -> None:
+    track = followed_site().views[0].track
+    assert track is not None
+    located = track.located.copy()
+    located[:, list(hidden)] = False
+    origins = reference(replace(track, located=located), triangulation().sites[0], "reference", None)
+    np.testing.assert_allclose(origins.positions_mm[:2], [REFERENCE_MM + STEP_MM, REFERENCE_MM])
+    # In the third frame nothing of it is seen.
+    np.testing.assert_allclose(origins.positions_mm[2], REFERENCE_MM)
+    assert origins.same_frame.tolist() == [True, True, False]
 
 
 def test_tracks_from_the_isocentre(client: TestClient, study: FinishedStudy) -> None:
