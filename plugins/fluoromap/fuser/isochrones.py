@@ -30,34 +30,35 @@ def isochrones(chamber: ChamberMap, levels_ms: Array) -> tuple[Isochrone, ...]:
     where early meets late; a line ends where activation turns about a point.
     """
     covered = np.flatnonzero(chamber.covered[chamber.faces].all(axis=1))
-    edges = np.sort(chamber.faces[covered][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    # One number an edge sorts several times faster than a pair.
-    numbers, of_face = np.unique(edges[:, 0] * len(chamber.vertices_mm) + edges[:, 1], return_inverse=True)
-    ends = np.stack(np.divmod(numbers, len(chamber.vertices_mm)), axis=1)
-    of_face = of_face.reshape(-1, 3)
-    return tuple(line for level in levels_ms for line in _lines(chamber, covered, of_face, ends, float(level)))
+    corners = chamber.faces[covered].T
+    return tuple(line for level in levels_ms for line in _lines(chamber, covered, corners, float(level)))
 
 
-def _lines(chamber: ChamberMap, covered: IntArray, of_face: IntArray, ends: IntArray, level: float) -> list[Isochrone]:
-    """Of one time: ``of_face`` (c, 3) the edges of the covered faces, ``ends`` (e, 2) the vertices of the edges."""
+def _lines(chamber: ChamberMap, covered: IntArray, corners: IntArray, level: float) -> list[Isochrone]:
+    """Of one time: ``corners`` (3, c) of the covered faces."""
     after, cycle = chamber.lat_ms - level, chamber.cycle_length_ms
     if cycle is not None:
         after = around(after, cycle)
-    first, second = after[ends].T
     # A vertex exactly on the level counts as later, so that a crossed face has exactly two crossed edges.
-    cut = (first >= 0) != (second >= 0)
+    first, second, third = (after >= 0)[corners]
+    crossed = np.flatnonzero((first != second) | (second != third))
+    corners, opposite = corners[:, crossed], np.roll(corners[:, crossed], -1, axis=0)
+    cut = (after[corners] >= 0) != (after[opposite] >= 0)
     if cycle is not None:
-        cut &= np.abs(first - second) < cycle / 2
-    of_crossed = cut[of_face]
-    crossed = np.flatnonzero(of_crossed.sum(axis=1) == 2)
+        cut &= np.abs(after[corners] - after[opposite]) < cycle / 2
+        whole = cut.sum(axis=0) == 2
+        crossed, corners, opposite, cut = crossed[whole], corners[:, whole], opposite[:, whole], cut[:, whole]
     if not len(crossed):
         return []
-    segments = of_face[crossed][of_crossed[crossed]].reshape(-1, 2)
+    # An edge as one number, the same from both its faces.
+    vertices = len(chamber.vertices_mm)
+    edges = np.minimum(corners, opposite) * vertices + np.maximum(corners, opposite)
     lines = []
-    for edges, used in _chains(segments):
-        share = (first[edges] / (first[edges] - second[edges]))[:, None]
-        a, b = chamber.vertices_mm[ends[edges]].swapaxes(0, 1)
-        lines.append(Isochrone(level, (1 - share) * a + share * b, covered[crossed[used]]))
+    for passed, used in _chains(edges.T[cut.T].reshape(-1, 2)):
+        a, b = np.divmod(passed, vertices)
+        share = (after[a] / (after[a] - after[b]))[:, None]
+        points = (1 - share) * chamber.vertices_mm[a] + share * chamber.vertices_mm[b]
+        lines.append(Isochrone(level, points, covered[crossed[used]]))
     return lines
 
 

@@ -192,8 +192,13 @@ def _draw_lines(
 
     def near(levels_ms: Array) -> list[Array]:
         """The parts of the isochrones on the wall that faces the viewer."""
-        lines = [(canvas.project(line.points_mm)[0], facing[line.faces]) for line in isochrones(chamber, levels_ms)]
-        return [at[run] for at, seen in lines for run in runs(seen)]
+        lines = isochrones(chamber, levels_ms)
+        if not lines:
+            return []
+        # All in one, with a gap after each.
+        at = canvas.project(np.concatenate([line.points_mm for line in lines]))[0]
+        seen = np.concatenate([np.append(facing[line.faces], False) for line in lines])
+        return [at[run] for run in runs(seen[:-1])]
 
     levels = times.edges_ms
     draw(near(levels if look.until_ms is None else levels[levels < look.until_ms]), WHITE, LINE_SHARE, thickness)
