@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-COLOUR_TYPES = {2: 0, 3: 2}
-"""Grey for a picture of two axes, RGB for one of three."""
+GREY, RGB = 0, 2
+"""Colour types."""
 
 UP = 2
 """The filter that keeps of each byte the difference to the one above it."""
@@ -28,8 +28,8 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
     ValueError
         When it is neither, not of 8 bits, or empty.
     """
-    grey, rgb = picture.ndim == 2, picture.ndim == 3 and picture.shape[2] == 3
-    if picture.dtype != np.uint8 or not (grey or rgb) or picture.size == 0:
+    grey = picture.ndim == 2
+    if picture.dtype != np.uint8 or not (grey or picture.shape[2:] == (3,)) or picture.size == 0:
         raise ValueError(f"a picture is uint8, grey or RGB, and not empty; this one is {picture.dtype} {picture.shape}")
     rows, columns = picture.shape[:2]
     flat = picture.reshape(rows, -1)
@@ -37,7 +37,7 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
     lines[:, 0] = UP
     lines[0, 1:] = flat[0]
     np.subtract(flat[1:], flat[:-1], out=lines[1:, 1:])
-    header = struct.pack(">2I5B", columns, rows, 8, COLOUR_TYPES[picture.ndim], 0, 0, 0)
+    header = struct.pack(">2I5B", columns, rows, 8, GREY if grey else RGB, 0, 0, 0)
     # Noise does not compress: more effort takes up to twice as long and saves a tenth.
     content = zlib.compress(lines.tobytes(), level=2)
     return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", content) + _chunk(b"IEND", b"")

@@ -212,7 +212,6 @@ def _rows(
     sources = error_sources(cameras, points, pixels.labels, catalogue, params, np.zeros((12, 12)), None)
     noise = pixel_noise_px2(pixels.covariances)
     fixed = combine @ noise @ combine.T
-    pixel_variance = np.diagonal(fixed)[:n].copy()
     fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
     # The gantry's own sources are the unknowns; a wrong source distance acts as an offset along the ray, which is one.
     parts = {share: np.zeros_like(fixed) for share in _SCALED}
@@ -223,7 +222,7 @@ def _rows(
     jacobian = jacobians(cameras, points)
     return _Rows(
         residual, combine @ gantry_effect_px(jacobian, points), fixed, parts["breathing"], parts["phase_mismatch"],
-        combine @ breathing_effect_px(jacobian), n, pixel_variance,
+        combine @ breathing_effect_px(jacobian), n, np.diagonal(fixed)[:n],
     )  # fmt: skip
 
 

@@ -226,19 +226,26 @@ def _shift(
     seen = _seen(session, job, located, view, frame, manifest.reference)
     if seen is None:
         return located.reference_mm
+    moved: Array = located.reference_mm + _displacement_mm(located, camera_of(located, view), seen)
+    return moved
+
+
+def _displacement_mm(located: LocatedSite, camera: Camera, seen: NamedChain) -> Array:
+    """How far (3,) a view shows a catheter from where two views located it; 0 where they located none of it.
+
+    The least displacement that explains it: what is along the rays a single view cannot tell.
+    """
     pairs = [
         (point.position_mm, pixel)
         for electrode, pixel in zip(seen.electrodes, seen.pixels_uv, strict=True)
-        if (point := located.point(manifest.reference, electrode)) is not None
+        if (point := located.point(seen.catheter, electrode)) is not None
     ]
     if not pairs:
-        return located.reference_mm
+        return np.zeros(3)
     positions, pixels = (np.array(column) for column in zip(*pairs, strict=True))
-    camera = camera_of(located, view)
     off_px = (pixels - camera.project(positions)).mean(axis=0)
-    # The least displacement that brings it there: what is along the rays a single view cannot tell.
-    moved: Array = located.reference_mm + np.linalg.pinv(camera.jacobian(located.reference_mm)) @ off_px
-    return moved
+    displacement: Array = np.linalg.pinv(camera.jacobian(positions.mean(axis=0))) @ off_px
+    return displacement
 
 
 def _tip(
