@@ -19,10 +19,10 @@ from typing import Any
 import httpx
 from rich.console import Console
 
-from fluoromap.demo import SPEC
-from fluoromap.results import Client, inputs_of, progress_bars, send
-from fluoromap.simulation import simulate
-from fluoromap.supervisor import private_service
+from fluoromap_service.cli.client import Client, inputs_of, progress_bars, send
+from fluoromap_service.cli.demonstration import SPEC
+from fluoromap_service.cli.supervisor import private_service
+from fluoromap_service.dicom.simulation import simulate
 
 PATIENCE_S = 600.0
 POLL_SECONDS = 0.05

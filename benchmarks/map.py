@@ -26,8 +26,8 @@ from scipy.spatial import ConvexHull as Hull
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import ChamberMap, Fuser, MappedSite, Silent
-from fluoromap.fuser.overlay import Look, draw_overlay
-from fluoromap.fuser.png import encode_png
+from fluoromap.drawing.overlay import Look, draw_overlay
+from fluoromap.drawing.png import encode_png
 from fluoromap.fuser.surface import face_areas_mm2, hull_surface, volume_mm3
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.phantom import StudySpec, simulate_study

@@ -40,7 +40,7 @@ from fluoromap.phantom import FRONTAL, LATERAL, HeartKind, StudySpec, simulate_s
 from fluoromap.phantom.motion import DIASTOLIC_PHASE, Beats, Breathing
 from fluoromap.phantom.placement import Anatomy, draw_anatomy
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain import CatheterChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 
 Array = NDArray[np.float64]
 Truth = Mapping[str, Array]

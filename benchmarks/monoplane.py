@@ -171,7 +171,7 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
                     believed.append((body @ np.swapaxes(poses[0], 1, 2) + poses[1][:, None] - s.points_mm)[1:])
                     view = view_of(s, pixels, a_priori, wrong_mm**2 / 3 * np.eye(3))
                     for k, solver in enumerate(solvers):
-                        track = solver.follow(view, Silent())
+                        track = solver.track(view, Silent())
                         errors[k].append((track.positions_mm - s.points_mm)[1:])
                         stated[k].append(track.covariance_mm2[1:])
                 cells = ""
@@ -297,7 +297,7 @@ def beating_hearts(rng: np.random.Generator) -> Iterator[str]:
                     try:
                         track = RigidPose(
                             RigidPose.Params(known_rigid=not known, gantry_angle_sd_deg=0, isocentre_sd_mm=0)
-                        ).follow(view, Silent())
+                        ).track(view, Silent())
                     except Refusal:
                         refused += 1
                     else:

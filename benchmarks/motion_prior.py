@@ -181,9 +181,9 @@ def run_scene(scene: Scene, seeds: Sequence[int], paper: bool = False) -> Scores
             others = () if scene.own_cycle else located.sites[1:]
             view = monoplane_view(matched[0], located.sites[0], number == 0, others)
             start = time.process_time()
-            track = solver.follow(view, Silent())
+            track = solver.track(view, Silent())
             scores.milliseconds.append(1000 * (time.process_time() - start) / len(view.observations))
-            before = [step.follow(view, Silent()) for step in steps]
+            before = [step.track(view, Silent()) for step in steps]
             scores.by_view[number].append(score(track, run, before))
     return scores
 

@@ -24,8 +24,8 @@ from fluoromap.geometry import Gantry
 from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, Contrast, SimulatedRun, StudySpec, simulate_study
 from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
-from fluoromap.segmenter.catheter_chain import CatheterChain
-from fluoromap.segmenter.four_step import FourStep
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.four_step.plugin import FourStep
 
 Array = NDArray[np.float64]
 

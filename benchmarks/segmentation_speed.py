@@ -34,20 +34,20 @@ from skimage.measure import label, regionprops
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
-from fluoromap.dicom import deterministic_uid, open_frames, read_instance, write_cine
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.phantom import Contrast, SimulatedRun, StudySpec, simulate_study
-from fluoromap.segmenter.blob_chains import BlobDetector
-from fluoromap.segmenter.blobs import find_blobs
-from fluoromap.segmenter.catheter_chain import CatheterChain
-from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
+from fluoromap.segmenter.catheter_chain.blob_chains import BlobDetector
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.field_mask import find_field
-from fluoromap.segmenter.four_step import FourStep
-from fluoromap.segmenter.frame_chains import FourStepDetector, FourStepParams
-from fluoromap.segmenter.homomorphic import homomorphic
+from fluoromap.segmenter.four_step.blobs import find_blobs
+from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
+from fluoromap.segmenter.four_step.frame_chains import FourStepDetector, FourStepParams
+from fluoromap.segmenter.four_step.homomorphic import homomorphic
+from fluoromap.segmenter.four_step.morphology import disk, disk_morphology
+from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
+from fluoromap.segmenter.four_step.plugin import FourStep
 from fluoromap.segmenter.log_image import Image, LogTransform
-from fluoromap.segmenter.morphology import disk, disk_morphology
-from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
+from fluoromap_service.dicom import deterministic_uid, open_frames, read_instance, write_cine
 
 Work = Callable[[], object]
 
@@ -63,7 +63,7 @@ REAL = {
 START = """
 import time
 begun = time.process_time()
-from fluoromap.workers.process import warm_up
+from fluoromap_workers.pool_child import warm_up
 from fluoromap.registry import plugins
 plugins()
 imported = time.process_time()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -16,7 +15,6 @@ import pytest
 if TYPE_CHECKING:
     from fastapi.testclient import TestClient
 
-sys.path.insert(0, str(Path(__file__).parent))
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 # The Celery application is configured when it is imported.
@@ -82,7 +80,7 @@ def sample_data() -> Path:
 def simulated_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files of a simulated study of five sites, made once for all xdist workers."""
     from fluoromap.phantom import StudySpec
-    from fluoromap.simulation import simulate
+    from fluoromap_service.dicom.simulation import simulate
 
     root = tmp_path_factory.getbasetemp()
     root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
@@ -101,9 +99,9 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(folder))
     monkeypatch.setenv("FLUOROMAP_BROKER_URL", "eager")
     monkeypatch.delenv("FLUOROMAP_DATABASE_URL", raising=False)
-    from fluoromap.settings import settings
-    from fluoromap.store.engine import engine
-    from fluoromap.store.models import Base
+    from fluoromap_service.settings import settings
+    from fluoromap_service.store.engine import engine
+    from fluoromap_service.store.models import Base
 
     settings.cache_clear()
     Base.metadata.create_all(engine())
@@ -117,7 +115,7 @@ def service(data_dir: Path) -> TestClient:
     """A client of the whole application, as from the same machine; decoding processes stay for the next test."""
     from fastapi.testclient import TestClient
 
-    from fluoromap.api.app import create_app
+    from fluoromap_service.api.app import create_app
 
     return TestClient(create_app(), base_url="http://127.0.0.1")
 

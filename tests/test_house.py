@@ -15,9 +15,9 @@ import pytest
 import typer.main
 import yaml
 
-from fluoromap.cli import app
 from fluoromap.reasons import Reason
-from fluoromap.settings import Settings
+from fluoromap_service.cli.app import app
+from fluoromap_service.settings import Settings
 
 TOP = Path(__file__).parent.parent
 COMPOSE: dict[str, Any] = yaml.safe_load((TOP / "docker-compose.yml").read_text())
@@ -87,7 +87,7 @@ def test_long_running_services_are_watched_and_may_end_their_work() -> None:
     for name in ("postgres", "redis", "api", "worker"):
         assert "healthcheck" in SERVICES[name]
         assert SERVICES[name]["restart"] == "unless-stopped"
-    from fluoromap.queue import app as celery
+    from fluoromap_service.jobs.queue import app as celery
 
     assert int(SERVICES["worker"]["stop_grace_period"].removesuffix("s")) > celery.conf.worker_soft_shutdown_timeout
 

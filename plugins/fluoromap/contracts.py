@@ -659,7 +659,7 @@ class Triangulator(Protocol):
 class MonoplaneSolver(Protocol):
     """Follows the electrodes in 3D through one view; raises :class:`Refusal` where the view cannot tell."""
 
-    def follow(self, view: MonoplaneView, context: Context) -> Track: ...
+    def track(self, view: MonoplaneView, context: Context) -> Track: ...
 
 
 @runtime_checkable

@@ -24,7 +24,7 @@ GROUPS: dict[Kind, str] = {
 _METHODS: dict[Kind, str] = {
     "segmenter": "segment",
     "triangulator": "triangulate",
-    "monoplane": "follow",
+    "monoplane": "track",
     "fuser": "fuse",
 }
 DEFAULTS: dict[Kind, str] = {

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from fluoromap.supervisor import program
+from fluoromap_service.cli.supervisor import program
 
 PATIENCE_SECONDS = 240
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
@@ -12,15 +11,12 @@ import numpy as np
 import psutil
 import pytest
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from processes import environment_of, process, wait_until_ready
 
-from fluoromap.dicom import write_cine
 from fluoromap.geometry import Gantry
-from fluoromap.results import Client, inputs_of
-from fluoromap.supervisor import free_port
+from fluoromap_service.cli.client import Client, inputs_of
+from fluoromap_service.cli.supervisor import free_port
+from fluoromap_service.dicom import write_cine
 
 LARGEST_DIFFERENCE_MIB = 64
 PIXELS = 256

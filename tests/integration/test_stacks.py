@@ -5,19 +5,15 @@ Each runs a study undisturbed, and once more from nothing with the worker killed
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from processes import Fresh, Kill, embedded, environment_of, wait_until_ready, with_servers
 
-from fluoromap.results import Client, inputs_of
-from fluoromap.supervisor import free_port
+from fluoromap_service.cli.client import Client, inputs_of
+from fluoromap_service.cli.supervisor import free_port
 
 pytestmark = pytest.mark.timeout(900)
 

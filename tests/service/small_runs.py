@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pydicom
 
-from fluoromap.dicom import deterministic_uid, write_cine
 from fluoromap.geometry import Gantry
+from fluoromap_service.dicom import deterministic_uid, write_cine
 
 ROWS, COLUMNS, FRAMES = 48, 64, 3
 START = datetime(2026, 3, 1, 9, 30, tzinfo=UTC)

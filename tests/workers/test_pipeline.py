@@ -14,11 +14,11 @@ import pydicom
 import pytest
 from fastapi.testclient import TestClient
 
-from fluoromap.api.overlays import fusion_of
 from fluoromap.contracts import Context, Marks, Run, Segmentation
-from fluoromap.segmenter.catheter_chain import CatheterChain
-from fluoromap.store.engine import reading
-from fluoromap.store.models import Job
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap_service.api.results.overlays import fusion_of
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.models import Job
 
 
 def _send(service: TestClient, study_path: str, folder: Path) -> None:
@@ -131,9 +131,11 @@ def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: st
     for electrode in electrodes:
         electrode["v_px"] += 6.0 * (electrode["catheter"] == "mapping")
     keys = ("catheter", "electrode", "u_px", "v_px", "sd_px")
-    marks = [{key: electrode[key] for key in keys} for electrode in electrodes if electrode["catheter"] == "mapping"]
+    corrections = [
+        {key: electrode[key] for key in keys} for electrode in electrodes if electrode["catheter"] == "mapping"
+    ]
     kept = [{key: e[key] for key in keys} for e in electrodes if e["catheter"] != "mapping"]
-    assert service.put(path, json=marks + kept).status_code == 200
+    assert service.put(path, json=corrections + kept).status_code == 200
     second = _job(service, sent)
     fresh = _fresh_stages(second)
     assert fresh["segment"] == 1
@@ -153,11 +155,11 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     segment = CatheterChain.segment
     calls: list[int] = []
 
-    def fails_once(self: CatheterChain, run: Run, catalogue: Any, marks: Marks, context: Context) -> Segmentation:
+    def fails_once(self: CatheterChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
         calls.append(1)
         if len(calls) == 1:
             raise ArithmeticError("the plugin's own words")
-        return segment(self, run, catalogue, marks, context)
+        return segment(self, run, catalogue, corrections, context)
 
     monkeypatch.setattr(CatheterChain, "segment", fails_once)
     job = _job(service, sent)

@@ -9,23 +9,23 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from fluoromap import queue
 from fluoromap.contracts import Context
-from fluoromap.store import files
-from fluoromap.store.engine import reading, writing
-from fluoromap.store.jobs import Claim
-from fluoromap.store.models import Event, Job, JobState, StageRow, StageState, Study
-from fluoromap.workers import runner, tasks
-from fluoromap.workers.bridge import Work
+from fluoromap_service.jobs import queue
+from fluoromap_service.jobs.job_life import Claim
+from fluoromap_service.store import files
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.models import Event, Job, JobState, StageRow, StageState, Study
+from fluoromap_workers import runner, tasks
+from fluoromap_workers.stage_inputs import Work
 
 
 @pytest.fixture
 def stage(data_dir: Path) -> int:
     """A ready stage, the only one of its job."""
     with writing() as session:
-        session.add(Study(id="s", label="x", catheters=[], reference="r", mapping="m", frame_of_reference_uid="1.2"))
+        session.add(Study(id="s", label="x", catheters=[], reference="r", mapping="m"))
         session.flush()
-        session.add(Job(id="j", study_id="s", state=JobState.QUEUED, manifest={}))
+        session.add(Job(id="j", study_id="s", state=JobState.QUEUED, snapshot={}))
         session.flush()
         row = StageRow(
             job_id="j", name="segment", subject="1.2.3", plugin="p", plugin_version="1", depends_on=[],
@@ -61,7 +61,7 @@ def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.Mon
 
 def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     with writing() as session:
-        session.add(Job(id="other", study_id="s", state=JobState.QUEUED, manifest={}))
+        session.add(Job(id="other", study_id="s", state=JobState.QUEUED, snapshot={}))
         session.flush()
         for job, depends_on in (("j", [stage]), ("other", [])):
             state = StageState.PENDING if depends_on else StageState.READY

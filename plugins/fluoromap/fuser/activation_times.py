@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from fluoromap.contracts import Array
-from fluoromap.fuser.cycle import Cycle
+from fluoromap.fuser.reentry_cycle import Cycle
 from fluoromap.fuser.surface import SurfacePoints
 from fluoromap.fuser.surface_field import FieldPrior, Regression, SurfaceField
 

@@ -10,9 +10,9 @@ from pydantic import BaseModel, Field, model_validator
 from fluoromap.contracts import Array, BoolArray, ChamberMap, Context, IntArray, MappedSite, Refusal, SurfaceSite
 from fluoromap.fuser.activation_times import LEAST_SD_MS, ActivationTimes, LeaveOneOut
 from fluoromap.fuser.conduction import conduction_velocity
-from fluoromap.fuser.cycle import Cycle
 from fluoromap.fuser.earliest import earliest_sites
 from fluoromap.fuser.outlying_times import agreeing_sites
+from fluoromap.fuser.reentry_cycle import Cycle
 from fluoromap.fuser.surface import (
     SurfacePoints,
     distance_along_surface,

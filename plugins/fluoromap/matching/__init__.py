@@ -1,6 +1,6 @@
 """Catheter names across frames, runs and sites; cardiac phase; pairs across views."""
 
-from fluoromap.matching.study import SiteRuns, match_study
+from fluoromap.matching.study_matching import SiteRuns, match_study
 
 __all__ = ["VERSION", "SiteRuns", "match_study"]
 

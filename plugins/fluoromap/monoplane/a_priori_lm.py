@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Track
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.observed import (
+from fluoromap.monoplane.observed_view import (
     ObservedView,
     isocentre_covariance_mm2,
     lateral_covariance_mm2,
@@ -62,7 +62,7 @@ class APrioriLM:
     def __init__(self, params: APrioriLM.Params) -> None:
         self._params = params
 
-    def follow(self, view: MonoplaneView, context: Context) -> Track:
+    def track(self, view: MonoplaneView, context: Context) -> Track:
         """Follow every electrode that has an a-priori position; raises Refusal NO_A_PRIORI where none has."""
         observed = observe(view)
         context.check()

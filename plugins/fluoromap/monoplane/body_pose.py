@@ -7,7 +7,7 @@ from scipy.linalg import rq
 
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.observed import outwards
+from fluoromap.monoplane.observed_view import outwards
 
 FEWEST_ELECTRODES = 4
 LEAST_BREADTH_MM = 0.2

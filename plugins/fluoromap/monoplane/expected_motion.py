@@ -11,7 +11,7 @@ from fluoromap.contracts import Array, MonoplaneView, SiteCycle
 from fluoromap.monoplane.a_priori_lm import moved_share
 from fluoromap.monoplane.cycle_prior import CycleCurve, fit_cycle
 from fluoromap.monoplane.motion_field import displacements
-from fluoromap.monoplane.observed import ObservedView, turned_covariance_mm2
+from fluoromap.monoplane.observed_view import ObservedView, turned_covariance_mm2
 from fluoromap.reasons import Reason
 
 

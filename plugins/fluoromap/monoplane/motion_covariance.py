@@ -11,7 +11,7 @@ from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
-from fluoromap.monoplane.observed import isocentre_covariance_mm2
+from fluoromap.monoplane.observed_view import isocentre_covariance_mm2
 
 FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29

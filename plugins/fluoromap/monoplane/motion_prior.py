@@ -16,7 +16,7 @@ from fluoromap.monoplane.catheter_lengths import catheter_lengths
 from fluoromap.monoplane.expected_motion import expect
 from fluoromap.monoplane.gaussian_path import Evidence, PathPrior, estimate_gains, most_probable, surprise
 from fluoromap.monoplane.motion_covariance import BEND, FIXED, OFFSET, TILT, MotionCovariance, MotionParams
-from fluoromap.monoplane.observed import ObservedView, lateral_covariance_mm2, observe, turned_covariance_mm2
+from fluoromap.monoplane.observed_view import ObservedView, lateral_covariance_mm2, observe, turned_covariance_mm2
 from fluoromap.reasons import Reason
 
 _STEPS = 5
@@ -57,7 +57,7 @@ class MotionPrior:
     def __init__(self, params: MotionPrior.Params) -> None:
         self._params = params
 
-    def follow(self, view: MonoplaneView, context: Context) -> Track:
+    def track(self, view: MonoplaneView, context: Context) -> Track:
         """Follow every electrode that has an a-priori position.
 
         Raises

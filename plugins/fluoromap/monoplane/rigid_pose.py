@@ -12,7 +12,7 @@ from scipy.special import gammaincc
 from fluoromap.contracts import Array, Context, IntArray, MonoplaneView, Refusal, Track
 from fluoromap.monoplane.body_pose import follow_body, pose_covariance_mm2, solve_poses, spans
 from fluoromap.monoplane.bundle import AdjustedBody, BodyView, adjust
-from fluoromap.monoplane.observed import ObservedView, isocentre_covariance_mm2, observe, turned_covariance_mm2
+from fluoromap.monoplane.observed_view import ObservedView, isocentre_covariance_mm2, observe, turned_covariance_mm2
 from fluoromap.monoplane.rigidity import rigid_error_mm, tells_of_body
 from fluoromap.reasons import Reason
 
@@ -74,7 +74,7 @@ class RigidPose:
     def __init__(self, params: RigidPose.Params) -> None:
         self._params = params
 
-    def follow(self, view: MonoplaneView, context: Context) -> Track:
+    def track(self, view: MonoplaneView, context: Context) -> Track:
         """Follow the body of all electrodes with an a-priori position, which is refined within its covariance.
 
         Raises

@@ -4,7 +4,7 @@ from fluoromap.phantom.appearance import APPEARANCES, Appearance, Contrast
 from fluoromap.phantom.chamber import Chamber
 from fluoromap.phantom.fluoroscopy import RenderedFrames
 from fluoromap.phantom.motion import HeartKind
-from fluoromap.phantom.study import (
+from fluoromap.phantom.simulated_study import (
     FRONTAL,
     LATERAL,
     RunTruth,

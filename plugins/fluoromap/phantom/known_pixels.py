@@ -17,11 +17,11 @@ from fluoromap.contracts import (
     Segmentation,
 )
 from fluoromap.geometry import Camera, camera_from_gantry
-from fluoromap.matching.cycle import fold, pair_by_phase, phase_shift
 from fluoromap.matching.phase import cardiac_phases
+from fluoromap.matching.phase_matching import fold, pair_by_phase, phase_shift
 from fluoromap.matching.run_catheters import gather
 from fluoromap.phantom.motion import DIASTOLIC_PHASE
-from fluoromap.phantom.study import SimulatedRun, SimulatedStudy
+from fluoromap.phantom.simulated_study import SimulatedRun, SimulatedStudy
 
 
 def matched_sites(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.homomorphic import gaussian, reduce_by
+from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
 _SIZE = 128

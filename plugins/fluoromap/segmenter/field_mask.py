@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray, FrameSource, IntArray, PixelFacts, Shutter
 from fluoromap.segmenter.collimator import within_collimator
-from fluoromap.segmenter.homomorphic import gaussian, reduce_by
+from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
 MARGIN_PX = 16

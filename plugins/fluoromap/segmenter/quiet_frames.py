@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.homomorphic import gaussian, reduce_by
+from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
 MOST_AVERAGED = 7

@@ -10,7 +10,7 @@ import numpy as np
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 from fluoromap.matching.two_view import triangulate_linear
-from fluoromap.triangulator.seen import Cameras, TwoViewPixels
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import jacobians
 
 _STEPS = 8

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, MatchedSite, Triangulation
 from fluoromap.triangulator.estimate import EachAlone
-from fluoromap.triangulator.study import locate_study
+from fluoromap.triangulator.study_triangulation import locate_study
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, MatchedSite, Triangulation
 from fluoromap.triangulator.estimate import AllTogether
-from fluoromap.triangulator.study import calibrate_and_locate
+from fluoromap.triangulator.study_triangulation import calibrate_and_locate
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 

@@ -16,9 +16,9 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Calibration
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.estimate import alone_gain, triangulate_maximum_likelihood
-from fluoromap.triangulator.seen import Cameras, TwoViewPixels
 from fluoromap.triangulator.spacing import neighbours
 from fluoromap.triangulator.strays import epipolar_rows
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import (
     Share,
     UncertaintyParams,

@@ -10,7 +10,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array
-from fluoromap.triangulator.seen import TwoViewPixels
+from fluoromap.triangulator.two_view_pixels import TwoViewPixels
 
 STUDY_LIMIT_MM = 0.75
 """A spacing whose median over the study is farther than this from the catalogue's is the catalogue's fault."""

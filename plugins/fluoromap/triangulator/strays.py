@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array
-from fluoromap.triangulator.seen import Cameras, TwoViewPixels
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import ErrorSource, jacobians, pixel_noise_px2
 
 STRAY_BEYOND_SD = 4.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, View
 from fluoromap.geometry import Camera
-from fluoromap.triangulator.seen import Cameras, TwoViewPixels
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 FEWEST_SITES = 3

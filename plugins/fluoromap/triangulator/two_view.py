@@ -11,13 +11,13 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import with_alternative
-from fluoromap.triangulator.cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.estimate import Estimate, Method
-from fluoromap.triangulator.seen import Cameras, TwoViewPixels, seen_in_both
 from fluoromap.triangulator.self_calibration import GantryBelief
+from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
 from fluoromap.triangulator.strays import epipolar_rows, strays_doubted
 from fluoromap.triangulator.table_motion import Jump
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, seen_in_both
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
     UncertaintyParams,

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
-from fluoromap.triangulator.seen import Cameras
+from fluoromap.triangulator.two_view_pixels import Cameras
 
 Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
 """Where an error source counts in the :class:`~fluoromap.contracts.ErrorBudget`."""

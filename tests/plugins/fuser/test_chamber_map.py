@@ -6,8 +6,8 @@ from chambers import directions, fused, sites_at, smooth, sphere, wave
 from pydantic import ValidationError
 
 from fluoromap.contracts import MappedSite, Refusal
+from fluoromap.drawing.isochrones import isochrones
 from fluoromap.fuser.chamber_map import MapParams
-from fluoromap.fuser.isochrones import isochrones
 from fluoromap.reasons import Reason
 
 FUSERS = pytest.mark.parametrize("fuse", [fused, smooth], ids=["hull", "smooth"])

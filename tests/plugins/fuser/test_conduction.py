@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.fuser.conduction import conduction_velocity
-from fluoromap.fuser.cycle import Cycle
+from fluoromap.fuser.reentry_cycle import Cycle
 
 UP = np.array([0.0, 0.0, 1.0])
 

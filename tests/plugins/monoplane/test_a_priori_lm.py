@@ -123,7 +123,7 @@ def view(simulation, frames: int = 5, a_priori: bool = True, hidden: int | None 
 
 def test_a_track_says_that_its_depth_is_assumed_and_how_unsure_it_is(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
-    track = APrioriLM(APrioriLM.Params(isocentre_sd_mm=0)).follow(view(simulation, hidden=2), Silent())
+    track = APrioriLM(APrioriLM.Params(isocentre_sd_mm=0)).track(view(simulation, hidden=2), Silent())
     assert track.labels[0] == ("mapping", 1)
     assert not track.located[2, :4].any()
     assert track.located[2, 4:].all()
@@ -146,7 +146,7 @@ def test_a_track_says_that_its_depth_is_assumed_and_how_unsure_it_is(simulate) -
 def test_an_isocentre_that_stands_elsewhere_counts_across_the_view(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
     known, unknown = (
-        APrioriLM(APrioriLM.Params(isocentre_sd_mm=sd)).follow(view(simulation), Silent()).covariance_mm2
+        APrioriLM(APrioriLM.Params(isocentre_sd_mm=sd)).track(view(simulation), Silent()).covariance_mm2
         for sd in (0.0, 0.7)
     )
     assert unknown[4, 0] - known[4, 0] == pytest.approx(np.diag([0.49, 0.49, 0.0]), abs=1e-9)
@@ -154,12 +154,12 @@ def test_an_isocentre_that_stands_elsewhere_counts_across_the_view(simulate) -> 
 
 def test_a_start_value_in_depth_widens_the_answer_s_doubt(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
-    plain = APrioriLM(APrioriLM.Params()).follow(view(simulation), Silent())
-    stepped = APrioriLM(APrioriLM.Params(depth_step_mm=2)).follow(view(simulation), Silent())
+    plain = APrioriLM(APrioriLM.Params()).track(view(simulation), Silent())
+    stepped = APrioriLM(APrioriLM.Params(depth_step_mm=2)).track(view(simulation), Silent())
     assert stepped.covariance_mm2[4, 0, 2, 2] > plain.covariance_mm2[4, 0, 2, 2] + 60
 
 
 def test_without_a_biplane_position_it_refuses(simulate) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(Refusal) as refusal:
-        APrioriLM(APrioriLM.Params()).follow(view(simulate("H18", "AP", 5), a_priori=False), Silent())
+        APrioriLM(APrioriLM.Params()).track(view(simulate("H18", "AP", 5), a_priori=False), Silent())
     assert refusal.value.reason is Reason.NO_A_PRIORI

@@ -22,7 +22,7 @@ from fluoromap.contracts import (
 from fluoromap.monoplane.expected_motion import expect
 from fluoromap.monoplane.motion_covariance import FIXED, MotionCovariance, MotionParams
 from fluoromap.monoplane.motion_prior import MotionPrior
-from fluoromap.monoplane.observed import observe
+from fluoromap.monoplane.observed_view import observe
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.known_pixels import matched_sites
 from fluoromap.reasons import Reason
@@ -66,7 +66,7 @@ def _study(
 
 
 def _follow(view: MonoplaneView, **parameters: float) -> Track:
-    return MotionPrior(MotionPrior.Params.model_validate({**EXACT, **parameters})).follow(view, Silent())
+    return MotionPrior(MotionPrior.Params.model_validate({**EXACT, **parameters})).track(view, Silent())
 
 
 def _rms(track: Track, truth: Array, positions: Array | None = None) -> float:

@@ -72,7 +72,7 @@ def view_of(  # type: ignore[no-untyped-def]
 
 def follow(view: MonoplaneView, **params: object) -> Track:
     known = {"gantry_angle_sd_deg": 0, "isocentre_sd_mm": 0, "known_rigid": True}
-    return RigidPose(RigidPose.Params.model_validate(known | params)).follow(view, Silent())
+    return RigidPose(RigidPose.Params.model_validate(known | params)).track(view, Silent())
 
 
 def refusal_of(view: MonoplaneView, **params: object) -> Refusal:

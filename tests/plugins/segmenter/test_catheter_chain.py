@@ -8,7 +8,7 @@ from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, StudySpec, simulate
 from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain import CatheterChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 
 PX_PER_MM = 512 / 178 * 2
 CHI2_95_2D = 5.991464547107979

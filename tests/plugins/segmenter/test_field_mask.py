@@ -5,9 +5,9 @@ import pytest
 from scipy import ndimage
 
 from fluoromap.contracts import PixelFacts, Shutter
-from fluoromap.dicom import open_frames, read_instance
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.field_mask import find_field, inside_shutter
+from fluoromap_service.dicom import open_frames, read_instance
 
 FACTS = PixelFacts(False, 12, False)
 

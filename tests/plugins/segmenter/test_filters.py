@@ -7,12 +7,13 @@ import pytest
 from scipy import ndimage
 
 from fluoromap.contracts import PixelFacts
-from fluoromap.segmenter.blobs import components, find_blobs, otsu_threshold
-from fluoromap.segmenter.complex_shock import complex_shock, to_grey_range
-from fluoromap.segmenter.homomorphic import equivalent_sigma, gaussian, homomorphic
+from fluoromap.segmenter.four_step.blobs import components, find_blobs, otsu_threshold
+from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
+from fluoromap.segmenter.four_step.homomorphic import equivalent_sigma, homomorphic
+from fluoromap.segmenter.four_step.morphology import disk_morphology
+from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
+from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.log_image import LogTransform
-from fluoromap.segmenter.morphology import disk_morphology
-from fluoromap.segmenter.perona_malik import edge_scale, perona_malik
 
 
 def plain_homomorphic(x, low=0.5, high=2.0, slope=1.0, cutoff=8.0, mode="reflect"):

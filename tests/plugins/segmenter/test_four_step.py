@@ -5,7 +5,7 @@ from pydantic import ValidationError
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import Chain, PixelFacts, Run, Segmenter, Silent, StageStopped
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.four_step import FourStep
+from fluoromap.segmenter.four_step.plugin import FourStep
 
 PX_PER_MM = 512 / 178 * 2
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
-from fluoromap.segmenter.contrast import Contrast
+from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.linking import Shafts, evidence, families, kind_probabilities, link
 
 PX = 5.75

@@ -8,7 +8,7 @@ import numpy as np
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain import CatheterChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.warm_run import DrawnFrames
 
 IN_A_NEW_PROCESS = """
@@ -17,7 +17,7 @@ from numba.core.dispatcher import Dispatcher
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.catheter_chain import CatheterChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 
 def kernels():
     modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("fluoromap.segmenter")]

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from finished_study import FinishedStudy, make_study
 
-from fluoromap.api import drawing
-from fluoromap.api.app import create_app
+from fluoromap_service.api.app import create_app
+from fluoromap_service.api.http import drawing_pool
 
 
 @pytest.fixture(scope="session")
@@ -40,4 +36,4 @@ def study(client: TestClient) -> FinishedStudy:
 def drawing_processes() -> Iterator[None]:
     """Ends the drawing processes with the session."""
     yield
-    drawing.close()
+    drawing_pool.close()

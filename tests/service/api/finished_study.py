@@ -29,15 +29,24 @@ from fluoromap.contracts import (
     Track,
     Triangulation,
 )
-from fluoromap.dicom import InstanceFacts, deterministic_uid, read_instance, write_cine
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
-from fluoromap.store import files, jobs
-from fluoromap.store.codec import encode
-from fluoromap.store.engine import reading, writing
-from fluoromap.store.manifest import CatheterPlan, GantryPlan, Manifest, PluginPlan, RejectedPlan, RunPlan, SitePlan
-from fluoromap.store.models import Base, Instance, Point, StageRow, Study
-from fluoromap.store.results import FollowedSite, FollowedView, MapOutcome
+from fluoromap_service.dicom import InstanceFacts, deterministic_uid, read_instance, write_cine
+from fluoromap_service.jobs import job_life
+from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack
+from fluoromap_service.store import files
+from fluoromap_service.store.codec import encode
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
+from fluoromap_service.study.snapshot import (
+    CatheterSnapshot,
+    GantrySnapshot,
+    PluginSnapshot,
+    RejectedSiteSnapshot,
+    RunSnapshot,
+    SiteSnapshot,
+    Snapshot,
+)
 
 SIZE = 96
 FRAMES = 3
@@ -76,22 +85,22 @@ class FinishedStudy:
         return stage_id
 
     @contextmanager
-    def claimed(self, name: str, subject: str | None = None) -> Iterator[tuple[Session, jobs.Claim]]:
+    def claimed(self, name: str, subject: str | None = None) -> Iterator[tuple[Session, job_life.Claim]]:
         stage_id = self.stage(name, subject)
         with writing() as session:
-            held = jobs.claim(session, stage_id, "tester")
+            held = job_life.claim(session, stage_id, "tester")
             assert held is not None
             yield session, held
 
     def end(self, name: str, subject: str | None, result: Any, rows: list[Base] | None = None) -> None:
         with self.claimed(name, subject) as (session, held):
             sha256 = files.keep_bytes(session, encode(result), "application/json")
-            assert jobs.finish(session, held, sha256, reused=False, rows=rows or ())
+            assert job_life.finish(session, held, sha256, reused=False, rows=rows or ())
 
     def fail(self, name: str, subject: str | None = None) -> None:
         error = {"code": "plugin_failed", "detail": f"The stage {name!r} failed: it broke."}
         with self.claimed(name, subject) as (session, held):
-            assert jobs.fail(session, held, error)
+            assert job_life.fail(session, held, error)
 
     def segmented(self) -> None:
         for uid in self.uids.values():
@@ -105,16 +114,16 @@ class FinishedStudy:
         self.matched()
         self.end("triangulate", None, triangulation(), self._points())
 
-    def mapped(self, outcome: MapOutcome | None = None) -> None:
+    def mapped(self, outcome: MapResult | None = None) -> None:
         self.triangulated()
-        self.end("fuse", None, outcome or map_outcome())
+        self.end("fuse", None, outcome or map_result())
 
     def followed(self, relative: bool = False) -> None:
         self.end("monoplane", "S01", followed_site(relative))
-        refused = FollowedView("a", None, Reason.NO_A_PRIORI, Reason.NO_A_PRIORI.sentence)
-        self.end("monoplane", "S02", FollowedSite("S02", (refused,)))
+        refused = ViewTrack("a", None, Reason.NO_A_PRIORI, Reason.NO_A_PRIORI.sentence)
+        self.end("monoplane", "S02", SiteTracks("S02", (refused,)))
 
-    def finish(self, outcome: MapOutcome | None = None) -> None:
+    def finish(self, outcome: MapResult | None = None) -> None:
         """End all stages."""
         self.mapped(outcome)
         self.followed()
@@ -154,16 +163,15 @@ def make_study() -> FinishedStudy:
     with writing() as session:
         study = Study(
             id="0" * 32, label="rhythm", catheters=[], reference="reference", mapping="mapping",
-            frame_of_reference_uid=deterministic_uid("frame"),
         )  # fmt: skip
         session.add(study)
         session.flush()
         runs = {uid: _stored_run(session, uid, view) for (_, view), uid in uids.items()}
-        plugin = PluginPlan(name="by-hand", version="1", params={})
-        manifest = Manifest(
+        plugin = PluginSnapshot(name="by-hand", version="1", params={})
+        snapshot = Snapshot(
             study=study.id,
             catheters=tuple(
-                CatheterPlan(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
+                CatheterSnapshot(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
                 for name in ("reference", "mapping")
             ),
             reference="reference",
@@ -175,17 +183,17 @@ def make_study() -> FinishedStudy:
             view="a",
             runs=runs,
             sites=tuple(
-                SitePlan(site=site, lat_ms=41.0, lat_sd_ms=2.0, view_a=uids[site, "a"], view_b=uids[site, "b"])
+                SiteSnapshot(site=site, lat_ms=41.0, lat_sd_ms=2.0, view_a=uids[site, "a"], view_b=uids[site, "b"])
                 for site in ("S01", "S02")
             ),
             rejected=(
-                RejectedPlan(
+                RejectedSiteSnapshot(
                     site="S03", lat_ms=None, view_a=None, view_b=None,
                     reasons=(Reason.ONE_VIEW_ONLY, Reason.NO_ACTIVATION_TIME),
                 ),
             ),
         )  # fmt: skip
-        job = jobs.create(session, study.id, manifest)
+        job = job_life.create(session, study.id, snapshot)
         return FinishedStudy(study.id, job.id, uids)
 
 
@@ -208,7 +216,7 @@ def _cine(uid: str, view: str) -> tuple[bytes, InstanceFacts]:
         return path.read_bytes(), read_instance(path)
 
 
-def _stored_run(session: Session, uid: str, view: str) -> RunPlan:
+def _stored_run(session: Session, uid: str, view: str) -> RunSnapshot:
     gantry = GANTRIES[view]
     content, facts = _cine(uid, view)
     sha256 = files.keep_bytes(session, content, "application/dicom")
@@ -218,12 +226,12 @@ def _stored_run(session: Session, uid: str, view: str) -> RunPlan:
             series_instance_uid=facts.series_instance_uid, series_number=1, acquired=None, facts=facts.to_json(),
         )
     )  # fmt: skip
-    plan = GantryPlan(
+    plan = GantrySnapshot(
         primary_deg=gantry.primary_deg, secondary_deg=gantry.secondary_deg, source_detector_mm=1000.0,
         source_isocentre_mm=700.0, pixel_spacing_mm=gantry.pixel_spacing_mm, rows=SIZE, columns=SIZE,
         image_axes=gantry.image_axes,
     )  # fmt: skip
-    return RunPlan(sha256=sha256, facts=facts.to_json(), gantry=plan, marks={})
+    return RunSnapshot(sha256=sha256, facts=facts.to_json(), gantry=plan, corrections={})
 
 
 def camera(view: str) -> Camera:
@@ -271,7 +279,7 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
     return Triangulation((site,), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
 
 
-def followed_site(relative: bool = False) -> FollowedSite:
+def followed_site(relative: bool = False) -> SiteTracks:
     """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
     is not seen in frame 2."""
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
@@ -293,10 +301,10 @@ def followed_site(relative: bool = False) -> FollowedSite:
         reasons=((), (), (Reason.DEPTH_ASSUMED,)),
         relative_covariance_mm2=np.tile(RELATIVE_COVARIANCE_A, (FRAMES, 3, 1, 1)) if relative else None,
     )
-    return FollowedSite("S01", (FollowedView("a", track, None, ""),))
+    return SiteTracks("S01", (ViewTrack("a", track, None, ""),))
 
 
-def map_outcome() -> MapOutcome:
+def map_result() -> MapResult:
     """An octahedron of 10 mm about the reference, one vertex without a time."""
     vertices = 10.0 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
@@ -317,8 +325,8 @@ def map_outcome() -> MapOutcome:
         coverage=0.8,
     )
     x, y, z = REFERENCE_MM.tolist()
-    return MapOutcome(chamber, None, "", (x, y, z))
+    return MapResult(chamber, None, "", (x, y, z))
 
 
-def no_map() -> MapOutcome:
-    return MapOutcome(None, Reason.TOO_FEW_SITES, Reason.TOO_FEW_SITES.sentence, None)
+def no_map() -> MapResult:
+    return MapResult(None, Reason.TOO_FEW_SITES, Reason.TOO_FEW_SITES.sentence, None)

@@ -17,8 +17,8 @@ from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.encaps import encapsulate
 from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
-from fluoromap.dicom import write_cine
 from fluoromap.geometry import Gantry
+from fluoromap_service.dicom import write_cine
 
 MakeXa = Callable[..., Path]
 ACQUIRED = datetime(2024, 5, 6, 7, 8, 9, 250000, tzinfo=UTC)

@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from pydicom.dataset import Dataset
 from pydicom.uid import EnhancedXAImageStorage
 
-from fluoromap.dicom import HeaderWarning, InstanceFacts, image_axes_from_orientation, read_instance
-from fluoromap.dicom.orientation import (
+from fluoromap.geometry import Gantry, camera_from_gantry
+from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
+from fluoromap_service.dicom import HeaderWarning, InstanceFacts, image_axes_from_orientation, read_instance
+from fluoromap_service.dicom.orientation import (
     field_of_view_of,
     image_axes_from_field_of_view,
     patient_orientation,
     upright_axes_world,
 )
-from fluoromap.geometry import Gantry, camera_from_gantry
-from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 
 MakeXa = Callable[..., Path]
 FRAMES = np.arange(3 * 8 * 16, dtype=np.uint16).reshape(3, 8, 16)

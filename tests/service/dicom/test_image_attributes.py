@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluoromap.dicom import HeaderWarning, InstanceFacts, frame_to_8bit, open_frames, read_instance
+from fluoromap_service.dicom import HeaderWarning, InstanceFacts, frame_to_8bit, open_frames, read_instance
 
 MakeXa = Callable[..., Path]
 FRAMES = np.arange(4 * 8 * 16, dtype=np.uint16).reshape(4, 8, 16)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pydicom.pixels.utils import pixel_array
 
-from fluoromap.dicom import DicomCode, DicomProblem, open_frames, read_instance
+from fluoromap_service.dicom import DicomCode, open_frames, read_instance
+from fluoromap_service.problem import Problem
 
 Sample = Callable[[str], Path]
 
@@ -36,7 +37,7 @@ def test_real_cine_cut_short(sample: Sample, tmp_path: Path) -> None:
     path = tmp_path / "cut.dcm"
     for length in (len(content) - 1, len(content) // 2, 5000, 300):
         path.write_bytes(content[:length])
-        with pytest.raises(DicomProblem) as caught:
+        with pytest.raises(Problem) as caught:
             read_instance(path)
         assert caught.value.code is DicomCode.TRUNCATED
 
@@ -50,7 +51,7 @@ def test_lossless_pair_is_identical(sample: Sample) -> None:
 
 
 def test_twelve_bit_jpeg_is_refused(sample: Sample) -> None:
-    with pytest.raises(DicomProblem, match="JPEG Extended") as caught:
+    with pytest.raises(Problem, match="JPEG Extended") as caught:
         read_instance(sample("xa_1024_jpeg_extended_12bit.dcm"))
     assert (caught.value.code, caught.value.status) == (DicomCode.UNDECODABLE, 422)
 

@@ -28,14 +28,21 @@ from pydicom.uid import (
     XRay3DAngiographicImageStorage,
 )
 
-from fluoromap.dicom import DicomCode, DicomProblem, read_instance
+from fluoromap_service.dicom import DicomCode, dicom_problem, read_instance
+from fluoromap_service.problem import Problem
 
 MakeXa = Callable[..., Path]
 FRAMES = np.arange(3 * 8 * 10, dtype=np.uint16).reshape(3, 8, 10)
 
 
-def refusal(path: Path) -> DicomProblem:
-    with pytest.raises(DicomProblem) as caught:
+def _where(problem: Problem) -> str:
+    """The one place that a problem names."""
+    ((where, _),) = problem.errors
+    return where
+
+
+def refusal(path: Path) -> Problem:
+    with pytest.raises(Problem) as caught:
         read_instance(path)
     problem = caught.value
     assert "SECRET" not in str(problem)
@@ -64,7 +71,7 @@ def test_bare_data_set(tmp_path: Path, cine: Path) -> None:
 @pytest.mark.parametrize("kind", [CTImageStorage, XRay3DAngiographicImageStorage])
 def test_other_kinds(make_xa: MakeXa, kind: str) -> None:
     problem = refusal(make_xa(FRAMES, SOPClassUID=kind))
-    assert (problem.code, problem.status, problem.where) == (DicomCode.NOT_XA, 422, "SOPClassUID")
+    assert (problem.code, problem.status, _where(problem)) == (DicomCode.NOT_XA, 422, "SOPClassUID")
 
 
 def test_secondary_capture_of_another_modality(make_xa: MakeXa) -> None:
@@ -79,7 +86,7 @@ def test_no_pixel_data_even_with_an_icon(make_xa: MakeXa) -> None:
     icon.add_new(0x7FE00010, "OW", b"\0" * 128)
     path = make_xa(FRAMES, PixelData=None, IconImageSequence=[icon])
     problem = refusal(path)
-    assert (problem.code, problem.status, problem.where) == (DicomCode.NO_PIXEL_DATA, 422, "PixelData")
+    assert (problem.code, problem.status, _where(problem)) == (DicomCode.NO_PIXEL_DATA, 422, "PixelData")
 
 
 def test_empty_pixel_data(make_xa: MakeXa) -> None:
@@ -114,7 +121,7 @@ def test_few_bytes_that_claim_gigabytes(make_xa: MakeXa) -> None:
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
         tracemalloc.stop()
-    assert (problem.code, problem.status, problem.where) == (DicomCode.PIXEL_DATA_MISMATCH, 400, "NumberOfFrames")
+    assert (problem.code, problem.status, _where(problem)) == (DicomCode.PIXEL_DATA_MISMATCH, 400, "NumberOfFrames")
 
 
 def test_native_length_that_claims_gigabytes(cine: Path) -> None:
@@ -128,7 +135,7 @@ def test_native_length_that_claims_gigabytes(cine: Path) -> None:
 def test_number_of_frames_that_fragments_cannot_hold(make_xa: MakeXa) -> None:
     path = make_xa(FRAMES, syntax=JPEGLosslessSV1, fragments=[b"\xff\xd8\xff\xd9"] * 3, NumberOfFrames=4)
     problem = refusal(path)
-    assert (problem.code, problem.where) == (DicomCode.PIXEL_DATA_MISMATCH, "NumberOfFrames")
+    assert (problem.code, _where(problem)) == (DicomCode.PIXEL_DATA_MISMATCH, "NumberOfFrames")
 
 
 @pytest.mark.parametrize(
@@ -170,7 +177,7 @@ def with_syntax(path: Path, old: str, new: str) -> Path:
 def test_transfer_syntaxes_nobody_decodes(make_xa: MakeXa, syntax: str) -> None:
     path = make_xa(FRAMES, syntax=JPEGLosslessSV1, fragments=[b"movie!"])
     problem = refusal(with_syntax(path, JPEGLosslessSV1, syntax))
-    assert (problem.code, problem.status, problem.where) == (DicomCode.UNDECODABLE, 422, "TransferSyntaxUID")
+    assert (problem.code, problem.status, _where(problem)) == (DicomCode.UNDECODABLE, 422, "TransferSyntaxUID")
     assert pydicom.uid.UID(syntax).name in str(problem)
 
 
@@ -219,7 +226,7 @@ def test_header_made_of_millions_of_empty_items(
     make_xa: MakeXa, defined_length: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The real budget takes seconds to use up.
-    monkeypatch.setattr("fluoromap.dicom.header.HEADER_READS", 30_000)
+    monkeypatch.setattr("fluoromap_service.dicom.header.HEADER_READS", 30_000)
     path = make_xa(FRAMES)
     content = path.read_bytes()
     at = content.index(b"\xe0\x7f\x10\x00OW")
@@ -241,9 +248,9 @@ def test_fragments_that_are_no_items(make_xa: MakeXa) -> None:
 
 
 def test_problem_survives_a_process_boundary() -> None:
-    problem = DicomProblem(DicomCode.TRUNCATED, "Sentence.", "PixelData")
+    problem = dicom_problem(DicomCode.TRUNCATED, "Sentence.", "PixelData")
     copy = pickle.loads(pickle.dumps(problem))
-    assert (copy.code, copy.message, copy.where, copy.status) == (DicomCode.TRUNCATED, "Sentence.", "PixelData", 400)
+    assert (copy.code, copy.detail, _where(copy), copy.status) == (DicomCode.TRUNCATED, "Sentence.", "PixelData", 400)
 
 
 def test_every_code_has_a_status() -> None:
@@ -261,6 +268,6 @@ def test_damaged_headers_are_read_or_refused(cine: Path, data: st.DataObject) ->
     for _ in range(data.draw(st.integers(1, 6))):
         content[data.draw(st.integers(128, header_end - 1))] = data.draw(st.integers(0, 255))
     cine.write_bytes(content)
-    # Anything but a DicomProblem is a bug, and fails here.
-    with contextlib.suppress(DicomProblem):
+    # Anything but a Problem is a bug, and fails here.
+    with contextlib.suppress(Problem):
         read_instance(cine).to_json()

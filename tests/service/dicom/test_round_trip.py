@@ -22,10 +22,11 @@ from pydicom.pixels.encoders.base import get_encoder
 from pydicom.uid import JPEGLSLossless, RLELossless
 
 from fluoromap.contracts import FrameSource
-from fluoromap.dicom import DicomProblem, InstanceFacts, deterministic_uid, open_frames, read_instance, write_cine
-from fluoromap.dicom.codestream import decode
-from fluoromap.dicom.pixel_layout import PixelLayout
 from fluoromap.geometry import Gantry
+from fluoromap_service.dicom import InstanceFacts, deterministic_uid, open_frames, read_instance, write_cine
+from fluoromap_service.dicom.codestream import decode
+from fluoromap_service.dicom.pixel_layout import PixelLayout
+from fluoromap_service.problem import Problem
 
 MakeXa = Callable[..., Path]
 ACQUIRED = datetime(2024, 5, 6, 7, 8, 9, 250000, tzinfo=UTC)
@@ -148,7 +149,7 @@ def test_damaged_jpeg_header_is_refused_before_the_decoder_sees_it(
     """GDCM would end the whole process at the first of these."""
     frame = np.zeros((32, 48), np.uint8)
     stream = jpeg_baseline(frame).replace(*damage, 1)
-    with pytest.raises(DicomProblem, match="no valid header"):
+    with pytest.raises(Problem, match="no valid header"):
         read_instance(make_xa(frame[None], syntax=pydicom.uid.JPEGBaseline8Bit, fragments=[stream]))
 
 
@@ -239,7 +240,7 @@ def test_more_pixel_data_than_announced(make_xa: MakeXa) -> None:
 
 def test_file_that_changed(cine: Path, make_xa: MakeXa) -> None:
     other = make_xa(np.zeros((1, 4, 4), np.uint8))
-    with pytest.raises(DicomProblem):
+    with pytest.raises(Problem):
         open_frames(other, read_instance(cine))
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
-from fluoromap.store.codec import decode, encode
+from fluoromap_service.store.codec import decode, encode
 
 
 def _segmentation() -> Segmentation:

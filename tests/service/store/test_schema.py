@@ -13,11 +13,11 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
 
-from fluoromap.settings import settings
-from fluoromap.store import engine as store_engine
-from fluoromap.store import schema
-from fluoromap.store.engine import engine, reading, writing
-from fluoromap.store.models import Base, Study, StudyInstance
+from fluoromap_service.settings import settings
+from fluoromap_service.store import engine as store_engine
+from fluoromap_service.store import schema
+from fluoromap_service.store.engine import engine, reading, writing
+from fluoromap_service.store.models import Base, Study, StudyInstance
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -44,11 +44,7 @@ def test_migrated_schema_equals_the_models() -> None:
 def test_upgrading_again_changes_nothing_and_keeps_the_rows() -> None:
     schema.upgrade()
     with writing() as session:
-        session.add(
-            Study(
-                id="s1", label="x", catheters=[], reference="reference", mapping="mapping", frame_of_reference_uid="1.2"
-            )
-        )
+        session.add(Study(id="s1", label="x", catheters=[], reference="reference", mapping="mapping"))
     schema.upgrade()
     with reading() as session:
         assert session.get_one(Study, "s1").label == "x"
@@ -65,7 +61,7 @@ def test_sqlite_still_holds_foreign_keys_after_an_upgrade(database: str) -> None
 
 @pytest.mark.usefixtures("database")
 def test_processes_that_migrate_at_once_all_succeed() -> None:
-    program = "from fluoromap.store.schema import upgrade; upgrade()"
+    program = "from fluoromap_service.store.schema import upgrade; upgrade()"
     started = [subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.PIPE) for _ in range(3)]
     errors = [process.communicate()[1].decode() for process in started]
     assert [process.returncode for process in started] == [0, 0, 0], errors

@@ -1,0 +1,39 @@
+"""Plain names: corrections and snapshots; results in binary form; columns that nothing read are gone."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0002"
+down_revision = "0001"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    op.drop_index("ix_mark_study_id", table_name="mark")
+    op.rename_table("mark", "correction")
+    with op.batch_alter_table("correction") as table:
+        table.drop_constraint("uq_mark_version", type_="unique")
+        table.create_unique_constraint("uq_correction_version", ["study_id", "sop_instance_uid", "frame", "version"])
+        table.create_index("ix_correction_study_id", ["study_id"])
+    with op.batch_alter_table("job") as table:
+        table.alter_column("manifest", new_column_name="snapshot")
+    with op.batch_alter_table("study") as table:
+        table.drop_column("frame_of_reference_uid")
+    with op.batch_alter_table("site") as table:
+        table.drop_column("electrogram")
+    with op.batch_alter_table("study_instance") as table:
+        table.drop_column("added")
+    _rename_corrections()
+    # Results were JSON and are MessagePack now: a new job computes them again.
+    op.execute("DELETE FROM stage_result")
+    op.execute("UPDATE stage SET result = NULL")
+
+
+def _rename_corrections() -> None:
+    connection = op.get_bind()
+    job = sa.table("job", sa.column("id", sa.String), sa.column("snapshot", sa.JSON))
+    for job_id, snapshot in connection.execute(sa.select(job.c.id, job.c.snapshot)).all():
+        for run in snapshot["runs"].values():
+            run["corrections"] = run.pop("marks", {})
+        connection.execute(job.update().where(job.c.id == job_id).values(snapshot=snapshot))

@@ -1,0 +1,1 @@
+"""The science: from fluoroscopy frames to an activation map. Arrays, millimetres and pixels only."""

@@ -1,0 +1,54 @@
+"""The activation running over the wall, as a moving picture."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from fluoromap.contracts import ChamberMap
+from fluoromap.drawing.colours import scale_of
+from fluoromap.drawing.overlay import Look, draw_overlay
+from fluoromap.geometry import Camera
+
+PICTURES = 24
+PICTURE_MS = 120
+LAST_PICTURE_MS = 1500
+COLOURS = 256
+
+
+def draw_propagation(
+    frame: NDArray[np.uint8],
+    camera: Camera,
+    chamber: ChamberMap,
+    shift_world_mm: ArrayLike,
+    highlight_site: str,
+    tip_uv: ArrayLike | None,
+    look: Look,
+) -> bytes:
+    """A GIF that runs through the map's times, from the earliest to the latest, and starts again.
+
+    Parameters as of :func:`fluoromap.drawing.overlay.draw_overlay`; ``look.until_ms`` is not read. Every picture is the overlay
+    with its time written in the corner, the wall coloured as far as it is activated by then.
+    """
+    times = look.times or scale_of(chamber, look.step_ms, look.palette)
+    pictures = [
+        Image.fromarray(
+            draw_overlay(
+                frame, camera, chamber, shift_world_mm, highlight_site, tip_uv, replace(look, until_ms=float(until_ms))
+            )
+        )
+        for until_ms in np.linspace(times.start_ms, times.stop_ms, PICTURES)
+    ]
+    # One palette for all pictures, of the last one, which has every colour: what does not change is not stored again.
+    palette = pictures[-1].quantize(COLOURS, dither=Image.Dither.NONE)
+    reduced = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    stream = io.BytesIO()
+    shown_ms = [PICTURE_MS] * (PICTURES - 1) + [LAST_PICTURE_MS]
+    reduced[0].save(
+        stream, format="GIF", save_all=True, append_images=reduced[1:], duration=shown_ms, loop=0, disposal=1
+    )
+    return stream.getvalue()

@@ -1,0 +1,248 @@
+"""The map fused on a fluoroscopy frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw
+
+from fluoromap.contracts import Array, BoolArray, ChamberMap
+from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
+from fluoromap.drawing.isochrones import isochrones
+from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, bar_box, draw_colour_bar, halo_text
+from fluoromap.drawing.raster import Raster, rasterise
+from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
+from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, bands_shown, colour_table, outline_edges, runs
+from fluoromap.fuser.surface import face_normals
+from fluoromap.geometry import Camera
+
+Picture = NDArray[np.uint8]
+
+TINT = 0.32
+"""Share of the map's colour in a pixel: electrodes keep two thirds of their contrast."""
+
+HATCH_TINT = 0.4
+LINE_SHARE = 0.5
+OUTLINE_SHARE = 0.9
+OUTLINE_RGB = (140, 225, 255)
+LEAST_DEPTH_MM = 10.0
+OUT_OF_SIGHT_PX = -1e6
+CHI2_95_2D = 5.991464547107979
+ELLIPSE_RGB = (255, 255, 120)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How an overlay is drawn.
+
+    scale : pixels of the picture per pixel of the frame, along each side. palette, step_ms : of the isochrones, None being
+    the step that suits the map. covariances_mm2 : site -> (3, 3) of its position, drawn as the 95 % ellipse. until_ms : the
+    wall is coloured only where it is activated by then, its front a thick line; None colours all. times : colour scale that
+    several pictures share, in place of palette and step.
+    """
+
+    scale: int = 1
+    palette: Palette = "safe"
+    step_ms: float | None = None
+    covariances_mm2: Mapping[str, Array] = field(default_factory=dict)
+    until_ms: float | None = None
+    times: Scale | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale < 1:
+            raise ValueError("scale must be 1 or more")
+        if self.step_ms is not None and not self.step_ms > 0:
+            raise ValueError("step_ms must be positive")
+
+
+def draw_overlay(
+    frame: NDArray[np.uint8],
+    camera: Camera,
+    chamber: ChamberMap,
+    shift_world_mm: ArrayLike,
+    highlight_site: str,
+    tip_uv: ArrayLike | None,
+    look: Look | None = None,
+) -> Picture:
+    """The map projected into a frame, as the paper fuses it.
+
+    Drawn are the bands and lines of equal time on the wall that faces the viewer, who looks from the detector as the
+    displayed image does; a hatch where no site is near; the hull's outline; every site with its time in ms (filled: on
+    the wall facing the viewer, ring: on the far wall; amber with a question mark: contradicted by its neighbours); a star
+    at the highlighted site's tip; a colour bar.
+
+    Parameters
+    ----------
+    frame : (rows, columns) uint8
+        Stored pixels after windowing.
+    camera : Camera
+        Of this run, for stored pixels.
+    chamber : ChamberMap
+        Relative to the reference catheter.
+    shift_world_mm : (3,)
+        Position of the reference catheter in this run: world = map + shift.
+    highlight_site : str
+        The site this run belongs to; a name that is not in the map draws no time.
+    tip_uv : (2,) or None
+        Where the tip was seen in this frame; None takes the site's position from the map.
+    look : Look
+
+    Returns
+    -------
+    (rows * scale, columns * scale, 3) uint8
+        RGB; pixel (u, v) of the frame has its centre at ((u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5).
+
+    Raises
+    ------
+    ValueError
+        When the frame is not of the camera's size.
+    """
+    if frame.dtype != np.uint8 or frame.shape != (camera.rows, camera.columns):
+        raise ValueError(f"the frame must be uint8 of shape {(camera.rows, camera.columns)}, not {frame.shape}")
+    look = look or Look()
+    canvas = _Canvas(camera.translated(shift_world_mm), look.scale)
+    times = look.times or scale_of(chamber, look.step_ms, look.palette)
+    size = (camera.columns * look.scale, camera.rows * look.scale)
+    grey = Image.fromarray(frame)
+    image = (grey if look.scale == 1 else grey.resize(size, Image.Resampling.BICUBIC)).convert("RGB")
+
+    facing = canvas.facing(chamber)
+    raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
+    _tint(image, bands_shown(raster, chamber, times, canvas.unit, look.until_ms), times)
+    _draw_lines(image, canvas, chamber, facing, times, look)
+    _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms)
+    if look.until_ms is not None:
+        text, size_px = f"{milliseconds(look.until_ms)} ms", round(1.6 * canvas.letters)
+        halo_text(ImageDraw.Draw(image), (3.2 * size_px, size_px), text, size_px, WHITE, BLACK)
+    return np.asarray(image)
+
+
+class _Canvas:
+    """Where map coordinates lie in the picture, and how thick a line or a letter is there."""
+
+    def __init__(self, camera: Camera, scale: int) -> None:
+        self._camera = camera
+        self._scale = scale
+        self.unit = scale * float(np.clip(min(camera.rows, camera.columns) / 512, 0.6, 3.0))
+        self.letters = max(9, round(12 * self.unit))
+
+    def to_picture(self, uv: Array) -> Array:
+        placed: Array = (uv + 0.5) * self._scale - 0.5
+        return placed
+
+    def project(self, points_mm: Array) -> tuple[Array, Array]:
+        """Picture coordinates (k, 2) and nearness to the detector (k,): the depth from the source."""
+        depth = self._camera.depth_mm(points_mm)
+        # What lies behind the source would come out mirrored.
+        behind = depth < LEAST_DEPTH_MM
+        uv = self._camera.project(np.where(behind[:, None], self._camera.axis_world * 1e3, points_mm))
+        return self.to_picture(np.where(behind[:, None], OUT_OF_SIGHT_PX, uv)), depth
+
+    def ellipse(self, point_mm: Array, covariance_mm2: Array) -> Array:
+        """Outline (k, 2) in the picture of the 95 % ellipse of a point's projection, to first order."""
+        step = 1e-3
+        ends = self.project(point_mm + step * np.concatenate([np.eye(3), -np.eye(3)]))[0]
+        jacobian = (ends[:3] - ends[3:]).T / (2 * step)
+        values, vectors = np.linalg.eigh(jacobian @ covariance_mm2 @ jacobian.T)
+        angles = np.linspace(0, 2 * np.pi, 49)
+        circle = np.stack([np.cos(angles), np.sin(angles)]) * np.sqrt(CHI2_95_2D * np.maximum(values, 0.0))[:, None]
+        outline: Array = self.project(point_mm[None])[0] + (vectors @ circle).T
+        return outline
+
+    def facing(self, chamber: ChamberMap) -> BoolArray:
+        """Faces whose outer side looks at the detector: the ray from the source leaves the chamber through them."""
+        normals = face_normals(chamber.vertices_mm, chamber.faces)
+        rays = chamber.vertices_mm[chamber.faces].mean(axis=1) - self._camera.source_world_mm
+        outward: BoolArray = (normals * rays).sum(axis=1) > 0
+        return outward
+
+
+def _tint(image: Image.Image, shown: NDArray[np.int32], times: Scale) -> None:
+    shares = np.full(times.bands + 3, TINT)
+    shares[[NOTHING, HATCH, NO_DATA]] = 0.0, HATCH_TINT, 0.0
+    table = np.column_stack([colour_table(times, BLACK), (255 * shares).round().astype(np.uint8)])
+    # One number a pixel is taken several times faster than four.
+    layer = Image.fromarray(table.view(np.uint32)[:, 0][shown].view(np.uint8).reshape(*shown.shape, 4))
+    image.paste(layer, mask=layer)
+
+
+def _draw_lines(
+    image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale, look: Look
+) -> None:
+    """Isochrones, outline and ellipses, drawn at twice the size and averaged: smooth lines."""
+    thickness = max(2, round(2 * canvas.unit))
+
+    def draw(lines: Sequence[Array], colour: RGB, share: float, width: int) -> None:
+        if not len(lines):
+            return
+        points = np.concatenate(lines)
+        low = np.clip(np.floor(points.min(axis=0) - width), 0, image.size).astype(np.int64)
+        high = np.clip(np.ceil(points.max(axis=0) + width), 0, image.size).astype(np.int64)
+        if (high <= low).any():
+            return
+        mask = Image.new("L", tuple((2 * (high - low)).tolist()))
+        pen = ImageDraw.Draw(mask)
+        for line in lines:
+            # Pillow cuts coordinates to whole numbers; half a pixel more rounds them.
+            pen.line(((line - low + 0.5) * 2).ravel().tolist(), fill=round(255 * share), width=width, joint="curve")
+        image.paste(colour, (*low.tolist(), *high.tolist()), mask.reduce(2))
+
+    def near(levels_ms: Array) -> list[Array]:
+        """The parts of the isochrones on the wall that faces the viewer."""
+        lines = isochrones(chamber, levels_ms)
+        if not lines:
+            return []
+        # All in one, with a gap after each.
+        at = canvas.project(np.concatenate([line.points_mm for line in lines]))[0]
+        seen = np.concatenate([np.append(facing[line.faces], False) for line in lines])
+        return [at[run] for run in runs(seen[:-1])]
+
+    levels = times.edges_ms
+    draw(near(levels if look.until_ms is None else levels[levels < look.until_ms]), WHITE, LINE_SHARE, thickness)
+    if look.until_ms is not None:
+        draw(near(np.array([look.until_ms])), WHITE, 1.0, 3 * thickness)
+    outline = canvas.project(chamber.vertices_mm)[0][outline_edges(chamber.faces, facing)]
+    draw(list(outline), OUTLINE_RGB, OUTLINE_SHARE, round(1.5 * thickness))
+    for site in chamber.sites:
+        if site.site in look.covariances_mm2:
+            ellipse = canvas.ellipse(site.position_mm, look.covariances_mm2[site.site])
+            draw([ellipse], ELLIPSE_RGB, OUTLINE_SHARE, thickness)
+
+
+def _draw_sites(
+    image: Image.Image, canvas: _Canvas, chamber: ChamberMap, raster: Raster, highlight_site: str,
+    tip_uv: ArrayLike | None, times: Scale, until_ms: float | None,
+) -> None:  # fmt: skip
+    size, unit = canvas.letters, canvas.unit
+    uv, _ = canvas.project(np.array([site.position_mm for site in chamber.sites]))
+    places: list[Point] = [(float(u), float(v)) for u, v in uv]
+    on_near_wall = raster.visible(*canvas.project(np.array([site.surface_mm for site in chamber.sites])))
+    index = next((i for i, site in enumerate(chamber.sites) if site.site == highlight_site), None)
+    highlighted = None if index is None else chamber.sites[index]
+    star = None if index is None else places[index]
+    if tip_uv is not None:
+        u, v = canvas.to_picture(np.asarray(tip_uv, dtype=np.float64)).tolist()
+        star = (u, v)
+
+    others = [i for i in range(len(places)) if i != index]
+    marks = [places[i] for i in others] + ([] if star is None else [star])
+    reach = 4 * unit
+    taken = [(u - reach, v - reach, u + reach, v + reach) for u, v in marks]
+    labels = Labels(image.width, image.height, [*taken, bar_box(times, image.size, size)])
+    draw = ImageDraw.Draw(image)
+    if star is not None and highlighted is not None:
+        text, larger = f"{time_text(highlighted)} ms", round(1.25 * size)
+        halo_text(draw, labels.place(star, text, larger, 10 * unit), text, larger, WHITE, BLACK)
+    for i in others:
+        draw_time(draw, labels, places[i], chamber.sites[i], unit, size, near=bool(on_near_wall[i]))
+    for i in others:
+        draw_dot(image, places[i], chamber.sites[i], times, unit, near=bool(on_near_wall[i]))
+    if star is not None:
+        draw_star(image, star, 8 * unit)
+    mark = until_ms
+    if mark is None and highlighted is not None and not is_outlier(highlighted):
+        mark = highlighted.lat_ms
+    draw_colour_bar(image, times, size, dark=True, mark_ms=mark)

@@ -1,0 +1,99 @@
+"""What the pictures share of the chamber's wall: its colours in a raster, its outline, the lit parts of a line."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.contracts import Array, BoolArray, ChamberMap, IntArray
+from fluoromap.drawing.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale
+from fluoromap.drawing.raster import Raster
+
+NO_DATA, HATCH, NOTHING = -1, -2, -3
+"""Where there is no band: no site is near, the hatch that says so, no wall or one that is not to be coloured yet."""
+
+_WITHIN = -4
+"""Of a face that crosses a limit, until its pixels were looked at."""
+
+
+def bands_shown(
+    raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None = None
+) -> NDArray[np.int32]:
+    """Band of ``times`` that each pixel (rows, columns) shows; ``NO_DATA``, ``HATCH`` or ``NOTHING`` where none.
+
+    Only what is activated by ``until_ms``, where given, has a band. ``unit`` is the size of the picture's details, 1 for a
+    picture of 512 pixels. The negative values count a colour table, as :func:`colour_table` makes it, from its end.
+    """
+    lat, cycle = _times_past_rim(chamber), chamber.cycle_length_ms
+
+    def band(lat_ms: Array) -> NDArray[np.int64]:
+        return times.band(lat_ms) if until_ms is None else np.where(lat_ms <= until_ms, times.band(lat_ms), NOTHING)
+
+    covered, at_corners = chamber.covered[chamber.faces], band(lat)[chamber.faces]
+    corners_covered: IntArray = covered.sum(axis=1)
+    # Faces that cross no limit need no look at their pixels; round a cycle equal corners may lie on either side of it.
+    one_band = (corners_covered == 3) & (np.ptp(at_corners, axis=1) == 0)
+    if cycle is not None:
+        one_band &= np.ptp(lat[chamber.faces], axis=1) < cycle / 2
+    of_face = np.where(one_band, at_corners[:, 0], np.where(corners_covered > 0, _WITHIN, NO_DATA))
+    shown = np.append(of_face, NOTHING).astype(np.int32)[raster.face]
+
+    flat = shown.ravel()
+    within = np.flatnonzero(flat == _WITHIN)
+    flat[within] = band(raster.sample(within, lat, cycle))
+    rim = within[corners_covered[raster.face.ravel()[within]] < 3]
+    flat[rim[raster.sample(rim, chamber.covered.astype(np.float64)) <= 0.5]] = NO_DATA
+    far = np.flatnonzero(flat == NO_DATA)
+    v, u = np.divmod(far, shown.shape[1])
+    flat[far[(u + v) % max(4, round(7 * unit)) < max(1, round(unit))]] = HATCH
+    return shown
+
+
+def colour_table(times: Scale, nothing: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """RGB (bands + 3, 3) that :func:`bands_shown` counts."""
+    table: NDArray[np.uint8] = np.concatenate(
+        [times.band_colours(), np.array([nothing, NO_DATA_HATCH_RGB, NO_DATA_RGB], dtype=np.uint8)]
+    )
+    return table
+
+
+def _times_past_rim(chamber: ChamberMap) -> Array:
+    """Times at the vertices within one cycle, those just past the covered part taking the mean of their covered
+    neighbours: else a face on the rim would run through all bands down to 0."""
+    lat, faces, cycle = chamber.lat_ms.copy(), chamber.faces, chamber.cycle_length_ms
+    if not chamber.covered.any():
+        return lat
+    lat[~chamber.covered] = low = float(lat[chamber.covered].min())
+    if cycle is not None:
+        lat = low + (lat - low) % cycle
+    known = chamber.covered[faces].astype(np.float64)
+    # Round a cycle times have no mean but their directions on a circle have.
+    turns = lat[faces].astype(np.complex128) if cycle is None else np.exp(2j * np.pi * (lat[faces] - low) / cycle)
+    of_face = (known * turns).sum(axis=1)
+    parts = [
+        np.bincount(faces.ravel(), np.repeat(part, 3), minlength=len(lat)) for part in (of_face.real, of_face.imag)
+    ]
+    count = np.bincount(faces.ravel(), np.repeat(known.sum(axis=1), 3), minlength=len(lat))
+    rim = ~chamber.covered & (count > 0)
+    total = parts[0][rim] + 1j * parts[1][rim]
+    if cycle is None:
+        lat[rim] = total.real / count[rim]
+    else:
+        lat[rim] = low + np.angle(total) % (2 * np.pi) * cycle / (2 * np.pi)
+    return lat
+
+
+def outline_edges(faces: IntArray, facing: BoolArray) -> IntArray:
+    """Edges (e, 2) between a face that faces the viewer and one that does not."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    vertices = int(faces.max()) + 1
+    # One number an edge sorts several times faster than a pair.
+    unique, of_edge = np.unique(edges[:, 0] * vertices + edges[:, 1], return_inverse=True)
+    rim = unique[np.bincount(of_edge, np.repeat(facing, 3), minlength=len(unique)) == 1]
+    return np.stack(np.divmod(rim, vertices), axis=1)
+
+
+def runs(flags: BoolArray) -> list[slice]:
+    """Slices of a line's points, one for each run of segments whose flag is set."""
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [slice(int(start), int(stop) + 1) for start, stop in changes.reshape(-1, 2)]

@@ -1,5 +1,0 @@
-"""The paper's Figures 3, 4 and 5 on a simulated study: the map from exact depth above, from one view's depth below."""
-
-from fluoromap.figures.paper import PaperFigures, paper_figures
-
-__all__ = ["PaperFigures", "paper_figures"]

@@ -1,0 +1,342 @@
+"""Matching of a whole study: from the chains of every run to named, paired, phase-matched catheters."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import (
+    Alternative,
+    Array,
+    Chain,
+    Context,
+    IntArray,
+    MatchedSite,
+    Matching,
+    NamedChain,
+    Observation,
+    PhasePair,
+    RejectedSite,
+    Segmentation,
+)
+from fluoromap.geometry import Camera, ray_angle_deg
+from fluoromap.matching.doubts import (
+    gantry_angles,
+    geometry_is_doubtful,
+    groups_with_extra,
+    mirror,
+    mirrored_gain,
+    mirrored_sites,
+)
+from fluoromap.matching.hypotheses import Hypotheses, enumerate_pairings
+from fluoromap.matching.identity import PairedCatheter, look_alike_groups, name_look_alikes
+from fluoromap.matching.joint_choice import SiteChoice, choose_pairings
+from fluoromap.matching.pairs import PairTable, pair_table
+from fluoromap.matching.phase import cardiac_phases
+from fluoromap.matching.phase_matching import FoldedRun, fold, motion_misfit, pair_by_phase, phase_shift
+from fluoromap.matching.run_catheters import RunCatheter, gather
+from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
+from fluoromap.reasons import Reason
+
+LEAST_PROBABILITY = 0.02
+"""Another pairing that is less probable counts as ruled out."""
+
+
+@dataclass(frozen=True)
+class SiteRuns:
+    """The two runs of one site as the segmenter left them; None where it failed."""
+
+    site: str
+    camera_a: Camera
+    camera_b: Camera
+    segmentation_a: Segmentation | None
+    segmentation_b: Segmentation | None
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewOfSite:
+    """One run of a site on its way: its phases and its unnamed catheters."""
+
+    segmentation: Segmentation
+    phases: Array | None
+    irregular: bool
+    unsure: float
+    catheters: tuple[RunCatheter, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _ComparedSite:
+    """A site whose chains are compared across its views but not yet paired.
+
+    mirrored_gain : see :func:`~fluoromap.matching.doubts.mirrored_gain`. doubtful : one of its views might be mirrored.
+    """
+
+    runs: SiteRuns
+    a: _ViewOfSite
+    b: _ViewOfSite
+    folded: tuple[FoldedRun, FoldedRun] | None
+    table: PairTable
+    hypotheses: Hypotheses
+    mirrored_gain: float
+    doubtful: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _NamedSite:
+    """A site on its way to its answer. pairs : name -> chain of view a, of view b. notes : in doubt, and why."""
+
+    compared: _ComparedSite
+    pairs: dict[str, tuple[int, int]]
+    alternative: dict[str, tuple[int, int]] | None
+    probability: float
+    notes: tuple[tuple[str, Reason], ...]
+
+
+def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Context) -> Matching:
+    """Name the catheters of all sites, pair them across each site's views and match the views by cardiac phase.
+
+    The mapping catheter is told by its tip, look-alikes by hand or by motion over the whole study. A site needs its
+    mapping catheter in both views; one without the reference catheter is matched all the same. Pairs are chosen over the
+    whole study at once; where another pairing cannot be ruled out at a site it is kept as the site's alternative.
+
+    Parameters
+    ----------
+    sites : sequence of SiteRuns
+        All sites of the study: look-alikes are named from all of them together.
+    catalogue : Catalogue
+        Of the study.
+    context : Context
+        For progress and cancellation.
+
+    Returns
+    -------
+    Matching
+        Every site is either in ``sites`` or, with its reasons, in ``rejected``.
+    """
+    groups = look_alike_groups(catalogue)
+    compared: list[_ComparedSite] = []
+    rejected: list[RejectedSite] = []
+    for index, runs in enumerate(sites):
+        context.check()
+        answer = _compare(runs, catalogue, groups)
+        if isinstance(answer, _ComparedSite):
+            compared.append(answer)
+        else:
+            rejected.append(RejectedSite(runs.site, answer))
+        context.progress(0.7 * (index + 1) / len(sites))
+    mirrored, maybe = mirrored_sites([site.mirrored_gain for site in compared])
+    sound = []
+    for site, is_mirrored, is_doubtful in zip(compared, mirrored, maybe, strict=True):
+        if is_mirrored:
+            rejected.append(RejectedSite(site.runs.site, (Reason.VIEW_MIRRORED,)))
+        else:
+            sound.append(replace(site, doubtful=is_doubtful))
+    matched = []
+    for index, named in enumerate(_name_all(sound, groups, catalogue)):
+        context.check()
+        if catalogue.mapping in named.pairs:
+            matched.append(_matched(named, catalogue))
+        else:
+            reason = Reason.CATHETER_NOT_FOUND if named.pairs else Reason.PAIRING_FAILED
+            rejected.append(RejectedSite(named.compared.runs.site, (reason,)))
+        context.progress(0.7 + 0.3 * (index + 1) / len(sound))
+    return Matching(tuple(matched), tuple(rejected))
+
+
+@functools.lru_cache(maxsize=64)
+def _compare(
+    runs: SiteRuns, catalogue: Catalogue, groups: tuple[tuple[str, ...], ...]
+) -> _ComparedSite | tuple[Reason, ...]:
+    """The site with its chains compared, or why they cannot be.
+
+    A correction changes one site: the same runs, the very objects, are compared once.
+    """
+    if runs.segmentation_a is None or runs.segmentation_b is None:
+        return (Reason.PLUGIN_FAILED,)
+    if ray_angle_deg(runs.camera_a, runs.camera_b) < PARALLEL_BELOW_DEG:
+        return (Reason.VIEWS_PARALLEL,)
+    a, b = _view(runs.segmentation_a, runs.camera_a), _view(runs.segmentation_b, runs.camera_b)
+    if not a.catheters or not b.catheters:
+        empty = [view.segmentation for view in (a, b) if not view.catheters]
+        told = [reason for segmentation in empty for reason in _told(segmentation)]
+        return tuple(dict.fromkeys(told or [Reason.NO_ELECTRODES]))
+    folded = None
+    if a.phases is not None and b.phases is not None:
+        folded = (
+            fold(a.catheters, a.phases, a.unsure),
+            fold(b.catheters, b.phases, b.unsure),
+        )
+
+    # A mirror hardly changes how catheters move across the epipolar lines.
+    motion_cost = motion_misfit((runs.camera_a, runs.camera_b), folded, len(a.catheters), len(b.catheters))
+    slots = [k for k, group in enumerate(groups) for _ in group]
+
+    def compare(camera_a: Camera, camera_b: Camera) -> tuple[PairTable, Hypotheses]:
+        table = pair_table((camera_a, camera_b), a.catheters, b.catheters, motion_cost, catalogue, groups)
+        return table, enumerate_pairings(table, slots, runs.camera_b.px_per_mm)
+
+    table, hypotheses = compare(runs.camera_a, runs.camera_b)
+    mirrored = [compare(mirror(runs.camera_a), runs.camera_b)[1], compare(runs.camera_a, mirror(runs.camera_b))[1]]
+    return _ComparedSite(runs, a, b, folded, table, hypotheses, mirrored_gain(hypotheses, mirrored))
+
+
+def _told(segmentation: Segmentation) -> list[Reason]:
+    """What the segmenter said about a run without electrodes; the diastolic mean's word counts most."""
+    entries = [segmentation.diastole] if segmentation.diastole is not None else []
+    reasons = [entry.manual_needed for entry in [*entries, *segmentation.frames] if entry.manual_needed is not None]
+    return reasons[:1]
+
+
+def _view(segmentation: Segmentation, camera: Camera) -> _ViewOfSite:
+    catheters = gather(segmentation, None, camera.px_per_mm)
+    beats = cardiac_phases(segmentation, catheters)
+    if beats is None:
+        return _ViewOfSite(segmentation, None, False, 0.5, catheters)
+    # Knowing the phase, a catheter that is missing at diastole can be taken from the same moment of another beat.
+    catheters = gather(segmentation, beats.phases, camera.px_per_mm)
+    return _ViewOfSite(segmentation, beats.phases, beats.irregular, beats.unsure, catheters)
+
+
+def _name_all(
+    sites: Sequence[_ComparedSite], groups: tuple[tuple[str, ...], ...], catalogue: Catalogue
+) -> list[_NamedSite]:
+    """Pair and name the catheters of all sites."""
+    slots = [k for k, group in enumerate(groups) for _ in group]
+    alone = (catalogue.mapping,)
+    roving = slots.index(groups.index(alone)) if alone in groups else -1
+    gantries = [gantry_angles(site.runs.camera_a, site.runs.camera_b) for site in sites]
+    choices = choose_pairings([site.hypotheses for site in sites], slots, roving, gantries)
+    names: list[list[str]] = [[""] * len(slots) for _ in sites]
+    doubts: dict[str, Reason] = {}
+    for number, group in enumerate(groups):
+        first = slots.index(number)
+        places = range(first, first + len(group))
+        members = []
+        for site, choice in zip(sites, choices, strict=True):
+            filled = [slot for slot in places if choice.pairs[slot, 0] >= 0]
+            members.append([_paired(site, choice.pairs[slot], slot - first) for slot in filled])
+        given, reason = name_look_alikes(group, catalogue.reference, members)
+        for at_site, ones, labels in zip(names, members, given, strict=True):
+            for one, label in zip(ones, labels, strict=True):
+                at_site[first + one.place] = label
+            # Where a place is empty in the answer, what the alternative has there gets the name that is left.
+            left = [name for name in group if name not in at_site]
+            for slot in places:
+                at_site[slot] = at_site[slot] or left.pop(0)
+        if reason is not None:
+            doubts.update(dict.fromkeys(group, reason))
+    return [
+        _named_site(site, choice, own, doubts, groups, slots)
+        for site, choice, own in zip(sites, choices, names, strict=True)
+    ]
+
+
+def _paired(site: _ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
+    i, j = int(pair[0]), int(pair[1])
+    return PairedCatheter(site.a.catheters[i], site.b.catheters[j], site.table.position_mm[i, j], place)
+
+
+def _named_site(
+    site: _ComparedSite,
+    choice: SiteChoice,
+    names: Sequence[str],
+    doubts: dict[str, Reason],
+    groups: tuple[tuple[str, ...], ...],
+    slots: Sequence[int],
+) -> _NamedSite:
+    # In the catalogue's order whichever way they were named: naming one by hand must not change the other sites' answers.
+    order = [name for group in groups for name in group]
+
+    def by_name(pairs: IntArray) -> dict[str, tuple[int, int]]:
+        found = {name: (int(i), int(j)) for name, (i, j) in zip(names, pairs, strict=True) if i >= 0}
+        return {name: found[name] for name in order if name in found}
+
+    pairs = by_name(choice.pairs)
+    notes = []
+    for name, (i, j) in pairs.items():
+        by_hand = site.a.catheters[i].manual_name or site.b.catheters[j].manual_name
+        if name in doubts and by_hand is None:
+            notes.append((name, doubts[name]))
+    for catheters, used in zip((site.a.catheters, site.b.catheters), zip(*pairs.values(), strict=True), strict=False):
+        unused = [one.manual_name for index, one in enumerate(catheters) if index not in used]
+        notes.extend((name, Reason.MARK_NOT_USED) for name in unused if name is not None)
+    alternative = None
+    if choice.alternative is not None and choice.probability >= LEAST_PROBABILITY:
+        alternative = by_name(choice.alternative)
+        notes.extend((name, Reason.IDENTITY_UNCERTAIN) for name, pair in pairs.items() if alternative.get(name) != pair)
+    if site.doubtful or geometry_is_doubtful(site.table, choice.pairs, site.runs.camera_b.px_per_mm):
+        notes.extend((name, Reason.GEOMETRY_DOUBTFUL) for name in pairs)
+    for number in groups_with_extra(site.table, choice.pairs, slots, site.a.catheters, site.b.catheters):
+        notes.extend((name, Reason.EXTRA_CATHETER) for name in groups[number] if name in pairs)
+    if site.a.irregular or site.b.irregular:
+        notes.extend((name, Reason.IRREGULAR_RHYTHM) for name in pairs)
+    return _NamedSite(site, pairs, alternative, choice.probability, tuple(dict.fromkeys(notes)))
+
+
+def _matched(named: _NamedSite, catalogue: Catalogue) -> MatchedSite:
+    site = named.compared
+    runs, a, b = site.runs, site.a, site.b
+    cameras = (runs.camera_a, runs.camera_b)
+    phases_b = b.phases
+    if site.folded is not None and phases_b is not None:
+        phases_b = (phases_b + phase_shift(cameras, site.folded, list(named.pairs.values()))) % 1.0
+    in_a = {name: a.catheters[i] for name, (i, _) in named.pairs.items()}
+    in_b = {name: b.catheters[j] for name, (_, j) in named.pairs.items()}
+    track_a, track_b = _track(in_a, a.segmentation, a.phases), _track(in_b, b.segmentation, phases_b)
+    alternative = None
+    if named.alternative is not None and catalogue.mapping in named.alternative:
+        other_a = {name: a.catheters[i] for name, (i, _) in named.alternative.items()}
+        other_b = {name: b.catheters[j] for name, (_, j) in named.alternative.items()}
+        alternative = Alternative(_at_diastole(catalogue, other_a, other_b, a.phases, phases_b), named.probability)
+    missing = [(name, Reason.CATHETER_NOT_FOUND) for name in catalogue.names if name not in named.pairs]
+    return MatchedSite(
+        site=runs.site,
+        camera_a=runs.camera_a,
+        camera_b=runs.camera_b,
+        diastole=_at_diastole(catalogue, in_a, in_b, a.phases, phases_b),
+        cycle=() if site.folded is None else pair_by_phase(track_a, track_b),
+        track_a=track_a,
+        track_b=track_b,
+        frame_times_a_ms=a.segmentation.frame_times_ms,
+        frame_times_b_ms=b.segmentation.frame_times_ms,
+        notes=(*missing, *named.notes),
+        alternative=alternative,
+    )
+
+
+def _named(name: str, chain: Chain) -> NamedChain:
+    return NamedChain(name, chain.electrodes, chain.pixels_uv, chain.covariance_px2)
+
+
+def _phase(phases: Array | None, frame: int) -> float | None:
+    return None if phases is None else float(phases[frame])
+
+
+def _track(named: dict[str, RunCatheter], segmentation: Segmentation, phases: Array | None) -> tuple[Observation, ...]:
+    """Every frame of a run with its named catheters."""
+    return tuple(
+        Observation(
+            frame,
+            _phase(phases, frame),
+            tuple(_named(name, one.chains[frame]) for name, one in named.items() if frame in one.chains),
+        )
+        for frame in range(len(segmentation.frames))
+    )
+
+
+def _at_diastole(
+    catalogue: Catalogue,
+    in_a: dict[str, RunCatheter],
+    in_b: dict[str, RunCatheter],
+    phases_a: Array | None,
+    phases_b: Array | None,
+) -> PhasePair:
+    """The diastolic chains; a view's frame is the mapping catheter's, should another's have come from another beat."""
+    views = []
+    for named, phases in ((in_a, phases_a), (in_b, phases_b)):
+        frame = named[catalogue.mapping].diastole_frame
+        chains = tuple(_named(name, one.diastole) for name, one in named.items())
+        views.append(Observation(frame, _phase(phases, frame), chains))
+    return PhasePair(views[0].phase, views[0], views[1])

@@ -1,0 +1,166 @@
+"""Figures 3, 4 and 5 of the paper, made in one go."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Context
+from fluoromap.drawing.overlay import Picture
+from fluoromap.drawing.png import encode_png
+from fluoromap.paper.figures.differences import MapDifference, SiteDifference, map_difference, site_differences
+from fluoromap.paper.figures.moment import NOISE_PX, MomentInView, PhantomView, farthest_phase, moment_in_views
+from fluoromap.paper.figures.pictures import figure, in_space, on_frame
+from fluoromap.phantom import SimulatedRun, SimulatedStudy, StudySpec, simulate_study
+from fluoromap.registry import DEFAULTS
+
+SITES = 20
+"""Mapping sites, as in the paper."""
+# A run of about two seconds, as in the paper, with about 15 images a cycle.
+_FRAMES, _FRAME_RATE_HZ = 60, 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class ViewNumbers:
+    """What the figures of one view say. figures : their numbers in the paper."""
+
+    view: PhantomView
+    figures: tuple[int, ...]
+    difference: MapDifference
+    sites: tuple[SiteDifference, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FigureNumbers:
+    """What all figures say.
+
+    phase : of the cardiac cycle, 0 at an R wave, at the shown moment. moved_mm : mean distance of the tips from their
+    places at diastole then. shown_site : whose frames Figures 4 and 5 show. simulated_sites : how many there were.
+    """
+
+    simulated: bool
+    seed: int
+    simulated_sites: int
+    noise_px: float
+    breathing_mm: float
+    monoplane: str
+    fuser: str
+    phase: float
+    moved_mm: float
+    shown_site: str
+    views: tuple[ViewNumbers, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PaperFigures:
+    """The pictures by their number in the paper, RGB, and what they say."""
+
+    pictures: Mapping[int, Picture]
+    numbers: FigureNumbers
+
+    def files(self) -> dict[str, bytes]:
+        """Name and content of every file: a PNG a figure, and ``figures.json``."""
+        content = {f"figure{number}.png": encode_png(picture) for number, picture in self.pictures.items()}
+        text = json.dumps(asdict(self.numbers), indent=2, allow_nan=False)
+        return {**content, "figures.json": f"{text}\n".encode()}
+
+
+def paper_figures(seed: int, context: Context, sites: int = SITES) -> PaperFigures:
+    """Make the figures; the same arguments give the same pictures.
+
+    Parameters
+    ----------
+    seed : int
+        Of the simulated heart.
+    sites : int
+        Mapping sites, 4 or more.
+
+    Raises
+    ------
+    ValueError
+        When the heart does not fit into the views' fields.
+    Refusal
+        When a view cannot be followed or the sites make no map.
+    """
+    study = simulate_study(StudySpec(seed, sites, _FRAMES, _FRAME_RATE_HZ, heart="dog", contrast=("LAT", "PA")))
+    phase = farthest_phase(study)
+    context.progress(0.05)
+    views = moment_in_views(study, phase, context)
+    lateral, frontal = views["LAT"], views["PA"]
+    # Where the tip moved most, depth from one view has most to answer for.
+    shown = max(lateral.sites, key=lambda site: site.moved_mm).exact.site
+    numbers = FigureNumbers(
+        simulated=True,
+        seed=seed,
+        simulated_sites=sites,
+        noise_px=NOISE_PX,
+        breathing_mm=study.spec.breathing_mm,
+        monoplane=DEFAULTS["monoplane"],
+        fuser=DEFAULTS["fuser"],
+        phase=phase,
+        moved_mm=float(np.mean([site.moved_mm for site in lateral.sites])),
+        shown_site=shown,
+        views=(_numbers(lateral, (3, 4)), _numbers(frontal, (5,))),
+    )
+    of_lateral, of_frontal = numbers.views
+    lateral_run, frontal_run = _runs(study, shown)
+    pictures = {
+        3: _figure("Figure 3. Isochronal map in 3D", in_space(lateral), of_lateral, numbers),
+        4: _figure(
+            f"Figure 4. Map fused on the lateral frame, site {shown}",
+            on_frame(lateral, shown, lateral_run.frames[lateral.site(shown).frame]),
+            of_lateral,
+            numbers,
+        ),
+        5: _figure(
+            f"Figure 5. Map fused on the postero-anterior frame, site {shown}",
+            on_frame(frontal, shown, frontal_run.frames[frontal.site(shown).frame]),
+            of_frontal,
+            numbers,
+        ),
+    }
+    context.progress(1.0)
+    return PaperFigures(pictures, numbers)
+
+
+def _runs(study: SimulatedStudy, name: str) -> tuple[SimulatedRun, SimulatedRun]:
+    return next(site.runs for site in study.sites if site.name == name)
+
+
+def _numbers(moment: MomentInView, figures: tuple[int, ...]) -> ViewNumbers:
+    sites = site_differences(moment.sites)
+    return ViewNumbers(moment.view, figures, map_difference(moment, sites), sites)
+
+
+def _figure(title: str, maps: tuple[Picture, Picture], shown: ViewNumbers, numbers: FigureNumbers) -> Picture:
+    exact, single_view = maps
+    parts = (
+        ("Exact depth: the phantom's true tips", exact),
+        (f"Single-view depth: from the {shown.view} view alone ({numbers.monoplane})", single_view),
+    )
+    return figure(f"{title} (simulated, seed {numbers.seed})", parts, _caption(shown, numbers))
+
+
+def _caption(shown: ViewNumbers, numbers: FigureNumbers) -> tuple[str, ...]:
+    of = shown.difference
+    farthest = next(site for site in shown.sites if site.site == of.farthest_site)
+    compared = 100 * of.compared_points / of.covered_points
+    return (
+        f"Sites, single view against exact: RMS {of.rms_mm:.2f} mm (along the ray {of.rms_along_ray_mm:.2f}, lateral "
+        f"{of.rms_lateral_mm:.2f}); largest {of.largest_mm:.2f} mm at {farthest.site} (along the ray "
+        f"{abs(farthest.along_ray_mm):.2f}, lateral {farthest.lateral_mm:.2f}). "
+        f"Times of the two maps over the covered wall: median difference {of.median_ms:.1f} ms, largest "
+        f"{of.largest_ms:.1f} ms ({compared:.0f} % of its points are covered in both).",
+        f"Moment: phase {numbers.phase:.2f} of the cycle, when the tips are farthest from their places at diastole "
+        f"({numbers.moved_mm:.1f} mm on average). Positions are relative to the reference catheter; same colours above and "
+        f"below; wall by {numbers.fuser}.",
+        f"The single view is given the positions at diastole and the cycle of the site's own two runs (the followed run is "
+        f"one of them), taken one after the other with up to {numbers.breathing_mm:g} mm of breathing. Given the cycles of "
+        f"other sites instead, as where a site has one usable view: RMS {of.other_cycles_rms_mm:.2f} mm, largest "
+        f"{of.other_cycles_largest_mm:.2f} mm.",
+        f"Simulated dog's heart, seed {numbers.seed}; {len(shown.sites)} of {numbers.simulated_sites} sites; electrodes at "
+        f"their true pixels with {numbers.noise_px:g} px noise an axis (not segmented).",
+    )

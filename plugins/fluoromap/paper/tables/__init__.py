@@ -1,0 +1,12 @@
+"""The paper's tables beside ours, and the same simulated data through the solvers that do find depth.
+
+Everything here is simulated. The helices are the paper's own simulation (Table 1); the hearts are the phantom's, in the
+paper's design of Table 2, whose own data are not public.
+"""
+
+from fluoromap.paper.tables.depth_figures import DepthFigures
+from fluoromap.paper.tables.one_view import OneViewTables, one_view_tables
+from fluoromap.paper.tables.table1 import Table1Row
+from fluoromap.paper.tables.table2 import Table2Row
+
+__all__ = ["DepthFigures", "OneViewTables", "Table1Row", "Table2Row", "one_view_tables"]

@@ -1,0 +1,1 @@
+"""Segmenter ``catheter-chain``: blobs linked to chains that fit a catheter."""

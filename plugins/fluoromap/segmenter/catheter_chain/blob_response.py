@@ -1,0 +1,156 @@
+"""Dark blobs of electrode size: the Laplacian of Gaussians of a log image at three scales, and its maxima."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.spatial import cKDTree
+
+from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
+from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
+
+_SCALES_MM = 0.52, 0.73, 1.04
+_LEAST_RING_PX = 5.0
+_CLEAR_SNR = 4.0
+_APART_MM = 0.57
+_MOST = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlobResponse:
+    """Response of one log image to dark blobs.
+
+    stack : (3, rows, columns) float32, scale-normalised half Laplacian in log units, positive where dark; image size over
+    ``reduction``. best : (rows, columns) the same over noise, the largest of the scales. noise : (3,) robust standard
+    deviation of ``stack`` inside the field. smooth : (rows, columns) the reduced log image at the smallest scale.
+    pixel_noise : standard deviation of a pixel of the reduced log image.
+    """
+
+    stack: Image
+    best: Image
+    noise: Array
+    smooth: Image
+    pixel_noise: float
+    reduction: int
+    px_per_mm: float
+
+    @classmethod
+    def of_image(cls, x: Image, inside: BoolArray, ring_mm: float, px_per_mm: float) -> BlobResponse:
+        """Response of a log image, worked out at half its size unless a ring would be narrower than 5 px of the frame."""
+        reduction = 2 if ring_mm * px_per_mm >= _LEAST_RING_PX and min(x.shape) >= 64 else 1
+        small = reduce_by(x, 2) if reduction == 2 else x
+        scale = px_per_mm / reduction
+        stack = np.zeros((len(_SCALES_MM), *small.shape), np.float32)
+        blurred, before, smooth = small, 0.0, small
+        for level, sigma_mm in enumerate(_SCALES_MM):
+            sigma = max(sigma_mm * scale, 0.7 * (level + 1))
+            blurred = gaussian(blurred, math.sqrt(sigma**2 - before**2))
+            before = sigma
+            if level == 0:
+                smooth = blurred
+            _half_laplacian(blurred, sigma, stack[level])
+        valid = inside[::reduction, ::reduction][::3, ::3]
+        noise = np.array([robust_sd(level[::3, ::3][valid]) for level in stack])
+        best, other = np.empty((2, *small.shape), np.float32)
+        np.multiply(stack[0], np.float32(1.0 / noise[0]), out=best)
+        for level in range(1, len(stack)):
+            np.multiply(stack[level], np.float32(1.0 / noise[level]), out=other)
+            np.maximum(best, other, out=best)
+        return cls(
+            stack, best, noise, smooth, pixel_noise(small, inside[::reduction, ::reduction]), reduction, px_per_mm
+        )
+
+    def candidates(self, allowed: BoolArray, expected: int) -> tuple[Array, Array]:
+        """Maxima over u, v and scale above 4 robust standard deviations.
+
+        Scales compete by response: by response over noise, a long tip would split in two. What is weaker than a fifth of
+        the ``expected``-th best is dropped.
+
+        Returns
+        -------
+        points_uv : (n, 2) pixels of the frame, sub-pixel. snr : (n,) response over noise, strongest response first.
+        """
+        scale, v, u = self._maxima(allowed[:: self.reduction, :: self.reduction])
+        strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
+        scale, v, u = scale[strongest], v[strongest], u[strongest]
+        places = self._sub_pixel(scale, v, u)
+        kept = np.flatnonzero(_apart(places, _APART_MM * self.px_per_mm / self.reduction))[:_MOST]
+        scale, places = scale[kept], places[kept]
+        snr = self.stack[scale, v[kept], u[kept]] / self.noise[scale]
+        if len(snr) > expected:
+            keep = snr >= 0.2 * np.sort(snr)[-expected]
+            places, snr = places[keep], snr[keep]
+        shift = 0.5 * (self.reduction - 1)
+        return places * self.reduction + shift, snr
+
+    def _maxima(self, allowed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
+        """(scale, v, u) of what no neighbour in any scale exceeds, ``allowed`` being nowhere at the border."""
+        first, second, third = self.stack
+        top = np.maximum(np.maximum(first, second), third).reshape(-1)
+        columns = self.stack.shape[2]
+        clear = np.flatnonzero((top > np.float32(_CLEAR_SNR * self.noise.min())) & allowed.reshape(-1))
+        for step in (1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns):
+            clear = clear[top[clear] >= top[clear + step]]
+        v, u = np.divmod(clear, columns)
+        scale = np.argmax(self.stack[:, v, u], axis=0)
+        clear = top[clear] > _CLEAR_SNR * self.noise[scale]
+        return scale[clear], v[clear], u[clear]
+
+    def _sub_pixel(self, scale: IntArray, v: IntArray, u: IntArray) -> Array:
+        """Tops of the paraboloids through these maxima and their neighbours, (n, 2) pixels of ``stack``."""
+        steps = np.arange(-1, 2)
+        near = self.stack[scale[:, None, None], v[:, None, None] + steps[:, None], u[:, None, None] + steps]
+        near = near.astype(np.float64)
+        gu, gv = 0.5 * (near[:, 1, 2] - near[:, 1, 0]), 0.5 * (near[:, 2, 1] - near[:, 0, 1])
+        uu = near[:, 1, 2] + near[:, 1, 0] - 2.0 * near[:, 1, 1]
+        vv = near[:, 2, 1] + near[:, 0, 1] - 2.0 * near[:, 1, 1]
+        uv = 0.25 * (near[:, 2, 2] + near[:, 0, 0] - near[:, 0, 2] - near[:, 2, 0])
+        determinant = uu * vv - uv * uv
+        moves = np.stack([uv * gv - vv * gu, uv * gu - uu * gv], axis=1)
+        curved = determinant > 0
+        moves[curved] /= determinant[curved, None]
+        moves[~curved] = 0.0
+        tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
+        return tops
+
+    def at(self, points_uv: Array) -> Array:
+        """Response over noise at points of the frame, the best scale of each, (n,)."""
+        rows, columns = self.smooth.shape
+        places = (points_uv - 0.5 * (self.reduction - 1)) / self.reduction
+        u = np.minimum(np.maximum(np.rint(places[:, 0]), 0), columns - 1).astype(np.int64)
+        v = np.minimum(np.maximum(np.rint(places[:, 1]), 0), rows - 1).astype(np.int64)
+        over_noise: Array = self.best[v, u].astype(np.float64)
+        return over_noise
+
+
+def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
+    """Write half the Laplacian of ``x`` times sigma squared; nought at the border."""
+    columns = x.shape[1]
+    flat = x.reshape(-1)
+    middle = slice(columns, flat.size - columns)
+    _sum_round(
+        flat[: middle.stop - columns], flat[columns - 1 : middle.stop - 1], flat[middle], flat[columns + 1 : middle.stop + 1],
+        flat[2 * columns :], np.float32(0.5 * sigma**2), out.reshape(-1)[middle],
+    )  # fmt: skip
+    out[:, 0] = out[:, -1] = 0
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _sum_round(up, left, centre, right, down, weight, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    four = np.float32(4)
+    for i in range(out.size):
+        out[i] = weight * (up[i] + down[i] + left[i] + right[i] - four * centre[i])
+
+
+def _apart(places: Array, distance: float) -> BoolArray:
+    """Which of these, in order, lie farther than ``distance`` from all kept before, (n,)."""
+    keep = np.ones(len(places), np.bool_)
+    if len(places) > 1:
+        pairs = cKDTree(places).query_pairs(distance, output_type="ndarray")
+        for first, second in pairs[np.argsort(pairs[:, 0], kind="stable")].tolist():
+            keep[second] &= not keep[first]
+    return keep

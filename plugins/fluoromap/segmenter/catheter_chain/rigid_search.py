@@ -1,0 +1,81 @@
+"""Where a chain seen before stands now, if nothing but its place and direction changed: search on the blob response."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.log_image import Image
+
+_TURNS_RAD = np.deg2rad([0.0, -4.0, 4.0, -8.0, 8.0])
+_MOST_SNR = 12.0
+_TAKEN_SNR = 2.0
+_TAKEN_MM = 0.9
+_FAR_WEIGHT = 1.2
+_OUTSIDE = -5.0
+
+
+def rigid_search(
+    response: BlobResponse, points_uv: Array, shift: Array, reach_px: float, taken: Sequence[Chain]
+) -> Array:
+    """The points moved by about ``shift``, at most ``reach_px`` farther and turned by up to 8 degrees, to where the summed
+    response over noise is highest; (n, 2) pixels.
+
+    Near electrodes of chains that are ``taken`` the response counts little: a catheter does not jump onto another.
+    """
+    best = response.best.copy()
+    offset, factor = 0.5 * (response.reduction - 1), 1.0 / response.reduction
+    for chain in taken:
+        _dim(best, (chain.pixels_uv - offset) * factor, _TAKEN_MM * response.px_per_mm * factor)
+    middle = points_uv.mean(axis=0)
+    reach = int(reach_px * factor)
+    steps = np.arange(-reach, reach + 1)
+    squares = steps * steps + steps[:, None] ** 2
+    price = np.where(squares <= reach * reach, _FAR_WEIGHT / max(reach, 1) * squares, np.inf).astype(np.float32)
+    turns = []
+    for turn in _TURNS_RAD:
+        cosine, sine = math.cos(turn), math.sin(turn)
+        turns.append((points_uv - middle) @ np.array([[cosine, sine], [-sine, cosine]]) + (middle + shift))
+    places = np.rint((np.array(turns) - offset) * factor).astype(np.int64) - reach
+    left, top = places.min(axis=(0, 1)).tolist()
+    right, bottom = (places.max(axis=(0, 1)) + len(steps)).tolist()
+    near = _cut_out(best, left, right, top, bottom)
+    highest = -np.inf
+    found: Array = turns[0]
+    for turned, corners in zip(turns, (places - [left, top]).tolist(), strict=True):
+        total = -price
+        for u, v in corners:
+            total += near[v : v + len(steps), u : u + len(steps)]
+        place = int(total.argmax())
+        if total.flat[place] > highest:
+            highest = float(total.flat[place])
+            row, column = divmod(place, len(steps))
+            found = turned + np.array([steps[column], steps[row]]) * response.reduction
+    return found
+
+
+def _cut_out(best: Image, left: int, right: int, top: int, bottom: int) -> Image:
+    """Response in a rectangle, not above 12; what lies outside the image speaks against a place there."""
+    cut: Image = np.full((bottom - top, right - left), _OUTSIDE, np.float32)
+    rows, columns = best.shape
+    u0, u1, v0, v1 = max(left, 0), min(right, columns), max(top, 0), min(bottom, rows)
+    if u0 < u1 and v0 < v1:
+        cut[v0 - top : v1 - top, u0 - left : u1 - left] = np.minimum(best[v0:v1, u0:u1], np.float32(_MOST_SNR))
+    return cut
+
+
+def _dim(best: Image, places: Array, radius: float) -> None:
+    """Lower the response within ``radius`` of the places, (n, 2), in place."""
+    rows, columns = best.shape
+    steps = np.arange(-math.ceil(radius), math.ceil(radius) + 2)
+    middle = np.floor(places).astype(np.int64)
+    u = middle[:, 0, None, None] + steps
+    v = middle[:, 1, None, None] + steps[:, None]
+    near = (u - places[:, 0, None, None]) ** 2 + (v - places[:, 1, None, None]) ** 2 <= radius * radius
+    near = near & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    u, v = (np.broadcast_to(axis, near.shape)[near] for axis in (u, v))
+    best[v, u] = np.minimum(best[v, u], np.float32(_TAKEN_SNR))

@@ -1,0 +1,130 @@
+"""One image -> its chains: the four steps, linking and refinement in a row, with their guards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import Array, Chain, FrameChains
+from fluoromap.reasons import Reason
+from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.four_step.blobs import Blobs, find_blobs
+from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
+from fluoromap.segmenter.four_step.contrast import Contrast
+from fluoromap.segmenter.four_step.homomorphic import homomorphic
+from fluoromap.segmenter.four_step.morphology import disk_morphology
+from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
+from fluoromap.segmenter.gaussian_blur import reduce_by
+from fluoromap.segmenter.linking import Shafts, evidence, families, link
+from fluoromap.segmenter.log_image import Image, pixel_noise
+from fluoromap.segmenter.placing import place_chains
+
+MOST_FOREGROUND = 0.02
+MOST_BLOBS = 40
+"""Beyond these the threshold has split noise or contrast medium from the rest, not electrodes."""
+
+_LEAST_LINE = 0.05
+_OWN_MM = 0.6
+
+
+class FourStepParams(BaseModel, extra="forbid"):
+    """Parameters of the four-step segmenter; the defaults are the ones to keep."""
+
+    gamma_low: float = Field(
+        0.5, ge=0.0, le=1.0, description="Homomorphic gain of slow shading, gamma_L of equation (4)."
+    )
+    gamma_high: float = Field(2.0, ge=1.0, le=10.0, description="Homomorphic gain of detail, gamma_H of equation (4).")
+    slope: float = Field(
+        1.0, gt=0.0, le=10.0, description="Sharpness c of the homomorphic filter's transition, equation (4)."
+    )
+    cutoff: float = Field(
+        8.0, ge=2.0, le=64.0, description="Cutoff D0 of the homomorphic filter in cycles per image width, equation (4)."
+    )
+    diffusion_sweeps: int = Field(15, ge=0, le=100, description="Sweeps of Perona-Malik diffusion, equation (5).")
+    edge_factor: float = Field(
+        2.0, gt=0.0, le=20.0, description="Edge scale K of equation (6) in robust standard deviations of the noise."
+    )
+    shock_sweeps: int = Field(15, ge=0, le=100, description="Sweeps of the complex shock filter, equation (7).")
+    background_mm: float = Field(
+        2.43,
+        ge=0.5,
+        le=6.0,
+        description="Radius of the closing disk at the isocentre; more than half an electrode's length.",
+    )
+    opening_mm: float = Field(
+        0.35, ge=0.1, le=2.0, description="Radius of the opening disk at the isocentre; less than half a ring's length."
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FourStepDetector:
+    """Finds chains in the images of one run, whose field and scale are fixed."""
+
+    catalogue: Catalogue
+    field: FieldMask
+    px_per_mm: float
+    settings: FourStepParams
+
+    def blobs(self, x: Image) -> tuple[Blobs, Image, float] | None:
+        """Blobs of a log image, the diffused image and K; None for a flat one. Equations (4) to (7), then disks."""
+        inside, of = self.field.inside, self.settings
+        # Each image takes the name of the one before, which frees that: memory that grows is given back to the system
+        # after every frame, and costs as much time as a filter to get again.
+        image = homomorphic(x, of.gamma_low, of.gamma_high, of.slope, of.cutoff)
+        k = edge_scale(image, inside, of.edge_factor)
+        if k is None:
+            return None
+        diffused = image = perona_malik(image, k, of.diffusion_sweeps)
+        image = to_grey_range(image, inside)
+        image = complex_shock(image, of.shock_sweeps)
+        image = disk_morphology(
+            image,
+            min(max(2, round(of.background_mm * self.px_per_mm)), max(2, min(x.shape) // 4)),
+            max(1, round(of.opening_mm * self.px_per_mm)),
+        )
+        smallest, largest = 0.6 * self.px_per_mm**2, 24.0 * self.px_per_mm**2
+        return find_blobs(image, inside, self.field.candidates, smallest, largest), diffused, k
+
+    def chains(self, x: Image, frame: int) -> FrameChains:
+        """Chains of one log image, or why there are none."""
+        if min(x.shape) < 16:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        found = self.blobs(self.field.fill(x))
+        if found is None:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        blobs, diffused, k = found
+        if blobs.foreground > MOST_FOREGROUND or len(blobs) > MOST_BLOBS:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        contrast = Contrast.of_frame(x, self.field.inside, self.px_per_mm)
+        shafts = Shafts(diffused, 1, max(_LEAST_LINE, 0.5 * k), self.px_per_mm)
+        kinds = families(self.catalogue)
+        points = _with_lost(blobs.centroids_uv, contrast.peaks(self.field.candidates), self.px_per_mm)
+        linked = link(points, evidence(contrast.of(points)), np.zeros(len(points)), shafts, kinds, sure=len(blobs))
+        if not linked:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        noise = pixel_noise(reduce_by(x, 2), self.field.inside[::2, ::2])
+        chains = [placed.chain for placed in place_chains(x, points, linked, shafts, kinds, noise)]
+        return FrameChains(frame, tuple(replace(chain, scores=contrast.of(chain.pixels_uv)) for chain in chains))
+
+    def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        """Always None: the paper looks at whole frames."""
+        return None
+
+    def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Always False: what the threshold leaves beside the chains may be anything."""
+        return False
+
+
+def _with_lost(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:
+    """Blobs, then the peaks that are not one of them: steeply foreshortened rings are narrower than the opening disk, and
+    electrodes of crossing catheters merge into one component."""
+    if not len(peaks_uv):
+        return blobs_uv
+    if len(blobs_uv):
+        away = np.linalg.norm(peaks_uv[:, None, :] - blobs_uv[None, :, :], axis=2).min(axis=1)
+        peaks_uv = peaks_uv[away > _OWN_MM * px_per_mm]
+    return np.concatenate([blobs_uv, peaks_uv])

@@ -1,0 +1,1 @@
+"""The service: the doors, the store, and the command line."""

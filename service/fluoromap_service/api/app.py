@@ -1,0 +1,112 @@
+"""The service as an ASGI application."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
+
+from fluoromap_service.api.http import drawing_pool, problems
+from fluoromap_service.api.http.body_limit import BodyLimit, TooLarge
+from fluoromap_service.api.http.security import Doorkeeper, Reader
+from fluoromap_service.api.jobs import events, jobs
+from fluoromap_service.api.openapi import document
+from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
+from fluoromap_service.api.service import health, plugins
+from fluoromap_service.api.study import activation_times, electrodes, electrograms, frames, instances, sites, studies
+from fluoromap_service.jobs import queue
+from fluoromap_service.settings import settings
+
+SWEEP_SECONDS = 1.0
+
+ROUTERS = (
+    studies.router,
+    instances.router,
+    frames.router,
+    electrodes.router,
+    activation_times.router,
+    electrograms.router,
+    sites.router,
+    jobs.router,
+    events.router,
+    points.router,
+    tracks.router,
+    maps.router,
+    overlays.router,
+    report.router,
+    archive.router,
+    plugins.router,
+    health.router,
+)
+
+log = structlog.get_logger(__name__)
+
+
+def create_app() -> FastAPI:
+    """The application for the process's settings."""
+    # The usual documentation pages fetch their scripts from elsewhere; hospital networks are closed.
+    app = FastAPI(
+        title="fluoromap",
+        summary="Activation maps of a heart chamber from ordinary C-arm fluoroscopy",
+        version="1",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=None,
+        redirect_slashes=False,
+        lifespan=_lifespan,
+    )
+    problems.install(app)
+    _install_body_limit(app)
+    for router in ROUTERS:
+        app.include_router(router)
+
+    @app.get("/v1/openapi.json", include_in_schema=False)
+    def openapi(caller: Reader) -> JSONResponse:
+        return JSONResponse(document(app))
+
+    app.add_middleware(BodyLimit)
+    app.add_middleware(Doorkeeper)
+    return app
+
+
+def _install_body_limit(app: FastAPI) -> None:
+    @app.exception_handler(TooLarge)
+    async def too_large(request: Request, error: TooLarge) -> JSONResponse:
+        return problems.answer(error.problem)
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    tasks = [] if settings().eager else [asyncio.create_task(_sweep()), asyncio.create_task(_warm_up())]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+        drawing_pool.close()
+
+
+async def _warm_up() -> None:
+    await run_in_threadpool(drawing_pool.start)
+
+
+async def _sweep() -> None:
+    """Free dead workers' stages and announce what is due, for as long as the service runs."""
+    failing = False
+    while True:
+        try:
+            await run_in_threadpool(queue.sweep)
+            failing = False
+        except Exception as error:
+            # The database may come back; one line when it goes is enough.
+            if not failing:
+                log.warning("sweep_failed", error=type(error).__name__)
+            failing = True
+        await asyncio.sleep(SWEEP_SECONDS)

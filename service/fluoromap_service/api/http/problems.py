@@ -1,0 +1,111 @@
+"""Errors as RFC 9457 problem documents with a stable code. No stack trace and no patient data ever stands in one."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from sqlalchemy.exc import DataError
+from starlette.exceptions import HTTPException
+
+from fluoromap_service.problem import Problem
+
+MEDIA_TYPE = "application/problem+json"
+
+log = structlog.get_logger(__name__)
+
+
+class ProblemDetail(BaseModel):
+    """One place in the request that is wrong."""
+
+    where: str = Field(
+        description="Field path, 'row 7, column lat_ms' or a DICOM keyword.", examples=["row 7, column lat_ms"]
+    )
+    message: str = Field(description="What is wrong there and what to do.")
+
+
+class ProblemDocument(BaseModel):
+    """RFC 9457 problem document."""
+
+    type: str = Field(examples=["about:blank"])
+    title: str = Field(examples=["Unprocessable Content"])
+    status: int = Field(examples=[422])
+    detail: str = Field(description="A sentence that says what to do.")
+    code: str = Field(description="Stable name of the error.", examples=["no_ready_site"])
+    errors: list[ProblemDetail] = Field(default_factory=list)
+
+
+def document(problem: Problem) -> dict[str, Any]:
+    """Return the problem as an RFC 9457 document."""
+    return {
+        "type": "about:blank",
+        "title": HTTPStatus(problem.status).phrase,
+        "status": problem.status,
+        "detail": problem.detail,
+        "code": problem.code,
+        "errors": [{"where": where, "message": message} for where, message in problem.errors],
+        **problem.extra,
+    }
+
+
+def answer(problem: Problem) -> JSONResponse:
+    """Return the problem as an HTTP answer."""
+    return JSONResponse(document(problem), problem.status, problem.headers, MEDIA_TYPE)
+
+
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries for the problems a route may answer with."""
+    return {
+        status: {"model": ProblemDocument, "content": {MEDIA_TYPE: {}}, "description": HTTPStatus(status).phrase}
+        for status in statuses
+    }
+
+
+_CODES = {400: "malformed", 404: "not_found", 405: "method_not_allowed", 415: "unsupported_media_type"}
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of the application a problem document."""
+
+    @app.exception_handler(Problem)
+    async def refused(request: Request, error: Problem) -> JSONResponse:
+        return answer(error)
+
+    @app.exception_handler(HTTPException)
+    async def http(request: Request, error: HTTPException) -> JSONResponse:
+        code = _CODES.get(error.status_code, HTTPStatus(error.status_code).phrase.lower().replace(" ", "_"))
+        return answer(Problem(error.status_code, code, str(error.detail), headers=error.headers))
+
+    @app.exception_handler(RequestValidationError)
+    async def validation(request: Request, error: RequestValidationError) -> JSONResponse:
+        malformed = any(item["type"] == "json_invalid" for item in error.errors())
+        bodiless = any(tuple(item["loc"]) == ("body",) for item in error.errors())
+        media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
+        if bodiless and not (media_type == "application/json" or media_type.endswith("+json")):
+            return answer(Problem(415, "unsupported_media_type", "Send the body as application/json."))
+        if bodiless and not await request.body():
+            return answer(Problem(400, "malformed", "The request has no body."))
+        places = [
+            (".".join(str(part) for part in item["loc"]), item["msg"].removeprefix("Value error, "))
+            for item in error.errors()
+        ]
+        if malformed:
+            return answer(Problem(400, "malformed", "The request body is not valid JSON.", places))
+        return answer(Problem(422, "invalid", "Some fields of the request are wrong.", places))
+
+    @app.exception_handler(DataError)
+    async def unstorable(request: Request, error: DataError) -> JSONResponse:
+        detail = "The request holds a value that cannot be kept: a NUL character, or a number out of range."
+        return answer(Problem(422, "invalid", detail))
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        log.error(
+            "unexpected_error", error=type(error).__name__, path=request.scope.get("route_path", ""), exc_info=error
+        )
+        return answer(Problem(500, "internal", "The service failed; its log tells more. Nothing was changed."))

@@ -1,0 +1,135 @@
+"""Who may do what: every request passes the doorkeeper, whatever route it is for, so no new route can forget it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from fastapi import Depends, Request, Security
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import HTTPConnection
+from starlette.types import ASGIApp, Receive, Send
+from starlette.types import Scope as AsgiScope
+
+from fluoromap_service import auth
+from fluoromap_service.api.http.problems import answer
+from fluoromap_service.auth import Caller, Scope
+from fluoromap_service.problem import Problem
+
+OPEN_PATHS = frozenset({"/v1/health", "/v1/ready"})
+"""The only paths that answer without a token."""
+
+_READING = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
+class Doorkeeper:
+    """ASGI middleware that lets a request in only when its caller is known and may do that kind of thing.
+
+    Reading needs ``read``, everything else at least ``write``; a route asks for more with :data:`Admin`.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket") or scope["path"] in OPEN_PATHS:
+            await self._app(scope, receive, send)
+            return
+        connection = HTTPConnection(scope)
+        try:
+            caller = await run_in_threadpool(_identify, connection)
+            _demand(caller, Scope.READ if scope.get("method") in _READING else Scope.WRITE)
+        except Problem as problem:
+            await answer(problem)(scope, receive, send)
+            return
+        scope.setdefault("state", {})["caller"] = caller
+        await self._app(scope, receive, send)
+
+
+def _identify(connection: HTTPConnection) -> Caller:
+    scheme, _, credentials = connection.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer" and credentials.strip():
+        caller = auth.verify(credentials.strip())
+        if caller is not None:
+            return caller
+        if auth.any_token():
+            raise _unauthorised(
+                "This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"'
+            )
+    elif auth.any_token():
+        raise _unauthorised("This service needs an access token: send 'Authorization: Bearer <token>'.")
+    _check_local(connection)
+    return auth.OPEN
+
+
+def _unauthorised(detail: str, challenge: str = "") -> Problem:
+    return Problem(401, "unauthorized", detail, headers={"WWW-Authenticate": f"Bearer {challenge}".strip()})
+
+
+def _check_local(connection: HTTPConnection) -> None:
+    """An open service is reachable from any web page in the user's browser: only its own pages may talk to it."""
+    server = connection.scope.get("server")
+    if server is None or not auth.is_loopback(str(server[0])):
+        raise _unauthorised("No access token was made yet; make one with 'fluoromap token create'.")
+    host = connection.headers.get("host", "")
+    name = _host_name(host)
+    if name is None or not auth.is_loopback(name):
+        raise Problem(403, "foreign_host", "Without tokens this service answers only under localhost or 127.0.0.1.")
+    origin = connection.headers.get("origin")
+    if origin is not None and origin.lower() != f"{connection.scope['scheme']}://{host}".lower():
+        raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
+
+
+def _host_name(host: str) -> str | None:
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:
+        return None
+
+
+def _demand(caller: Caller, scope: Scope) -> None:
+    if not caller.may(scope):
+        raise Problem(
+            403,
+            "forbidden",
+            f"This token lacks the scope '{scope}'.",
+            headers={"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{scope}"'},
+        )
+
+
+# Only documents the scheme in the OpenAPI document: the doorkeeper has checked the token already.
+Token = Annotated[
+    HTTPAuthorizationCredentials | None,
+    Security(HTTPBearer(auto_error=False, description="A token made with 'fluoromap token create'.")),
+]
+
+
+def _caller_with(request: Request, scope: Scope) -> str:
+    caller: Caller | None = getattr(request.state, "caller", None)
+    if caller is None:
+        raise _unauthorised("This service needs an access token: send 'Authorization: Bearer <token>'.")
+    _demand(caller, scope)
+    return caller.name
+
+
+async def _reader(request: Request, _: Token) -> str:
+    return _caller_with(request, Scope.READ)
+
+
+async def _writer(request: Request, _: Token) -> str:
+    return _caller_with(request, Scope.WRITE)
+
+
+async def _admin(request: Request, _: Token) -> str:
+    return _caller_with(request, Scope.ADMIN)
+
+
+Reader = Annotated[str, Depends(_reader)]
+"""The caller's name ("open" where no token is needed); the caller may read."""
+
+Writer = Annotated[str, Depends(_writer)]
+"""As :data:`Reader`; the caller may change things."""
+
+Admin = Annotated[str, Depends(_admin)]
+"""As :data:`Reader`; the caller may do everything."""

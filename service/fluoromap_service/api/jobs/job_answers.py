@@ -1,0 +1,158 @@
+"""Jobs as clients see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from fluoromap_service.api.http.problems import ProblemDocument
+from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
+from fluoromap_service.jobs.stage_results import stages_of
+from fluoromap_service.store.models import ENDED_JOB, ENDED_STAGE, Event, Job, JobState, StageRow, StageState
+
+_FAULTS = frozenset({"plugin_failed", "worker_lost"})
+"""Codes of errors that are nobody's data's fault: status 500; all others: 422."""
+
+
+class StageAnswer(BaseModel):
+    """One stage of a job for one run, site or study."""
+
+    name: Literal["segment", "match", "triangulate", "monoplane", "fuse"]
+    subject: str = Field(description="SOPInstanceUID, site or study that the stage is about.")
+    plugin: str
+    version: str
+    state: StageState
+    attempt: int = Field(description="How often it was begun; more than 1 after a worker died.")
+    progress: float = Field(ge=0, le=1)
+    reused: bool = Field(description="The result of the same work in an earlier job was taken.")
+    error: ProblemDocument | None
+
+
+class Links(BaseModel):
+    """Where the results are, each as soon as its stage is done."""
+
+    points: str
+    tracks: str
+    map: str
+    overlays: str
+    report: str
+
+
+class JobAnswer(BaseModel):
+    """One run of the pipeline over a study."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "7f0c5b1e9a3d4c27b4a1f1f5d6e7a809", "study": "0d9e8f7a6b5c4d3e2f1a0b9c8d7e6f5a", "state": "running",
+                    "progress": 0.43,
+                    "stages": [
+                        {
+                            "name": "segment", "subject": "1.2.826.0.1.3680043.8.498.1", "plugin": "four-step",
+                            "version": "1", "state": "done", "attempt": 1, "progress": 1.0, "reused": False, "error": None,
+                        }
+                    ],
+                    "error": None, "created": "2026-03-01T09:30:00.000Z", "started": "2026-03-01T09:30:00.210Z",
+                    "finished": None,
+                    "links": {
+                        "points": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/points",
+                        "tracks": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/tracks",
+                        "map": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/map",
+                        "overlays": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/overlays",
+                        "report": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/report.html",
+                    },
+                }
+            ]
+        }
+    )  # fmt: skip
+
+    id: str
+    study: str
+    state: JobState
+    progress: float = Field(ge=0, le=1, description="Mean over the stages; 1 when the job has ended.")
+    stages: list[StageAnswer]
+    error: ProblemDocument | None
+    created: str
+    started: str | None
+    finished: str | None
+    links: Links
+
+
+def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
+    root = f"/v1/jobs/{job.id}"
+    return JobAnswer(
+        id=job.id,
+        study=job.study_id,
+        state=JobState(job.state),
+        progress=_progress(job, stages),
+        stages=[_stage(row) for row in stages],
+        error=_problem(job.error),
+        created=rfc3339(job.created),
+        started=rfc3339_or_none(job.started),
+        finished=rfc3339_or_none(job.finished),
+        links=Links(
+            points=f"{root}/points",
+            tracks=f"{root}/tracks",
+            map=f"{root}/map",
+            overlays=f"{root}/overlays",
+            report=f"{root}/report.html",
+        ),
+    )
+
+
+def read_job(session: Session, job: Job) -> JobAnswer:
+    return job_answer(job, stages_of(session, job.id))
+
+
+def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
+    """The answers of several jobs by their ids, with one query for all stages."""
+    ids = [job.id for job in jobs]
+    stages: dict[str, list[StageRow]] = {job_id: [] for job_id in ids}
+    for row in session.scalars(select(StageRow).where(StageRow.job_id.in_(ids)).order_by(StageRow.id)):
+        stages[row.job_id].append(row)
+    return {job.id: job_answer(job, stages[job.id]) for job in jobs}
+
+
+def etag_of(session: Session, job: Job) -> str:
+    """Changes with every claim, beat that tells progress, end and request to cancel."""
+    last = session.scalar(select(func.max(Event.id)).where(Event.job_id == job.id))
+    return f'"{job.id}-{job.version}-{last or 0}"'
+
+
+def _progress(job: Job, stages: Sequence[StageRow]) -> float:
+    if job.state in ENDED_JOB or not stages:
+        return 1.0
+    parts = [1.0 if row.state in ENDED_STAGE else row.progress for row in stages]
+    return round(sum(parts) / len(parts), 4)
+
+
+def _stage(row: StageRow) -> StageAnswer:
+    return StageAnswer.model_validate(
+        {
+            "name": row.name,
+            "subject": row.subject,
+            "plugin": row.plugin,
+            "version": row.plugin_version,
+            "state": row.state,
+            "attempt": row.attempt,
+            "progress": round(row.progress, 3),
+            "reused": row.reused,
+            "error": _problem(row.error),
+        }
+    )
+
+
+def _problem(error: dict[str, Any] | None) -> ProblemDocument | None:
+    """What a stage stored of its failure as a problem document."""
+    if error is None:
+        return None
+    code = str(error.get("code", "plugin_failed"))
+    status = 500 if code in _FAULTS else 422
+    detail = str(error.get("detail", "The stage failed."))
+    return ProblemDocument(type="about:blank", title=HTTPStatus(status).phrase, status=status, detail=detail, code=code)

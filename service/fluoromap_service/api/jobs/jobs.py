@@ -1,0 +1,180 @@
+"""Jobs: starting, watching and stopping them."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import select, tuple_
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+
+from fluoromap_service.api.http.etags import known, not_modified
+from fluoromap_service.api.http.idempotency import OnceJson
+from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.security import Reader, Writer
+from fluoromap_service.api.jobs.finished import job_of
+from fluoromap_service.api.jobs.job_answers import JobAnswer, etag_of, read_job, read_jobs
+from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.problem import Problem, not_found
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.models import ENDED_JOB, Job, Study
+from fluoromap_service.study.freeze import PipelineRequest, freeze
+
+router = APIRouter(tags=["jobs"])
+
+LOOK_SECONDS = 0.25
+"""Time between two looks at the database while a client waits."""
+
+RETRY_SECONDS = 2
+
+JobId = Annotated[str, Path(description="The job's id.")]
+
+
+class JobRequest(BaseModel):
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [{"pipeline": {"triangulator": {"name": "linear", "params": {}}}, "view": "both"}]
+        },
+    )
+
+    pipeline: PipelineRequest = Field(
+        default_factory=PipelineRequest, description="The plugins to use; stages left out take the defaults."
+    )
+    view: Literal["a", "b", "both"] = Field("both", description="The views to follow frame by frame.")
+
+
+@router.post(
+    "/v1/studies/{study_id}/jobs",
+    status_code=202,
+    summary="Start a job",
+    response_model=JobAnswer,
+    responses={
+        202: {
+            "description": "Accepted; follow it at Location.",
+            "headers": {
+                "Location": {"schema": {"type": "string"}, "description": "The job."},
+                "Retry-After": {"schema": {"type": "integer"}, "description": "Seconds to wait before looking."},
+            },
+        },
+        **responses(400, 401, 403, 404, 422),
+    },
+)
+def create_job(
+    study_id: Annotated[str, Path(description="The study's id.")],
+    caller: Writer,
+    once: OnceJson,
+    body: JobRequest | None = None,
+) -> Response:
+    """Freeze the study as it stands and run the pipeline over it; work that an earlier job did already is taken over.
+
+    At least one site needs both views, their geometry and an activation time; else 422 lists what each site misses.
+    """
+    asked = body or JobRequest()
+
+    def start(session: Session) -> Response:
+        study = session.get(Study, study_id)
+        if study is None:
+            raise not_found("study")
+        snapshot = freeze(session, study, asked.pipeline, asked.view)
+        job = job_life.create(session, study.id, snapshot)
+        session.flush()
+        answer = read_job(session, job)
+        headers = {"Location": f"/v1/jobs/{job.id}", "Retry-After": str(RETRY_SECONDS)}
+        return JSONResponse(answer.model_dump(mode="json"), 202, headers)
+
+    response = once.answer(start)
+    queue.publish_due()
+    return response
+
+
+@router.get(
+    "/v1/jobs", summary="List jobs", response_model=Page[JobAnswer], responses=responses(400, 401, 403, 422)
+)  # fmt: skip
+def list_jobs(
+    caller: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only this study's.")] = None
+) -> Page[JobAnswer]:
+    """All jobs, the newest first."""
+    query = select(Job).order_by(Job.created.desc(), Job.id.desc()).limit(pages.limit + 1)
+    if study is not None:
+        query = query.where(Job.study_id == study)
+    after = pages.key(float, str)
+    if after is not None:
+        query = query.where(tuple_(Job.created, Job.id) < after)
+    with reading() as session:
+        found = session.scalars(query).all()
+        answers = read_jobs(session, found)
+    return pages.page(found, lambda job: answers[job.id], lambda job: [job.created, job.id])
+
+
+@router.get(
+    "/v1/jobs/{job_id}",
+    summary="Look at a job",
+    response_model=JobAnswer,
+    responses={304: {"description": "Unchanged since the ETag sent."}, **responses(401, 403, 404, 422)},
+)
+async def get_job(
+    job_id: JobId,
+    request: Request,
+    response: Response,
+    caller: Reader,
+    wait: Annotated[float, Query(ge=0, le=60, description="Longest time in seconds to wait for a change.")] = 0.0,
+) -> JobAnswer | Response:
+    """State, progress, stages and links of a job.
+
+    With `wait` the answer comes when the job's state changes (with `If-None-Match`: when anything about it changes), when
+    the job has ended, or when the time is over.
+    """
+    state, etag = first_state, _ = await run_in_threadpool(_look, job_id)
+    conditional = "if-none-match" in request.headers
+    end = time.monotonic() + wait
+    while state not in ENDED_JOB and time.monotonic() < end:
+        if (not known(request, etag)) if conditional else (state != first_state):
+            break
+        await asyncio.sleep(min(LOOK_SECONDS, max(end - time.monotonic(), 0.0)))
+        state, etag = await run_in_threadpool(_look, job_id)
+    answer, etag = await run_in_threadpool(_answer, job_id)
+    if known(request, etag):
+        return not_modified(etag)
+    response.headers["ETag"] = etag
+    response.headers["Cache-Control"] = "private, no-cache"
+    return answer
+
+
+@router.post(
+    "/v1/jobs/{job_id}:cancel",
+    status_code=202,
+    summary="Stop a job",
+    response_model=JobAnswer,
+    responses=responses(401, 403, 404, 409),
+)
+def cancel_job(job_id: JobId, caller: Writer) -> JobAnswer:
+    """What has not begun never will; what runs stops at its next check. Results already made stay readable."""
+    with writing() as session:
+        job = job_of(session, job_id)
+        if not job_life.cancel(session, job.id):
+            raise Problem(409, "job_ended", f"This job has ended already: it {_ENDS[job.state]}.")
+        session.flush()
+        return read_job(session, job)
+
+
+_ENDS = {"succeeded": "succeeded", "failed": "failed", "cancelled": "was cancelled"}
+
+
+def _look(job_id: str) -> tuple[str, str]:
+    with reading() as session:
+        job = job_of(session, job_id)
+        return job.state, etag_of(session, job)
+
+
+def _answer(job_id: str) -> tuple[JobAnswer, str]:
+    with reading() as session:
+        job = job_of(session, job_id)
+        etag = etag_of(session, job)
+        return read_job(session, job), etag

@@ -1,0 +1,258 @@
+"""The chamber's activation map and its mesh."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Path, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from fluoromap.contracts import ChamberMap, SurfaceSite
+from fluoromap.reasons import Reason
+from fluoromap_service.api.http.etags import file_response, known, not_modified
+from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.security import Reader
+from fluoromap_service.api.jobs.finished import job_of, map_of
+from fluoromap_service.api.results.origins import FrameOfReference, Origin, OriginQuery, Position
+from fluoromap_service.jobs.stage_results import MapResult
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.renderings import Rendered, rendered
+
+router = APIRouter(tags=["results"])
+
+JobId = Annotated[str, Path(description="The job's id.")]
+
+
+class MapSite(BaseModel):
+    """A site on the map."""
+
+    site: str
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    surface_mm: Position = Field(description="Where on the surface the site counts.")
+    distance_mm: float = Field(description="From the site to that place.")
+    lat_ms: float
+    leave_one_out_error_ms: float | None = Field(
+        description="What the other sites predict here minus what was measured."
+    )
+    reasons: list[Reason] = Field(description="For example `lat_outlier`.")
+
+
+class Earliest(BaseModel):
+    site: str
+    probability: float = Field(description="That this site is the earliest, given the errors of the times.")
+
+
+class Velocity(BaseModel):
+    """Speed of activation along the wall: the median where at least four sites lie within 15 mm, and its 95 % interval."""
+
+    median_m_per_s: float
+    low_m_per_s: float
+    high_m_per_s: float
+
+
+class ActivationMap(BaseModel):
+    """The chamber's surface with activation times at its vertices."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "frame": {"axes": "LPS", "origin": "reference", "unit": "mm"},
+                    "vertices_mm": [[31.0, -8.0, 13.0], [28.0, -4.0, 9.0], [25.0, -9.0, 12.0], [27.0, -8.0, 20.0]],
+                    "faces": [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]],
+                    "lat_ms": [41.0, 38.5, 36.0, None],
+                    "lat_sd_ms": [2.0, 2.6, 2.9, None],
+                    "covered": [True, True, True, False],
+                    "sites": [
+                        {
+                            "site": "S03", "x_mm": 31.2, "y_mm": -8.4, "z_mm": 12.9, "surface_mm": [31.0, -8.0, 13.0],
+                            "distance_mm": 0.5, "lat_ms": 41.0, "leave_one_out_error_ms": 1.7, "reasons": [],
+                        }
+                    ],
+                    "earliest": [{"site": "S03", "probability": 0.92}],
+                    "total_activation_time_ms": 74.0,
+                    "leave_one_out_rms_ms": 5.1,
+                    "volume_ml": 96.0,
+                    "area_cm2": 104.0,
+                    "coverage": 0.83,
+                    "warnings": [],
+                    "conduction_velocity": {"median_m_per_s": 0.78, "low_m_per_s": 0.7, "high_m_per_s": 0.87},
+                    "cycle_length_ms": None,
+                }
+            ]
+        }
+    )  # fmt: skip
+
+    frame: FrameOfReference
+    vertices_mm: list[Position]
+    faces: list[tuple[int, int, int]] = Field(description="Vertices counted from 0; outward by the right-hand rule.")
+    lat_ms: list[float | None] = Field(description="At each vertex; null where no site is near.")
+    lat_sd_ms: list[float | None]
+    covered: list[bool]
+    sites: list[MapSite]
+    earliest: list[Earliest] = Field(description="Most probable first.")
+    total_activation_time_ms: float
+    leave_one_out_rms_ms: float | None
+    volume_ml: float
+    area_cm2: float
+    coverage: float = Field(ge=0, le=1, description="Covered share of the area.")
+    warnings: list[Reason]
+    conduction_velocity: Velocity | None = Field(description="Null where no sites lie close enough together.")
+    cycle_length_ms: float | None = Field(description="Of a re-entry: times repeat after it, so that early meets late.")
+
+
+class MeshFormat(StrEnum):
+    """File formats of the mesh."""
+
+    PLY = "ply"
+    STL = "stl"
+    GLB = "glb"
+    VTP = "vtp"
+    MAT = "mat"
+    CSV = "csv"
+
+
+MESH_MEDIA_TYPES = {
+    MeshFormat.PLY: "model/ply",
+    MeshFormat.STL: "model/stl",
+    MeshFormat.GLB: "model/gltf-binary",
+    MeshFormat.VTP: "model/vnd.vtp+xml",
+    MeshFormat.MAT: "application/x-matlab-data",
+    MeshFormat.CSV: "text/csv",
+}
+
+
+def shift_of(outcome: MapResult, origin: Origin) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """What is added to the map's coordinates, (3,) mm.
+
+    A map without ``reference_mm`` lies about the isocentre: no site's reference catheter was located.
+    """
+    if origin is Origin.REFERENCE or outcome.reference_mm is None:
+        return np.zeros(3)
+    return np.array(outcome.reference_mm)
+
+
+def activation_map(outcome: MapResult, chamber: ChamberMap, origin: Origin) -> ActivationMap:
+    shift = shift_of(outcome, origin)
+    covered = chamber.covered.tolist()
+    return ActivationMap(
+        frame=FrameOfReference(origin=origin),
+        vertices_mm=(chamber.vertices_mm + shift).tolist(),
+        faces=chamber.faces.tolist(),
+        lat_ms=_where(covered, chamber.lat_ms.tolist()),
+        lat_sd_ms=_where(covered, chamber.lat_sd_ms.tolist()),
+        covered=covered,
+        sites=[_site(site, shift) for site in chamber.sites],
+        earliest=[Earliest(site=site, probability=probability) for site, probability in chamber.earliest],
+        total_activation_time_ms=chamber.total_activation_time_ms,
+        leave_one_out_rms_ms=chamber.leave_one_out_rms_ms,
+        volume_ml=chamber.volume_ml,
+        area_cm2=chamber.area_cm2,
+        coverage=chamber.coverage,
+        warnings=list(chamber.warnings),
+        conduction_velocity=_velocity(chamber),
+        cycle_length_ms=chamber.cycle_length_ms,
+    )
+
+
+def _velocity(chamber: ChamberMap) -> Velocity | None:
+    velocity = chamber.conduction_velocity
+    if velocity is None:
+        return None
+    return Velocity(
+        median_m_per_s=velocity.median_m_per_s, low_m_per_s=velocity.low_m_per_s, high_m_per_s=velocity.high_m_per_s
+    )
+
+
+def _where(covered: list[bool], values: list[float]) -> list[float | None]:
+    return [value if inside else None for inside, value in zip(covered, values, strict=True)]
+
+
+def _site(site: SurfaceSite, shift: Any) -> MapSite:
+    x, y, z = (site.position_mm + shift).tolist()
+    return MapSite(
+        site=site.site,
+        x_mm=x,
+        y_mm=y,
+        z_mm=z,
+        surface_mm=(site.surface_mm + shift).tolist(),
+        distance_mm=site.distance_mm,
+        lat_ms=site.lat_ms,
+        leave_one_out_error_ms=site.leave_one_out_error_ms,
+        reasons=list(site.reasons),
+    )
+
+
+def chamber_of(outcome: MapResult) -> ChamberMap:
+    """The map of an outcome that has one, as :func:`fluoromap_service.api.jobs.finished.map_of` returns it."""
+    assert outcome.chamber is not None
+    return outcome.chamber
+
+
+def mesh_of(job_id: str, outcome: MapResult, result: str, mesh_format: MeshFormat, origin: Origin) -> Rendered:
+    """The kept mesh of a map whose stage's result has the hash ``result``."""
+
+    def make() -> bytes:
+        from fluoromap.meshes.mesh_file import mesh_bytes
+
+        return mesh_bytes(chamber_of(outcome), mesh_format.value, shift_of(outcome, origin))
+
+    asked = {"mesh": mesh_format.value, "origin": origin.value, "map": result}
+    return rendered(job_id, asked, MESH_MEDIA_TYPES[mesh_format], make)
+
+
+@router.get(
+    "/v1/jobs/{job_id}/map",
+    summary="Activation map",
+    response_model=ActivationMap,
+    responses={304: {"description": "Unchanged since the ETag sent."}, **responses(401, 403, 404, 409, 422)},
+)
+def get_map(
+    job_id: JobId, request: Request, response: Response, caller: Reader, origin: OriginQuery = Origin.REFERENCE
+) -> ActivationMap | Response:
+    """The chamber's surface with activation times, as soon as the stage `fuse` is done (before: 409 `not_ready`).
+
+    409 `no_map` with a sentence when the located sites support no surface.
+    """
+    with reading() as session:
+        outcome, stage = map_of(session, job_of(session, job_id))
+    etag = f'"{stage.result}-{origin}"'
+    if known(request, etag):
+        return not_modified(etag)
+    response.headers["ETag"] = etag
+    return activation_map(outcome, chamber_of(outcome), origin)
+
+
+_MESHES = {media: {"schema": {"type": "string", "format": "binary"}} for media in MESH_MEDIA_TYPES.values()}
+
+
+@router.get(
+    "/v1/jobs/{job_id}/mesh.{mesh_format}",
+    summary="Chamber mesh",
+    response_class=Response,
+    responses={
+        200: {"content": _MESHES, "description": "The mesh file."},
+        304: {"description": "Unchanged since the ETag sent."},
+        **responses(401, 403, 404, 409, 422),
+    },
+)
+def get_mesh(
+    job_id: JobId,
+    mesh_format: Annotated[
+        MeshFormat,
+        Path(description="PLY and GLB have colours, VTP has the times as scalars, MAT is OpenEP's structure."),
+    ],
+    request: Request,
+    caller: Reader,
+    origin: OriginQuery = Origin.REFERENCE,
+) -> Response:
+    """The chamber with activation times as a mesh file, coordinates in mm along DICOM patient axes."""
+    with reading() as session:
+        outcome, stage = map_of(session, job_of(session, job_id))
+    mesh = mesh_of(job_id, outcome, str(stage.result), mesh_format, origin)
+    media_type = MESH_MEDIA_TYPES[mesh_format]
+    return file_response(request, mesh.path, mesh.sha256, media_type, f"chamber-{origin}.{mesh_format}")

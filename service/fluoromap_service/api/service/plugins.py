@@ -1,0 +1,55 @@
+"""The installed stage plugins."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
+
+from fluoromap import registry
+from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.security import Reader
+
+router = APIRouter(tags=["plugins"])
+
+
+class Plugin(BaseModel):
+    """An installed plugin, or one that did not load with the reason."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "kind": "triangulator", "name": "linear", "version": "1", "distribution": "fluoromap",
+                    "default": False, "parameters": {"type": "object", "properties": {}, "title": "NoParams"},
+                    "error": None,
+                }
+            ]
+        }
+    )  # fmt: skip
+
+    kind: Literal["segmenter", "triangulator", "monoplane", "fuser"]
+    name: str
+    version: str | None = Field(description="Null where the plugin did not load.")
+    distribution: str | None = Field(description="The installed package it comes from.")
+    default: bool = Field(description="Stands in where a job names no plugin of this kind.")
+    parameters: dict[str, Any] | None = Field(description="JSON schema of its parameters; null where it did not load.")
+    error: str | None = Field(description="Why it did not load.")
+
+
+@router.get("/v1/plugins", summary="Installed plugins", response_model=list[Plugin], responses=responses(401, 403))
+def list_plugins(caller: Reader) -> list[Plugin]:
+    """All installed segmenters, triangulators, monoplane solvers and fusers, the broken ones with their error."""
+    return [
+        Plugin(
+            kind=row.kind,
+            name=row.name,
+            version=row.version,
+            distribution=row.distribution,
+            default=row.default,
+            parameters=row.parameters,
+            error=row.error,
+        )
+        for row in registry.plugins()
+    ]

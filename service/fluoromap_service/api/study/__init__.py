@@ -1,0 +1,1 @@
+"""Routes on studies, their runs and their sites."""

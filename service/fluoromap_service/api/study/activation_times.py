@@ -1,0 +1,52 @@
+"""The table of activation times."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
+
+from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.security import Writer
+from fluoromap_service.api.study.csv_input import activation_times, csv_text
+from fluoromap_service.api.study.studies import StudyId
+from fluoromap_service.store.engine import writing
+from fluoromap_service.study import sites, studies
+
+router = APIRouter(prefix="/v1/studies/{study_id}", tags=["sites"])
+
+
+class TableOut(BaseModel):
+    """What the table did."""
+
+    sites: int = Field(description="Sites in the table.", examples=[12])
+    unmatched: list[str] = Field(description="Those no run is bound to (yet).", examples=[["S12"]])
+
+
+@router.put(
+    "/activation-times",
+    responses=responses(400, 401, 403, 404, 413, 415, 422),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                "text/csv": {"schema": {"type": "string"}, "example": "site,lat_ms\nS01,12.5\nS02,41\n"},
+            },
+        }
+    },
+)
+async def put_activation_times(study_id: StudyId, request: Request, caller: Writer) -> TableOut:
+    """Replace the activation-time table: ``site,lat_ms`` and optionally ``view_a,view_b``; all or nothing.
+
+    A time is that of the mapping catheter minus that of the reference. It may come before the runs.
+    """
+    text = await csv_text(request)
+
+    def act() -> TableOut:
+        with writing() as session:
+            study = studies.lock(session, study_id)
+            table = activation_times(text)
+            unmatched = sites.put_table(session, study, table)
+            return TableOut(sites=len(table), unmatched=unmatched)
+
+    return await run_in_threadpool(act)

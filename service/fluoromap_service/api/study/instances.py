@@ -1,0 +1,289 @@
+"""The runs of a study: DICOM in, what the service knows of them out."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+
+from fluoromap.geometry import Gantry
+from fluoromap_service.api.http.drawing_pool import drawn
+from fluoromap_service.api.http.idempotency import Once, OnceUpload
+from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.problems import ProblemDocument, document, responses
+from fluoromap_service.api.http.security import Reader, Writer
+from fluoromap_service.api.http.timestamps import rfc3339_or_none
+from fluoromap_service.api.study.studies import StudyId
+from fluoromap_service.api.study.uploads import Part, receive
+from fluoromap_service.dicom import InstanceFacts, read_instance
+from fluoromap_service.problem import Problem
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.models import Study
+from fluoromap_service.study import instances, sites, studies
+from fluoromap_service.study.instances import StudyRun
+from fluoromap_service.study.sites import BoundSite
+
+router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+
+InstanceUid = Annotated[str, Path(description="SOP Instance UID.", max_length=64)]
+Spacing = Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)]
+SITE = "Mapping site that all runs of the request belong to."
+
+
+class GantryOut(BaseModel):
+    """Effective gantry: the header's values, completed and overridden by PATCH; null where unknown."""
+
+    primary_deg: float | None = Field(description="LAO positive, RAO negative.", examples=[-90.0])
+    secondary_deg: float | None = Field(description="Cranial positive, caudal negative.", examples=[0.0])
+    source_detector_mm: float | None = Field(examples=[1000.0])
+    source_isocentre_mm: float | None = Field(examples=[750.0])
+    pixel_spacing_mm: list[float] | None = Field(
+        description="[row, column] spacing at the detector (ImagerPixelSpacing).", examples=[[0.3, 0.3]]
+    )
+
+
+class InstanceOut(BaseModel):
+    """One run."""
+
+    sop_instance_uid: str = Field(examples=["1.2.826.0.1.3680043.8.498.1"])
+    site: str | None = Field(description="Mapping site it is bound to.", examples=["S03"])
+    view: Literal["a", "b"] | None = Field(examples=["a"])
+    frames: int = Field(examples=[120])
+    rows: int = Field(examples=[512])
+    columns: int = Field(examples=[512])
+    frame_time_ms: float | None = Field(description="Null for a single frame.", examples=[16.7])
+    acquired: str | None = Field(examples=["2026-03-01T09:30:00.000Z"])
+    plane: Literal["single", "A", "B"]
+    gantry: GantryOut
+    missing: list[str] = Field(
+        description="DICOM keywords to complete by PATCH.", examples=[["DistanceSourceToDetector"]]
+    )
+    warnings: list[str] = Field(
+        description="Codes of what is odd; 'unbound': no site uses this run.", examples=[["table_moved"]]
+    )
+
+
+class UploadOut(BaseModel):
+    """What became of each file."""
+
+    instances: list[InstanceOut]
+    rejected: list[ProblemDocument] = Field(description="Each tells its `part`, counted from 1.")
+
+
+class GantryPatch(BaseModel):
+    """Gantry values that complete or override the header's; null returns to the header's."""
+
+    model_config = ConfigDict(extra="forbid")
+    primary_deg: float | None = Field(None, ge=-180, le=180, allow_inf_nan=False)
+    secondary_deg: float | None = Field(None, ge=-90, le=90, allow_inf_nan=False)
+    source_detector_mm: float | None = Field(None, ge=100, le=3000, allow_inf_nan=False)
+    source_isocentre_mm: float | None = Field(None, ge=100, le=3000, allow_inf_nan=False)
+    pixel_spacing_mm: tuple[Spacing, Spacing] | None = None
+
+
+class InstancePatch(BaseModel):
+    """What to change; members left out stay."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"site": "S03", "gantry": {"source_detector_mm": 1000.0}}]},
+    )
+    site: str | None = Field(None, description="Moves the run to this site; null takes it out again.", max_length=64)
+    gantry: GantryPatch | None = None
+
+
+def instance_shape(run: StudyRun, views: dict[str, tuple[BoundSite, str]]) -> InstanceOut:
+    bound = views.get(run.uid)
+    warnings = [str(warning) for warning in run.facts.warnings]
+    warnings += bound[0].warnings if bound else ["unbound"]
+    return InstanceOut.model_validate(
+        {
+            "sop_instance_uid": run.uid,
+            "site": bound[0].site if bound else None,
+            "view": bound[1] if bound else None,
+            "frames": run.facts.frames,
+            "rows": run.facts.rows,
+            "columns": run.facts.columns,
+            "frame_time_ms": run.facts.frame_time_ms if run.facts.frames > 1 else None,
+            "acquired": rfc3339_or_none(run.facts.acquired),
+            "plane": run.facts.plane,
+            "gantry": run.gantry,
+            "missing": run.missing,
+            "warnings": list(dict.fromkeys(warnings)),
+        }
+    )
+
+
+@router.post(
+    "",
+    status_code=201,
+    response_model=UploadOut,
+    responses={
+        200: {"model": UploadOut, "description": "Nothing new."},
+        **responses(400, 401, 403, 404, 409, 413, 415, 422),
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "required": ["file"],
+                        "properties": {
+                            "file": {"type": "array", "items": {"type": "string", "format": "binary"}},
+                            "site": {"type": "string", "description": SITE},
+                        },
+                    }
+                },
+                "application/dicom": {"schema": {"type": "string", "format": "binary"}},
+            },
+        }
+    },
+)
+async def upload_instances(
+    study_id: StudyId,
+    request: Request,
+    once: OnceUpload,
+    caller: Writer,
+    site: Annotated[str | None, Query(description=SITE, examples=["S03"])] = None,
+) -> Response:
+    """Send X-ray runs, one or many. Each file is checked by itself; what is wrong with one does not hold up the others."""
+    await run_in_threadpool(_check_study, study_id)
+    with ExitStack() as stack:
+        parts, told = await receive(request, stack)
+        site = told if told is not None else site
+        if site is not None and not sites.is_site_name(site):
+            raise Problem(422, "invalid_site", "This cannot be the name of a site.", [("site", "not usable as a name")])
+        if not parts:
+            raise Problem(422, "no_file", "The request has no part named 'file'.", [("file", "missing")])
+        return await run_in_threadpool(_store, study_id, parts, site, once)
+
+
+def _check_study(study_id: str) -> None:
+    with reading() as session:
+        studies.get(session, study_id)
+
+
+def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Response:
+    once.content = "\n".join([site or "", *(part.sha256 for part in parts)])
+    checked = [_read(part) for part in parts]
+
+    def act(session: Session) -> Response:
+        study = studies.lock(session, study_id)
+        stored: list[str] = []
+        rejected: list[Problem] = []
+        new = False
+        for number, (part, facts) in enumerate(zip(parts, checked, strict=True), start=1):
+            try:
+                if isinstance(facts, Problem):
+                    raise facts
+                new |= instances.add(
+                    session, study_id, part.path, facts, part.sha256, file_name=part.file_name, site=site
+                )
+                stored.append(facts.sop_instance_uid)
+            except Problem as problem:
+                rejected.append(_of_part(problem, number))
+        documents = [document(problem) for problem in rejected]
+        if not stored:
+            first = rejected[0]
+            raise Problem(first.status, first.code, first.detail, first.errors, extra={"rejected": documents})
+        if site is not None:
+            sites.mention(session, study_id, site)
+        sites.settle(session, study)
+        body = {"instances": _shapes(session, study, stored), "rejected": documents}
+        return JSONResponse(body, 201 if new else 200)
+
+    return once.answer(act)
+
+
+def _read(part: Part) -> InstanceFacts | Problem:
+    # In a process of its own: a hostile file can crash a decoder.
+    try:
+        return drawn(read_instance, part.path)
+    except Problem as problem:
+        if problem.status == 429:
+            raise
+        return problem
+
+
+def _of_part(problem: Problem, number: int) -> Problem:
+    problem.extra["part"] = number
+    return problem
+
+
+def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, Any]]:
+    views = sites.views_of(sites.resolve(session, study))
+    runs = {run.uid: run for run in instances.runs_of(session, study.id)}
+    return [instance_shape(runs[uid], views).model_dump() for uid in dict.fromkeys(uids)]
+
+
+@router.get("", responses=responses(400, 401, 403, 404, 422))
+def list_instances(study_id: StudyId, paging: Pages, caller: Reader) -> Page[InstanceOut]:
+    """The study's runs in the order of arrival."""
+    with reading() as session:
+        study = studies.get(session, study_id)
+        views = sites.views_of(sites.resolve(session, study))
+        runs = instances.runs_of(session, study_id)
+        return paging.slice(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
+
+
+def _one(session: Session, study: Study, uid: str) -> InstanceOut:
+    run = instances.run_of(session, study.id, uid)
+    return instance_shape(run, sites.views_of(sites.resolve(session, study)))
+
+
+@router.get("/{uid}", responses=responses(401, 403, 404, 422))
+def get_instance(study_id: StudyId, uid: InstanceUid, caller: Reader) -> InstanceOut:
+    """One run."""
+    with reading() as session:
+        return _one(session, studies.get(session, study_id), uid)
+
+
+@router.patch("/{uid}", responses=responses(400, 401, 403, 404, 422))
+def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, caller: Writer) -> InstanceOut:
+    """Complete or override what the header says, or move the run to another site."""
+    with writing() as session:
+        study = studies.lock(session, study_id)
+        run = instances.run_of(session, study_id, uid)
+        if "site" in body.model_fields_set:
+            sites.move_run(session, study, run, body.site)
+        if "gantry" in body.model_fields_set:
+            changes = {} if body.gantry is None else body.gantry.model_dump(mode="json", exclude_unset=True)
+            kept = {} if body.gantry is None else run.link.gantry
+            run.link.gantry = {name: value for name, value in {**kept, **changes}.items() if value is not None}
+            _check_gantry(run)
+        session.flush()
+        sites.settle(session, study)
+        return _one(session, study, uid)
+
+
+def _check_gantry(run: StudyRun) -> None:
+    detector, isocentre = run.gantry["source_detector_mm"], run.gantry["source_isocentre_mm"]
+    if detector is not None and isocentre is not None and isocentre >= detector:
+        places = [("body.gantry.source_isocentre_mm", "the isocentre lies between source and detector")]
+        raise Problem(422, "invalid_gantry", "These gantry values do not fit together.", places)
+    plan = instances.effective_gantry(run.facts, run.link.gantry)
+    if plan is None:
+        return
+    try:
+        Gantry(**plan.model_dump())
+    except ValueError as error:
+        raise Problem(
+            422, "invalid_gantry", "These gantry values do not fit together.", [("body.gantry", str(error))]
+        ) from None
+
+
+@router.delete("/{uid}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409, 422))
+def delete_instance(study_id: StudyId, uid: InstanceUid, caller: Writer) -> None:
+    """Take a run out of the study; its file goes when no other study refers to it. 409 while a job works on it."""
+    with writing() as session:
+        study = studies.lock(session, study_id)
+        gone = instances.remove(session, study_id, uid)
+        sites.settle(session, study)
+    instances.unlink_unreferenced(gone)

@@ -1,0 +1,182 @@
+"""Files arriving over HTTP, written to the store's disk as they come."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from fastapi import Request
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from fluoromap_service.problem import Problem
+from fluoromap_service.store import files
+
+MOST_PARTS = 2000
+_LONGEST_FIELD = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One file that has arrived whole. ``file_name`` may name the patient: never in a log, path or error."""
+
+    path: Path
+    sha256: str
+    file_name: str | None
+
+
+@dataclass(slots=True)
+class _Arriving:
+    path: Path
+    file_name: str | None
+    stream: BinaryIO
+    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
+
+    def write(self, data: bytes) -> None:
+        self.stream.write(data)
+        self.digest.update(data)
+
+    def finish(self) -> Part:
+        # On disk now, so that the transaction which keeps the file need not wait for it.
+        self.stream.flush()
+        os.fsync(self.stream.fileno())
+        self.stream.close()
+        return Part(self.path, self.digest.hexdigest(), self.file_name)
+
+
+class _Form:
+    """The callbacks of a multipart parser: parts named ``file`` go to disk, the field ``site`` to memory."""
+
+    def __init__(self, boundary: bytes, stack: ExitStack) -> None:
+        self._stack = stack
+        self._header = (b"", b"")
+        self._disposition = b""
+        self._arriving: _Arriving | None = None
+        self._text: bytearray | None = None
+        self._parts = 0
+        self.files: list[Part] = []
+        self.site: str | None = None
+        self.ended = False
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._on_part_begin,
+                "on_header_field": self._on_header_field,
+                "on_header_value": self._on_header_value,
+                "on_header_end": self._on_header_end,
+                "on_headers_finished": self._on_headers_finished,
+                "on_part_data": self._on_part_data,
+                "on_part_end": self._on_part_end,
+                "on_end": self._on_end,
+            },
+        )
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._parser.write(data)
+        except FormParserError:
+            raise _malformed() from None
+
+    def _on_part_begin(self) -> None:
+        self._parts += 1
+        if self._parts > MOST_PARTS:
+            raise Problem(
+                413, "too_many_parts", f"A request may have {MOST_PARTS} parts; send the rest in another one."
+            )
+        self._header, self._disposition = (b"", b""), b""
+
+    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
+        self._header = (self._header[0] + data[start:end], self._header[1])
+
+    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header = (self._header[0], self._header[1] + data[start:end])
+
+    def _on_header_end(self) -> None:
+        if self._header[0].lower() == b"content-disposition":
+            self._disposition = self._header[1]
+        self._header = (b"", b"")
+
+    def _on_headers_finished(self) -> None:
+        _, options = parse_options_header(self._disposition)
+        name = options.get(b"name", b"").decode("utf-8", "replace")
+        if name == "file":
+            told = options.get(b"filename")
+            file_name = None if told is None else told.decode("utf-8", "replace")
+            self._arriving = _arriving(self._stack, file_name)
+        elif name == "site":
+            self._text = bytearray()
+        else:
+            raise Problem(
+                422, "unknown_part", "A request has parts named 'file' and may have a field named 'site'.",
+                [("multipart/form-data", "a part with another name, or without one")],
+            )  # fmt: skip
+
+    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._arriving is not None:
+            self._arriving.write(data[start:end])
+        elif self._text is not None:
+            self._text += data[start:end]
+            if len(self._text) > _LONGEST_FIELD:
+                raise Problem(422, "invalid_site", "The field 'site' is too long.", [("site", "too long")])
+
+    def _on_part_end(self) -> None:
+        if self._arriving is not None:
+            self.files.append(self._arriving.finish())
+        elif self._text is not None:
+            try:
+                self.site = self._text.decode()
+            except UnicodeDecodeError:
+                raise Problem(400, "malformed", "The field 'site' is not UTF-8.", [("site", "not UTF-8")]) from None
+        self._arriving = self._text = None
+
+    def _on_end(self) -> None:
+        self.ended = True
+
+
+def _arriving(stack: ExitStack, file_name: str | None) -> _Arriving:
+    path = stack.enter_context(files.incoming())
+    return _Arriving(path, file_name and file_name[:1000], stack.enter_context(path.open("wb")))
+
+
+def _malformed() -> Problem:
+    return Problem(400, "malformed", "The multipart body is malformed or ends too early; send it again.")
+
+
+async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str | None]:
+    """Take in the files of a request and the field ``site``; ``stack`` removes at its end what nobody kept.
+
+    Raises
+    ------
+    Problem
+        400 for a malformed or truncated body, 413, 415 for another content type, 422 for a part of another name.
+    """
+    kind, options = parse_options_header(request.headers.get("content-type"))
+    try:
+        if kind == b"application/dicom":
+            return [await _receive_raw(request, stack)], None
+        if kind == b"multipart/form-data":
+            boundary = options.get(b"boundary")
+            if not boundary:
+                raise _malformed()
+            form = _Form(boundary, stack)
+            async for chunk in request.stream():
+                await run_in_threadpool(form.write, chunk)
+            if not form.ended:
+                raise _malformed()
+            return form.files, form.site
+    except ClientDisconnect:
+        raise Problem(400, "truncated", "The connection ended before the body did; send it again.") from None
+    raise Problem(415, "unsupported_media_type", "Send DICOM files as multipart/form-data or application/dicom.")
+
+
+async def _receive_raw(request: Request, stack: ExitStack) -> Part:
+    arriving = _arriving(stack, None)
+    async for chunk in request.stream():
+        await run_in_threadpool(arriving.write, chunk)
+    return await run_in_threadpool(arriving.finish)

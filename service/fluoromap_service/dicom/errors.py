@@ -1,0 +1,77 @@
+"""Why a DICOM file was refused: a closed list of codes, each with its HTTP status."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from fluoromap_service.problem import Problem
+
+
+class DicomCode(StrEnum):
+    """Stable codes of a refusal.
+
+    The status says who has to act: 400 and 413 the sender's transfer or archive, 415 the sender's choice of file, 422
+    the modality's export settings.
+    """
+
+    NOT_DICOM = "not_dicom"
+    """No DICOM file at all (415)."""
+    NO_PART10_HEADER = "no_part10_header"
+    """A bare data set: the preamble and file meta information of PS3.10 section 7.1 are missing (415)."""
+    MALFORMED = "malformed"
+    """The header cannot be parsed, or lacks an attribute every object has (400)."""
+    TRUNCATED = "truncated"
+    """The file ends before what it announces (400)."""
+    PIXEL_DATA_MISMATCH = "pixel_data_mismatch"
+    """Pixel data is whole but is not what NumberOfFrames, Rows, Columns and BitsAllocated announce (400)."""
+    HEADER_TOO_LARGE = "header_too_large"
+    """The attributes before the pixel data exceed every sensible size (413)."""
+    FRAME_TOO_LARGE = "frame_too_large"
+    """Rows or Columns exceed 8192 (413)."""
+    TOO_MANY_FRAMES = "too_many_frames"
+    """NumberOfFrames exceeds 20000 (413)."""
+    NOT_XA = "not_xa"
+    """DICOM, but not an X-ray angiographic or radiofluoroscopic image (422)."""
+    NO_PIXEL_DATA = "no_pixel_data"
+    """An object of the right kind without an image in it (422)."""
+    UNSUPPORTED_PIXELS = "unsupported_pixels"
+    """Colour, signed or otherwise unusual pixels (422)."""
+    UNDECODABLE = "undecodable"
+    """A transfer syntax this service cannot decode, or a frame that does not decode (422)."""
+
+    @property
+    def status(self) -> int:
+        """HTTP status of the refusal."""
+        return _STATUS[self]
+
+
+_STATUS: dict[DicomCode, int] = {
+    DicomCode.NOT_DICOM: 415,
+    DicomCode.NO_PART10_HEADER: 415,
+    DicomCode.MALFORMED: 400,
+    DicomCode.TRUNCATED: 400,
+    DicomCode.PIXEL_DATA_MISMATCH: 400,
+    DicomCode.HEADER_TOO_LARGE: 413,
+    DicomCode.FRAME_TOO_LARGE: 413,
+    DicomCode.TOO_MANY_FRAMES: 413,
+    DicomCode.NOT_XA: 422,
+    DicomCode.NO_PIXEL_DATA: 422,
+    DicomCode.UNSUPPORTED_PIXELS: 422,
+    DicomCode.UNDECODABLE: 422,
+}
+
+
+def dicom_problem(code: DicomCode, message: str, where: str | None = None) -> Problem:
+    """Return the problem of a DICOM file that cannot be used.
+
+    Parameters
+    ----------
+    code : DicomCode
+        Stable code; its ``status`` is the HTTP status.
+    message : str
+        One sentence for a PACS engineer: what is wrong and what to do. It holds no file name and no value that could
+        identify a patient.
+    where : str, optional
+        The DICOM keyword at fault.
+    """
+    return Problem(code.status, code, message, [] if where is None else [(where, message)])

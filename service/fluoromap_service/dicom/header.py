@@ -1,0 +1,335 @@
+"""Reading the attributes before the pixel data, in bounded memory and without believing a single length."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BufferedReader
+from typing import Any, cast
+
+from pydicom import config
+from pydicom.datadict import tag_for_keyword
+from pydicom.dataelem import RawDataElement
+from pydicom.dataset import Dataset
+from pydicom.filereader import read_dataset
+from pydicom.tag import BaseTag, Tag
+from pydicom.uid import (
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ImplicitVRLittleEndian,
+)
+
+from fluoromap_service.dicom.errors import DicomCode, dicom_problem
+from fluoromap_service.problem import Problem
+
+# pydicom's warnings quote the values they complain about, and a damaged header may have anyone's name in any place.
+config.settings.reading_validation_mode = config.IGNORE
+
+HEADER_BYTES = 16 * 2**20
+"""An Enhanced XA run of 1000 frames needs about 2 MB of functional groups."""
+HEADER_READS = 250_000
+SEQUENCE_ITEMS = 50_000
+UNDEFINED_LENGTH = 0xFFFFFFFF
+
+_PIXEL_DATA = 0x7FE00010
+_FRAME_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
+
+# Functional group macros of Enhanced XA and RF, PS3.3 C.8.19.6, and the attributes read from each.
+_MACROS: dict[str, tuple[str, ...]] = {
+    "PositionerPositionSequence": ("PositionerPrimaryAngle", "PositionerSecondaryAngle"),
+    "XRayGeometrySequence": ("DistanceSourceToDetector", "DistanceSourceToIsocenter"),
+    "FramePixelDataPropertiesSequence": ("ImagerPixelSpacing", "PixelIntensityRelationship"),
+    "FieldOfViewSequence": (
+        "FieldOfViewShape", "FieldOfViewDimensionsInFloat", "FieldOfViewRotation", "FieldOfViewHorizontalFlip",
+    ),
+    "TablePositionSequence": (
+        "TableTopVerticalPosition", "TableTopLongitudinalPosition", "TableTopLateralPosition",
+    ),
+    "IsocenterReferenceSystemSequence": (
+        "TableXPositionToIsocenter", "TableYPositionToIsocenter", "TableZPositionToIsocenter",
+    ),
+    "CollimatorShapeSequence": (
+        "CollimatorShape", "CollimatorLeftVerticalEdge", "CollimatorRightVerticalEdge",
+        "CollimatorUpperHorizontalEdge", "CollimatorLowerHorizontalEdge", "CenterOfCircularCollimator",
+        "RadiusOfCircularCollimator", "VerticesOfThePolygonalCollimator",
+    ),
+    "FrameVOILUTSequence": ("WindowCenter", "WindowWidth"),
+    "FrameContentSequence": ("FrameAcquisitionDateTime",),
+}  # fmt: skip
+_MACRO_OF = {keyword: macro for macro, keywords in _MACROS.items() for keyword in keywords}
+
+_PLAIN = (
+    "ImageType", "SOPClassUID", "SOPInstanceUID", "StudyInstanceUID", "SeriesInstanceUID", "SeriesNumber", "Modality",
+    "AcquisitionDateTime", "AcquisitionDate", "AcquisitionTime", "ContentDate", "ContentTime", "SeriesDate", "SeriesTime",
+    "TimezoneOffsetFromUTC", "FrameTime", "FrameTimeVector", "FrameIncrementPointer", "CineRate",
+    "RecommendedDisplayFrameRate", "PlaneIdentification", "PositionerMotion", "PositionerPrimaryAngleIncrement",
+    "PositionerSecondaryAngleIncrement", "DistanceSourceToPatient", "EstimatedRadiographicMagnificationFactor",
+    "IntensifierSize", "FieldOfViewDimensions", "PatientOrientation", "TableMotion", "TableVerticalIncrement",
+    "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "ShutterShape", "ShutterLeftVerticalEdge",
+    "ShutterRightVerticalEdge", "ShutterUpperHorizontalEdge", "ShutterLowerHorizontalEdge", "CenterOfCircularShutter",
+    "RadiusOfCircularShutter", "VerticesOfThePolygonalShutter", "SamplesPerPixel", "PhotometricInterpretation",
+    "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
+)  # fmt: skip
+
+
+def _tag(keyword: str) -> BaseTag:
+    tag = tag_for_keyword(keyword)
+    if tag is None:
+        raise KeyError(keyword)
+    return Tag(tag)
+
+
+# Only these are ever read: what identifies the patient stays in the file.
+_WANTED: list[BaseTag | int] = [_tag(keyword) for keyword in (*_PLAIN, *_MACRO_OF, *_FRAME_GROUPS)]
+
+
+@dataclass(frozen=True, slots=True)
+class PixelElement:
+    """Where the top-level PixelData value lies in the file: offset and announced length in bytes."""
+
+    offset: int
+    length: int
+
+
+class Header:
+    """The wanted attributes of one instance.
+
+    An attribute that an Enhanced object keeps in a functional group is looked up by its own keyword: in the data set
+    itself, then in the group shared by all frames, then in the first frame's. An optional attribute whose value cannot be
+    read counts as absent.
+    """
+
+    def __init__(self, dataset: Dataset, transfer_syntax: str, pixel_element: PixelElement | None, size: int) -> None:
+        self.transfer_syntax = transfer_syntax
+        self.pixel_element = pixel_element
+        self.file_size = size
+        self._dataset = dataset
+        shared, self._per_frame = (self._items(dataset, keyword) for keyword in _FRAME_GROUPS)
+        self._groups = [*shared[:1], *self._per_frame[:1]]
+
+    def numbers(self, keyword: str) -> tuple[float, ...]:
+        """All values of a numeric attribute; empty when it is absent, empty, unreadable or not finite."""
+        for dataset in self._places(keyword):
+            if values := self._numbers(dataset, keyword):
+                return values
+        return ()
+
+    def holds(self, keyword: str) -> bool:
+        """Whether an attribute is there and not empty, readable or not."""
+        return any(self._value(dataset, keyword) not in (None, "", b"") for dataset in self._places(keyword))
+
+    def number(self, keyword: str) -> float | None:
+        """The first value of a numeric attribute."""
+        values = self.numbers(keyword)
+        return values[0] if values else None
+
+    def integer(self, keyword: str) -> int | None:
+        """The first value of an attribute that counts something; None also when it is not a whole number."""
+        value = self.number(keyword)
+        return int(value) if value is not None and value == int(value) else None
+
+    def texts(self, keyword: str) -> tuple[str, ...]:
+        """All values of a text or UID attribute, stripped; empty when absent or unreadable."""
+        for dataset in self._places(keyword):
+            if values := self._texts(dataset, keyword):
+                return values
+        return ()
+
+    def text(self, keyword: str) -> str:
+        """The first value of a text attribute, "" when absent."""
+        values = self.texts(keyword)
+        return values[0] if values else ""
+
+    def numbers_per_frame(self, keyword: str) -> list[tuple[float, ...]]:
+        """The values each frame's own functional groups hold; empty for objects without such groups."""
+        return [self._numbers(item, keyword) for item in self._macro_items(keyword)]
+
+    def texts_per_frame(self, keyword: str) -> list[tuple[str, ...]]:
+        """As :meth:`numbers_per_frame`, for text."""
+        return [self._texts(item, keyword) for item in self._macro_items(keyword)]
+
+    def tags(self, keyword: str) -> tuple[int, ...]:
+        """The values of an attribute that points to others (VR AT)."""
+        return tuple(int(value) for value in _values(self._value(self._dataset, keyword)) if isinstance(value, int))
+
+    def _places(self, keyword: str) -> Iterator[Dataset]:
+        yield self._dataset
+        if macro := _MACRO_OF.get(keyword):
+            for group in self._groups:
+                yield from self._items(group, macro)[:1]
+
+    def _macro_items(self, keyword: str) -> Iterator[Dataset]:
+        for frame in self._per_frame:
+            yield (self._items(frame, _MACRO_OF[keyword])[:1] or [Dataset()])[0]
+
+    def _items(self, dataset: Dataset, keyword: str) -> list[Dataset]:
+        tag = _tag(keyword)
+        if tag not in dataset:
+            return []
+        raw = dataset.get_item(tag)
+        # pydicom builds an object of about 2 kB for each item, however empty.
+        if (
+            isinstance(raw, RawDataElement)
+            and raw.value is not None
+            and raw.value.count(b"\xfe\xff\x00\xe0") > SEQUENCE_ITEMS
+        ):
+            raise dicom_problem(DicomCode.HEADER_TOO_LARGE, f"{keyword} holds too many items.", keyword)
+        items = self._value(dataset, keyword)
+        return list(items) if items is not None and not isinstance(items, str | bytes) else []
+
+    def _numbers(self, dataset: Dataset, keyword: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(value) for value in _values(self._value(dataset, keyword)))
+        except (TypeError, ValueError):
+            return ()
+        return values if all(math.isfinite(value) for value in values) else ()
+
+    def _texts(self, dataset: Dataset, keyword: str) -> tuple[str, ...]:
+        values = tuple(str(value).strip(" \0") for value in _values(self._value(dataset, keyword)))
+        return values if any(values) else ()
+
+    @staticmethod
+    def _value(dataset: Dataset, keyword: str) -> Any:
+        tag = _tag(keyword)
+        if tag not in dataset:
+            return None
+        # Converting a value raises nearly anything, from ValueError to struct.error; an optional value is then absent,
+        # and the caller complains about one it needs.
+        try:
+            return dataset[tag].value
+        except Problem:
+            raise
+        except Exception:
+            return None
+
+
+def _values(value: Any) -> list[Any]:
+    if value is None or value == "":
+        return []
+    if isinstance(value, str | bytes | int | float):
+        return [value]
+    try:
+        return list(value)
+    except TypeError:
+        return [value]
+
+
+class _BoundedReader:
+    """A file that refuses to be read beyond its end or beyond a budget. Remembers why: pydicom hides some exceptions."""
+
+    def __init__(self, file: BufferedReader) -> None:
+        self._file = file
+        self._bytes = HEADER_BYTES
+        self._reads = HEADER_READS
+        self.problem: Problem | None = None
+
+    def read(self, count: int = -1) -> bytes:
+        self._bytes -= count
+        self._reads -= 1
+        if count < 0 or self._bytes < 0 or self._reads < 0:
+            self.problem = dicom_problem(
+                DicomCode.HEADER_TOO_LARGE, "The attributes before the pixel data are too large for an image."
+            )
+            raise self.problem
+        value = self._file.read(count)
+        # pydicom asks for the 8 bytes of the next element's header to find out whether the file is at its end.
+        if len(value) < count and not (count == 8 and not value):
+            self.problem = truncated()
+            raise self.problem
+        return value
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+
+def truncated(where: str | None = None) -> Problem:
+    """The refusal of a file that ends too early."""
+    return dicom_problem(
+        DicomCode.TRUNCATED, "The file ends before what it announces; the transfer was cut short, send it again.", where
+    )
+
+
+def read_header(file: BufferedReader) -> Header:
+    """The wanted attributes of a DICOM file, and where its pixel data lies.
+
+    Parameters
+    ----------
+    file : binary file
+        Open for reading and seeking.
+
+    Raises
+    ------
+    Problem
+        ``not_dicom``, ``no_part10_header``, ``malformed``, ``truncated``, ``header_too_large``, and ``undecodable`` for
+        transfer syntaxes whose header cannot be read in bounded memory.
+
+    References
+    ----------
+    PS3.10 section 7.1 (file meta information), PS3.5 chapter 7 (data elements).
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    start = file.read(132)
+    if start[128:] != b"DICM":
+        raise _no_preamble(start)
+    reader = _BoundedReader(file)
+    try:
+        return _parse(reader, size)
+    except Problem:
+        raise
+    except Exception as error:
+        if reader.problem is not None:
+            raise reader.problem from None
+        if reader.tell() >= size:
+            raise truncated() from None
+        raise dicom_problem(DicomCode.MALFORMED, "The DICOM header cannot be parsed.") from error
+
+
+def _parse(reader: _BoundedReader, size: int) -> Header:
+    stream = cast(Any, reader)
+    syntax_tag = _tag("TransferSyntaxUID")
+    meta = read_dataset(
+        stream, False, True, stop_when=lambda tag, vr, length: tag.group != 2, specific_tags=[syntax_tag]
+    )
+    syntax = str(meta.get("TransferSyntaxUID", "")).strip(" \0")
+    if not syntax:
+        raise dicom_problem(
+            DicomCode.MALFORMED, "The file meta information has no TransferSyntaxUID.", "TransferSyntaxUID"
+        )
+    if syntax in (DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian):
+        name = "Deflated" if syntax == DeflatedExplicitVRLittleEndian else "Big Endian"
+        raise dicom_problem(
+            DicomCode.UNDECODABLE,
+            f"The {name} Explicit VR transfer syntax is not supported; send Explicit VR Little Endian.",
+            "TransferSyntaxUID",
+        )
+
+    found: list[PixelElement] = []
+
+    def at_pixel_data(tag: BaseTag, vr: str | None, length: int) -> bool:
+        if tag == _PIXEL_DATA:
+            found.append(PixelElement(reader.tell(), length))
+            return True
+        if length != UNDEFINED_LENGTH and reader.tell() + length > size:
+            raise truncated()
+        return False
+
+    dataset = read_dataset(
+        stream, syntax == ImplicitVRLittleEndian, True, stop_when=at_pixel_data, specific_tags=_WANTED
+    )
+    return Header(dataset, syntax, found[-1] if found else None, size)
+
+
+def _no_preamble(start: bytes) -> Problem:
+    # A bare data set begins with an element of group 0002 or 0008, PS3.5 section 7.1.
+    if start[:2] in (b"\x02\x00", b"\x08\x00") and len(start) >= 8:
+        return dicom_problem(
+            DicomCode.NO_PART10_HEADER,
+            "This looks like a bare DICOM data set; export it as a DICOM file with preamble and file meta information.",
+        )
+    return dicom_problem(DicomCode.NOT_DICOM, "This is not a DICOM file.")

@@ -1,0 +1,100 @@
+"""What the stored numbers mean: intensity relationship, bits, display window, and the part that was exposed."""
+
+from __future__ import annotations
+
+from fluoromap.contracts import PixelFacts, Shutter
+from fluoromap_service.dicom.facts import HeaderWarning, Pair
+from fluoromap_service.dicom.header import Header
+
+_Rectangle = tuple[float, float, float, float]
+_Circle = tuple[float, float, float]
+
+
+def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warnings: list[HeaderWarning]) -> PixelFacts:
+    """Meaning of the pixels; ``bits_stored`` as measured, which BitsStored (0028,0101) need not be.
+
+    PixelIntensityRelationship (0028,1040): LIN, LOG or DISP, PS3.3 C.8.7.1.1.2.
+    """
+    relationship = header.text("PixelIntensityRelationship")
+    if relationship not in ("LIN", "LOG", "DISP"):
+        warnings.append(HeaderWarning.PIXEL_INTENSITY_UNKNOWN)
+    return PixelFacts(
+        logarithmic=relationship != "LIN",
+        bits_stored=bits_stored,
+        monochrome1=header.text("PhotometricInterpretation") == "MONOCHROME1",
+        shutter=_shutter(header, rows, columns, warnings),
+    )
+
+
+def window(header: Header) -> Pair | None:
+    """The first display window (centre, width), WindowCenter (0028,1050) and WindowWidth (0028,1051)."""
+    centre, width = header.number("WindowCenter"), header.number("WindowWidth")
+    return (centre, width) if centre is not None and width is not None and width >= 1 else None
+
+
+def r_wave_frames(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[int, ...]:
+    """Frames of R waves from 0, ascending; RWavePointer (0028,6040) counts from 1."""
+    told = {int(value) - 1 for value in header.numbers("RWavePointer")}
+    inside = tuple(sorted(frame for frame in told if 0 <= frame < frames))
+    if len(inside) < len(told):
+        warnings.append(HeaderWarning.R_WAVES_IGNORED)
+    return inside
+
+
+def _shutter(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> Shutter | None:
+    """Collimator (0018,1700) ff. and display shutter (0018,1600) ff., PS3.3 C.8.7.4 and C.7.6.11; both count from 1."""
+    rectangle: _Rectangle | None = None
+    circle: _Circle | None = None
+    polygon: tuple[Pair, ...] | None = None
+    for kind in ("Collimator", "Shutter"):
+        for shape in header.texts(f"{kind}Shape"):
+            match shape:
+                case "RECTANGULAR" if edges := _rectangle(header, kind, rows, columns):
+                    rectangle = _overlap(rectangle, edges)
+                case "CIRCULAR" if found := _circle(header, kind):
+                    circle = min(circle or found, found, key=lambda each: each[2])
+                case "POLYGONAL" if vertices := _polygon(header, kind):
+                    polygon = vertices
+                case _:
+                    warnings.append(HeaderWarning.SHUTTER_IGNORED)
+    if rectangle is not None and not (rectangle[0] < rectangle[1] and rectangle[2] < rectangle[3]):
+        warnings.append(HeaderWarning.SHUTTER_IGNORED)
+        rectangle = None
+    if rectangle is None and circle is None and polygon is None:
+        return None
+    return Shutter(rectangle, circle, polygon)
+
+
+def _rectangle(header: Header, kind: str, rows: int, columns: int) -> _Rectangle | None:
+    edges = [
+        header.number(f"{kind}{edge}Edge")
+        for edge in ("LeftVertical", "RightVertical", "UpperHorizontal", "LowerHorizontal")
+    ]
+    left, right, upper, lower = edges
+    if left is None or right is None or upper is None or lower is None or left >= right or upper >= lower:
+        return None
+    if right <= 1 or lower <= 1 or left >= columns or upper >= rows:
+        return None
+    return left - 1, right - 1, upper - 1, lower - 1
+
+
+def _circle(header: Header, kind: str) -> _Circle | None:
+    centre, radius = header.numbers(f"CenterOfCircular{kind}"), header.number(f"RadiusOfCircular{kind}")
+    if len(centre) != 2 or radius is None or radius <= 0:
+        return None
+    row, column = centre
+    return column - 1, row - 1, radius
+
+
+def _polygon(header: Header, kind: str) -> tuple[Pair, ...] | None:
+    numbers = header.numbers(f"VerticesOfThePolygonal{kind}")
+    if len(numbers) < 6 or len(numbers) % 2:
+        return None
+    pairs = zip(numbers[::2], numbers[1::2], strict=True)
+    return tuple((column - 1, row - 1) for row, column in pairs)
+
+
+def _overlap(first: _Rectangle | None, second: _Rectangle) -> _Rectangle:
+    if first is None:
+        return second
+    return max(first[0], second[0]), min(first[1], second[1]), max(first[2], second[2]), min(first[3], second[3])

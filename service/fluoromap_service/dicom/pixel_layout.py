@@ -1,0 +1,247 @@
+"""How the pixels of one instance lie in its file: checked against the file's bytes, nothing decoded, nothing loaded."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from io import BufferedReader
+
+from pydicom import uid
+
+from fluoromap_service.dicom.errors import DicomCode, dicom_problem
+from fluoromap_service.dicom.facts import HeaderWarning
+from fluoromap_service.dicom.header import UNDEFINED_LENGTH, Header, truncated
+from fluoromap_service.problem import Problem
+
+LARGEST_SIDE = 8192
+MOST_FRAMES = 20_000
+
+NATIVE = frozenset({uid.ExplicitVRLittleEndian, uid.ImplicitVRLittleEndian})
+JPEG = frozenset({uid.JPEGBaseline8Bit, uid.JPEGExtended12Bit, uid.JPEGLossless, uid.JPEGLosslessSV1})
+JPEG_LS = frozenset({uid.JPEGLSLossless, uid.JPEGLSNearLossless})
+JPEG_2000 = frozenset({uid.JPEG2000Lossless, uid.JPEG2000})
+RLE = frozenset({uid.RLELossless})
+DECODABLE = NATIVE | JPEG | JPEG_LS | JPEG_2000 | RLE
+
+_MOST_FRAGMENTS = 200_000
+_ITEM, _DELIMITER = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
+
+Extent = tuple[int, int]
+"""(offset, length) of bytes in the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class PixelLayout:
+    """Size and encoding of the frames, and where each lies.
+
+    Parameters
+    ----------
+    rows, columns, frames : int
+    bits_allocated, bits_stored : int
+        As the header tells.
+    transfer_syntax : str
+    extents : tuple of tuple of Extent
+        For each frame the pieces of the file that make it up, in order.
+    """
+
+    rows: int
+    columns: int
+    frames: int
+    bits_allocated: int
+    bits_stored: int
+    transfer_syntax: str
+    extents: tuple[tuple[Extent, ...], ...]
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one decoded frame."""
+        return self.rows * self.columns * self.bits_allocated // 8
+
+
+def syntax_name(transfer_syntax: str) -> str:
+    """Name of a transfer syntax for messages; an unknown one is named by its UID."""
+    return uid.UID(transfer_syntax).name
+
+
+def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarning]) -> PixelLayout:
+    """Check what the header announces against the bytes that are there, and find every frame.
+
+    Raises
+    ------
+    Problem
+        ``malformed``, ``frame_too_large``, ``too_many_frames``, ``unsupported_pixels``, ``undecodable``, ``no_pixel_data``,
+        ``truncated`` or ``pixel_data_mismatch``.
+
+    References
+    ----------
+    PS3.3 C.7.6.3 (image pixel module), PS3.5 section 8 and annex A.4 (encapsulation).
+    """
+    rows, columns, frames = _size(header)
+    bits_allocated, bits_stored = _bits(header)
+    element, syntax = header.pixel_element, header.transfer_syntax
+    if element is None or element.length == 0:
+        raise dicom_problem(DicomCode.NO_PIXEL_DATA, "The object holds no image (no PixelData).", "PixelData")
+    if syntax not in DECODABLE:
+        raise dicom_problem(
+            DicomCode.UNDECODABLE,
+            f"Transfer syntax {syntax_name(syntax)} cannot be decoded; send uncompressed, RLE, JPEG, JPEG-LS or JPEG 2000.",
+            "TransferSyntaxUID",
+        )
+    if syntax in NATIVE:
+        extents = _native_extents(header, frames, rows * columns * bits_allocated // 8, warnings)
+    else:
+        fragments = _fragments(file, header)
+        extents = _group(file, fragments, frames, syntax, warnings)
+    return PixelLayout(rows, columns, frames, bits_allocated, bits_stored, syntax, extents)
+
+
+def _size(header: Header) -> tuple[int, int, int]:
+    rows, columns = (_count(header, keyword) for keyword in ("Rows", "Columns"))
+    frames = _count(header, "NumberOfFrames") if header.holds("NumberOfFrames") else 1
+    if max(rows, columns) > LARGEST_SIDE:
+        raise dicom_problem(
+            DicomCode.FRAME_TOO_LARGE, f"Frames larger than {LARGEST_SIDE} pixels a side are not accepted.", "Rows"
+        )
+    if frames > MOST_FRAMES:
+        raise dicom_problem(
+            DicomCode.TOO_MANY_FRAMES, f"Runs of more than {MOST_FRAMES} frames are not accepted.", "NumberOfFrames"
+        )
+    return rows, columns, frames
+
+
+def _count(header: Header, keyword: str) -> int:
+    value = header.integer(keyword)
+    if value is None or value < 1:
+        raise dicom_problem(DicomCode.MALFORMED, f"{keyword} is missing or not a positive number.", keyword)
+    return value
+
+
+def _bits(header: Header) -> tuple[int, int]:
+    if header.integer("SamplesPerPixel") not in (1, None) or header.text("PhotometricInterpretation") not in (
+        "MONOCHROME1",
+        "MONOCHROME2",
+    ):
+        raise dicom_problem(
+            DicomCode.UNSUPPORTED_PIXELS,
+            "Only grey-scale images (MONOCHROME1, MONOCHROME2) can be used.",
+            "PhotometricInterpretation",
+        )
+    allocated = header.integer("BitsAllocated")
+    if allocated not in (8, 16):
+        raise dicom_problem(DicomCode.UNSUPPORTED_PIXELS, "Only 8 or 16 bits a pixel can be used.", "BitsAllocated")
+    stored = header.integer("BitsStored") or allocated
+    if not 1 <= stored <= allocated or header.integer("HighBit") not in (stored - 1, None):
+        raise dicom_problem(
+            DicomCode.UNSUPPORTED_PIXELS, "BitsStored and HighBit do not fit BitsAllocated.", "BitsStored"
+        )
+    if header.integer("PixelRepresentation") not in (0, None):
+        raise dicom_problem(DicomCode.UNSUPPORTED_PIXELS, "Signed pixels cannot be used.", "PixelRepresentation")
+    return allocated, stored
+
+
+def _mismatch(message: str, where: str = "NumberOfFrames") -> Problem:
+    return dicom_problem(DicomCode.PIXEL_DATA_MISMATCH, message, where)
+
+
+def _native_extents(
+    header: Header, frames: int, frame_bytes: int, warnings: list[HeaderWarning]
+) -> tuple[tuple[Extent, ...], ...]:
+    element = header.pixel_element
+    assert element is not None
+    announced = frames * frame_bytes
+    if element.length == UNDEFINED_LENGTH:
+        raise _mismatch("Uncompressed PixelData has no length.", "PixelData")
+    if element.length < announced:
+        raise _mismatch(
+            f"PixelData holds {element.length} bytes, but NumberOfFrames, Rows and Columns announce {announced}."
+        )
+    if element.offset + element.length > header.file_size:
+        raise truncated("PixelData")
+    if element.length > announced + announced % 2:
+        warnings.append(HeaderWarning.PIXEL_DATA_LONGER)
+    return tuple(((element.offset + frame * frame_bytes, frame_bytes),) for frame in range(frames))
+
+
+@dataclass(frozen=True, slots=True)
+class _Fragments:
+    """The pieces of encapsulated pixel data: the basic offset table, and value offset and length of each fragment."""
+
+    offset_table: tuple[int, ...]
+    extents: tuple[Extent, ...]
+
+
+def _fragments(file: BufferedReader, header: Header) -> _Fragments:
+    element = header.pixel_element
+    assert element is not None
+    if element.length != UNDEFINED_LENGTH:
+        raise _mismatch("Compressed PixelData must be encapsulated (undefined length).", "PixelData")
+    table: tuple[int, ...] | None = None
+    extents: list[Extent] = []
+    position = element.offset
+    while True:
+        file.seek(position)
+        start = file.read(8)
+        if len(start) < 8:
+            raise truncated("PixelData")
+        group, number, length = struct.unpack("<HHL", start)
+        position += 8
+        if (group, number) == _DELIMITER:
+            break
+        if (group, number) != _ITEM or length == UNDEFINED_LENGTH:
+            raise dicom_problem(DicomCode.MALFORMED, "The compressed PixelData is not made of items.", "PixelData")
+        if position + length > header.file_size:
+            raise truncated("PixelData")
+        if table is None:
+            if length > 4 * MOST_FRAMES:
+                raise dicom_problem(DicomCode.MALFORMED, "The offset table is too long.", "PixelData")
+            table = struct.unpack(f"<{length // 4}L", file.read(length // 4 * 4))
+        elif length:
+            extents.append((position, length))
+            if len(extents) > _MOST_FRAGMENTS:
+                raise dicom_problem(DicomCode.MALFORMED, "PixelData has too many fragments.", "PixelData")
+        position += length
+    return _Fragments(table or (), tuple(extents))
+
+
+def _group(
+    file: BufferedReader, fragments: _Fragments, frames: int, syntax: str, warnings: list[HeaderWarning]
+) -> tuple[tuple[Extent, ...], ...]:
+    """Which fragments belong to which frame: one each; else as the offset table tells; else a frame begins where a
+    compressed image does (PS3.5 A.4: a fragment never holds parts of two frames)."""
+    extents = fragments.extents
+    if len(extents) < frames:
+        raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData holds {len(extents)} fragments.")
+    if len(extents) == frames:
+        return tuple((extent,) for extent in extents)
+    if frames == 1 and len(fragments.offset_table) <= 1:
+        return (extents,)
+    starts = _starts_by_table(fragments) or _starts_by_signature(file, extents, syntax)
+    if len(starts) < frames:
+        raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData holds {len(starts)}.")
+    if len(starts) > frames:
+        warnings.append(HeaderWarning.PIXEL_DATA_LONGER)
+    ends = [*starts[1:], len(extents)]
+    return tuple(extents[start:end] for start, end in list(zip(starts, ends, strict=True))[:frames])
+
+
+def _starts_by_table(fragments: _Fragments) -> list[int]:
+    """Number of the first fragment of each frame; empty when the table is empty or names places where none begins."""
+    table, extents = fragments.offset_table, fragments.extents
+    if not table or table[0] != 0:
+        return []
+    # Offsets count from the first fragment's item tag, 8 bytes before its value.
+    number_at = {offset - extents[0][0]: number for number, (offset, _) in enumerate(extents)}
+    starts = [number_at.get(offset, -1) for offset in table]
+    return starts if starts == sorted(set(starts)) and starts[0] == 0 else []
+
+
+def _starts_by_signature(file: BufferedReader, extents: tuple[Extent, ...], syntax: str) -> list[int]:
+    if syntax in RLE:
+        return list(range(len(extents)))
+    signature = b"\xff\x4f\xff\x51" if syntax in JPEG_2000 else b"\xff\xd8\xff"
+    starts = []
+    for number, (offset, _) in enumerate(extents):
+        file.seek(offset)
+        if file.read(len(signature)) == signature:
+            starts.append(number)
+    return starts if starts and starts[0] == 0 else []

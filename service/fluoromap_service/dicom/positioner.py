@@ -1,0 +1,174 @@
+"""Where gantry and table stood, as far as the header tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
+from fluoromap_service.dicom.facts import HeaderWarning, Pair
+from fluoromap_service.dicom.header import Header
+from fluoromap_service.dicom.orientation import image_axes_from_field_of_view, image_axes_from_orientation
+
+_STILL_DEG = 0.5
+_STILL_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class GantryFacts:
+    """The gantry values of a header, None where it does not tell; fields as in ``InstanceFacts``."""
+
+    primary_deg: float | None
+    secondary_deg: float | None
+    source_detector_mm: float | None
+    source_isocentre_mm: float | None
+    pixel_spacing_mm: Pair | None
+    missing: tuple[str, ...]
+
+
+def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> GantryFacts:
+    """Gantry values of legacy XA (PS3.3 C.8.7.5, C.8.7.3) or Enhanced XA (C.8.19.6), each checked for what a C-arm can do.
+
+    A distance of 0, which some systems write for "unknown", counts as absent.
+    """
+    primary = _within(header.number("PositionerPrimaryAngle"), -180, 180, warnings)
+    secondary = _within(header.number("PositionerSecondaryAngle"), -90, 90, warnings)
+    detector = _within(header.number("DistanceSourceToDetector") or None, 200, 3000, warnings)
+    isocentre = _source_isocentre_mm(header, detector, warnings)
+    spacing = _pixel_spacing_mm(header, rows, columns, warnings)
+    told = {
+        "PositionerPrimaryAngle": primary,
+        "PositionerSecondaryAngle": secondary,
+        "DistanceSourceToDetector": detector,
+        "DistanceSourceToPatient": isocentre,
+        "ImagerPixelSpacing": spacing,
+    }
+    missing = tuple(keyword for keyword, value in told.items() if value is None)
+    return GantryFacts(primary, secondary, detector, isocentre, spacing, missing)
+
+
+def _within(value: float | None, low: float, high: float, warnings: list[HeaderWarning]) -> float | None:
+    if value is None or low <= value <= high:
+        return value
+    _warn(warnings, HeaderWarning.GEOMETRY_IMPLAUSIBLE)
+    return None
+
+
+def _warn(warnings: list[HeaderWarning], warning: HeaderWarning) -> None:
+    if warning not in warnings:
+        warnings.append(warning)
+
+
+def _source_isocentre_mm(header: Header, detector_mm: float | None, warnings: list[HeaderWarning]) -> float | None:
+    farthest = detector_mm - 1e-3 if detector_mm else 3000
+    told = header.number("DistanceSourceToIsocenter") or header.number("DistanceSourceToPatient") or None
+    isocentre = _within(told, 100, farthest, warnings)
+    if isocentre is not None or detector_mm is None:
+        return isocentre
+    # ERMF = SID / SOD, PS3.3 C.8.7.5.
+    magnification = header.number("EstimatedRadiographicMagnificationFactor")
+    if magnification is None or magnification <= 1 or detector_mm / magnification < 100:
+        return None
+    _warn(warnings, HeaderWarning.SOURCE_ISOCENTRE_FROM_MAGNIFICATION)
+    return detector_mm / magnification
+
+
+def _pixel_spacing_mm(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> Pair | None:
+    """Row and column spacing at the detector. PixelSpacing (0028,0030) is never used: it may be divided by the
+    magnification already."""
+    told = header.numbers("ImagerPixelSpacing")
+    if len(told) == 2 and any(told):
+        if all(0.01 <= value <= 5 for value in told):
+            return told[0], told[1]
+        _warn(warnings, HeaderWarning.GEOMETRY_IMPLAUSIBLE)
+    substitutes = (
+        (
+            HeaderWarning.PIXEL_SPACING_FROM_FIELD_OF_VIEW,
+            header.numbers("FieldOfViewDimensionsInFloat") or header.numbers("FieldOfViewDimensions"),
+        ),
+        (HeaderWarning.PIXEL_SPACING_FROM_INTENSIFIER, header.numbers("IntensifierSize")),
+    )
+    for warning, size in substitutes:
+        if not 1 <= len(size) <= 2:
+            continue
+        # Which of two dimensions lies along the rows is read both ways in practice: pixels are square, so take the
+        # order that makes them so.
+        orders = ((size[0], size[-1]), (size[-1], size[0]))
+        height, width = min(orders, key=lambda order: abs(order[0] * columns - order[1] * rows))
+        spacing = height / rows, width / columns
+        if all(0.01 <= value <= 5 for value in spacing):
+            _warn(warnings, warning)
+            return spacing
+    return None
+
+
+def image_axes(header: Header, gantry: GantryFacts, warnings: list[HeaderWarning]) -> ImageAxes:
+    """Upright to stored offsets, from the field of view's rotation and flip, else from PatientOrientation."""
+    by_view = _by_field_of_view(header, warnings)
+    orientation = orientation_letters(header)
+    by_patient: ImageAxes | None = None
+    if orientation is not None and gantry.primary_deg is not None and gantry.secondary_deg is not None:
+        by_patient = image_axes_from_orientation(orientation, gantry.primary_deg, gantry.secondary_deg)
+        if by_patient is None:
+            _warn(warnings, HeaderWarning.ORIENTATION_UNUSABLE)
+    if by_view is not None and by_patient is not None and by_view != by_patient:
+        _warn(warnings, HeaderWarning.ORIENTATION_CONFLICT)
+    return by_view or by_patient or UPRIGHT
+
+
+def _by_field_of_view(header: Header, warnings: list[HeaderWarning]) -> ImageAxes | None:
+    rotation, flip = header.number("FieldOfViewRotation"), header.text("FieldOfViewHorizontalFlip")
+    if rotation is None and not flip:
+        return None
+    axes = image_axes_from_field_of_view(rotation or 0.0, flip == "YES")
+    if axes is None:
+        _warn(warnings, HeaderWarning.ORIENTATION_UNUSABLE)
+    return axes
+
+
+def orientation_letters(header: Header) -> tuple[str, str] | None:
+    """PatientOrientation (0020,0020) as two strings of letters, None when absent."""
+    letters = header.texts("PatientOrientation")
+    return (letters[0], letters[1]) if len(letters) == 2 and all(letters) else None
+
+
+def table_mm(header: Header) -> tuple[float, float, float] | None:
+    """Table top (lateral, longitudinal, vertical) in the machine's frame, where the header tells all three.
+
+    (300A,0128) to (300A,012A), else the Enhanced objects' table position to the isocentre (0018,9466) to (0018,9468).
+    """
+    for keywords in (
+        ("TableTopLateralPosition", "TableTopLongitudinalPosition", "TableTopVerticalPosition"),
+        ("TableXPositionToIsocenter", "TableZPositionToIsocenter", "TableYPositionToIsocenter"),
+    ):
+        lateral, longitudinal, vertical = (header.number(keyword) for keyword in keywords)
+        if lateral is not None and longitudinal is not None and vertical is not None:
+            return lateral, longitudinal, vertical
+    return None
+
+
+def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
+    """Warn when gantry or table moved during the run: increments of legacy XA (0018,1520), (0018,1521), (0018,1135) to
+    (0018,1137), or differing functional groups."""
+    gantry_moved = any(
+        _spread(header, f"{axis}Increment", axis) > _STILL_DEG
+        for axis in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")
+    )
+    if gantry_moved:
+        _warn(warnings, HeaderWarning.POSITIONER_MOVED)
+    axes = (("Lateral", "X"), ("Longitudinal", "Z"), ("Vertical", "Y"))
+    table_moved = any(
+        _spread(header, f"Table{name}Increment", f"TableTop{name}Position", f"Table{letter}PositionToIsocenter")
+        > _STILL_MM
+        for name, letter in axes
+    )
+    if table_moved:
+        _warn(warnings, HeaderWarning.TABLE_MOVED)
+
+
+def _spread(header: Header, increments: str, *per_frame: str) -> float:
+    """Largest distance from the first frame: legacy increments are relative to the first frame already."""
+    spreads = [max((abs(value) for value in header.numbers(increments)), default=0.0)]
+    for keyword in per_frame:
+        values = [numbers[0] for numbers in header.numbers_per_frame(keyword) if numbers]
+        spreads.append(max(values) - min(values) if values else 0.0)
+    return max(spreads)

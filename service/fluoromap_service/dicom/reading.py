@@ -1,0 +1,141 @@
+"""One DICOM file to the facts of a run, or to the reason why not."""
+
+from __future__ import annotations
+
+from io import BufferedReader
+from pathlib import Path
+
+from pydicom.uid import (
+    EnhancedXAImageStorage,
+    EnhancedXRFImageStorage,
+    MultiFrameGrayscaleByteSecondaryCaptureImageStorage,
+    MultiFrameGrayscaleWordSecondaryCaptureImageStorage,
+    SecondaryCaptureImageStorage,
+    XRayAngiographicImageStorage,
+    XRayRadiofluoroscopicImageStorage,
+)
+
+from fluoromap_service.dicom.errors import DicomCode, dicom_problem
+from fluoromap_service.dicom.facts import HeaderWarning, InstanceFacts, Plane, is_uid
+from fluoromap_service.dicom.frames import read_frame
+from fluoromap_service.dicom.header import Header, read_header
+from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
+from fluoromap_service.dicom.pixel_layout import PixelLayout, pixel_layout
+from fluoromap_service.dicom.positioner import gantry_facts, image_axes, orientation_letters, table_mm, warn_of_motion
+from fluoromap_service.dicom.timing import acquired, frame_times_ms
+from fluoromap_service.problem import Problem
+
+_PROJECTIONS = frozenset(
+    {
+        XRayAngiographicImageStorage,
+        XRayRadiofluoroscopicImageStorage,
+        EnhancedXAImageStorage,
+        EnhancedXRFImageStorage,
+    }
+)
+# Archives and workstations save XA runs as secondary captures; the modality still tells what they are.
+_CAPTURES = frozenset(
+    {
+        SecondaryCaptureImageStorage,
+        MultiFrameGrayscaleByteSecondaryCaptureImageStorage,
+        MultiFrameGrayscaleWordSecondaryCaptureImageStorage,
+    }
+)
+
+
+def read_instance(path: Path) -> InstanceFacts:
+    """Read and check one file; every fault that can be found without decoding all frames is found here.
+
+    The first frame is decoded as a proof. Memory does not grow with the file.
+
+    Raises
+    ------
+    Problem
+        With any code of :class:`DicomCode`.
+    OSError
+        When the file cannot be opened.
+    """
+    with path.open("rb") as file:
+        header = read_header(file)
+        _check_kind(header)
+        warnings: list[HeaderWarning] = []
+        layout = pixel_layout(file, header, warnings)
+        bits_used = _bits_used(file, layout)
+    if bits_used > layout.bits_stored:
+        warnings.append(HeaderWarning.BITS_STORED_EXCEEDED)
+    return _facts(header, layout, max(bits_used, layout.bits_stored), warnings)
+
+
+def _check_kind(header: Header) -> None:
+    kind, modality = header.text("SOPClassUID"), header.text("Modality")
+    if kind in _PROJECTIONS or (kind in _CAPTURES and modality in ("XA", "RF")):
+        return
+    if not kind:
+        raise _lacks("SOPClassUID")
+    raise dicom_problem(
+        DicomCode.NOT_XA,
+        "Only X-ray angiographic (XA) and radiofluoroscopic (RF) runs can be used; this object is of another kind.",
+        "SOPClassUID",
+    )
+
+
+def _lacks(keyword: str) -> Problem:
+    return dicom_problem(DicomCode.MALFORMED, f"{keyword} is missing or invalid.", keyword)
+
+
+def _bits_used(file: BufferedReader, layout: PixelLayout) -> int:
+    return int(read_frame(file, layout, 0).max()).bit_length()
+
+
+def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list[HeaderWarning]) -> InstanceFacts:
+    rows, columns, frames = layout.rows, layout.columns, layout.frames
+    times = frame_times_ms(header, frames, warnings)
+    gantry = gantry_facts(header, rows, columns, warnings)
+    axes = image_axes(header, gantry, warnings)
+    warn_of_motion(header, warnings)
+    pixels = pixel_facts(header, rows, columns, bits_stored, warnings)
+    waves = r_wave_frames(header, frames, warnings)
+    return InstanceFacts(
+        sop_class_uid=_uid(header, "SOPClassUID"),
+        sop_instance_uid=_uid(header, "SOPInstanceUID"),
+        study_instance_uid=_uid(header, "StudyInstanceUID"),
+        series_instance_uid=_uid(header, "SeriesInstanceUID"),
+        series_number=header.integer("SeriesNumber"),
+        frames=frames,
+        rows=rows,
+        columns=columns,
+        transfer_syntax=layout.transfer_syntax,
+        frame_times_ms=times,
+        frame_time_ms=times[-1] / (frames - 1) if frames > 1 else 0.0,
+        acquired=acquired(header),
+        plane=_plane(header),
+        primary_deg=gantry.primary_deg,
+        secondary_deg=gantry.secondary_deg,
+        source_detector_mm=gantry.source_detector_mm,
+        source_isocentre_mm=gantry.source_isocentre_mm,
+        pixel_spacing_mm=gantry.pixel_spacing_mm,
+        image_axes=axes,
+        patient_orientation=orientation_letters(header),
+        table_mm=table_mm(header),
+        pixels=pixels,
+        window=window(header),
+        r_wave_frames=waves,
+        missing=gantry.missing,
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _uid(header: Header, keyword: str) -> str:
+    value = header.text(keyword)
+    if not is_uid(value):
+        raise _lacks(keyword)
+    return value
+
+
+def _plane(header: Header) -> Plane:
+    """ImageType (0008,0008) value 3 of legacy XA, PS3.3 C.8.7.1.1.1; PlaneIdentification (0018,9457) of Enhanced XA."""
+    image_type = header.texts("ImageType")
+    told = {*image_type[2:3], header.text("PlaneIdentification")}
+    if told & {"BIPLANE A", "PLANE A"}:
+        return "A"
+    return "B" if told & {"BIPLANE B", "PLANE B"} else "single"

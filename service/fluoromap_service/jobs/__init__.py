@@ -1,0 +1,1 @@
+"""Jobs: the table of stages, their life, their results, and the queue."""

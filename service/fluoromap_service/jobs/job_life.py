@@ -1,0 +1,332 @@
+"""The life of jobs and stages. SQL is the truth; a message is only a hint that a row may be claimed.
+
+Every function works inside the caller's transaction and locks the job's row first, so that two stages that finish together
+see each other and nobody deadlocks.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import Row, or_, select, update
+from sqlalchemy.orm import Session, defer
+
+from fluoromap import matching
+from fluoromap_service.settings import settings
+from fluoromap_service.store.clock import db_now
+from fluoromap_service.store.models import (
+    ENDED_JOB,
+    ENDED_STAGE,
+    Base,
+    Event,
+    Job,
+    JobState,
+    StageRow,
+    StageState,
+    WorkerSeen,
+)
+from fluoromap_service.study.snapshot import Snapshot
+
+FATAL = frozenset({"match", "triangulate", "fuse"})
+"""Stages whose failure fails the job; the others fail their subject only."""
+
+LONGEST_REPUBLISH_SECONDS = 60.0
+_TOLD = (
+    StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """The right to run a stage, until its lease ends."""
+
+    stage_id: int
+    job_id: str
+    attempt: int
+    name: str
+    subject: str
+
+
+def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
+    """Add a job with all its stages; the first ones are ready, which is their announcement."""
+    job = Job(
+        id=uuid.uuid4().hex,
+        study_id=study_id,
+        state=JobState.QUEUED,
+        snapshot=snapshot.model_dump(mode="json"),
+    )
+    session.add(job)
+    session.flush()
+
+    def add(name: str, subject: str, plugin: str, version: str, depends_on: Sequence[int]) -> int:
+        state = StageState.PENDING if depends_on else StageState.READY
+        row = StageRow(
+            job_id=job.id, name=name, subject=subject, plugin=plugin, plugin_version=version,
+            depends_on=list(depends_on), state=state,
+        )  # fmt: skip
+        session.add(row)
+        session.flush()
+        return row.id
+
+    segmenter, triangulator = snapshot.segmenter, snapshot.triangulator
+    # Runs with corrections first: after a correction they are what is computed again, and everything waits for them.
+    used = sorted(
+        {uid for site in snapshot.sites for uid in (site.view_a, site.view_b)},
+        key=lambda uid: (not snapshot.runs[uid].corrections, uid),
+    )
+    segments = [add("segment", uid, segmenter.name, segmenter.version, []) for uid in used]
+    match = add("match", study_id, "fluoromap", matching.VERSION, segments)
+    triangulate = add("triangulate", study_id, triangulator.name, triangulator.version, [match])
+    add("fuse", study_id, snapshot.fuser.name, snapshot.fuser.version, [triangulate])
+    for site in snapshot.sites:
+        add("monoplane", site.site, snapshot.monoplane.name, snapshot.monoplane.version, [triangulate])
+    _tell_job(session, job)
+    return job
+
+
+def take_due(session: Session, limit: int = 200) -> list[int]:
+    """Ready stages that were never announced, or so long ago that the announcement may be lost; corrections them announced."""
+    wait = settings().republish_seconds
+    # Each repetition waits longer, so that a long queue is not announced over and over.
+    due = or_(
+        StageRow.published.is_(None),
+        StageRow.published < db_now() - StageRow.publications * wait,
+        StageRow.published < db_now() - LONGEST_REPUBLISH_SECONDS,
+    )
+    query = select(StageRow.id).where(StageRow.state == StageState.READY, due).order_by(StageRow.id).limit(limit)
+    ids = list(session.scalars(query.with_for_update(skip_locked=True)))
+    if ids:
+        session.execute(
+            update(StageRow)
+            .where(StageRow.id.in_(ids))
+            .values(published=db_now(), publications=StageRow.publications + 1)
+        )
+    return ids
+
+
+def ready(session: Session, job_id: str) -> list[Claim]:
+    """The job's stages that may be claimed, in the order they were made, as the claims they would give."""
+    columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
+    query = select(*columns).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
+    return [Claim(*row) for row in session.execute(query.order_by(StageRow.id))]
+
+
+def finish_ready(session: Session, job_id: str, results: Mapping[int, str]) -> None:
+    """End stages whose results are known already, stage id -> result, as far as nobody has claimed them."""
+    job = _lock(session, job_id)
+    for stage_id, result in results.items():
+        ended = session.execute(
+            update(StageRow)
+            .where(StageRow.id == stage_id, StageRow.state == StageState.READY)
+            .values(state=StageState.DONE, attempt=StageRow.attempt + 1, result=result, reused=True, progress=1.0)
+            .returning(*_TOLD)
+        ).first()
+        if ended is not None:
+            _tell_stage(session, job_id, ended)
+    _settle(session, job)
+
+
+def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
+    """Take a ready stage; None when the announcement was stale or doubled."""
+    job_id = session.scalar(select(StageRow.job_id).where(StageRow.id == stage_id, StageRow.state == StageState.READY))
+    if job_id is None:
+        return None
+    job = _lock(session, job_id)
+    row = session.execute(
+        update(StageRow)
+        .where(StageRow.id == stage_id, StageRow.state == StageState.READY)
+        .values(
+            state=StageState.RUNNING,
+            attempt=StageRow.attempt + 1,
+            lease_until=db_now() + settings().lease_seconds,
+            worker=worker,
+            progress=0.0,
+        )
+        .returning(*_TOLD)
+    ).first()
+    if row is None:
+        return None
+    if job.state == JobState.QUEUED:
+        job.state = JobState.RUNNING
+        job.started = session.scalar(select(db_now()))
+        _tell_job(session, job)
+    _tell_stage(session, job_id, row)
+    return Claim(stage_id, job_id, row.attempt, row.name, row.subject)
+
+
+def beat(session: Session, held: Claim, progress: float) -> Literal["alive", "cancelled", "lost"]:
+    """Extend the lease and tell the progress; answers whether the work is still wanted."""
+    alive = session.execute(
+        update(StageRow)
+        .where(*_held(held))
+        .values(lease_until=db_now() + settings().lease_seconds, progress=progress)
+        .returning(*_TOLD)
+    ).first()
+    if alive is None:
+        return "lost"
+    _tell_stage(session, held.job_id, alive)
+    cancelled = session.scalar(select(Job.cancel_requested).where(Job.id == held.job_id))
+    return "cancelled" if cancelled else "alive"
+
+
+def finish(session: Session, held: Claim, result: str, *, reused: bool, rows: Iterable[Base] = ()) -> bool:
+    """Store a stage's end. False when the claim was lost: the output is then thrown away."""
+    job = _lock(session, held.job_id)
+    if not _end(session, held, StageState.DONE, result=result, reused=reused, progress=1.0):
+        return False
+    session.add_all(rows)
+    _settle(session, job)
+    return True
+
+
+def fail(session: Session, held: Claim, error: dict[str, Any]) -> bool:
+    """Store that a stage raised. False when the claim was lost."""
+    job = _lock(session, held.job_id)
+    if not _end(session, held, StageState.FAILED, error=error):
+        return False
+    _settle(session, job)
+    return True
+
+
+def stopped(session: Session, held: Claim) -> None:
+    """Store that a stage stopped because its job was cancelled."""
+    job = _lock(session, held.job_id)
+    if _end(session, held, StageState.CANCELLED):
+        _settle(session, job)
+
+
+def cancel(session: Session, job_id: str) -> bool:
+    """Ask a job to stop: what has not begun never will, what runs stops at its next check. False when it had ended."""
+    job = _lock(session, job_id)
+    if job.state in ENDED_JOB:
+        return False
+    job.cancel_requested = True
+    _cancel_waiting(session, job_id, (StageState.PENDING, StageState.READY))
+    _settle(session, job)
+    return True
+
+
+def reap(session: Session) -> int:
+    """Free the stages whose workers fell silent; after the last attempt they fail. Returns how many."""
+    expired = session.execute(
+        select(StageRow.id, StageRow.job_id)
+        .where(StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now())
+        .order_by(StageRow.job_id, StageRow.id)
+    ).all()
+    for stage_id, job_id in expired:
+        # Whoever holds the job now either renews the lease or is another reaper.
+        free = session.scalar(select(Job.id).where(Job.id == job_id).with_for_update(skip_locked=True))
+        if free is None:
+            continue
+        job = _lock(session, job_id)
+        stage = session.get_one(StageRow, stage_id, populate_existing=True)
+        still_silent = session.scalar(
+            select(StageRow.id).where(
+                StageRow.id == stage_id, StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now()
+            )
+        )
+        if still_silent is None:
+            continue
+        if job.cancel_requested:
+            stage.state = StageState.CANCELLED
+        elif stage.attempt >= settings().max_attempts:
+            stage.state = StageState.FAILED
+            stage.error = {
+                "code": "worker_lost",
+                "detail": f"This stage was begun {stage.attempt} times and never came to an end: the worker died, ran out of "
+                "time or could not store the result; see its log, memory and disk.",
+            }
+        else:
+            stage.state = StageState.READY
+        stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
+        _tell_stage(session, job_id, stage)
+        _settle(session, job)
+    return len(expired)
+
+
+def worker_seen(session: Session, name: str) -> None:
+    """Note a worker's sign of life."""
+    row = session.get(WorkerSeen, name)
+    now = session.scalar(select(db_now())) or 0.0
+    if row is None:
+        session.add(WorkerSeen(name=name, seen=now))
+    else:
+        row.seen = now
+
+
+def _held(held: Claim) -> tuple[Any, ...]:
+    return (
+        StageRow.id == held.stage_id,
+        StageRow.attempt == held.attempt,
+        StageRow.state == StageState.RUNNING,
+    )
+
+
+def _lock(session: Session, job_id: str) -> Job:
+    locking = update(Job).where(Job.id == job_id).values(version=Job.version + 1).returning(Job)
+    # Without its snapshot, which is long and does not change.
+    answer = session.scalars(locking.options(defer(Job.snapshot)), execution_options={"populate_existing": True})
+    return answer.one()
+
+
+def _end(session: Session, held: Claim, state: StageState, **values: Any) -> bool:
+    ended = session.execute(
+        update(StageRow).where(*_held(held)).values(state=state, lease_until=None, **values).returning(*_TOLD)
+    ).first()
+    if ended is None:
+        return False
+    _tell_stage(session, held.job_id, ended)
+    return True
+
+
+def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState]) -> None:
+    waiting = session.execute(
+        update(StageRow)
+        .where(StageRow.job_id == job_id, StageRow.state.in_(list(states)))
+        .values(state=StageState.CANCELLED)
+        .returning(*_TOLD)
+    ).all()
+    for stage in waiting:
+        _tell_stage(session, job_id, stage)
+
+
+def _settle(session: Session, job: Job) -> None:
+    """Promote what became ready and end the job when nothing is left; the job's row is locked."""
+    rows = _stages(session, job.id)
+    broken = [row for row in rows if row.state == StageState.FAILED and row.name in FATAL]
+    if broken:
+        job.error = job.error or {"subject": broken[0].name, **(broken[0].error or {})}
+        dead = {"match": {"triangulate", "fuse", "monoplane"}, "triangulate": {"fuse", "monoplane"}, "fuse": set()}
+        if any(row.name in dead[broken[0].name] and row.state == StageState.PENDING for row in rows):
+            _cancel_waiting(session, job.id, (StageState.PENDING,))
+            rows = _stages(session, job.id)
+    ended = {row.id for row in rows if row.state in ENDED_STAGE}
+    for row in rows:
+        if row.state == StageState.PENDING and set(row.depends_on) <= ended:
+            row.state = StageState.READY
+            _tell_stage(session, job.id, row)
+    if len(ended) == len(rows):
+        if job.cancel_requested:
+            job.state = JobState.CANCELLED
+        else:
+            job.state = JobState.FAILED if broken else JobState.SUCCEEDED
+        job.finished = session.scalar(select(db_now()))
+        _tell_job(session, job)
+
+
+def _stages(session: Session, job_id: str) -> Sequence[StageRow]:
+    query = select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)
+    return session.scalars(query.execution_options(populate_existing=True)).all()
+
+
+def _tell_job(session: Session, job: Job) -> None:
+    session.add(Event(job_id=job.id, kind="job", data={"state": job.state, "error": job.error}))
+
+
+def _tell_stage(session: Session, job_id: str, stage: StageRow | Row[*tuple[Any, ...]]) -> None:
+    """Add the event of a stage's new state; ``stage`` is its row, or a result with the columns of ``_TOLD``."""
+    data = {column.key: getattr(stage, column.key) for column in _TOLD}
+    session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(float(stage.progress), 3)}))

@@ -1,0 +1,100 @@
+"""The Celery application and the one way to announce a stage."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import urlsplit
+
+import structlog
+from celery import Celery
+
+from fluoromap_service.jobs import job_life
+from fluoromap_service.settings import settings
+from fluoromap_service.store.engine import writing
+
+RUN_STAGE = "fluoromap.run_stage"
+"""Name of the registered task that runs a stage by its id."""
+
+STAYS_SECONDS = 10
+"""How long a worker takes one stage of a job after the other before others have their turn."""
+
+log = structlog.get_logger(__name__)
+
+
+def _transport_options(url: str) -> dict[str, Any]:
+    scheme = urlsplit(url).scheme
+    if scheme == "filesystem":
+        queue = settings().data_dir.resolve() / "queue"
+        for folder in (queue / "messages", queue / "control"):
+            folder.mkdir(parents=True, exist_ok=True)
+        return {
+            "data_folder_in": str(queue / "messages"),
+            "data_folder_out": str(queue / "messages"),
+            "control_folder": str(queue / "control"),
+            "polling_interval": 0.1,
+        }
+    # Without timeouts a silently dropped network would block a publisher for ever.
+    return {"socket_timeout": 5, "socket_connect_timeout": 2}
+
+
+def _make_app() -> Celery:
+    configured = settings()
+    url = "memory://" if configured.eager else configured.broker_url or "filesystem://localhost/"
+    app = Celery("fluoromap", broker=url)
+    app.conf.update(
+        imports=("fluoromap_workers.tasks",),
+        task_always_eager=configured.eager,
+        task_eager_propagates=True,
+        task_ignore_result=True,
+        task_acks_late=False,
+        task_serializer="json",
+        accept_content=["json"],
+        # Of the last stage, which is begun before the worker's stay with the job is over.
+        task_time_limit=configured.stage_seconds + STAYS_SECONDS,
+        worker_prefetch_multiplier=1,
+        # A child that replaces a dead one compiles its kernels first; by default it would be killed after 4 s, again and again.
+        worker_proc_alive_timeout=180,
+        worker_concurrency=configured.workers,
+        worker_max_memory_per_child=configured.worker_memory_mib * 1024 // 2,
+        worker_send_task_events=False,
+        worker_hijack_root_logger=False,
+        worker_redirect_stdouts=False,
+        worker_soft_shutdown_timeout=20,
+        broker_connection_retry_on_startup=True,
+        broker_transport_options=_transport_options(url),
+    )
+    return app
+
+
+app = _make_app()
+
+
+def publish(stage_ids: list[int]) -> None:
+    """Announce ready stages. A failure is only logged: the committed rows are announced again until claimed."""
+    if app.conf.task_always_eager:
+        app.loader.import_default_modules()
+    for stage_id in stage_ids:
+        try:
+            # A fresh signature each time: one made before the task was registered would bypass eager mode.
+            app.signature(RUN_STAGE, args=(stage_id,)).apply_async(retry=False)
+        except Exception as error:
+            # Whatever the broker's fault is, the rows are committed: the request that made them must not fail.
+            log.warning("broker_unreachable", error=type(error).__name__)
+            return
+
+
+def publish_due() -> int:
+    """Announce everything that is due; call it after any commit that made stages ready. Returns how many."""
+    with writing() as session:
+        ids = job_life.take_due(session)
+    publish(ids)
+    return len(ids)
+
+
+def sweep() -> None:
+    """Free the stages of dead workers and announce what is due; anyone may call it at any time."""
+    publish_due()
+    with writing() as session:
+        freed = job_life.reap(session)
+    if freed:
+        publish_due()

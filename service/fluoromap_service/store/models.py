@@ -1,0 +1,288 @@
+"""The tables. Times are seconds since 1970 UTC by the database's clock; frames in corrections are counted from 1."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Text,
+    UniqueConstraint,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from fluoromap_service.store.clock import db_now
+
+Json = dict[str, Any]
+
+
+class Base(DeclarativeBase):
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(column_0_label)s",
+            "uq": "uq_%(table_name)s_%(column_0_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+    type_annotation_map = {dict[str, Any]: JSON, list[Any]: JSON, float: Float(53)}  # noqa: RUF012
+
+
+class JobState(StrEnum):
+    """Where a job is."""
+
+    QUEUED = "queued"  # no stage has been claimed yet
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+class StageState(StrEnum):
+    """Where a stage is."""
+
+    PENDING = "pending"  # waits for other stages
+    READY = "ready"  # may be claimed; a committed ready row is the outbox
+    RUNNING = "running"  # claimed; alive while its lease is extended
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+ENDED_JOB = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED})
+ENDED_STAGE = frozenset({StageState.DONE, StageState.FAILED, StageState.CANCELLED})
+
+
+class Token(Base):
+    """An access token; only its hash is kept."""
+
+    __tablename__ = "token"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(100), unique=True)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    scopes: Mapped[list[Any]]
+    created: Mapped[float] = mapped_column(default=db_now())
+    expires: Mapped[float | None]
+    revoked: Mapped[float | None]
+
+
+class File(Base):
+    """A file in the store, by its content."""
+
+    __tablename__ = "file"
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    size: Mapped[int] = mapped_column(BigInteger)
+    media_type: Mapped[str] = mapped_column(String(100))
+    created: Mapped[float] = mapped_column(default=db_now())
+
+
+class Study(Base):
+    """A mapping study: one rhythm of one patient."""
+
+    __tablename__ = "study"
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    label: Mapped[str] = mapped_column(String(200))
+    chamber: Mapped[str | None] = mapped_column(String(100))
+    notes: Mapped[str | None] = mapped_column(Text)
+    catheters: Mapped[list[Any]]
+    reference: Mapped[str] = mapped_column(String(64))
+    mapping: Mapped[str] = mapped_column(String(64))
+    created: Mapped[float] = mapped_column(default=db_now(), index=True)
+    updated: Mapped[float] = mapped_column(default=db_now(), onupdate=db_now())
+
+
+class Instance(Base):
+    """A stored DICOM instance: one run. Kept once, whatever number of studies refer to it."""
+
+    __tablename__ = "instance"
+    sop_instance_uid: Mapped[str] = mapped_column(String(64), primary_key=True)
+    sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
+    study_instance_uid: Mapped[str] = mapped_column(String(64), index=True)
+    series_instance_uid: Mapped[str] = mapped_column(String(64))
+    series_number: Mapped[int | None]
+    acquired: Mapped[str | None] = mapped_column(String(40))  # local time as the file tells it, ISO 8601
+    facts: Mapped[Json]  # InstanceFacts.to_json()
+    created: Mapped[float] = mapped_column(default=db_now())
+
+
+class StudyInstance(Base):
+    """A study's reference to an instance, with what the study says of it."""
+
+    __tablename__ = "study_instance"
+    __table_args__ = (UniqueConstraint("study_id", "sop_instance_uid", name="uq_study_instance"),)
+    id: Mapped[int] = mapped_column(primary_key=True)  # rises in the order of arrival
+    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
+    sop_instance_uid: Mapped[str] = mapped_column(ForeignKey("instance.sop_instance_uid"), index=True)
+    file_name: Mapped[str | None] = mapped_column(
+        Text
+    )  # as uploaded; may name the patient: never in a log, path or error
+    site: Mapped[str | None] = mapped_column(String(64))  # where upload or PATCH put it
+    site_by: Mapped[str | None] = mapped_column(String(10))  # "upload" or "explicit"
+    gantry: Mapped[Json] = mapped_column(default=dict)  # completes or overrides what the header says
+
+
+class Site(Base):
+    """A mapping site: its activation time, and the runs it was explicitly bound to."""
+
+    __tablename__ = "site"
+    __table_args__ = (UniqueConstraint("study_id", "name", name="uq_site_name"),)
+    id: Mapped[int] = mapped_column(primary_key=True)  # rises in the order of first mention: the table's row order
+    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
+    name: Mapped[str] = mapped_column(String(64))
+    lat_ms: Mapped[float | None]
+    lat_sd_ms: Mapped[float | None]
+    lat_by: Mapped[str | None] = mapped_column(String(12))  # "csv", "explicit" or "electrogram"
+    csv_row: Mapped[int | None]  # row of the last activation-time table that named it
+    explicit_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs set by PUT
+    explicit_b: Mapped[str | None] = mapped_column(String(64))
+    csv_a: Mapped[str | None] = mapped_column(Text)  # UID, series number or file name as the table says
+    csv_b: Mapped[str | None] = mapped_column(Text)
+    paired_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs that acquisition time joined, for good
+    paired_b: Mapped[str | None] = mapped_column(String(64))
+
+
+class Correction(Base):
+    """The electrodes of one frame as set by hand; the newest version counts, ``electrodes`` null: back to automatic."""
+
+    __tablename__ = "correction"
+    __table_args__ = (
+        UniqueConstraint("study_id", "sop_instance_uid", "frame", "version", name="uq_correction_version"),
+    )
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
+    sop_instance_uid: Mapped[str] = mapped_column(String(64))
+    frame: Mapped[int]
+    version: Mapped[int]
+    electrodes: Mapped[list[Any] | None]
+    author: Mapped[str] = mapped_column(String(100))
+    created: Mapped[float] = mapped_column(default=db_now())
+
+
+class Job(Base):
+    """One run of the pipeline over a study, on a frozen snapshot."""
+
+    __tablename__ = "job"
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
+    state: Mapped[str] = mapped_column(String(10), index=True)
+    version: Mapped[int] = mapped_column(default=0)  # raised by each change: ETag, and the row lock of every finish
+    snapshot: Mapped[Json]
+    cancel_requested: Mapped[bool] = mapped_column(Boolean, default=False)
+    error: Mapped[Json | None]
+    created: Mapped[float] = mapped_column(default=db_now(), index=True)
+    started: Mapped[float | None]
+    finished: Mapped[float | None]
+
+
+class StageRow(Base):
+    """One stage of a job for one subject."""
+
+    __tablename__ = "stage"
+    __table_args__ = (
+        UniqueConstraint("job_id", "name", "subject", name="uq_stage"),
+        Index("ix_stage_state_published", "state", "published"),
+    )
+    id: Mapped[int] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
+    name: Mapped[str] = mapped_column(String(12))  # segment, match, triangulate, monoplane, fuse
+    subject: Mapped[str] = mapped_column(String(64))  # SOP instance UID, site or study id
+    plugin: Mapped[str] = mapped_column(String(100))
+    plugin_version: Mapped[str] = mapped_column(String(50))
+    depends_on: Mapped[list[Any]]  # ids of stages that must have ended first
+    state: Mapped[str] = mapped_column(String(10))
+    attempt: Mapped[int] = mapped_column(default=0)
+    lease_until: Mapped[float | None]
+    worker: Mapped[str | None] = mapped_column(String(100))
+    published: Mapped[float | None]
+    publications: Mapped[int] = mapped_column(default=0)
+    progress: Mapped[float] = mapped_column(default=0.0)
+    reused: Mapped[bool] = mapped_column(Boolean, default=False)
+    result: Mapped[str | None] = mapped_column(ForeignKey("file.sha256"), index=True)
+    error: Mapped[Json | None]
+
+
+class StageResult(Base):
+    """A result kept under the hash of plugin, version, parameters and everything the stage reads."""
+
+    __tablename__ = "stage_result"
+    key: Mapped[str] = mapped_column(String(64), primary_key=True)
+    sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
+    created: Mapped[float] = mapped_column(default=db_now())
+
+
+class Point(Base):
+    """One electrode of one site of one job, located or rejected. Coordinates from the isocentre and from the reference."""
+
+    __tablename__ = "point"
+    __table_args__ = (UniqueConstraint("job_id", "site", "catheter", "electrode", name="uq_point"),)
+    id: Mapped[int] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
+    site: Mapped[str] = mapped_column(String(64))
+    catheter: Mapped[str] = mapped_column(String(64))
+    electrode: Mapped[int]
+    position_mm: Mapped[list[Any] | None]  # [x, y, z]
+    covariance_mm2: Mapped[list[Any] | None]  # [xx, xy, xz, yy, yz, zz]
+    relative_mm: Mapped[list[Any] | None]
+    relative_covariance_mm2: Mapped[list[Any] | None]
+    view_a: Mapped[str | None] = mapped_column(String(64))
+    view_b: Mapped[str | None] = mapped_column(String(64))
+    frame_a: Mapped[int | None]  # counted from 1
+    frame_b: Mapped[int | None]
+    residual_a_px: Mapped[float | None]
+    residual_b_px: Mapped[float | None]
+    ray_angle_deg: Mapped[float | None]
+    lat_ms: Mapped[float | None]
+    grade: Mapped[str] = mapped_column(String(10))
+    relative_grade: Mapped[str] = mapped_column(String(10))
+    reasons: Mapped[list[Any]]
+
+
+class Event(Base):
+    """What happened to a job, in order; the source of the event stream."""
+
+    __tablename__ = "event"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
+    kind: Mapped[str] = mapped_column(String(10))  # "job" or "stage"
+    data: Mapped[Json]
+    created: Mapped[float] = mapped_column(default=db_now())
+
+
+class Rendering(Base):
+    """A picture or mesh made of a job's results on request, kept."""
+
+    __tablename__ = "rendering"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
+    key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of job and everything asked for
+    sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
+
+
+class Idempotency(Base):
+    """An answer given to a request with an Idempotency-Key, for 24 hours."""
+
+    __tablename__ = "idempotency"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of token, method, path and the client's key
+    request_sha256: Mapped[str] = mapped_column(String(64))
+    status: Mapped[int | None] = mapped_column(Integer)  # None while the first request is still being answered
+    headers: Mapped[Json | None]
+    body: Mapped[str | None] = mapped_column(Text)
+    created: Mapped[float] = mapped_column(default=db_now(), index=True)
+
+
+class WorkerSeen(Base):
+    """A worker's last sign of life, for readiness."""
+
+    __tablename__ = "worker_seen"
+    name: Mapped[str] = mapped_column(String(100), primary_key=True)
+    seen: Mapped[float]

@@ -1,0 +1,158 @@
+"""From a study as it stands now to a job's frozen input."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from sqlalchemy.orm import Session
+
+from fluoromap.registry import DEFAULTS, Kind, UnknownPlugin, plugin
+from fluoromap_service.problem import Problem
+from fluoromap_service.store.models import Study
+from fluoromap_service.study import corrections, sites
+from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
+from fluoromap_service.study.sites import BoundSite
+from fluoromap_service.study.snapshot import (
+    CatheterSnapshot,
+    CorrectedElectrode,
+    PluginSnapshot,
+    RejectedSiteSnapshot,
+    RunSnapshot,
+    SiteSnapshot,
+    Snapshot,
+)
+from fluoromap_service.study.studies import catalogue_of, catheter_rows, lock
+
+LAT_SD_MS = 2.0
+"""Standard deviation of an activation time whose source tells none: two readers of one electrogram differ by about this."""
+
+
+class StageRequest(BaseModel):
+    """A plugin for one stage."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str | None = Field(None, description="Name as in /v1/plugins; the default plugin when left out.")
+    params: dict[str, Any] = Field(default_factory=dict, description="Its parameters; defaults for those left out.")
+
+
+class PipelineRequest(BaseModel):
+    """The plugins a job shall use; stages left out take their defaults."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{"fuser": {"name": "convex-hull", "params": {}}}]}
+    )
+    segmenter: StageRequest = StageRequest()
+    triangulator: StageRequest = StageRequest()
+    monoplane: StageRequest = StageRequest()
+    fuser: StageRequest = StageRequest()
+
+
+def freeze(
+    session: Session, study: Study, pipeline: PipelineRequest, view: Literal["a", "b", "both"] = "both"
+) -> Snapshot:
+    """Freeze everything a job will read; needs a writing transaction, as pairs by time get their names here.
+
+    Raises
+    ------
+    Problem
+        422 ``unknown_plugin`` or ``invalid_parameter`` naming the field, ``no_ready_site`` with what each site misses.
+    """
+    plans = _plugin_snapshots(pipeline)
+    study = lock(session, study.id)
+    sites.settle(session, study)
+    bound = sites.resolve(session, study)
+    ready = [site for site in bound if site.ready]
+    if not ready:
+        raise _no_ready_site(bound)
+    runs = {run.uid: run for run in runs_of(session, study.id)}
+    by_hand = corrections.of_study(session, study.id)
+    used = sorted({uid for site in ready for uid in (site.view_a, site.view_b) if uid is not None})
+    return Snapshot(
+        study=study.id,
+        catheters=tuple(CatheterSnapshot(**row) for row in catheter_rows(catalogue_of(study))),
+        reference=study.reference,
+        mapping=study.mapping,
+        **plans,
+        view=view,
+        runs={uid: _run_snapshot(runs[uid], by_hand.get(uid, {})) for uid in used},
+        sites=tuple(_site_snapshot(site) for site in ready),
+        rejected=tuple(
+            RejectedSiteSnapshot(
+                site=site.site, lat_ms=site.lat_ms, view_a=site.view_a, view_b=site.view_b, reasons=site.reasons
+            )
+            for site in bound
+            if not site.ready
+        ),
+    )
+
+
+def _plugin_snapshots(pipeline: PipelineRequest) -> dict[Any, PluginSnapshot]:
+    plans: dict[Any, PluginSnapshot] = {}
+    errors: list[tuple[str, str]] = []
+    for kind, default in DEFAULTS.items():
+        asked: StageRequest = getattr(pipeline, kind)
+        plan = _plugin_snapshot(kind, asked.name or default, asked.params, errors)
+        if plan is not None:
+            plans[kind] = plan
+    if errors:
+        raise Problem(
+            422,
+            "invalid_parameter",
+            "Some parameters of the pipeline are wrong; /v1/plugins tells which there are.",
+            errors,
+        )
+    return plans
+
+
+def _plugin_snapshot(
+    kind: Kind, name: str, params: dict[str, Any], errors: list[tuple[str, str]]
+) -> PluginSnapshot | None:
+    try:
+        found = plugin(kind, name)
+    except UnknownPlugin as error:
+        raise Problem(
+            422, "unknown_plugin", "There is no such plugin; /v1/plugins tells which there are.",
+            [(f"pipeline.{kind}.name", str(error))],
+        ) from None  # fmt: skip
+    assert found.stage is not None
+    assert found.version is not None
+    try:
+        checked: BaseModel = found.stage.Params.model_validate(params)
+    except ValidationError as error:
+        for item in error.errors():
+            where = ".".join(["pipeline", kind, "params", *(str(part) for part in item["loc"])])
+            errors.append((where, item["msg"]))
+        return None
+    return PluginSnapshot(name=name, version=found.version, params=checked.model_dump(mode="json"))
+
+
+def _no_ready_site(bound: list[BoundSite]) -> Problem:
+    rows = [
+        {"site": site.site, "missing": list(site.missing), "reasons": [str(reason) for reason in site.reasons]}
+        for site in bound
+    ]
+    errors = [
+        (f"sites.{site.site}", ", ".join([*site.missing, *([site.refused.sentence] if site.refused else [])]))
+        for site in bound
+    ]
+    detail = (
+        "No site is ready: one needs an activation time and two runs with known geometry, 20 degrees or more apart."
+        if bound
+        else "The study has no site yet: send its runs and its activation times first."
+    )
+    return Problem(422, "no_ready_site", detail, errors, extra={"sites": rows})
+
+
+def _run_snapshot(run: StudyRun, by_hand: dict[int, tuple[CorrectedElectrode, ...]]) -> RunSnapshot:
+    gantry = effective_gantry(run.facts, run.link.gantry)
+    assert gantry is not None, "a ready site's runs have their geometry"
+    return RunSnapshot(sha256=run.instance.sha256, facts=run.facts.to_json(), gantry=gantry, corrections=by_hand)
+
+
+def _site_snapshot(site: BoundSite) -> SiteSnapshot:
+    assert site.lat_ms is not None
+    assert site.view_a is not None
+    assert site.view_b is not None
+    sd = LAT_SD_MS if site.lat_sd_ms is None else site.lat_sd_ms
+    return SiteSnapshot(site=site.site, lat_ms=site.lat_ms, lat_sd_ms=sd, view_a=site.view_a, view_b=site.view_b)

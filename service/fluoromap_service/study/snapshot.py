@@ -1,0 +1,120 @@
+"""A job's frozen input: everything its stages will read, so that later edits never touch a running job."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from fluoromap.catheters import Catalogue, Catheter
+from fluoromap.contracts import View
+from fluoromap.geometry import Camera, Gantry, camera_from_gantry
+from fluoromap.reasons import Reason
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CatheterSnapshot(_Frozen):
+    name: str
+    electrodes: int
+    spacing_mm: tuple[float, ...]
+    tip_mm: float
+    ring_mm: float
+
+
+class PluginSnapshot(_Frozen):
+    """A plugin with its version and complete parameters."""
+
+    name: str
+    version: str
+    params: dict[str, Any]
+
+
+class GantrySnapshot(_Frozen):
+    """Effective gantry of a run: the header's values, completed and overridden by the study's."""
+
+    primary_deg: float
+    secondary_deg: float
+    source_detector_mm: float
+    source_isocentre_mm: float
+    pixel_spacing_mm: tuple[float, float]
+    rows: int
+    columns: int
+    image_axes: tuple[tuple[int, int], tuple[int, int]]
+
+    def camera(self) -> Camera:
+        return camera_from_gantry(Gantry(**self.model_dump()))
+
+
+class CorrectedElectrode(_Frozen):
+    """One electrode set by hand."""
+
+    catheter: str
+    electrode: int
+    u_px: float
+    v_px: float
+    sd_px: float
+
+
+class RunSnapshot(_Frozen):
+    """One run: the stored file, what is known of it, and the frames marked by hand (counted from 1)."""
+
+    sha256: str
+    facts: dict[str, Any]
+    gantry: GantrySnapshot
+    corrections: dict[int, tuple[CorrectedElectrode, ...]]
+
+
+class SiteSnapshot(_Frozen):
+    """A site that is ready: two runs and a time."""
+
+    site: str
+    lat_ms: float
+    lat_sd_ms: float
+    view_a: str
+    view_b: str
+
+    def run(self, view: View) -> str:
+        return self.view_a if view == "a" else self.view_b
+
+
+class RejectedSiteSnapshot(_Frozen):
+    """A site that was not ready when the job was made, and why."""
+
+    site: str
+    lat_ms: float | None
+    view_a: str | None
+    view_b: str | None
+    reasons: tuple[Reason, ...]
+
+
+class Snapshot(_Frozen):
+    """The whole input of a job."""
+
+    study: str
+    catheters: tuple[CatheterSnapshot, ...]
+    reference: str
+    mapping: str
+    segmenter: PluginSnapshot
+    triangulator: PluginSnapshot
+    monoplane: PluginSnapshot
+    fuser: PluginSnapshot
+    view: Literal["a", "b", "both"]
+    runs: dict[str, RunSnapshot]
+    sites: tuple[SiteSnapshot, ...]
+    rejected: tuple[RejectedSiteSnapshot, ...]
+
+    def catalogue(self) -> Catalogue:
+        return Catalogue(
+            tuple(Catheter(**catheter.model_dump()) for catheter in self.catheters), self.reference, self.mapping
+        )
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views that are followed."""
+        return ("a", "b") if self.view == "both" else (self.view,)
+
+    def site(self, name: str) -> SiteSnapshot:
+        return next(site for site in self.sites if site.site == name)

@@ -1,0 +1,237 @@
+"""Overlays and the archive: what is drawn, of which frame, and that it is drawn once."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from finished_study import (
+    BREATH_MM,
+    DIASTOLE,
+    REFERENCE_ELECTRODES_MM,
+    REFERENCE_MM,
+    SIZE,
+    STEP_MM,
+    TIP_MM,
+    TIP_PIXEL,
+    FinishedStudy,
+    camera,
+    map_result,
+    matching,
+    no_map,
+    triangulation,
+)
+from numpy.typing import NDArray
+from PIL import Image
+from sqlalchemy import select
+
+from fluoromap.contracts import NamedChain
+from fluoromap.drawing.animation import PICTURES
+from fluoromap_service.api.results import overlays as overlay_routes
+from fluoromap_service.api.results.overlays import fusion_of
+from fluoromap_service.store import files
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.models import Job, Rendering, StudyInstance
+
+pytestmark = pytest.mark.usefixtures("drawing_processes")
+
+
+def _fusion(study: FinishedStudy, view: str, frame: int | None) -> overlay_routes.Fusion:
+    with reading() as session:
+        return fusion_of(session, session.get_one(Job, study.job_id), study.uids["S01", view], frame)
+
+
+def test_each_view_of_each_located_site_is_listed(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    listed = client.get(f"/v1/jobs/{study.job_id}/overlays").json()["overlays"]
+    assert [(entry["site"], entry["view"], entry["frame"]) for entry in listed] == [
+        ("S01", "a", DIASTOLE + 1),
+        ("S01", "b", DIASTOLE + 1),
+    ]
+    assert [entry["sop_instance_uid"] for entry in listed] == [study.uids["S01", "a"], study.uids["S01", "b"]]
+    assert client.get(listed[0]["href"]).headers["content-type"] == "image/png"
+
+
+def test_size_and_cache(client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    first = client.get(path)
+    assert first.status_code == 200, first.text
+    picture = Image.open(io.BytesIO(first.content))
+    assert (picture.size, picture.mode) == ((SIZE, SIZE), "RGB")
+    assert Image.open(io.BytesIO(client.get(f"{path}?scale=2").content)).size == (2 * SIZE, 2 * SIZE)
+
+    def never(*_: object) -> bytes:
+        raise AssertionError("drawn again")
+
+    monkeypatch.setattr(overlay_routes, "drawn", never)
+    assert client.get(path).content == first.content
+    assert client.get(f"{path}?frame={DIASTOLE + 1}").content == first.content
+    assert client.get(path, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
+    with reading() as session:
+        assert len(session.scalars(select(Rendering)).all()) == 2
+
+
+def test_the_file_name_tells_site_and_frame_only(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png?frame=1")
+    assert answer.headers["content-disposition"] == 'inline; filename="overlay-S01-1.png"'
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["frame=0", "frame=4", "scale=3", "frame=x", "colours=rainbow", "step_ms=7", "until_ms=nan", "ellipses=perhaps"],
+)
+def test_wrong_frames_and_scales(client: TestClient, study: FinishedStudy, query: str) -> None:
+    study.mapped()
+    answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png?{query}")
+    assert answer.status_code == 422
+
+
+@pytest.mark.parametrize("query", ["colours=red-early", "step_ms=10", "until_ms=25"])
+def test_each_wish_changes_the_picture(client: TestClient, study: FinishedStudy, query: str) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    plain, wished = client.get(path), client.get(f"{path}?{query}")
+    assert wished.status_code == 200, wished.text
+    assert wished.content != plain.content
+
+
+def test_ellipses_are_of_the_tip_from_the_reference(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    assert client.get(f"{path}?ellipses=true").status_code == 200
+    np.testing.assert_allclose(_fusion(study, "a", None).covariances_mm2["S01"], 0.1 * np.eye(3))
+
+
+def test_the_propagation_is_a_moving_picture(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.gif"
+    answer = client.get(path)
+    assert answer.headers["content-type"] == "image/gif"
+    assert answer.headers["content-disposition"] == 'inline; filename="propagation-S01-2.gif"'
+    moving = Image.open(io.BytesIO(answer.content))
+    assert (moving.size, moving.n_frames) == ((SIZE, SIZE), PICTURES)
+    assert client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+
+
+def test_runs_without_overlay(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    for uid in (study.uids["S02", "a"], "1.2.3"):
+        assert client.get(f"/v1/jobs/{study.job_id}/overlays/{uid}.png").status_code == 404
+
+
+def _stands_at(fusion: overlay_routes.Fusion, view: str, place_mm: NDArray[np.float64]) -> None:
+    """The map hangs on a place that this view shows where it shows ``place_mm``, at its depth."""
+    np.testing.assert_allclose(fusion.camera.project(fusion.shift_mm), camera(view).project(place_mm), atol=0.01)
+    assert abs(fusion.camera.depth_mm(fusion.shift_mm) - camera(view).depth_mm(place_mm)) < 0.1
+
+
+def test_the_map_hangs_on_the_reference_as_the_frame_shows_it(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    for view in ("a", "b"):
+        for frame in (None, 1):
+            _stands_at(_fusion(study, view, frame), view, REFERENCE_MM + BREATH_MM[view])
+    # Frame 3 does not show the reference.
+    np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
+    study.followed()
+    np.testing.assert_allclose(_fusion(study, "a", 1).shift_mm, REFERENCE_MM + STEP_MM)
+    _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + BREATH_MM["a"])
+    np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
+    _stands_at(_fusion(study, "b", 1), "b", REFERENCE_MM + BREATH_MM["b"])
+
+
+@pytest.mark.parametrize("shown", [(1,), (2,), (1, 2, 3), (3,)])
+def test_the_reference_may_be_shown_in_part(study: FinishedStudy, shown: tuple[int, ...]) -> None:
+    study.segmented()
+    whole = matching()
+    third = np.array([[7.0, 7.0]])
+    pixels = np.concatenate([camera("a").project(REFERENCE_ELECTRODES_MM + BREATH_MM["a"]), third])
+    chosen = [number - 1 for number in shown]
+    chain = NamedChain("reference", shown, pixels[chosen], np.tile(np.eye(2), (len(shown), 1, 1)))
+    site = whole.sites[0]
+    diastole = replace(site.diastole, a=replace(site.diastole.a, chains=(chain,)))
+    study.end("match", None, replace(whole, sites=(replace(site, diastole=diastole),)))
+    study.end("triangulate", None, triangulation())
+    study.end("fuse", None, map_result())
+    # The third was not located: it tells nothing of where the catheter is.
+    breath = BREATH_MM["a"] if shown != (3,) else 0.0
+    _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + breath)
+
+
+def test_the_star_stands_where_the_tip_was_seen(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    np.testing.assert_array_equal(_fusion(study, "a", 1).tip_uv, TIP_PIXEL["a"])
+    np.testing.assert_array_equal(_fusion(study, "b", None).tip_uv, TIP_PIXEL["b"])
+    np.testing.assert_allclose(_fusion(study, "a", 3).tip_uv, camera("a").project(TIP_MM))
+
+
+def test_a_deleted_runs_overlay_stays_when_it_was_drawn(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
+    kept = client.get(path).content
+    files.path_of(_fusion(study, "a", None).sha256).unlink()
+    assert client.get(path).content == kept
+    answer = client.get(f"{path}?frame=1")
+    assert (answer.status_code, answer.json()["code"]) == (409, "run_deleted")
+
+
+def test_a_deleted_run_takes_the_pictures_of_it_along(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    uid = study.uids["S01", "a"]
+    with writing() as session:
+        session.add(StudyInstance(study_id=study.study_id, sop_instance_uid=uid))
+    path = f"/v1/jobs/{study.job_id}/overlays/{uid}.png"
+    assert client.get(path).status_code == 200
+    assert client.delete(f"/v1/studies/{study.study_id}/instances/{uid}").status_code == 204
+    with reading() as session:
+        assert session.scalars(select(Rendering)).all() == []
+    answer = client.get(path)
+    assert (answer.status_code, answer.json()["code"]) == (409, "run_deleted")
+    # Other runs' pictures are drawn again.
+    assert client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png").status_code == 200
+
+
+def test_a_run_that_does_not_decode(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    files.path_of(_fusion(study, "b", None).sha256).write_bytes(b"\0" * 128 + b"DICM")
+    answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png")
+    assert 400 <= answer.status_code < 500
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_the_archive_holds_everything(client: TestClient, study: FinishedStudy) -> None:
+    study.finish()
+    path = f"/v1/jobs/{study.job_id}/archive.zip"
+    answer = client.get(path)
+    assert answer.headers["content-type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        assert set(archive.namelist()) == {
+            "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "map.png", "mesh/chamber.ply",
+            "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "mesh/chamber.mat", "mesh/chamber.csv", "report.html",
+            "overlays/S01-a.png", "overlays/S01-b.png",
+        }  # fmt: skip
+        assert json.loads(archive.read("job.json"))["state"] == "succeeded"
+        assert json.loads(archive.read("parameters.json"))["segmenter"]["name"] == "by-hand"
+        assert archive.read("points.csv").decode() == client.get(f"/v1/jobs/{study.job_id}/points.csv").text
+        assert json.loads(archive.read("map.json")) == client.get(f"/v1/jobs/{study.job_id}/map").json()
+    assert client.get(path).content == answer.content
+
+
+def test_the_archive_without_a_map(client: TestClient, study: FinishedStudy) -> None:
+    study.finish(no_map())
+    content = client.get(f"/v1/jobs/{study.job_id}/archive.zip").content
+    names = set(zipfile.ZipFile(io.BytesIO(content)).namelist())
+    assert names == {"job.json", "parameters.json", "points.csv", "tracks.csv", "report.html"}
+
+
+def test_the_archive_waits_for_the_end(client: TestClient, study: FinishedStudy) -> None:
+    study.mapped()
+    answer = client.get(f"/v1/jobs/{study.job_id}/archive.zip")
+    assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")

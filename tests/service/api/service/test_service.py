@@ -1,0 +1,87 @@
+"""Plugins, health, readiness, and what the OpenAPI document tells of the output half."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from finished_study import FinishedStudy
+
+from fluoromap import registry
+from fluoromap_service.jobs import job_life
+from fluoromap_service.settings import settings
+from fluoromap_service.store.engine import writing
+from fluoromap_service.store.models import WorkerSeen
+
+
+def test_plugins_are_listed_with_their_parameters(client: TestClient) -> None:
+    listed = client.get("/v1/plugins").json()
+    assert [(row["kind"], row["name"]) for row in listed] == [(row.kind, row.name) for row in registry.plugins()]
+    fuser = next(row for row in listed if row["name"] == "smooth-surface")
+    assert set(fuser) == {"kind", "name", "version", "distribution", "default", "parameters", "error"}
+    assert fuser["default"] is True
+    assert "fill_mm" in fuser["parameters"]["properties"]
+
+
+def test_a_broken_plugin_is_a_row(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = registry.Plugin("fuser", "broken", None, "someone", None, "ImportError: no module")
+    monkeypatch.setattr(registry, "plugins", lambda: (broken,))
+    (row,) = client.get("/v1/plugins").json()
+    assert (row["error"], row["parameters"], row["version"]) == ("ImportError: no module", None, None)
+
+
+def test_alive(client: TestClient) -> None:
+    assert client.get("/v1/health").json() == {"status": "alive"}
+
+
+def test_ready_with_jobs_running_inside_the_service(client: TestClient) -> None:
+    answer = client.get("/v1/ready")
+    assert answer.status_code == 200
+    assert [(check["name"], check["ok"]) for check in answer.json()["checks"]] == [
+        ("database", True), ("broker", True), ("files", True), ("worker", True),
+    ]  # fmt: skip
+
+
+def _checks(client: TestClient) -> tuple[int, dict[str, bool]]:
+    answer = client.get("/v1/ready")
+    return answer.status_code, {check["name"]: check["ok"] for check in answer.json()["checks"]}
+
+
+def test_not_ready_without_a_worker(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLUOROMAP_BROKER_URL", "")
+    settings.cache_clear()
+    assert _checks(client) == (503, {"database": True, "broker": True, "files": True, "worker": False})
+    with writing() as session:
+        job_life.worker_seen(session, "worker")
+    assert _checks(client)[0] == 200
+    with writing() as session:
+        session.get_one(WorkerSeen, "worker").seen -= 60
+    assert _checks(client)[0] == 503
+
+
+def test_not_ready_without_files(client: TestClient, data_dir: Path) -> None:
+    (data_dir / "files").write_text("in the way")
+    status, checks = _checks(client)
+    assert (status, checks["files"], checks["database"]) == (503, False, True)
+
+
+def test_not_ready_without_tables(client: TestClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("FLUOROMAP_DATABASE_URL", f"sqlite:///{tmp_path / 'empty.sqlite'}")
+    settings.cache_clear()
+    status, checks = _checks(client)
+    assert (status, checks["database"]) == (503, False)
+
+
+def test_every_route_is_documented(client: TestClient, study: FinishedStudy) -> None:
+    paths = client.get("/v1/openapi.json").json()["paths"]
+    assert "/v1/jobs/{job_id}/mesh.{mesh_format}" in paths
+    ours = {path: methods for path, methods in paths.items() if "/jobs" in path or path.count("/") == 2}
+    for path, methods in ours.items():
+        for method, route in methods.items():
+            assert route.get("summary"), f"{method} {path}"
+            assert route.get("description"), f"{method} {path}"
+            for parameter in route.get("parameters", []):
+                assert parameter.get("description"), f"{method} {path} {parameter['name']}"
+            if "{job_id}" in path:
+                assert "404" in route["responses"], f"{method} {path}"

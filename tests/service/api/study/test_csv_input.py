@@ -1,0 +1,145 @@
+"""Tables of activation times and electrograms: what spreadsheets write is taken, what is wrong is refused as a whole."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from fluoromap_service.api.study.csv_input import activation_times
+
+GOOD = {
+    "plain": "site,lat_ms\nA,1.5\nB,-20\n",
+    "bom": "\ufeffsite,lat_ms\nA,1.5\nB,-20\n",
+    "crlf": "site,lat_ms\r\nA,1.5\r\nB,-20\r\n",
+    "semicolon and decimal comma": "site;lat_ms\nA;1,5\nB;-20,0\n",
+    "tab": "site\tlat_ms\nA\t1,5\nB\t-20\n",
+    "quotes": '"site","lat_ms"\n"A","1,5"\n"B","-20"\n',
+    "column order, case, spaces, blank lines": " LAT_MS , site \n\n 1.5 , A\n-2e1,B\n,\n",
+    "views": "site,lat_ms,view_a,view_b\nA,1.5,,\nB,-20,3,4\n",
+    "no line end": "site,lat_ms\nA,1.5\nB,-20",
+}
+
+
+def _put(service: TestClient, study_path: str, content: str | bytes, kind: str = "text/csv") -> Any:
+    return service.put(f"{study_path}/activation-times", content=content, headers={"Content-Type": kind})
+
+
+def _times(service: TestClient, study_path: str) -> dict[str, float]:
+    return {site["site"]: site["lat_ms"] for site in service.get(f"{study_path}/sites").json()["items"]}
+
+
+@pytest.mark.parametrize("text", GOOD.values(), ids=GOOD.keys())
+def test_tables_as_programs_write_them(service: TestClient, study_path: str, text: str) -> None:
+    answer = _put(service, study_path, text.encode(), "text/csv; charset=utf-8")
+    assert answer.status_code == 200, answer.text
+    assert answer.json() == {"sites": 2, "unmatched": ["A", "B"]}
+    assert _times(service, study_path) == {"A": 1.5, "B": -20}
+
+
+BAD = {
+    "unknown column": ("site,lat_ms,lat_s\nA,1,2\n", "row 1"),
+    "missing column": ("site,time\nA,1\n", "row 1"),
+    "column twice": ("site,lat_ms,lat_ms\nA,1,2\n", "row 1"),
+    "empty": ("", "row 1"),
+    "doubled site": ("site,lat_ms\nA,1\nA,2\n", "row 3, column site"),
+    "text": ("site,lat_ms\nB,1\nA,soon\n", "row 3, column lat_ms"),
+    "nan": ("site,lat_ms\nA,NaN\n", "row 2, column lat_ms"),
+    "inf": ("site,lat_ms\n\nA,-inf\n", "row 3, column lat_ms"),
+    "overflow": ("site,lat_ms\nA,1e999\n", "row 2, column lat_ms"),
+    "no number": ("site,lat_ms\nA,\n", "row 2, column lat_ms"),
+    "thousands": ('site,lat_ms\nA,"1.000,5"\n', "row 2, column lat_ms"),
+    "underscore": ("site,lat_ms\nA,1_0\n", "row 2, column lat_ms"),
+    "far too late": ("site,lat_ms\nA,20000\n", "row 2, column lat_ms"),
+    "no site": ("site,lat_ms\n,4\n", "row 2, column site"),
+    "site with slash": ("site,lat_ms\na/b,4\n", "row 2, column site"),
+    "decimal comma between commas": ("site,lat_ms\nA,1,5\n", "row 2"),
+    "same view twice": ("site,lat_ms,view_a,view_b\nA,1,7,7\n", "row 2, column view_b"),
+}
+
+
+@pytest.mark.parametrize(("text", "where"), BAD.values(), ids=BAD.keys())
+def test_a_wrong_table_is_refused_as_a_whole(service: TestClient, study_path: str, text: str, where: str) -> None:
+    _put(service, study_path, "site,lat_ms\nkept,7\n")
+    answer = _put(service, study_path, text)
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_table")
+    assert where in [error["where"] for error in answer.json()["errors"]]
+    assert _times(service, study_path) == {"kept": 7}
+
+
+def test_every_mistake_is_told_at_once() -> None:
+    from fluoromap_service.api.http.problems import Problem
+
+    with pytest.raises(Problem) as caught:
+        activation_times("site,lat_ms\nA,x\nA,nan\n")
+    assert [where for where, _ in caught.value.errors] == [
+        "row 2, column lat_ms",
+        "row 3, column site",
+        "row 3, column lat_ms",
+    ]
+    assert caught.value.detail.startswith("The table has 3 mistakes;")
+    with pytest.raises(Problem, match="has 1 mistake;"):
+        activation_times("site,lat_ms\nA,x\n")
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "status"),
+    [
+        (b"site,lat_ms\nA,1\n", "application/json", 415),
+        (b"site,lat_ms\nA,1\n", "text/csv; charset=latin-1", 415),
+        ("site,lat_ms\nÄ,1\n".encode("latin-1"), "text/csv", 400),
+        ("site,lat_ms\nA,1\n".encode("utf-16"), "text/csv", 400),
+        (b'site,lat_ms\n"A,1\n', "text/csv", 400),
+    ],
+    ids=["json", "charset", "latin-1", "utf-16", "open quote"],
+)
+def test_bodies_that_are_no_table(service: TestClient, study_path: str, content: bytes, kind: str, status: int) -> None:
+    assert _put(service, study_path, content, kind).status_code == status
+
+
+def test_a_new_table_replaces_the_old_one(service: TestClient, study_path: str) -> None:
+    _put(service, study_path, "site,lat_ms\nA,1\nB,2\n")
+    service.put(f"{study_path}/sites/C", json={"lat_ms": 9})
+    _put(service, study_path, "site,lat_ms\nB,3\n")
+    assert _times(service, study_path) == {"B": 3, "C": 9}
+
+
+def test_a_table_for_no_study(service: TestClient) -> None:
+    assert _put(service, "/v1/studies/none", "site,lat_ms\nA,1\n").status_code == 404
+
+
+def _electrogram() -> str:
+    time = np.arange(0, 400.0)
+
+    def deflection(at: float) -> Any:
+        return -np.tanh((time - at) / 2) * np.exp(-(((time - at) / 12) ** 2))
+
+    noise = np.random.default_rng(1).normal(0, 0.005, (2, len(time)))
+    rows = zip(time, deflection(120.0) + noise[0], deflection(161.0) + noise[1], strict=True)
+    return "time_ms,reference,mapping\n" + "".join(f"{t:.1f},{r:.5f},{m:.5f}\n" for t, r, m in rows)
+
+
+def test_an_electrogram_gives_the_activation_time(service: TestClient, study_path: str) -> None:
+    path = f"{study_path}/electrograms/S09"
+    answer = service.put(path, content=_electrogram(), headers={"Content-Type": "text/csv"})
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["lat_ms"] == pytest.approx(41, abs=1.5)
+    assert answer.json()["lat_ms"] == pytest.approx(answer.json()["mapping_ms"] - answer.json()["reference_ms"])
+    assert _times(service, study_path) == {"S09": answer.json()["lat_ms"]}
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        ("time_ms,reference,mapping\n0,0,0\n1,0,0\n", "unusable_electrogram"),
+        ("time_ms,reference,mapping\n", "unusable_electrogram"),
+        ("time_ms,reference,mapping\n0,0,x\n", "invalid_table"),
+        ("time_ms,reference\n0,0\n", "invalid_table"),
+    ],
+)
+def test_an_electrogram_that_tells_nothing(service: TestClient, study_path: str, content: str, code: str) -> None:
+    answer = service.put(f"{study_path}/electrograms/X", content=content, headers={"Content-Type": "text/csv"})
+    assert (answer.status_code, answer.json()["code"]) == (422, code)
+    assert _times(service, study_path) == {}

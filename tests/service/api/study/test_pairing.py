@@ -1,0 +1,292 @@
+"""Which runs belong to which site, by every rule; and when a site is ready for a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from small_runs import edited, run_uid, small_run
+
+from fluoromap.reasons import Reason
+from fluoromap_service.problem import Problem
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.study import sites, studies
+from fluoromap_service.study.freeze import PipelineRequest, freeze
+
+Upload = Callable[..., Any]
+LAT, PA = -90.0, 0.0
+
+
+@pytest.fixture
+def site_list(service: TestClient, study_path: str) -> Callable[[], dict[str, Any]]:
+    def ask() -> dict[str, Any]:
+        answer = service.get(f"{study_path}/sites")
+        assert answer.status_code == 200
+        return {site["site"]: site for site in answer.json()["items"]}
+
+    return ask
+
+
+def _views(site: dict[str, Any]) -> tuple[Any, Any, Any]:
+    return site["view_a"], site["view_b"], site["bound_by"]
+
+
+def _csv(service: TestClient, study_path: str, text: str) -> Any:
+    return service.put(f"{study_path}/activation-times", content=text, headers={"Content-Type": "text/csv"})
+
+
+def test_neighbours_in_time_are_paired_and_named_for_good(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any
+) -> None:
+    upload((4, PA), (2, PA), (1, LAT), (3, LAT))
+    assert {name: _views(site) for name, site in site_list().items()} == {
+        "S01": (run_uid(1), run_uid(2), "time"),
+        "S02": (run_uid(3), run_uid(4), "time"),
+    }
+    upload((0, LAT), (5, LAT))
+    assert _views(site_list()["S01"]) == (run_uid(1), run_uid(2), "time")
+    assert len(site_list()) == 2
+    late = service.get(f"{study_path}/instances/{run_uid(5)}").json()
+    assert late["site"] is late["view"] is None
+    assert "unbound" in late["warnings"]
+
+
+def test_runs_that_arrive_one_by_one_in_any_order_pair_by_acquisition(upload: Upload, site_list: Any) -> None:
+    for number, angle in ((1, LAT), (4, PA), (3, LAT), (2, PA)):
+        upload((number, angle))
+    found = site_list()
+    assert {_views(site)[:2] for site in found.values()} == {(run_uid(1), run_uid(2)), (run_uid(3), run_uid(4))}
+    assert set(found) == {"S01", "S02"}
+
+
+def test_view_a_is_nearer_to_lateral(upload: Upload, site_list: Any) -> None:
+    upload((1, 10.0), (2, 70.0))
+    assert _views(site_list()["S01"])[:2] == (run_uid(2), run_uid(1))
+
+
+def test_a_third_run_stays_unbound_and_the_shorter_gap_wins(
+    service: TestClient, study_path: str, tmp_path: Path, site_list: Any
+) -> None:
+    for number, angle, seconds in ((1, LAT, 0), (2, PA, 20), (3, PA, 40), (4, LAT, 300), (5, PA, 320)):
+        content = small_run(tmp_path, number, angle, seconds=seconds)
+        service.post(f"{study_path}/instances", content=content, headers={"Content-Type": "application/dicom"})
+    assert [_views(site)[:2] for site in site_list().values()] == [(run_uid(1), run_uid(2)), (run_uid(4), run_uid(5))]
+
+
+def test_views_less_than_30_degrees_apart_are_not_paired_by_time(upload: Upload, site_list: Any) -> None:
+    upload((1, 0.0), (2, 25.0), (3, 178.0))
+    assert site_list() == {}
+
+
+def test_the_site_given_at_upload_binds(upload: Upload, site_list: Any) -> None:
+    upload((1, LAT), (4, PA), site="apex")
+    upload((2, PA), (3, LAT))
+    assert _views(site_list()["apex"]) == (run_uid(1), run_uid(4), "upload")
+    assert _views(site_list()["S01"]) == (run_uid(3), run_uid(2), "time")
+
+
+def test_the_table_binds_by_uid_series_number_and_file_name(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any
+) -> None:
+    table = f"site,lat_ms,view_a,view_b\nA,1,{run_uid(4)},2\nB,2,run1.dcm,run3.dcm\nC,3,nowhere.dcm,\n"
+    assert _csv(service, study_path, table).json() == {"sites": 3, "unmatched": ["A", "B", "C"]}
+    upload((1, LAT), (2, PA), (3, PA), (4, LAT), site="elsewhere")
+    found = site_list()
+    assert _views(found["A"]) == (run_uid(4), run_uid(2), "csv")
+    assert _views(found["B"]) == (run_uid(1), run_uid(3), "csv")
+    assert _csv(service, study_path, table).json()["unmatched"] == ["C"]
+
+
+@pytest.mark.parametrize("table_first", [True, False])
+def test_row_order_binds_when_the_counts_agree(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any, table_first: bool
+) -> None:
+    table = "site,lat_ms\nzeta,10\nalpha,20\n"
+    if table_first:
+        assert _csv(service, study_path, table).json() == {"sites": 2, "unmatched": ["zeta", "alpha"]}
+    upload((3, LAT), (4, PA), (1, LAT), (2, PA))
+    if not table_first:
+        assert len(site_list()) == 2
+        assert _csv(service, study_path, table).json() == {"sites": 2, "unmatched": []}
+    found = site_list()
+    assert list(found) == ["zeta", "alpha"]
+    assert _views(found["zeta"]) == (run_uid(1), run_uid(2), "order")
+    assert _views(found["alpha"]) == (run_uid(3), run_uid(4), "order")
+    assert found["zeta"]["missing"] == []
+    answer = _csv(service, study_path, table + "third,30\n")
+    assert answer.json()["unmatched"] == ["zeta", "alpha", "third"]
+
+
+def test_a_table_that_uses_the_permanent_names_keeps_them(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any
+) -> None:
+    upload((1, LAT), (2, PA), (3, LAT), (4, PA))
+    assert list(site_list()) == ["S01", "S02"]
+    assert _csv(service, study_path, "site,lat_ms\nS02,5\nS01,7\n").json()["unmatched"] == []
+    found = site_list()
+    assert _views(found["S02"]) == (run_uid(3), run_uid(4), "time")
+    assert found["S02"]["lat_ms"] == 5
+
+
+def test_put_comes_before_every_other_rule(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any
+) -> None:
+    upload((1, LAT), (2, PA), site="upload")
+    upload((3, LAT), (4, PA))
+    put = {"lat_ms": 12.5, "view_a": run_uid(4), "view_b": run_uid(1)}
+    answer = service.put(f"{study_path}/sites/mine", json=put)
+    assert answer.status_code == 200
+    assert (answer.json()["lat_ms"], *_views(answer.json())) == (12.5, run_uid(4), run_uid(1), "explicit")
+    assert _views(site_list()["upload"]) == (None, run_uid(2), "upload")
+    moved = service.put(f"{study_path}/sites/second", json={"view_b": run_uid(1)}).json()
+    assert (moved["view_b"], moved["missing"]) == (run_uid(1), ["lat_ms", "view_a"])
+    assert site_list()["mine"]["missing"] == ["view_b"]
+
+
+def test_patch_moves_a_run_and_takes_it_out_again(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any
+) -> None:
+    upload((1, LAT), (2, PA))
+    path = f"{study_path}/instances/{run_uid(1)}"
+    moved = service.patch(path, json={"site": "moved"}).json()
+    assert (moved["site"], moved["view"]) == ("moved", "a")
+    assert _views(site_list()["moved"]) == (run_uid(1), None, "explicit")
+    service.patch(path, json={"site": None})
+    assert [_views(site) for site in site_list().values()] == [(run_uid(1), run_uid(2), "time")]
+
+
+@pytest.mark.parametrize(
+    "body", [{"view_a": "1.2.3"}, {"view_a": "SAME", "view_b": "SAME"}, {"lat": 3}, {"lat_ms": "x"}]
+)
+def test_a_binding_that_cannot_be(service: TestClient, study_path: str, upload: Upload, body: dict[str, Any]) -> None:
+    upload((1, LAT))
+    body = {key: run_uid(1) if value == "SAME" else value for key, value in body.items()}
+    answer = service.put(f"{study_path}/sites/X", json=body)
+    assert answer.status_code == 422
+    assert answer.json()["errors"]
+    assert service.get(f"{study_path}/sites/X").status_code == 404
+
+
+def _reasons(study_path: str, site: str) -> tuple[Reason, ...]:
+    with reading() as session:
+        return sites.one(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
+
+
+def test_what_makes_a_site_unusable(service: TestClient, study_path: str, upload: Upload, tmp_path: Path) -> None:
+    upload((1, LAT), (2, PA), (3, 10.0), (4, 25.0))
+    incomplete = edited(
+        small_run(tmp_path, 5, LAT), DistanceSourceToPatient=None, EstimatedRadiographicMagnificationFactor=None
+    )
+    service.post(f"{study_path}/instances", content=incomplete, headers={"Content-Type": "application/dicom"})
+
+    def put(site: str, **body: Any) -> Any:
+        return service.put(f"{study_path}/sites/{site}", json=body).json()
+
+    assert put("good", lat_ms=1, view_a=run_uid(1), view_b=run_uid(2))["missing"] == []
+    assert put("parallel", lat_ms=1, view_a=run_uid(3), view_b=run_uid(4))["warnings"] == ["views_parallel"]
+    assert put("blind", lat_ms=1, view_a=run_uid(5))["missing"] == ["view_b", "gantry:view_a"]
+    assert put("timeless")["missing"] == ["lat_ms", "view_a", "view_b"]
+    assert _reasons(study_path, "good") == ()
+    assert _reasons(study_path, "parallel") == (Reason.VIEWS_PARALLEL,)
+    assert _reasons(study_path, "blind") == (Reason.ONE_VIEW_ONLY, Reason.NO_GEOMETRY)
+    patched = service.patch(f"{study_path}/instances/{run_uid(5)}", json={"gantry": {"source_isocentre_mm": 750}})
+    assert patched.json()["missing"] == []
+    assert _reasons(study_path, "blind") == (Reason.ONE_VIEW_ONLY,)
+
+    with writing() as session:
+        study = studies.get(session, study_path.rsplit("/", 1)[1])
+        snapshot = freeze(session, study, PipelineRequest())
+    assert [site.site for site in snapshot.sites] == ["good"]
+    assert set(snapshot.runs) == {run_uid(1), run_uid(2)}
+    assert {site.site: site.reasons for site in snapshot.rejected} == {
+        "parallel": (Reason.VIEWS_PARALLEL,),
+        "blind": (Reason.ONE_VIEW_ONLY,),
+    }
+    assert snapshot.runs[run_uid(1)].gantry.camera().rows == 48
+
+
+def test_a_pair_between_20_and_30_degrees_is_computed(service: TestClient, study_path: str, upload: Upload) -> None:
+    upload((1, 0.0), (2, 25.0))
+    body = {"lat_ms": 1, "view_a": run_uid(1), "view_b": run_uid(2)}
+    assert service.put(f"{study_path}/sites/X", json=body).json()["warnings"] == []
+    assert _reasons(study_path, "X") == ()
+
+
+def test_a_table_that_moved_is_not_paired_and_refused_when_told(
+    service: TestClient, study_path: str, upload: Upload, tmp_path: Path, site_list: Any
+) -> None:
+    upload((1, LAT))
+    moved = edited(
+        small_run(tmp_path, 2, PA),
+        TableTopLateralPosition=30,
+        TableTopLongitudinalPosition=0,
+        TableTopVerticalPosition=0,
+    )
+    still = edited(
+        small_run(tmp_path, 1, LAT),
+        SOPInstanceUID="2.25.77",
+        TableTopLateralPosition=0,
+        TableTopLongitudinalPosition=0,
+        TableTopVerticalPosition=0,
+    )
+    service.delete(f"{study_path}/instances/{run_uid(1)}")
+    for content in (moved, still):
+        answer = service.post(f"{study_path}/instances", content=content, headers={"Content-Type": "application/dicom"})
+        assert answer.status_code == 201, answer.text
+    assert site_list() == {}
+    put = service.put(f"{study_path}/sites/X", json={"lat_ms": 1, "view_a": "2.25.77", "view_b": run_uid(2)}).json()
+    assert "table_moved" in put["warnings"]
+    assert _reasons(study_path, "X") == (Reason.TABLE_MOVED,)
+
+
+def test_no_ready_site_lists_what_each_misses(service: TestClient, study_path: str, upload: Upload) -> None:
+    empty = service.post(f"{study_path}/jobs", json={})
+    assert (empty.status_code, empty.json()["code"]) == (422, "no_ready_site")
+    upload((1, LAT), (2, PA))
+    answer = service.post(f"{study_path}/jobs", json={})
+    assert (answer.status_code, answer.json()["code"]) == (422, "no_ready_site")
+    assert answer.json()["sites"] == [{"site": "S01", "missing": ["lat_ms"], "reasons": ["no_activation_time"]}]
+    assert service.get("/v1/jobs").json()["items"] == []
+
+
+@pytest.mark.parametrize(
+    ("pipeline", "code", "where"),
+    [
+        ({"segmenter": {"name": "deep-magic"}}, "unknown_plugin", "pipeline.segmenter.name"),
+        (
+            {"fuser": {"name": "convex-hull", "params": {"fill_mm": -4}}},
+            "invalid_parameter",
+            "pipeline.fuser.params.fill_mm",
+        ),
+        (
+            {"fuser": {"name": "convex-hull", "params": {"fil_mm": 4}}},
+            "invalid_parameter",
+            "pipeline.fuser.params.fil_mm",
+        ),
+        ({"fusor": {}}, "invalid", "body.pipeline.fusor"),
+    ],
+)
+def test_a_wrong_pipeline_names_the_field(
+    service: TestClient, study_path: str, pipeline: dict[str, Any], code: str, where: str
+) -> None:
+    answer = service.post(f"{study_path}/jobs", json={"pipeline": pipeline})
+    assert (answer.status_code, answer.json()["code"]) == (422, code)
+    assert [error["where"] for error in answer.json()["errors"]] == [where]
+
+
+def test_marks_travel_into_the_manifest(service: TestClient, study_path: str, upload: Upload) -> None:
+    upload((1, LAT), (2, PA), site="X")
+    service.put(f"{study_path}/sites/X", json={"lat_ms": 3})
+    electrode = {"catheter": "mapping", "electrode": 1, "u_px": 10.0, "v_px": 20.0}
+    service.put(f"{study_path}/instances/{run_uid(1)}/frames/2/electrodes", json=[electrode])
+    with writing() as session:
+        study = studies.get(session, study_path.rsplit("/", 1)[1])
+        snapshot = freeze(session, study, PipelineRequest(), "a")
+    assert snapshot.views == ("a",)
+    (correction,) = snapshot.runs[run_uid(1)].corrections[2]
+    assert (correction.catheter, correction.u_px, correction.sd_px) == ("mapping", 10.0, 1.0)
+    with pytest.raises(Problem, match="no such study"), writing() as session:
+        studies.lock(session, "nothing")

@@ -1,0 +1,270 @@
+"""The life of jobs and stages on SQL alone: no Celery, no plugin."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select, update
+
+from fluoromap_service.jobs import job_life
+from fluoromap_service.settings import settings
+from fluoromap_service.store import files
+from fluoromap_service.store.clock import db_now
+from fluoromap_service.store.engine import engine, reading, writing
+from fluoromap_service.store.models import Base, Event, Job, JobState, StageRow, StageState, Study
+from fluoromap_service.study.snapshot import (
+    CatheterSnapshot,
+    GantrySnapshot,
+    PluginSnapshot,
+    RunSnapshot,
+    SiteSnapshot,
+    Snapshot,
+)
+
+GANTRY = GantrySnapshot(
+    primary_deg=0, secondary_deg=0, source_detector_mm=1000, source_isocentre_mm=500,
+    pixel_spacing_mm=(0.35, 0.35), rows=512, columns=512, image_axes=((1, 0), (0, 1)),
+)  # fmt: skip
+
+
+def _snapshot(study: str, sites: int = 2) -> Snapshot:
+    plan = PluginSnapshot(name="p", version="1", params={})
+    run = RunSnapshot(sha256="0" * 64, facts={}, gantry=GANTRY, corrections={})
+    catheters = tuple(
+        CatheterSnapshot(name=name, electrodes=4, spacing_mm=(3.5, 6, 3), tip_mm=2, ring_mm=1)
+        for name in ("reference", "mapping")
+    )
+    plans = tuple(
+        SiteSnapshot(site=f"S{i:02}", lat_ms=1.0 * i, lat_sd_ms=1.0, view_a=f"1.{i}.1", view_b=f"1.{i}.2")
+        for i in range(1, sites + 1)
+    )
+    runs = {uid: run for plan_ in plans for uid in (plan_.view_a, plan_.view_b)}
+    return Snapshot(
+        study=study, catheters=catheters, reference="reference", mapping="mapping", segmenter=plan, triangulator=plan,
+        monoplane=plan, fuser=plan, view="both", runs=runs, sites=plans, rejected=(),
+    )  # fmt: skip
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def job(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A committed job of two sites in an empty database."""
+    monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("FLUOROMAP_LEASE_SECONDS", "30")
+    if request.param == "postgresql":
+        monkeypatch.setenv("FLUOROMAP_DATABASE_URL", request.getfixturevalue("postgres_url"))
+    settings.cache_clear()
+    Base.metadata.create_all(engine())
+    with writing() as session:
+        session.add(Study(id="s", label="x", catheters=[], reference="reference", mapping="mapping"))
+        session.flush()
+        created = job_life.create(session, "s", _snapshot("s"))
+    yield created.id
+    engine().dispose()
+    settings.cache_clear()
+
+
+def _stage_ids(job_id: str, name: str | None = None, state: StageState | None = None) -> list[int]:
+    with reading() as session:
+        query = select(StageRow.id).where(StageRow.job_id == job_id).order_by(StageRow.id)
+        if name:
+            query = query.where(StageRow.name == name)
+        if state:
+            query = query.where(StageRow.state == state)
+        return list(session.scalars(query))
+
+
+def _claim(stage_id: int, worker: str = "w") -> job_life.Claim | None:
+    with writing() as session:
+        return job_life.claim(session, stage_id, worker)
+
+
+def _finish(held: job_life.Claim) -> bool:
+    with writing() as session:
+        sha256 = files.keep_bytes(session, b"{}", "application/json")
+        return job_life.finish(session, held, sha256, reused=False)
+
+
+def _work(job_id: str, end: Callable[[job_life.Claim], object] = _finish, only: str | None = None) -> None:
+    """Claim and end every ready stage, in order, until none is left."""
+    while ready := _stage_ids(job_id, only, StageState.READY):
+        held = _claim(ready[0])
+        assert held is not None
+        end(held)
+
+
+def _job(job_id: str) -> Job:
+    with reading() as session:
+        return session.get_one(Job, job_id)
+
+
+def _silence(stage_id: int) -> None:
+    """As if the stage's worker had died long ago."""
+    with writing() as session:
+        session.execute(update(StageRow).where(StageRow.id == stage_id).values(lease_until=db_now() - 1))
+
+
+def test_stages_run_in_order_and_the_job_succeeds(job: str) -> None:
+    assert _job(job).state == JobState.QUEUED
+    assert set(_stage_ids(job, state=StageState.READY)) == set(_stage_ids(job, "segment"))
+    _work(job, only="segment")
+    assert _stage_ids(job, state=StageState.READY) == _stage_ids(job, "match")
+    assert _job(job).state == JobState.RUNNING
+    _work(job)
+    done = _job(job)
+    assert done.state == JobState.SUCCEEDED
+    assert done.started is not None
+    assert done.finished is not None
+    assert done.finished >= done.started
+
+
+def test_a_ready_stage_is_announced_once_and_again_only_after_a_while(job: str) -> None:
+    with writing() as session:
+        assert sorted(job_life.take_due(session)) == _stage_ids(job, "segment")
+    with writing() as session:
+        assert job_life.take_due(session) == []
+        session.execute(update(StageRow).values(published=db_now() - 100))
+    with writing() as session:
+        assert sorted(job_life.take_due(session)) == _stage_ids(job, "segment")
+
+
+def test_a_stage_is_claimed_once(job: str) -> None:
+    stage = _stage_ids(job, "segment")[0]
+    assert _claim(stage) is not None
+    assert _claim(stage) is None
+    assert _claim(10**9) is None
+
+
+def test_two_stages_that_finish_together_start_their_child(job: str) -> None:
+    """Without the job's lock each would see the other unfinished and the child would never start."""
+    segments = _stage_ids(job, "segment")
+    for stage in segments[:-2]:
+        held = _claim(stage)
+        assert held is not None
+        _finish(held)
+    last = [_claim(stage) for stage in segments[-2:]]
+    barrier = threading.Barrier(2)
+
+    def together(held: job_life.Claim) -> None:
+        barrier.wait()
+        _finish(held)
+
+    threads = [threading.Thread(target=together, args=(held,)) for held in last if held]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert _stage_ids(job, state=StageState.READY) == _stage_ids(job, "match")
+
+
+def test_a_dead_workers_stage_is_free_again_and_its_late_output_thrown_away(job: str) -> None:
+    stage = _stage_ids(job, "segment")[0]
+    dead = _claim(stage, "dead")
+    assert dead is not None
+    _silence(stage)
+    with writing() as session:
+        assert job_life.reap(session) == 1
+    alive = _claim(stage, "alive")
+    assert alive is not None
+    assert alive.attempt == 2
+    assert not _finish(dead)
+    with writing() as session:
+        assert job_life.beat(session, dead, 0.5) == "lost"
+        assert job_life.beat(session, alive, 0.5) == "alive"
+    assert _finish(alive)
+
+
+def test_a_stage_whose_workers_keep_dying_fails_with_the_reason_and_the_job_goes_on(job: str) -> None:
+    stage = _stage_ids(job, "segment")[0]
+    for _ in range(settings().max_attempts):
+        assert _claim(stage) is not None
+        _silence(stage)
+        with writing() as session:
+            job_life.reap(session)
+    with reading() as session:
+        row = session.get_one(StageRow, stage)
+        assert row.state == StageState.FAILED
+        assert row.error is not None
+        assert row.error["code"] == "worker_lost"
+    _work(job)
+    assert _job(job).state == JobState.SUCCEEDED
+
+
+def test_a_living_worker_is_not_reaped(job: str) -> None:
+    assert _claim(_stage_ids(job, "segment")[0]) is not None
+    with writing() as session:
+        assert job_life.reap(session) == 0
+
+
+@pytest.mark.parametrize("broken", ["match", "triangulate", "fuse"])
+def test_a_stage_the_study_needs_fails_the_job(job: str, broken: str) -> None:
+    def end(held: job_life.Claim) -> None:
+        if held.name != broken:
+            _finish(held)
+            return
+        with writing() as session:
+            assert job_life.fail(session, held, {"code": "plugin_failed", "detail": "no"})
+
+    _work(job, end)
+    ended = _job(job)
+    assert ended.state == JobState.FAILED
+    assert ended.error is not None
+    assert ended.error["detail"] == "no"
+    monoplane = {StageState.DONE} if broken == "fuse" else {StageState.CANCELLED}
+    with reading() as session:
+        states = session.scalars(select(StageRow.state).where(StageRow.name == "monoplane")).all()
+    assert set(states) == monoplane
+
+
+def test_a_failed_single_view_fails_its_site_only(job: str) -> None:
+    def end(held: job_life.Claim) -> None:
+        if held.name != "monoplane":
+            _finish(held)
+            return
+        with writing() as session:
+            job_life.fail(session, held, {"code": "plugin_failed", "detail": "no"})
+
+    _work(job, end)
+    assert _job(job).state == JobState.SUCCEEDED
+
+
+def test_cancelling_stops_what_waits_at_once_and_what_runs_at_its_next_check(job: str) -> None:
+    held = _claim(_stage_ids(job, "segment")[0])
+    assert held is not None
+    with writing() as session:
+        assert job_life.cancel(session, job)
+    assert _job(job).state == JobState.RUNNING
+    with writing() as session:
+        assert job_life.beat(session, held, 0.1) == "cancelled"
+        job_life.stopped(session, held)
+    assert _job(job).state == JobState.CANCELLED
+    with writing() as session:
+        assert not job_life.cancel(session, job)
+
+
+def test_cancelling_a_job_whose_worker_died_ends_it(job: str) -> None:
+    stage = _stage_ids(job, "segment")[0]
+    assert _claim(stage) is not None
+    with writing() as session:
+        job_life.cancel(session, job)
+    _silence(stage)
+    with writing() as session:
+        job_life.reap(session)
+    assert _job(job).state == JobState.CANCELLED
+
+
+def test_every_change_is_an_event_in_order(job: str) -> None:
+    _work(job)
+    with reading() as session:
+        events = session.scalars(select(Event).where(Event.job_id == job).order_by(Event.id)).all()
+    assert [event.data["state"] for event in events if event.kind == "job"] == ["queued", "running", "succeeded"]
+    stages: dict[tuple[str, str], list[str]] = {}
+    for event in events:
+        if event.kind == "stage":
+            stages.setdefault((event.data["name"], event.data["subject"]), []).append(event.data["state"])
+    assert len(stages) == len(_stage_ids(job))
+    for states in stages.values():
+        assert [state for state, _ in itertools.groupby(states)][-2:] == ["running", "done"]
