@@ -12,8 +12,9 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.proposals import log_odds
 
-_EVIDENCE_FROM, _EVIDENCE_MOST = 4.0, 2.2
+_EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
 _SHAFT_WEIGHT = 0.4
 _SHARED = 1.5
 _LOST = 2.0
@@ -77,10 +78,9 @@ def families(catalogue: Catalogue) -> tuple[Family, ...]:
     return tuple(Family(tuple(member.name for member in group), group[0]) for group in groups)
 
 
-def evidence(contrast_over_noise: Array) -> Array:
-    """What a candidate adds to a chain's score: 0 at 4 sigma, growing with the logarithm, at most 2.2."""
-    rising: Array = np.log(np.maximum(contrast_over_noise, 1e-3) / _EVIDENCE_FROM)
-    return np.clip(rising, -1.0, _EVIDENCE_MOST)
+def evidence(probability: Array) -> Array:
+    """What a candidate adds to a chain's score: its log-odds, 0 for an even chance, from -1 to 2.2."""
+    return np.clip(log_odds(probability), _EVIDENCE_LEAST, _EVIDENCE_MOST)
 
 
 def link(

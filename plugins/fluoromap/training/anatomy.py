@@ -11,7 +11,7 @@ from numpy.random import Generator
 from PIL import Image as PillowImage
 from scipy.ndimage import affine_transform
 
-from fluoromap.segmenter.homomorphic import gaussian
+from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.training.drawing import Canvas, Image
 from fluoromap.training.randomness import between, chance, random_curve, scaled, smooth_field
 

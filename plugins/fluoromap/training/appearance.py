@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from fluoromap.segmenter.homomorphic import gaussian
+from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.training.drawing import Image
 from fluoromap.training.randomness import between, chance, scaled, smooth_field
 

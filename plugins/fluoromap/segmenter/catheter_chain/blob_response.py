@@ -12,12 +12,14 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
+from fluoromap.segmenter.proposals import Likeness, Proposals, probability_of_contrast
 
 _SCALES_MM = 0.52, 0.73, 1.04
 _LEAST_RING_PX = 5.0
 _CLEAR_SNR = 4.0
 _APART_MM = 0.57
 _MOST = 60
+_BLUR_MM = 1.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,15 +66,16 @@ class BlobResponse:
             stack, best, noise, smooth, pixel_noise(small, inside[::reduction, ::reduction]), reduction, px_per_mm
         )
 
-    def candidates(self, allowed: BoolArray, expected: int) -> tuple[Array, Array]:
-        """Maxima over u, v and scale above 4 robust standard deviations.
+    @property
+    def likeness(self) -> Likeness:
+        """Response over noise."""
+        return Likeness(self.best, self.reduction, 0.5 * (self.reduction - 1))
+
+    def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
+        """Maxima over u, v and scale above 4 robust standard deviations, strongest response first.
 
         Scales compete by response: by response over noise, a long tip would split in two. What is weaker than a fifth of
         the ``expected``-th best is dropped.
-
-        Returns
-        -------
-        points_uv : (n, 2) pixels of the frame, sub-pixel. snr : (n,) response over noise, strongest response first.
         """
         scale, v, u = self._maxima(allowed[:: self.reduction, :: self.reduction])
         strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
@@ -85,7 +88,10 @@ class BlobResponse:
             keep = snr >= 0.2 * np.sort(snr)[-expected]
             places, snr = places[keep], snr[keep]
         shift = 0.5 * (self.reduction - 1)
-        return places * self.reduction + shift, snr
+        variance = self._variance(snr)
+        return Proposals(
+            places * self.reduction + shift, probability_of_contrast(snr), variance[:, None, None] * np.eye(2)
+        )
 
     def _maxima(self, allowed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
         """(scale, v, u) of what no neighbour in any scale exceeds, ``allowed`` being nowhere at the border."""
@@ -117,7 +123,19 @@ class BlobResponse:
         tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
         return tops
 
-    def at(self, points_uv: Array) -> Array:
+    def probability_at(self, points_uv: Array) -> Array:
+        """Probability of electrodes at points of the frame, (n,)."""
+        return probability_of_contrast(self.scores_at(points_uv))
+
+    def variance_at(self, points_uv: Array) -> Array:
+        """Of the places of maxima as strong as the response at these points, (n,) pixels squared."""
+        return self._variance(self.scores_at(points_uv))
+
+    def _variance(self, snr: Array) -> Array:
+        variance: Array = (_BLUR_MM * self.px_per_mm / np.maximum(snr, 1.0)) ** 2
+        return variance
+
+    def scores_at(self, points_uv: Array) -> Array:
         """Response over noise at points of the frame, the best scale of each, (n,)."""
         rows, columns = self.smooth.shape
         places = (points_uv - 0.5 * (self.reduction - 1)) / self.reduction

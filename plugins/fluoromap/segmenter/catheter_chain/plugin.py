@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
 from pydantic import BaseModel
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Chain, Context, FrameChains, Marks, NoParams, Run, Segmentation
-from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain.blob_chains import BlobDetector
+from fluoromap.contracts import Context, Marks, NoParams, Run, Segmentation
+from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
+from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run
+from fluoromap.segmenter.seen_part import as_seen
 from fluoromap.segmenter.warm_run import compile_on_drawn_run
 
-DIM_BELOW = 0.2
-"""An electrode that is fainter than this share of its chain's clearest was predicted, not seen: it is not told."""
-LEAST_SEEN = 3
-"""A catheter of which fewer electrodes are seen cannot be told from background, nor which end is its tip."""
+_ACCEPTANCE = Acceptance(
+    least_clearness=0.75, carried_clearness=0.6, sure_clearness=1.1, extra_clearness=1.3, least_score=3.5
+)
+"""Scores are contrast over noise."""
 
 
 class CatheterChain:
@@ -42,34 +43,18 @@ class CatheterChain:
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Chains of all frames and of the diastolic mean; see :class:`~fluoromap.contracts.Segmenter`."""
-        found = segment_run(
-            run, catalogue, marks, context, lambda field: BlobDetector(catalogue, field, run.px_per_mm), carry=True
+        return as_seen(
+            segment_run(
+                run, catalogue, marks, context, lambda field: blob_chains(catalogue, field, run.px_per_mm), carry=True
+            )
         )
-        diastole = None if found.diastole is None else _as_seen(found.diastole)
-        return replace(found, frames=tuple(map(_as_seen, found.frames)), diastole=diastole)
 
 
-def _as_seen(entry: FrameChains) -> FrameChains:
-    """The chains without electrodes that the image does not show; where none is left, that is said."""
-    chains = tuple(seen for chain in entry.chains if (seen := _seen_part(chain)) is not None)
-    reason = entry.manual_needed
-    if entry.chains and not chains:
-        reason = reason or Reason.MANUAL_NEEDED
-    return replace(entry, chains=chains, manual_needed=reason)
+def blob_chains(catalogue: Catalogue, field: FieldMask, px_per_mm: float) -> ChainDetector:
+    """Return the detector of one run: blobs of the size of the catalogue's electrodes, and the chains of them."""
+    ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
 
+    def blobs(x: Image) -> BlobResponse:
+        return BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
 
-def _seen_part(chain: Chain) -> Chain | None:
-    if chain.manual:
-        return chain
-    seen = np.flatnonzero(chain.scores >= DIM_BELOW * chain.scores.max())
-    if len(seen) == len(chain.electrodes):
-        return chain
-    if len(seen) < LEAST_SEEN:
-        return None
-    return replace(
-        chain,
-        electrodes=tuple(chain.electrodes[index] for index in seen),
-        pixels_uv=chain.pixels_uv[seen],
-        covariance_px2=chain.covariance_px2[seen],
-        scores=chain.scores[seen],
-    )
+    return ChainDetector(catalogue, field, px_per_mm, blobs, _ACCEPTANCE)

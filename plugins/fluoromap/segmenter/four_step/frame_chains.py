@@ -22,6 +22,7 @@ from fluoromap.segmenter.gaussian_blur import reduce_by
 from fluoromap.segmenter.linking import Shafts, evidence, families, link
 from fluoromap.segmenter.log_image import Image, pixel_noise
 from fluoromap.segmenter.placing import place_chains
+from fluoromap.segmenter.proposals import probability_of_contrast
 
 MOST_FOREGROUND = 0.02
 MOST_BLOBS = 40
@@ -103,7 +104,7 @@ class FourStepDetector:
         shafts = Shafts(diffused, 1, max(_LEAST_LINE, 0.5 * k), self.px_per_mm)
         kinds = families(self.catalogue)
         points = _with_lost(blobs.centroids_uv, contrast.peaks(self.field.candidates), self.px_per_mm)
-        linked = link(points, evidence(contrast.of(points)), np.zeros(len(points)), shafts, kinds, sure=len(blobs))
+        linked = link(points, evidence(probability_of_contrast(contrast.of(points))), np.zeros(len(points)), shafts, kinds, sure=len(blobs))
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         noise = pixel_noise(reduce_by(x, 2), self.field.inside[::2, ::2])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fluoromap.segmenter.homomorphic import gaussian
+from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.log_image import Image
 
 _NEIGHBOURHOOD_PX = 16.0

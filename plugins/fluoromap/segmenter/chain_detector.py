@@ -1,4 +1,4 @@
-"""One image -> its chains by blobs: candidates, linking and refinement in a row; and chains that were seen before."""
+"""One image -> its chains: proposals, linking and refinement in a row; and chains that were seen before."""
 
 from __future__ import annotations
 
@@ -11,44 +11,63 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
-from fluoromap.segmenter.catheter_chain.rigid_search import rigid_search
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import Family, Linked, Shafts, chain_score, evidence, families, link
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.placing import place_chains, widened_covariance
+from fluoromap.segmenter.proposals import ImageEvidence, Proposer
 from fluoromap.segmenter.refinement import refine
+from fluoromap.segmenter.rigid_search import rigid_search
 from fluoromap.segmenter.unseen_electrodes import complete
 
-_BLUR_MM = 1.75
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
-_SURE_CLEARNESS = 1.1
-_LEAST_CLEARNESS = 0.75
-_LEAST_SNR = 3.5
 _CARRIED_SLACK = 2.5
-_CARRIED_CLEARNESS = 0.6
 _STRAYED_PX = 5.0
 _HIDING_MM, _LEAST_FREE = 1.2, 2
 _FITS = 2.0
 _BENDING = 0.12
-_BESIDE_MM, _EXTRA_CLEARNESS = 2.0, 1.3
+_BESIDE_MM = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """How sure chains have to be, in the measures of one proposer.
+
+    least_clearness, carried_clearness : of :attr:`~fluoromap.segmenter.refinement.Refined.clearness`, of a chain found in its
+    image and of one carried there. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter beside
+    those of the catalogue is reported from here on. least_score : of the median of a chain's scores. seen_score, least_seen :
+    at least this share of a chain's electrodes has this score.
+    """
+
+    least_clearness: float
+    carried_clearness: float
+    sure_clearness: float
+    extra_clearness: float
+    least_score: float
+    seen_score: float = -np.inf
+    least_seen: float = 0.0
+
+    def accepts(self, scores: Array) -> bool:
+        """Whether a chain's scores are enough, (electrodes,)."""
+        return bool(np.median(scores) >= self.least_score and np.mean(scores >= self.seen_score) >= self.least_seen)
 
 
 @dataclass(slots=True, eq=False)
-class BlobDetector:
-    """Finds chains in the images of one run, whose field and scale are fixed. Keeps the response of the image it saw last."""
+class ChainDetector:
+    """Finds chains in the images of one run, whose field and scale are fixed. Keeps what it knows of the last image."""
 
     catalogue: Catalogue
     field: FieldMask
     px_per_mm: float
-    _last: tuple[Image, BlobResponse] | None = dataclasses.field(default=None, init=False, repr=False)
+    proposer: Proposer
+    acceptance: Acceptance
+    _last: tuple[Image, ImageEvidence] | None = dataclasses.field(default=None, init=False, repr=False)
 
-    def response(self, x: Image) -> BlobResponse:
-        """Response of a log image to blobs of the size of this catalogue's electrodes."""
+    def evidence(self, x: Image) -> ImageEvidence:
+        """What the proposer knows about a log image."""
         if self._last is None or self._last[0] is not x:
-            ring_mm = min(catheter.ring_mm for catheter in self.catalogue.catheters)
-            self._last = x, BlobResponse.of_image(x, self.field.inside, ring_mm, self.px_per_mm)
+            self._last = x, self.proposer(x)
         return self._last[1]
 
     def chains(self, x: Image, frame: int) -> FrameChains:
@@ -59,18 +78,18 @@ class BlobDetector:
         """
         if min(x.shape) < 16:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
-        response = self.response(x)
+        seen = self.evidence(x)
         electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
-        points, snr = response.candidates(self.field.candidates, max(2, electrodes // 2))
+        proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
+        points, weights, variance = proposed.points_uv, evidence(proposed.probability), proposed.variance_px2
         kinds = families(self.catalogue)
-        shafts = self._shafts(response)
-        weights, variance = evidence(snr), self._variance(snr)
+        shafts = self._shafts(seen)
         sound = len(points)
         linked = link(points, weights, variance, shafts, kinds, slack=_COMPANION_SLACK)
         if not self._settled(linked, weights):
 
             def dark(places: Array) -> Array:
-                return np.where(self._in_field(places), evidence(response.at(places)), -1.0)
+                return np.where(self._in_field(places), evidence(seen.probability_at(places)), -1.0)
 
             more = complete(points, weights, variance, dark, kinds, self.px_per_mm)
             linked = link(
@@ -81,11 +100,11 @@ class BlobDetector:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         placed = [
             one
-            for one in place_chains(x, points, linked, shafts, kinds, response.pixel_noise, sound)
-            if one.clearness >= _LEAST_CLEARNESS
+            for one in place_chains(x, points, linked, shafts, kinds, seen.pixel_noise, sound)
+            if one.clearness >= self.acceptance.least_clearness
         ]
         floor = min(family.floor for family in kinds)
-        sure = any(one.clearness >= _SURE_CLEARNESS and one.chain.scores[0] >= floor for one in placed)
+        sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for one in placed)
         found = [one.chain for one in placed]
         chains = tuple(
             replace(
@@ -93,11 +112,11 @@ class BlobDetector:
                 covariance_px2=widened_covariance(
                     chain, [other for other in found if other is not chain], self.px_per_mm
                 ),
-                scores=response.at(chain.pixels_uv),
+                scores=seen.scores_at(chain.pixels_uv),
             )
             for chain in found
         )
-        chains = tuple(chain for chain in chains if np.median(chain.scores) >= _LEAST_SNR)
+        chains = tuple(chain for chain in chains if self.acceptance.accepts(chain.scores))
         return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
 
     def _settled(self, linked: Sequence[Linked], weights: Array) -> bool:
@@ -107,15 +126,15 @@ class BlobDetector:
         return all(chain.score >= weights[list(chain.candidates)].sum() - _FITS for chain in linked)
 
     def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
-        """A chain seen before, found again by a rigid search on the blob response and refined; None where the image does
+        """A chain seen before, found again by a rigid search and refined; None where the image does
         not support it. What refinement measures is weighed against where the search put it; an electrode that it
         moves by more than 5 px stays there, less sure; one that another catheter hides is put where the others have it,
         of which there must be two."""
         family = self._family(chain)
         if family is None:
             return None
-        response = self.response(x)
-        guess = rigid_search(response, chain.pixels_uv, shift, reach_px, taken)
+        seen = self.evidence(x)
+        guess = rigid_search(seen.likeness, chain.pixels_uv, shift, reach_px, taken, self.px_per_mm)
         hidden = np.zeros(len(guess), np.bool_)
         for other in taken:
             near = np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
@@ -127,7 +146,7 @@ class BlobDetector:
             guess[None],
             family.catheter,
             self.px_per_mm,
-            response.pixel_noise,
+            seen.pixel_noise,
             hidden[None],
             np.zeros((1, len(guess)), np.bool_),
         )
@@ -141,27 +160,28 @@ class BlobDetector:
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         if not self._in_field(points).all():
             return None
-        snr = response.at(points)
-        if hidden.any():
-            snr[hidden] = np.median(snr[~hidden])
-        score = chain_score(points, evidence(snr), self._variance(snr), self._shafts(response), family)
-        if score < family.floor - _CARRIED_SLACK or place.clearness[0] < _CARRIED_CLEARNESS:
+        scores, weights, variance = seen.scores_at(points), evidence(seen.probability_at(points)), seen.variance_at(points)
+        for values in (scores, weights, variance) if hidden.any() else ():
+            values[hidden] = np.median(values[~hidden])
+        score = chain_score(points, weights, variance, self._shafts(seen), family)
+        if score < family.floor - _CARRIED_SLACK or place.clearness[0] < self.acceptance.carried_clearness:
             return None
-        carried = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=snr, manual=False)
+        carried = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False)
         return replace(carried, covariance_px2=widened_covariance(carried, taken, self.px_per_mm))
 
     def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Whether one more catheter of the catalogue's kinds shows clearly beside these chains."""
-        response = self.response(x)
-        points, snr = response.candidates(self.field.candidates, 2)
+        seen = self.evidence(x)
+        proposed = seen.proposals(self.field.candidates, 2)
         taken = np.concatenate([chain.pixels_uv for chain in chains])
-        free = np.linalg.norm(points[:, None] - taken[None], axis=2).min(axis=1) > _BESIDE_MM * self.px_per_mm
-        points, snr = points[free], snr[free]
+        away = np.linalg.norm(proposed.points_uv[:, None] - taken[None], axis=2).min(axis=1)
+        free = away > _BESIDE_MM * self.px_per_mm
+        points = proposed.points_uv[free]
         kinds = families(self.catalogue)
-        shafts = self._shafts(response)
-        linked = link(points, evidence(snr), self._variance(snr), shafts, kinds)
-        placed = place_chains(x, points, linked, shafts, kinds, response.pixel_noise)
-        return any(one.clearness >= _EXTRA_CLEARNESS for one in placed)
+        shafts = self._shafts(seen)
+        linked = link(points, evidence(proposed.probability[free]), proposed.variance_px2[free], shafts, kinds)
+        placed = place_chains(x, points, linked, shafts, kinds, seen.pixel_noise)
+        return any(one.clearness >= self.acceptance.extra_clearness for one in placed)
 
     def _in_field(self, points_uv: Array) -> BoolArray:
         """Which points lie where electrodes may be, (n,)."""
@@ -180,11 +200,6 @@ class BlobDetector:
         ]
         return max(whole, key=lambda family: sum(chain.probability(name) for name in family.names), default=None)
 
-    def _shafts(self, response: BlobResponse) -> Shafts:
-        clear = max(_LEAST_LINE, _LINE_NOISE * response.pixel_noise)
-        return Shafts(response.smooth, response.reduction, clear, self.px_per_mm)
-
-    def _variance(self, snr: Array) -> Array:
-        """Of the place of a blob's maximum, square pixels."""
-        variance: Array = (_BLUR_MM * self.px_per_mm / np.maximum(snr, 1.0)) ** 2
-        return variance
+    def _shafts(self, seen: ImageEvidence) -> Shafts:
+        clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
+        return Shafts(seen.smooth, seen.reduction, clear, self.px_per_mm)
