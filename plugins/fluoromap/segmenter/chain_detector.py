@@ -15,9 +15,10 @@ from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import Family, Linked, Shafts, chain_score, evidence, families, link
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.placing import place_chains, widened_covariance
-from fluoromap.segmenter.proposals import ImageEvidence, Proposer
+from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.unlisted import SURE, continues, not_on, unexplained_between
 from fluoromap.segmenter.unseen_electrodes import complete
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
@@ -37,7 +38,9 @@ class Acceptance:
     least_clearness, carried_clearness : of :attr:`~fluoromap.segmenter.refinement.Refined.clearness`, of a chain found in its
     image and of one carried there. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter beside
     those of the catalogue is reported from here on. least_score : of the median of a chain's scores. seen_score, least_seen :
-    at least this share of a chain's electrodes has this score.
+    at least this share of a chain's electrodes has this score. unseen_evidence : an electrode that was not proposed is predicted
+    only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is not accepted as a
+    catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
     """
 
     least_clearness: float
@@ -47,6 +50,8 @@ class Acceptance:
     least_score: float
     seen_score: float = -np.inf
     least_seen: float = 0.0
+    unseen_evidence: float = 0.0
+    strict: bool = False
 
     def accepts(self, scores: Array) -> bool:
         """Whether a chain's scores are enough, (electrodes,)."""
@@ -89,9 +94,12 @@ class ChainDetector:
         if not self._settled(linked, weights):
 
             def dark(places: Array) -> Array:
-                return np.where(self._in_field(places), evidence(seen.probability_at(places)), -1.0)
+                probability = seen.unseen_probability_at(places)
+                return np.where(self._in_field(places) & (probability > 0), evidence(probability), -np.inf)
 
-            more = complete(points, weights, variance, dark, kinds, self.px_per_mm)
+            more = complete(
+                points, weights, variance, dark, self.acceptance.unseen_evidence, kinds, self.px_per_mm
+            )
             linked = link(
                 more.points_uv, more.weights, more.variance_px2, shafts, kinds, len(points), _COMPANION_SLACK, more.rows
             )
@@ -117,7 +125,21 @@ class ChainDetector:
             for chain in found
         )
         chains = tuple(chain for chain in chains if self.acceptance.accepts(chain.scores))
+        if self.acceptance.strict:
+            chains = self._of_catalogue(chains, proposed)
         return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
+
+    def _of_catalogue(self, chains: tuple[Chain, ...], proposed: Proposals) -> tuple[Chain, ...]:
+        """The chains that are not part of a catheter with more electrodes than the catalogue has."""
+        sure = proposed.points_uv[proposed.probability >= SURE]
+        free = not_on(sure, chains, self.px_per_mm)
+        kept = []
+        for chain in chains:
+            family = self._family(chain)
+            between = unexplained_between(chain, free, self.px_per_mm)
+            if family is not None and between == 0 and not continues(chain, sure, family.catheter, self.px_per_mm):
+                kept.append(chain)
+        return tuple(kept)
 
     def _settled(self, linked: Sequence[Linked], weights: Array) -> bool:
         """Whether there is a chain of its own candidates for each catheter, none of them much worse than its candidates are."""

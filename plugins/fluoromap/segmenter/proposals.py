@@ -76,11 +76,14 @@ class ImageEvidence(Protocol):
     def probability_at(self, points_uv: Array) -> Array:
         """Probability that electrodes are at points of the frame, (n,)."""
 
+    def unseen_probability_at(self, points_uv: Array) -> Array:
+        """Probability of electrodes that were not proposed, (n,); 0 where an electrode would have the place of a proposed one."""
+
     def variance_at(self, points_uv: Array) -> Array:
         """Variance of each coordinate of electrodes that are proposed at these points, (n,) pixels squared."""
 
     def scores_at(self, points_uv: Array) -> Array:
-        """The proposer's own measure of how clearly electrodes show at points of the frame, (n,): ``Chain.scores``."""
+        """The proposer's own measure of how clearly the electrodes of one chain show, (n,): ``Chain.scores``."""
 
 
 Proposer = Callable[[Image], ImageEvidence]

@@ -16,7 +16,6 @@ from fluoromap.segmenter.linking import Family
 from fluoromap.segmenter.refinement import on_curve
 
 _LEAST_SEEN = 3
-_DARK = 0.0
 _INNER_SD_MM, _END_SD_MM = 0.4, 0.7
 _MOST = 100
 
@@ -40,6 +39,7 @@ def complete(
     weights: Array,
     variance_px2: Array,
     evidence_at: Callable[[Array], Array],
+    least_evidence: float,
     kinds: Sequence[Family],
     px_per_mm: float,
 ) -> Completed:
@@ -50,7 +50,9 @@ def complete(
     points_uv, weights, variance_px2 : (n, 2), (n,), (n,)
         As in :func:`~fluoromap.segmenter.linking.link`.
     evidence_at : callable
-        (k, 2) pixels -> (k,) evidence; a predicted electrode where there is none is dropped.
+        (k, 2) pixels -> (k,) evidence.
+    least_evidence : float
+        A predicted electrode that has no more is dropped.
     kinds : sequence of Family
     px_per_mm : float
         At the isocentre.
@@ -67,7 +69,7 @@ def complete(
             paths = chain_search.paths(points, weights, np.diff(seen) * px_per_mm)
             predicted = _shares(family.catheter, lacking) @ points[paths]
             dark = evidence_at(predicted)
-            kept = np.flatnonzero(dark > _DARK)
+            kept = np.flatnonzero(dark > least_evidence)
             kept = kept[np.argsort(-(dark[kept] + weights[paths[kept]].sum(axis=1)), kind="stable")[:_MOST]]
             numbers = count + np.arange(len(kept))
             of_family.append(np.insert(paths[kept], lacking, numbers, axis=1))

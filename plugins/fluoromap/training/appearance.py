@@ -49,8 +49,8 @@ def take_picture(random: Generator, things: Image, body: Image) -> Picture:
     grey = _grey_levels(random, seen)
     if chance(random, 0.5):
         grey += np.float32(between(random, 0.2, 2.5)) * (grey - gaussian(grey, between(random, 0.8, 6.0)))
-    if chance(random, 0.08):
-        grey = gaussian(grey, between(random, 0.6, 1.3))
+    if chance(random, 0.15):
+        grey = gaussian(grey, between(random, 0.5, 1.3))
     return Picture(_stored(random, grey), float(noise.std()), gaussian(intensity, 4.0))
 
 

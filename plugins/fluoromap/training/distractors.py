@@ -161,6 +161,18 @@ def _beads(random: Generator, count: int) -> Array:
     return faded
 
 
+def _drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
+    """A vessel or tube that the contrast medium has left but for a few plugs and rims, which lie in a row like electrodes."""
+    curve = random_curve(random, between(random, 15.0, 70.0), 0.5, between(random, 0.2, 2.0), tilt=0.0)
+    line = _placed(random, canvas, curve, px_per_mm)
+    radius, dark = between(random, 0.7, 2.2) * px_per_mm, scaled(random, 0.1, 1.5)
+    canvas.stroke(line, radius, dark * between(random, 0.05, 0.5), 0.0 if chance(random, 0.6) else between(random, 0.5, 0.9))
+    for k in random.integers(0, len(line), int(random.integers(1, 8))).tolist():
+        half = radius * scaled(random, 0.4, 3.0)
+        canvas.disc(line[k] + random.normal(size=2) * 0.2 * radius, half, radius * between(random, 0.4, 1.05), float(curve.heading[k]),
+                    dark * between(random, 0.2, 1.0), between(random, 0.6, 2.5), between(random, 2.0, 4.0))  # fmt: skip
+
+
 def _residue(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     """Contrast medium left in crumbs along a line or an edge."""
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.2, 2.0))
@@ -290,7 +302,8 @@ _KINDS: tuple[tuple[Callable[[Generator, Canvas, float], None], float], ...] = (
     (_plain_catheter, 0.3),
     (_coil, 0.17),
     (_vessels, 0.38),
-    (_residue, 0.15),
+    (_drained_tube, 0.25),
+    (_residue, 0.18),
     (_echo_probe, 0.1),
     (_segmented_shaft, 0.08),
     (_temperature_probe, 0.15),

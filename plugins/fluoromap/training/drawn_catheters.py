@@ -19,7 +19,6 @@ LABEL_COLUMNS = 6
 
 _STEP_MM = 0.5
 _FRENCH_RADII_MM = 0.67, 0.83, 1.0, 1.0, 1.0, 1.17, 1.17, 1.33
-_SPINE = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +28,6 @@ class Design:
     centres_mm: Array
     lengths_mm: Array
     loop: bool = False
-    dim_between: bool = False
 
 
 def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Design:
@@ -116,7 +114,7 @@ def _course(random: Generator, design: Design, scene_mm: float) -> Curve:
 def _draw_shaft(random: Generator, canvas: Canvas, line: Array, radius: float, metal: float, px_per_mm: float) -> None:
     kind = random.random()
     if kind < 0.1:
-        strength = _SPINE
+        strength = 0.0
     elif kind < 0.82:
         strength = min(metal * between(random, 0.04, 0.7), 0.8)
     else:
@@ -137,6 +135,8 @@ def _draw_electrodes(
     wide = radius * between(random, 0.9, 1.12)
     edge = between(random, 0.4, 1.0)
     labels = np.zeros((len(places), LABEL_COLUMNS))
+    if chance(random, 0.25):
+        _fill_gaps(random, canvas, places, wide, metal, px_per_mm)
     for number, (place, heading, shortening) in enumerate(zip(places, headings, shortenings, strict=True)):
         length = float(design.lengths_mm[number])
         tilted = math.sqrt(max(0.0, 1.0 - shortening * shortening))
@@ -151,6 +151,18 @@ def _draw_electrodes(
         )  # fmt: skip
         labels[number] = place[0], place[1], float(number == 0), strength, half, wide
     return labels
+
+
+def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, metal: float, px_per_mm: float) -> None:
+    """Darken short gaps: wires, glue and blur merge a tip with its ring, or a pair of rings."""
+    share = between(random, 0.3, 0.95)
+    only_tip = chance(random, 0.5)
+    for number in range(1 if only_tip else len(places) - 1):
+        step = places[number + 1] - places[number]
+        length = float(np.linalg.norm(step))
+        if length < 5.0 * px_per_mm and chance(random, 0.8):
+            middle = 0.5 * (places[number] + places[number + 1])
+            canvas.band(middle, math.atan2(step[1], step[0]), 0.25 * length, 0.95 * wide, share * metal, 0.0, False, 0.7)
 
 
 def _draw_sheath(random: Generator, canvas: Canvas, line: Array, radius: float, px_per_mm: float) -> None:

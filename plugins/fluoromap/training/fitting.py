@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from fluoromap.training.network import ElectrodeNetwork, losses
-from fluoromap.training.scenes import Scene
-from fluoromap.training.targets import training_pair
+from fluoromap.training.targets import Prepared, training_pair
 
 BATCH = 16
 STEPS_A_SHARD = 60
@@ -38,7 +37,7 @@ class Progress:
 
 
 def fit(
-    scenes: Iterable[list[Scene]], shard_count: int, seed: int, threads: int, report: Callable[[Progress], None]
+    scenes: Iterable[list[Prepared]], shard_count: int, seed: int, threads: int, report: Callable[[Progress], None]
 ) -> ElectrodeNetwork:
     """Train on the scenes and return the network whose weights are a running mean over the last steps.
 
@@ -53,7 +52,7 @@ def fit(
     optimiser = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=_DECAY)
     random = np.random.default_rng([seed, 1])
     started, step, last_step = time.monotonic(), 0, shard_count * STEPS_A_SHARD
-    kept: deque[list[Scene]] = deque(maxlen=_SHARDS_KEPT)
+    kept: deque[list[Prepared]] = deque(maxlen=_SHARDS_KEPT)
     for number, shard in enumerate(scenes):
         kept.append(shard)
         sums = torch.zeros(len(_WEIGHTS))
@@ -76,7 +75,7 @@ def fit(
     return network.cpu().eval()
 
 
-def _batches(random: np.random.Generator, kept: deque[list[Scene]]) -> Iterator[tuple[Tensor, Tensor]]:
+def _batches(random: np.random.Generator, kept: deque[list[Prepared]]) -> Iterator[tuple[Tensor, Tensor]]:
     """Batches of scenes of the last shards, the newest shard's as often as the others'."""
     for _ in range(STEPS_A_SHARD):
         pairs = []

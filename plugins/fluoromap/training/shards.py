@@ -12,7 +12,8 @@ import numpy as np
 
 from fluoromap.catheters import Catheter
 from fluoromap.training.drawing import Image
-from fluoromap.training.scenes import Scene, make_scene
+from fluoromap.training.scenes import make_scene
+from fluoromap.training.targets import Prepared
 
 SCENES_A_SHARD = 480
 SCENE_PX = 160
@@ -34,10 +35,12 @@ def _start(sources: _Sources) -> None:
     _sources = sources
 
 
-def _make(key: tuple[int, int, int]) -> list[Scene]:
+def _make(key: tuple[int, int, int]) -> list[Prepared]:
     seed, shard, count = key
     return [
-        make_scene(np.random.default_rng([seed, shard, k]), SCENE_PX, _sources.catalogue, _sources.backgrounds)
+        Prepared.of_scene(
+            make_scene(np.random.default_rng([seed, shard, k]), SCENE_PX, _sources.catalogue, _sources.backgrounds)
+        )
         for k in range(count)
     ]
 
@@ -45,11 +48,11 @@ def _make(key: tuple[int, int, int]) -> list[Scene]:
 def shards(
     seed: int, count: int, workers: int, catalogue: Sequence[Catheter] = (), backgrounds: Sequence[Image] = (),
     scenes: int = SCENES_A_SHARD,
-) -> Iterator[list[Scene]]:  # fmt: skip
+) -> Iterator[list[Prepared]]:  # fmt: skip
     """Yield ``count`` lists of scenes, made a few lists ahead by ``workers`` processes."""
     sources = _Sources(tuple(catalogue), tuple(backgrounds))
     with multiprocessing.get_context("spawn").Pool(workers, _start, (sources,)) as pool:
-        waiting: deque[AsyncResult[list[Scene]]] = deque()
+        waiting: deque[AsyncResult[list[Prepared]]] = deque()
         for shard in range(count + workers + _AHEAD):
             if shard < count:
                 waiting.append(pool.apply_async(_make, ((seed, shard, scenes),)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
@@ -20,14 +21,27 @@ _UNKNOWN_WITHIN = 4.0
 _GAIN_SD = 0.15
 
 
-def training_pair(random: Generator, scene: Scene) -> tuple[Image, Image]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """A scene and its normalised picture, (size, size) float32."""
+
+    scene: Scene
+    picture: Image
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> Prepared:
+        """Normalise a scene's picture."""
+        return cls(scene, normalise(scene.pixels.astype(np.float32)))
+
+
+def training_pair(random: Generator, prepared: Prepared) -> tuple[Image, Image]:
     """Return a scene's normalised picture, turned or mirrored at random, and its targets.
 
     Returns
     -------
     picture : (size, size). targets : (5, size / 2, size / 2), see :func:`~fluoromap.training.network.losses`.
     """
-    picture, places = normalise(scene.pixels.astype(np.float32)), scene.electrodes_uv.copy()
+    scene, picture, places = prepared.scene, prepared.picture, prepared.scene.electrodes_uv.copy()
     # The grid starts at pixel 0: mirrored about the last pixel, every other place in a cell occurs as often.
     last = len(picture) - 1
     if chance(random, 0.5):

@@ -127,6 +127,8 @@ class BlobResponse:
         """Probability of electrodes at points of the frame, (n,)."""
         return probability_of_contrast(self.scores_at(points_uv))
 
+    unseen_probability_at = probability_at
+
     def variance_at(self, points_uv: Array) -> Array:
         """Of the places of maxima as strong as the response at these points, (n,) pixels squared."""
         return self._variance(self.scores_at(points_uv))

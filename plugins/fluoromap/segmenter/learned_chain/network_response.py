@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray
@@ -20,8 +21,10 @@ NETWORK_PX_PER_MM = 3.2
 """The scale in the middle of those the network is trained on."""
 
 _TAKEN_AS_IS = 0.8, 1.2
-_LEAST_PROBABILITY = 0.1
+_LEAST_PROBABILITY = 0.03
 _APART_CELLS = 1.2
+_OWN_CELLS = 2.0
+_FLOOR_CELLS = 0.4
 _MOST = 120
 _SMOOTH_MM = 0.52
 _CLEAR_LIKENESS = 12.0
@@ -34,13 +37,14 @@ class NetworkResponse:
     """Answers of the network to one log image.
 
     probability : (rows, columns) float32 of an electrode's centre in each cell. answers : (rows, columns, heads) float32.
-    cell_px, first_px : frame pixels from cell to cell, and where the first lies. variance_gain : see
+    found : electrodes in the whole image. cell_px, first_px : frame pixels from cell to cell, and where the first lies. variance_gain : see
     :class:`~fluoromap.segmenter.learned_chain.weights.Trained`. smooth, reduction, pixel_noise : see
     :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
     """
 
     probability: Image
     answers: Image
+    found: Proposals
     cell_px: float
     first_px: float
     variance_gain: float
@@ -60,10 +64,11 @@ class NetworkResponse:
         small = reduce_by(x, reduction) if reduction > 1 else x
         smooth = gaussian(small, max(_SMOOTH_MM * px_per_mm / reduction, 0.7))
         noise = pixel_noise(small, inside[::reduction, ::reduction])
+        cell_px, first_px = CELL_PX / scale, 0.5 / scale - 0.5
+        found = _peaks(probability, answers, cell_px, first_px, trained.variance_gain)
         return cls(
-            probability, answers, CELL_PX / scale, 0.5 / scale - 0.5, trained.variance_gain, smooth, reduction,
-            max(noise, least_noise),
-        )  # fmt: skip
+            probability, answers, found, cell_px, first_px, trained.variance_gain, smooth, reduction, max(noise, least_noise)
+        )
 
     @property
     def likeness(self) -> Likeness:
@@ -71,21 +76,13 @@ class NetworkResponse:
         return Likeness(np.float32(_CLEAR_LIKENESS) * _highest_near(self.probability), self.cell_px, self.first_px)
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
-        """Cells that no neighbour exceeds, 0.1 or more, each 1.2 cells from all better ones; most probable first."""
-        v, u = np.nonzero((self.probability >= _LEAST_PROBABILITY) & (self.probability >= _highest_near(self.probability)))
-        best = np.argsort(-self.probability[v, u], kind="stable")[: 2 * _MOST]
-        v, u = v[best], u[best]
-        answers = self.answers[v, u].astype(np.float64)
-        offsets = np.clip(answers[:, [_OFFSET_U, _OFFSET_V]], -_MOST_OFFSET_CELLS, _MOST_OFFSET_CELLS)
-        cells = np.stack([u, v], axis=1) + offsets
-        points = cells * self.cell_px + self.first_px
+        """Electrodes found where ``allowed``, most probable first."""
         rows, columns = allowed.shape
-        column, row = np.rint(points).astype(np.int64).T
+        column, row = np.rint(self.found.points_uv).astype(np.int64).T
         within = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
         within &= allowed[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        kept = np.flatnonzero(within & _apart(cells))[:_MOST]
-        variance = self._variance(answers[kept, _LOG_VARIANCE])
-        return Proposals(points[kept], self.probability[v, u][kept].astype(np.float64), variance[:, None, None] * np.eye(2))
+        kept = np.flatnonzero(within)[:_MOST]
+        return Proposals(self.found.points_uv[kept], self.found.probability[kept], self.found.covariance_px2[kept])
 
     def probability_at(self, points_uv: Array) -> Array:
         """The highest probability of the cell of each point and its eight neighbours, (n,)."""
@@ -93,16 +90,39 @@ class NetworkResponse:
         near: Array = self.probability[v, u].astype(np.float64)
         return near
 
-    scores_at = probability_at
+    def unseen_probability_at(self, points_uv: Array) -> Array:
+        """The same; 0 within two cells of an electrode that was found."""
+        probability = self.probability_at(points_uv)
+        if len(self.found) and len(points_uv):
+            away, _ = cKDTree(self.found.points_uv).query(points_uv)
+            probability[away < _OWN_CELLS * self.cell_px] = 0.0
+        return probability
+
+    def scores_at(self, points_uv: Array) -> Array:
+        """Probability of the electrode found nearest to each point, each counted for one point only, (n,).
+
+        Points without one have the probability of their own cell.
+        """
+        rows, columns = self.probability.shape
+        u, v = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64).T
+        scores: Array = self.probability[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)].astype(np.float64)
+        if not len(self.found):
+            return scores
+        away = np.linalg.norm(points_uv[:, None] - self.found.points_uv[None], axis=2)
+        near = np.flatnonzero(away.min(axis=0) < _OWN_CELLS * self.cell_px)
+        points, found = linear_sum_assignment(np.minimum(away[:, near], _OWN_CELLS * self.cell_px))
+        matched = away[points, near[found]] < _OWN_CELLS * self.cell_px
+        taken = np.zeros(len(scores), np.bool_)
+        taken[points[matched]] = True
+        shared = ~taken & (away[:, near].min(axis=1, initial=np.inf) < _OWN_CELLS * self.cell_px)
+        scores[shared] = 0.0
+        scores[points[matched]] = self.found.probability[near[found[matched]]]
+        return scores
 
     def variance_at(self, points_uv: Array) -> Array:
         """Of the places of electrodes at these points, (n,) pixels squared."""
         v, u = self._best_cells(points_uv)
-        return self._variance(self.answers[v, u, _LOG_VARIANCE].astype(np.float64))
-
-    def _variance(self, log_variance: Array) -> Array:
-        variance: Array = self.variance_gain * np.exp(np.clip(log_variance, -8.0, 4.0)) * self.cell_px**2
-        return variance
+        return _variance_px2(self.answers[v, u, _LOG_VARIANCE].astype(np.float64), self.variance_gain, self.cell_px)
 
     def _best_cells(self, points_uv: Array) -> tuple[Array, Array]:
         rows, columns = self.probability.shape
@@ -113,6 +133,27 @@ class NetworkResponse:
         best = self.probability[v, u].reshape(len(middle), 9).argmax(axis=1)
         one = np.arange(len(middle))
         return v.reshape(-1, 9)[one, best], u.reshape(-1, 9)[one, best]
+
+
+def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, variance_gain: float) -> Proposals:
+    """Cells that no neighbour exceeds, 0.03 or more, each 1.2 cells from all better ones; most probable first."""
+    v, u = np.nonzero((probability >= _LEAST_PROBABILITY) & (probability >= _highest_near(probability)))
+    best = np.argsort(-probability[v, u], kind="stable")[: 2 * _MOST]
+    v, u = v[best], u[best]
+    said = answers[v, u].astype(np.float64)
+    offsets = np.clip(said[:, [_OFFSET_U, _OFFSET_V]], -_MOST_OFFSET_CELLS, _MOST_OFFSET_CELLS)
+    cells = np.stack([u, v], axis=1) + offsets
+    kept = np.flatnonzero(_apart(cells))
+    variance = _variance_px2(said[kept, _LOG_VARIANCE], variance_gain, cell_px)
+    return Proposals(
+        cells[kept] * cell_px + first_px, probability[v, u][kept].astype(np.float64), variance[:, None, None] * np.eye(2)
+    )
+
+
+def _variance_px2(log_variance: Array, gain: float, cell_px: float) -> Array:
+    """What the network states, and a floor: real electrodes are not drawn by the rules it learned from."""
+    variance: Array = (gain * np.exp(np.clip(log_variance, -8.0, 4.0)) + _FLOOR_CELLS**2) * cell_px**2
+    return variance
 
 
 def network_scale(px_per_mm: float) -> float:

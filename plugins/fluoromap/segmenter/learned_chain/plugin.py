@@ -19,12 +19,12 @@ from fluoromap.segmenter.seen_part import as_seen
 from fluoromap.segmenter.warm_run import compile_on_drawn_run
 
 _IN_A_RUN = Acceptance(
-    least_clearness=0.1, carried_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.5, seen_score=0.3,
-    least_seen=0.75,
+    least_clearness=0.1, carried_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.35, seen_score=0.03,
+    least_seen=0.75, unseen_evidence=-1.5, strict=True,
 )  # fmt: skip
 _ALONE = Acceptance(
-    least_clearness=0.3, carried_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.7, seen_score=0.5,
-    least_seen=0.75,
+    least_clearness=0.3, carried_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.7, seen_score=0.1,
+    least_seen=0.75, unseen_evidence=-1.5, strict=True,
 )  # fmt: skip
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 

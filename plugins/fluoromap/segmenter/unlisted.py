@@ -1,0 +1,90 @@
+"""Rows of electrodes that the catalogue does not explain: a longer catheter must not pass for a shorter one of the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fluoromap.catheters import Catheter
+from fluoromap.contracts import Array, Chain
+
+SURE = 0.5
+"""Proposals of this probability have to be explained."""
+
+_OWN_MM = 1.2
+_BESIDE_MM = 1.0
+_ROW_CONTINUES = 2
+_LEAST_COSINE = 0.88
+_LONGEST_STEP = 1.25
+
+
+def unexplained_between(chain: Chain, points_uv: Array, px_per_mm: float) -> int:
+    """Count points on the way from the chain's first electrode to its last that are none of its electrodes.
+
+    Parameters
+    ----------
+    chain : Chain
+    points_uv : (n, 2)
+        Sure proposals that no other chain has, pixels.
+    """
+    free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
+    count = 0
+    for point in free:
+        for start, end in zip(chain.pixels_uv[:-1], chain.pixels_uv[1:], strict=True):
+            way = end - start
+            length = max(float(np.linalg.norm(way)), 1e-9)
+            along = float((point - start) @ way) / length
+            beside = abs(float(way[0] * (point - start)[1] - way[1] * (point - start)[0])) / length
+            if 0.0 < along < length and beside < _BESIDE_MM * px_per_mm:
+                count += 1
+                break
+    return count
+
+
+def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
+    """Whether two or more points go on in the chain's line beyond one of its ends, no farther apart than its electrodes are.
+
+    Parameters
+    ----------
+    chain : Chain
+        All electrodes of the catheter.
+    points_uv : (n, 2)
+        Sure proposals of the image, pixels; its own electrodes and those of other chains may be among them.
+    catheter : Catheter
+    """
+    free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
+    seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1)
+    step = _LONGEST_STEP * float(np.max(catheter.spacing_mm)) * float(seen.sum()) / float(np.sum(catheter.spacing_mm))
+    for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
+        at, before, left = row[-1], row[-3] if len(row) > 2 else row[-2], free
+        count = 0
+        while len(left):
+            way = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)
+            moves = left - at
+            lengths = np.maximum(np.linalg.norm(moves, axis=1), 1e-9)
+            fits = (lengths <= step) & (moves @ way >= _LEAST_COSINE * lengths)
+            if not fits.any():
+                break
+            nearest = int(np.argmin(np.where(fits, lengths, np.inf)))
+            before, at = at, left[nearest]
+            left = np.delete(left, nearest, axis=0)
+            count += 1
+        if count >= _ROW_CONTINUES:
+            return True
+    return False
+
+
+def not_on(points_uv: Array, chains: Sequence[Chain], px_per_mm: float) -> Array:
+    """Return the points that are no electrode of these chains, (k, 2)."""
+    if not chains:
+        return points_uv
+    taken = np.concatenate([chain.pixels_uv for chain in chains])
+    return points_uv[_apart(points_uv, taken, _OWN_MM * px_per_mm)]
+
+
+def _apart(points_uv: Array, taken_uv: Array, distance: float) -> Array:
+    if not len(points_uv):
+        return np.zeros(0, np.bool_)
+    away: Array = np.linalg.norm(points_uv[:, None] - taken_uv[None], axis=2).min(axis=1) > distance
+    return away
