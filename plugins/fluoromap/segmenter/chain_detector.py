@@ -12,7 +12,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.linking import Family, Linked, Shafts, chain_score, evidence, families, link
+from fluoromap.segmenter.linking import Family, Linked, Shafts, Trust, chain_score, evidence, families, link
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.placing import place_chains, widened_covariance
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
@@ -40,7 +40,8 @@ class Acceptance:
     those of the catalogue is reported from here on. least_score : of the median of a chain's scores. seen_score, least_seen :
     at least this share of a chain's electrodes has this score. unseen_evidence : an electrode that was not proposed is predicted
     only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is not accepted as a
-    catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
+    catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line. trust : see
+    :class:`~fluoromap.segmenter.linking.Trust`.
     """
 
     least_clearness: float
@@ -52,6 +53,7 @@ class Acceptance:
     least_seen: float = 0.0
     unseen_evidence: float = 0.0
     strict: bool = False
+    trust: Trust = Trust()
 
     def accepts(self, scores: Array) -> bool:
         """Whether a chain's scores are enough, (electrodes,)."""
@@ -86,7 +88,7 @@ class ChainDetector:
         seen = self.evidence(x)
         electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
         proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
-        points, weights, variance = proposed.points_uv, evidence(proposed.probability), proposed.variance_px2
+        points, weights, variance = proposed.points_uv, evidence(proposed.probability, self.acceptance.trust), proposed.variance_px2
         kinds = families(self.catalogue)
         shafts = self._shafts(seen)
         sound = len(points)
@@ -95,7 +97,7 @@ class ChainDetector:
 
             def dark(places: Array) -> Array:
                 probability = seen.unseen_probability_at(places)
-                return np.where(self._in_field(places) & (probability > 0), evidence(probability), -np.inf)
+                return np.where(self._in_field(places) & (probability > 0), evidence(probability, self.acceptance.trust), -np.inf)
 
             more = complete(
                 points, weights, variance, dark, self.acceptance.unseen_evidence, kinds, self.px_per_mm
@@ -182,7 +184,7 @@ class ChainDetector:
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         if not self._in_field(points).all():
             return None
-        scores, weights, variance = seen.scores_at(points), evidence(seen.probability_at(points)), seen.variance_at(points)
+        scores, weights, variance = seen.scores_at(points), evidence(seen.probability_at(points), self.acceptance.trust), seen.variance_at(points)
         for values in (scores, weights, variance) if hidden.any() else ():
             values[hidden] = np.median(values[~hidden])
         score = chain_score(points, weights, variance, self._shafts(seen), family)
@@ -201,7 +203,7 @@ class ChainDetector:
         points = proposed.points_uv[free]
         kinds = families(self.catalogue)
         shafts = self._shafts(seen)
-        linked = link(points, evidence(proposed.probability[free]), proposed.variance_px2[free], shafts, kinds)
+        linked = link(points, evidence(proposed.probability[free], self.acceptance.trust), proposed.variance_px2[free], shafts, kinds)
         placed = place_chains(x, points, linked, shafts, kinds, seen.pixel_noise)
         return any(one.clearness >= self.acceptance.extra_clearness for one in placed)
 

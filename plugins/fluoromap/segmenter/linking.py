@@ -78,9 +78,21 @@ def families(catalogue: Catalogue) -> tuple[Family, ...]:
     return tuple(Family(tuple(member.name for member in group), group[0]) for group in groups)
 
 
-def evidence(probability: Array) -> Array:
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What the log-odds of one candidate are worth beside those of its neighbours in a chain.
+
+    share : 1 where candidates were judged one by one; less where the proposer saw the neighbours too, so that its errors go
+    together. chain : added for each candidate, because candidates in a chain are electrodes more often than others.
+    """
+
+    share: float = 1.0
+    chain: float = 0.0
+
+
+def evidence(probability: Array, trust: Trust = Trust()) -> Array:  # noqa: B008 -- a frozen value
     """What a candidate adds to a chain's score: its log-odds, 0 for an even chance, from -1 to 2.2."""
-    return np.clip(log_odds(probability), _EVIDENCE_LEAST, _EVIDENCE_MOST)
+    return np.clip(trust.chain + trust.share * log_odds(probability), _EVIDENCE_LEAST, _EVIDENCE_MOST)
 
 
 def link(

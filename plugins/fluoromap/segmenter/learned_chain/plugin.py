@@ -13,18 +13,20 @@ from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.linking import Trust
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run
 from fluoromap.segmenter.seen_part import as_seen
 from fluoromap.segmenter.warm_run import compile_on_drawn_run
 
+_TRUST = Trust(share=0.25, chain=0.6)
 _IN_A_RUN = Acceptance(
-    least_clearness=0.1, carried_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.35, seen_score=0.03,
-    least_seen=0.75, unseen_evidence=-1.5, strict=True,
+    least_clearness=0.1, carried_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.2, seen_score=0.02,
+    least_seen=0.75, unseen_evidence=-1.5, strict=True, trust=_TRUST,
 )  # fmt: skip
 _ALONE = Acceptance(
-    least_clearness=0.3, carried_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.7, seen_score=0.1,
-    least_seen=0.75, unseen_evidence=-1.5, strict=True,
+    least_clearness=0.3, carried_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.6, seen_score=0.1,
+    least_seen=0.75, unseen_evidence=-1.5, strict=True, trust=_TRUST,
 )  # fmt: skip
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
