@@ -290,7 +290,7 @@ def _disk_peers(x: Image) -> dict[str, Work]:
 
         peers["SimpleITK"] = by_sitk
     if cv2 is not None:
-        large, small = disk(14).astype(np.uint8), disk(2).astype(np.uint8)
+        large, small = disk(14), disk(2)  # type: ignore[no-untyped-call]
 
         def by_cv2() -> object:
             return cv2.morphologyEx(cv2.morphologyEx(x, cv2.MORPH_BLACKHAT, large), cv2.MORPH_OPEN, small)

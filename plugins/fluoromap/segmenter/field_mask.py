@@ -104,7 +104,8 @@ def inside_shutter(shutter: Shutter, u: Array, v: Array) -> BoolArray:
         inside &= (u - centre_u) ** 2 + (v - centre_v) ** 2 < radius**2
     if shutter.polygon is not None and len(shutter.polygon) >= 3:
         places = np.stack([u.ravel(), v.ravel()], axis=1)
-        inside &= points_in_poly(places, np.asarray(shutter.polygon, dtype=np.float64)).reshape(u.shape)
+        corners = np.asarray(shutter.polygon, dtype=np.float64)
+        inside &= points_in_poly(places, corners).reshape(u.shape)  # type: ignore[no-untyped-call]
     return inside
 
 

@@ -53,7 +53,7 @@ def otsu_threshold(x: Image, inside: BoolArray) -> float:
         return float(upper_edges[0])
     # Empty bins at either end would make the class means of scikit-image undefined.
     occupied = slice(levels[0], levels[-1] + 1)
-    return float(threshold_otsu(hist=(counts[occupied], upper_edges[occupied])))
+    return float(threshold_otsu(hist=(counts[occupied], upper_edges[occupied])))  # type: ignore[no-untyped-call]
 
 
 def find_blobs(x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: float, largest_px: float) -> Blobs:
@@ -72,7 +72,7 @@ def find_blobs(x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: 
     """
     threshold = max(otsu_threshold(x, inside), float(np.finfo(np.float32).tiny))
     bright = (x >= np.float32(threshold)) & inside
-    foreground = np.count_nonzero(bright) / max(np.count_nonzero(inside), 1)
+    foreground = int(np.count_nonzero(bright)) / max(int(np.count_nonzero(inside)), 1)
     if foreground > MOST_FOREGROUND:
         return Blobs(np.zeros((0, 2)), np.zeros(0), foreground)
     areas, centroids = components(bright)
@@ -91,7 +91,7 @@ def components(bright: BoolArray) -> tuple[Array, Array]:
     areas_px : (n,)
     centroids_uv : (n, 2) pixels
     """
-    labels = label(bright, connectivity=2).reshape(-1)
+    labels = label(bright, connectivity=2).reshape(-1)  # type: ignore[no-untyped-call]
     pixels = np.flatnonzero(labels)
     component = labels[pixels] - 1
     v, u = np.divmod(pixels, bright.shape[1])
