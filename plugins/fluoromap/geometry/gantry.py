@@ -1,4 +1,4 @@
-"""The C-arm's gantry and the camera that belongs to it."""
+"""The position of a C-arm's gantry, and the camera that belongs to it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEAST_SOURCE_MM = 200.0
 
 @dataclass(frozen=True, slots=True)
 class Gantry:
-    """Where source and detector stood for a run.
+    """Position of source and detector during a run.
 
     Parameters
     ----------
@@ -37,12 +37,13 @@ class Gantry:
         Size of the stored image.
     image_axes : tuple
         Integer matrix that takes (u, v) offsets of the upright image, seen from the detector, to offsets of the stored
-        image; what FieldOfViewRotation, FieldOfViewHorizontalFlip or PatientOrientation tell. The identity by default.
+        image. It follows from FieldOfViewRotation, FieldOfViewHorizontalFlip or PatientOrientation. The identity by
+        default.
 
     Raises
     ------
     ValueError
-        When a number is outside what a C-arm can do.
+        When a number is outside the range of a C-arm.
     """
 
     primary_deg: float
@@ -106,12 +107,11 @@ def view_axes(primary_deg: float, secondary_deg: float) -> Array:
 
 @functools.lru_cache(maxsize=256)
 def camera_from_gantry(gantry: Gantry) -> Camera:
-    """Perspective camera of a gantry position, for stored pixels; the same object for the same position.
+    """Return the perspective camera of a gantry position, for stored pixels.
 
-    The displayed image looks at the patient from the detector: a frontal view shows the patient's left on the image's
-    right. With a the primary and b the secondary angle, n = (sin a cos b, -cos a cos b, sin b) points from the
-    isocentre to the detector, e_u = (cos a, sin a, 0), e_v = (sin a sin b, -cos a sin b, -cos b); (e_u, e_v, n) is
-    left-handed. DICOM PS3.3 C.8.7.5.1.2; the isocentre projects to the middle of the field, PS3.17 FFF.2.1.5.2.
+    The same position returns the same object. The axes are those of :func:`view_axes`; the isocentre projects to the middle
+    of the
+    field (DICOM PS3.17 FFF.2.1.5.2).
     """
     axes = view_axes(gantry.primary_deg, gantry.secondary_deg)
     # Millimetres on the detector are turned like the image, then converted to stored pixels.
