@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +16,7 @@ from fluoromap.drawing.raster import rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_time, is_outlier
 from fluoromap.drawing.wall import bands_shown, colour_table, outline_edges, runs
 from fluoromap.fuser.surface import face_normals
+from fluoromap.geometry import view_axes
 
 Direction = tuple[str, float, float, tuple[str, str, str, str]]
 
@@ -90,11 +90,8 @@ class _Panel:
     """One direction: an orthographic camera whose image axes are those of a C-arm at the same angles."""
 
     def __init__(self, primary_deg: float, secondary_deg: float, middle_mm: Array, px_per_mm: float) -> None:
-        a, b = math.radians(primary_deg), math.radians(secondary_deg)
-        e_u = (math.cos(a), math.sin(a), 0.0)
-        e_v = (math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b))
-        self._axes = np.array([e_u, e_v])
-        self._to_viewer = np.array([math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)])
+        axes = view_axes(primary_deg, secondary_deg)
+        self._axes, self._to_viewer = axes[:2], axes[2]
         self._middle = middle_mm
         self._px_per_mm = px_per_mm
 
