@@ -1,8 +1,8 @@
 """How well electrodes are found in real frames: ``python benchmarks/real_frames.py DIR [options]``; ``--help`` lists them.
 
 DIR holds pictures (PNG, JPEG, TIFF) and DICOM files, and label files ``*_labels.csv`` with the columns ``file``, ``catheter``,
-``electrode`` (1 is the tip), ``u_px``, ``v_px`` (the centre of the first pixel is (0, 0)). The files of one label file, in the order
-of their names, are one run. DICOM files without a label file are runs without catheters: all that is found in them is false.
+``electrode`` (1 is the tip), ``u_px``, ``v_px`` (the centre of the first pixel is (0, 0)). The files of one label file, in the
+order of their names, are one run. DICOM files without a label file are runs without catheters: all that is found in them is false.
 Beside a label file, ``*_set.json`` may describe the run: ``{"px_per_mm": 3.1, "frame_ms": 66.7, "logarithmic": false, "catheters":
 [{"name": "cs", "type": "decapolar-2-5-2"}]}``; the catheters' names are those of the label file.
 
@@ -63,7 +63,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--segmenter", nargs="+", default=["catheter-chain", "learned-chain"])
     parser.add_argument("--weights", help="weights file of learned-chain")
-    parser.add_argument("--px-per-mm", type=float, help="at the isocentre; else from set file or DICOM header, else 3.4")
+    parser.add_argument(
+        "--px-per-mm", type=float, help="at the isocentre; else from set file or DICOM header, else 3.4"
+    )
     parser.add_argument("--catheter", action="append", default=[], metavar="NAME=TYPE", help=", ".join(CATHETER_TYPES))
     parser.add_argument("--frames", type=int, default=1000, help="at most so many of each run")
     parser.add_argument("--single", action="store_true", help="every frame on its own, as stills are")
@@ -181,7 +183,9 @@ def _drawn(pixels: NDArray[np.generic], chains: tuple[Chain, ...], labels: dict[
     grey = pixels.astype(np.float64)
     low, high = np.percentile(grey, [0.5, 99.5])
     level = (np.clip((grey - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
-    picture = Image.fromarray(level).resize((2 * level.shape[1], 2 * level.shape[0]), Image.Resampling.BICUBIC).convert("RGB")
+    picture = (
+        Image.fromarray(level).resize((2 * level.shape[1], 2 * level.shape[0]), Image.Resampling.BICUBIC).convert("RGB")
+    )
     pen = ImageDraw.Draw(picture)
     for electrodes in labels.values():
         for u, v in (2 * uv + 0.5 for uv in electrodes.values()):

@@ -48,7 +48,9 @@ def main(arguments: Sequence[str]) -> None:
         "scenes": given.shards * SCENES_A_SHARD,
         "samples": given.shards * STEPS_A_SHARD * BATCH,
         "parameters": sum(parameter.numel() for parameter in trained.parameters()),
-        "pictures": f"synthetic scenes and {len(backgrounds)} frames of a lab" if backgrounds else "synthetic scenes only",
+        "pictures": f"synthetic scenes and {len(backgrounds)} frames of a lab"
+        if backgrounds
+        else "synthetic scenes only",
         "validation": validated.figures(),
     }
     write_weights(given.out, weights, validated.calibration(), facts)
@@ -60,9 +62,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, default=SHIPPED, help="weights file to write; the package's own by default")
     parser.add_argument("--seed", type=int, default=1, help="same seed, same weights on the same kind of processor")
     parser.add_argument("--shards", type=int, default=SHARDS, help=f"lists of {SCENES_A_SHARD} scenes to train on")
-    parser.add_argument("--threads", type=int, default=1, help="of the fit; another number gives slightly other weights")
-    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="processes that draw scenes")
-    parser.add_argument("--backgrounds", type=Path, help="folder of a lab's own frames without catheters, PNG, TIFF or JPEG")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="of the fit; another number gives slightly other weights"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="processes that draw scenes"
+    )
+    parser.add_argument(
+        "--backgrounds", type=Path, help="folder of a lab's own frames without catheters, PNG, TIFF or JPEG"
+    )
     parser.add_argument("--catalogue", type=Path, help="JSON list of a lab's own catheters, as in a study's catheters")
     return parser
 

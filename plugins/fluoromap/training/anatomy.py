@@ -40,7 +40,9 @@ def anatomy(random: Generator, size: int, px_per_mm: float) -> Image:
 
 def _draw_ribs(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     for _ in range(int(random.integers(1, 6))):
-        curve = random_curve(random, between(random, 0.8, 2.0) * canvas.size / px_per_mm, 2.0, 0.6, tilt=0.0, tilt_change=0.1)
+        curve = random_curve(
+            random, between(random, 0.8, 2.0) * canvas.size / px_per_mm, 2.0, 0.6, tilt=0.0, tilt_change=0.1
+        )
         line = curve.points_mm * px_per_mm
         line += random.uniform(0.0, canvas.size, 2) - line[len(line) // 2]
         half, dark = between(random, 3.0, 8.0) * px_per_mm, between(random, 0.03, 0.22)
@@ -97,7 +99,9 @@ def read_backgrounds(folder: Path) -> tuple[Image, ...]:
     FileNotFoundError
         When the folder has no such file.
     """
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in {".png", ".tif", ".tiff", ".jpg", ".jpeg"})
+    files = sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in {".png", ".tif", ".tiff", ".jpg", ".jpeg"}
+    )
     if not files:
         raise FileNotFoundError(f"{folder} has no PNG, TIFF or JPEG file: put electrode-free frames there")
     return tuple(_attenuation(np.asarray(PillowImage.open(path))) for path in files)

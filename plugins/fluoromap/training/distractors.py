@@ -35,7 +35,9 @@ def _placed(random: Generator, canvas: Canvas, curve: Curve, px_per_mm: float) -
     return placed
 
 
-def _long_line(random: Generator, canvas: Canvas, px_per_mm: float, bend: float, step_mm: float = _STEP_MM) -> tuple[Array, Array]:
+def _long_line(
+    random: Generator, canvas: Canvas, px_per_mm: float, bend: float, step_mm: float = _STEP_MM
+) -> tuple[Array, Array]:
     """Points (pixels) and headings of a line across the scene, about in the image plane."""
     length = between(random, 0.6, 2.2) * canvas.size / px_per_mm
     curve = random_curve(random, length, step_mm, bend, tilt=0.0, tilt_change=between(random, 0.0, 0.5))
@@ -74,7 +76,16 @@ def _ecg_electrode(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
         angle = float(heading[0]) + random.normal() * 0.5
         toward = np.array([math.cos(angle), math.sin(angle)])
         half = between(random, 2.0, 6.0) * px_per_mm
-        canvas.band(at - toward * (wide + half), angle, half, between(random, 0.6, 1.8) * px_per_mm, scaled(random, 0.2, 1.0), 0.0, False, 0.7)
+        canvas.band(
+            at - toward * (wide + half),
+            angle,
+            half,
+            between(random, 0.6, 1.8) * px_per_mm,
+            scaled(random, 0.2, 1.0),
+            0.0,
+            False,
+            0.7,
+        )
         if chance(random, 0.5):
             canvas.band(at - toward * (wide + 2.1 * half), angle, between(random, 0.8, 2.0) * px_per_mm,
                         between(random, 0.8, 2.2) * px_per_mm, scaled(random, 0.2, 1.0), 0.0, False, 0.7)  # fmt: skip
@@ -96,14 +107,28 @@ def _sheath(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     canvas.stroke(line, wide, scaled(random, 0.05, 0.5), between(random, 0.5, 0.88))
     if chance(random, 0.5):
         k = int(random.integers(len(line)))
-        canvas.band(line[k], float(heading[k]), between(random, 0.3, 0.9) * px_per_mm, wide, scaled(random, 0.1, 0.9), 0.8, False, 0.7)
+        canvas.band(
+            line[k],
+            float(heading[k]),
+            between(random, 0.3, 0.9) * px_per_mm,
+            wide,
+            scaled(random, 0.1, 0.9),
+            0.8,
+            False,
+            0.7,
+        )
 
 
 def _plain_catheter(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     """An angiography catheter or a swan-ganz: a shaft that ends without electrodes, hooked or curled."""
     curve = random_curve(random, between(random, 40.0, 120.0), 0.5, between(random, 0.8, 4.0), tilt_change=0.3)
     line = _placed(random, canvas, curve, px_per_mm)
-    canvas.stroke(line, between(random, 0.6, 1.3) * px_per_mm, scaled(random, 0.1, 0.9), 0.0 if chance(random, 0.4) else between(random, 0.4, 0.8))
+    canvas.stroke(
+        line,
+        between(random, 0.6, 1.3) * px_per_mm,
+        scaled(random, 0.1, 0.9),
+        0.0 if chance(random, 0.4) else between(random, 0.4, 0.8),
+    )
     if chance(random, 0.3):
         canvas.band(line[0], float(curve.heading[0]), between(random, 0.3, 1.5) * px_per_mm, between(random, 0.6, 1.3) * px_per_mm,
                     scaled(random, 0.1, 1.0), 0.0, True, 0.7)  # fmt: skip
@@ -130,7 +155,14 @@ def _vessels(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _branch(
-    random: Generator, canvas: Canvas, px_per_mm: float, start: Array, angle: float, radius_mm: float, dark: float, left: int
+    random: Generator,
+    canvas: Canvas,
+    px_per_mm: float,
+    start: Array,
+    angle: float,
+    radius_mm: float,
+    dark: float,
+    left: int,
 ) -> None:
     curve = random_curve(random, between(random, 12.0, 45.0), 0.5, between(random, 0.3, 2.5), tilt=0.0)
     turn = angle - float(curve.heading[0])
@@ -166,11 +198,22 @@ def _drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     curve = random_curve(random, between(random, 15.0, 70.0), 0.5, between(random, 0.2, 2.0), tilt=0.0)
     line = _placed(random, canvas, curve, px_per_mm)
     radius, dark = between(random, 0.7, 2.2) * px_per_mm, scaled(random, 0.1, 1.5)
-    canvas.stroke(line, radius, dark * between(random, 0.05, 0.5), 0.0 if chance(random, 0.6) else between(random, 0.5, 0.9))
+    canvas.stroke(
+        line, radius, dark * between(random, 0.05, 0.5), 0.0 if chance(random, 0.6) else between(random, 0.5, 0.9)
+    )
     for k in random.integers(0, len(line), int(random.integers(1, 8))).tolist():
         half = radius * scaled(random, 0.4, 3.0)
-        canvas.disc(line[k] + random.normal(size=2) * 0.2 * radius, half, radius * between(random, 0.4, 1.05), float(curve.heading[k]),
-                    dark * between(random, 0.2, 1.0), between(random, 0.6, 2.5), between(random, 2.0, 4.0))  # fmt: skip
+        place = line[k] + random.normal(size=2) * 0.2 * radius
+        wide, plug = radius * between(random, 0.4, 1.05), dark * between(random, 0.2, 1.0)
+        canvas.disc(
+            place,
+            half,
+            wide,
+            float(curve.heading[k]),
+            plug,
+            between(random, 0.6, 2.5),
+            between(random, 2.0, 4.0),
+        )
 
 
 def _residue(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
@@ -181,7 +224,15 @@ def _residue(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     for k in random.integers(0, len(line), int(random.integers(5, 40))).tolist():
         at = line[k] + _square(heading[k : k + 1])[0] * (random.normal() * wide)
         size = scaled(random, 0.2, 1.2) * px_per_mm
-        canvas.disc(at, size * scaled(random, 0.7, 2.0), size, float(heading[k]), dark * between(random, 0.3, 1.0), between(random, 0.8, 2.0), 2.0)
+        canvas.disc(
+            at,
+            size * scaled(random, 0.7, 2.0),
+            size,
+            float(heading[k]),
+            dark * between(random, 0.3, 1.0),
+            between(random, 0.8, 2.0),
+            2.0,
+        )
 
 
 def _echo_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
@@ -218,7 +269,16 @@ def _segments(random: Generator, canvas: Canvas, px_per_mm: float, start: Array,
     hollow = 0.0 if chance(random, 0.6) else between(random, 0.6, 0.9)
     for arc in np.arange(0.0, 0.5 * (len(line) - 1), pitch):
         k = int(2.0 * arc)
-        canvas.band(line[k], float(curve.heading[k]) + turn, 0.5 * long * px_per_mm, wide, dark * between(random, 0.8, 1.2), hollow, False, 0.8)
+        canvas.band(
+            line[k],
+            float(curve.heading[k]) + turn,
+            0.5 * long * px_per_mm,
+            wide,
+            dark * between(random, 0.8, 1.2),
+            hollow,
+            False,
+            0.8,
+        )
 
 
 def _temperature_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
@@ -236,12 +296,18 @@ def _temperature_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> N
 def _clip(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     """Surgical clips and staples: short dense strokes, alone, as a V or in a row."""
     at, angle = random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3)
-    length, radius, dark = between(random, 1.5, 7.0) * px_per_mm, scaled(random, 0.15, 0.6) * px_per_mm, scaled(random, 0.2, 1.6)
+    length, radius, dark = (
+        between(random, 1.5, 7.0) * px_per_mm,
+        scaled(random, 0.15, 0.6) * px_per_mm,
+        scaled(random, 0.2, 1.6),
+    )
     spread = between(random, 0.05, 0.8)
     step = random.normal(size=2) * 6.0 * px_per_mm
     for number in range(1 if chance(random, 0.6) else int(random.integers(2, 6))):
         place = at + number * step + random.normal(size=2) * 1.5 * px_per_mm
-        ends = [place + length * np.array([math.cos(angle + side), math.sin(angle + side)]) for side in (-spread, spread)]
+        ends = [
+            place + length * np.array([math.cos(angle + side), math.sin(angle + side)]) for side in (-spread, spread)
+        ]
         canvas.stroke(np.array([ends[0], place, ends[1]] if chance(random, 0.5) else [place, ends[0]]), radius, dark)
 
 
@@ -259,7 +325,11 @@ def _sternal_wire(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     for number in range(int(random.integers(1, 4))):
         angle = np.linspace(0.0, between(random, 4.0, 7.5), 40) + between(random, 0.0, 6.3)
         wide, high = between(random, 2.0, 10.0) * px_per_mm, between(random, 1.0, 9.0) * px_per_mm
-        loop = at + [random.normal() * 2.0, number * 14.0 * px_per_mm] + np.stack([wide * np.cos(angle), high * np.sin(angle)], axis=1)
+        loop = (
+            at
+            + np.array([random.normal() * 2.0, number * 14.0 * px_per_mm])
+            + np.stack([wide * np.cos(angle), high * np.sin(angle)], axis=1)
+        )
         canvas.stroke(loop, radius, dark)
         if chance(random, 0.7):
             canvas.stroke(np.array([loop[0], loop[0] + random.normal(size=2) * 3.0 * px_per_mm]), 1.8 * radius, dark)
@@ -279,7 +349,9 @@ def _valve_ring(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     canvas.stroke(ring, scaled(random, 0.15, 1.0) * px_per_mm, dark)
     if chance(random, 0.4):
         for k in range(0, 72, int(random.integers(6, 24))):
-            canvas.stroke(np.array([ring[k], ring[k] + axis * (between(random, 3.0, 12.0) * px_per_mm)]), 0.2 * px_per_mm, dark)
+            canvas.stroke(
+                np.array([ring[k], ring[k] + axis * (between(random, 3.0, 12.0) * px_per_mm)]), 0.2 * px_per_mm, dark
+            )
 
 
 def _device(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
@@ -290,8 +362,9 @@ def _device(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     dark = between(random, 0.3, 1.5)
     canvas.disc(at, size, size * between(random, 0.6, 1.0), between(random, 0.0, 6.3), dark, 1.0, 3.0)
     for _ in range(int(random.integers(0, 10))):
-        canvas.disc(at + random.normal(size=2) * 0.4 * size, scaled(random, 0.5, 5.0) * px_per_mm, scaled(random, 0.5, 5.0) * px_per_mm,
-                    between(random, 0.0, 6.3), between(random, -0.6, 0.6) * dark, 0.8, 5.0)  # fmt: skip
+        place = at + random.normal(size=2) * 0.4 * size
+        half_u, half_v = (scaled(random, 0.5, 5.0) * px_per_mm for _ in range(2))
+        canvas.disc(place, half_u, half_v, between(random, 0.0, 6.3), between(random, -0.6, 0.6) * dark, 0.8, 5.0)
 
 
 _KINDS: tuple[tuple[Callable[[Generator, Canvas, float], None], float], ...] = (

@@ -44,7 +44,12 @@ class Canvas:
         return self.depth.shape[0]
 
     def stroke(
-        self, points_uv: Array, radius_px: Array | float, strength: Array | float, hollow: float = 0.0, flat: bool = False
+        self,
+        points_uv: Array,
+        radius_px: Array | float,
+        strength: Array | float,
+        hollow: float = 0.0,
+        flat: bool = False,
     ) -> None:
         """Add a tube along a polyline.
 
@@ -78,7 +83,9 @@ class Canvas:
             edge_px,
         )  # fmt: skip
 
-    def disc(self, at_uv: Array, half_u: float, half_v: float, angle: float, strength: float, edge_px: float, power: float) -> None:
+    def disc(
+        self, at_uv: Array, half_u: float, half_v: float, angle: float, strength: float, edge_px: float, power: float
+    ) -> None:
         """Add a filled ellipse; ``power`` 2 is an ellipse, more of it a box with rounded corners."""
         _disc(self.depth, float(at_uv[0]), float(at_uv[1]), half_u, half_v, angle, strength, edge_px, power)
 

@@ -62,7 +62,10 @@ def _gaps(random: Generator, count: int) -> Array:
     """Between the edges of neighbouring electrodes, mm."""
     pattern = random.random()
     if pattern < 0.5:
-        pair, gap = float(random.choice([1.0, 2.0, 2.0, 2.0, 2.5])), float(random.choice([4.0, 5.0, 5.0, 5.0, 6.0, 8.0]))
+        pair, gap = (
+            float(random.choice([1.0, 2.0, 2.0, 2.0, 2.5])),
+            float(random.choice([4.0, 5.0, 5.0, 5.0, 6.0, 8.0])),
+        )
         return np.where(np.arange(count) % 2 == 0, pair, gap)
     if pattern < 0.65:
         return np.full(count, between(random, 1.5, 2.5))
@@ -108,7 +111,9 @@ def _course(random: Generator, design: Design, scene_mm: float) -> Curve:
     if design.loop:
         turns = between(random, 0.75, 1.05)
         return loop_curve(random, max(length / (2.0 * math.pi * turns), 5.0), turns, shaft, _STEP_MM)
-    return random_curve(random, length + shaft, _STEP_MM, between(random, 0.3, 1.8), tilt_change=between(random, 0.0, 0.6))
+    return random_curve(
+        random, length + shaft, _STEP_MM, between(random, 0.3, 1.8), tilt_change=between(random, 0.0, 0.6)
+    )
 
 
 def _draw_shaft(random: Generator, canvas: Canvas, line: Array, radius: float, metal: float, px_per_mm: float) -> None:
@@ -162,7 +167,9 @@ def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, me
         length = float(np.linalg.norm(step))
         if length < 5.0 * px_per_mm and chance(random, 0.8):
             middle = 0.5 * (places[number] + places[number + 1])
-            canvas.band(middle, math.atan2(step[1], step[0]), 0.25 * length, 0.95 * wide, share * metal, 0.0, False, 0.7)
+            canvas.band(
+                middle, math.atan2(step[1], step[0]), 0.25 * length, 0.95 * wide, share * metal, 0.0, False, 0.7
+            )
 
 
 def _draw_sheath(random: Generator, canvas: Canvas, line: Array, radius: float, px_per_mm: float) -> None:

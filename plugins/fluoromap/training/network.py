@@ -72,7 +72,9 @@ def losses(answer: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
     wanted = target[:, 0]
     there, counts = (wanted >= 0.999).float(), (wanted >= 0.0).float()
     near = (1.0 - wanted.clamp(0.0, 1.0)) ** 4
-    per_cell = there * (1.0 - heat) ** 2 * torch.log(heat) + (1.0 - there) * counts * near * heat**2 * torch.log(1.0 - heat)
+    per_cell = there * (1.0 - heat) ** 2 * torch.log(heat) + (1.0 - there) * counts * near * heat**2 * torch.log(
+        1.0 - heat
+    )
     of_heat = -per_cell.sum() / there.sum().clamp(min=1.0)
     here = target[:, 4]
     total = here.sum().clamp(min=1.0)

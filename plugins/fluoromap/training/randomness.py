@@ -49,7 +49,12 @@ class Curve:
 
 
 def random_curve(
-    random: Generator, length_mm: float, step_mm: float, bend: float, tilt: float | None = None, tilt_change: float = 0.3
+    random: Generator,
+    length_mm: float,
+    step_mm: float,
+    bend: float,
+    tilt: float | None = None,
+    tilt_change: float = 0.3,
 ) -> Curve:
     """Draw a smooth curve; ``bend`` 0 is straight, 1 a catheter in a heart. ``tilt`` is its mean angle to the image plane."""
     count = max(4, int(length_mm / step_mm))

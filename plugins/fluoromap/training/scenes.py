@@ -69,7 +69,9 @@ def make_scene(
     if not in_front:
         draw_distractors(random, canvas, px_per_mm)
     if backgrounds and chance(random, _OWN_BACKGROUND):
-        body = from_backgrounds(random, size, backgrounds) + between(random, 0.0, 0.6) * anatomy(random, size, px_per_mm)
+        body = from_backgrounds(random, size, backgrounds) + between(random, 0.0, 0.6) * anatomy(
+            random, size, px_per_mm
+        )
     else:
         body = anatomy(random, size, px_per_mm)
     picture = take_picture(random, canvas.depth, body)

@@ -31,7 +31,7 @@ _sources = _Sources((), ())
 
 
 def _start(sources: _Sources) -> None:
-    global _sources  # noqa: PLW0603 -- one value for the life of a worker process
+    global _sources
     _sources = sources
 
 

@@ -1,4 +1,4 @@
-"""Segmenter ``catheter-chain``, the default: blobs of electrode size, linked to the chains that the catalogue allows."""
+"""Segmenter ``catheter-chain``, the default: blobs linked to chains that fit the catalogue."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run
-from fluoromap.segmenter.seen_part import as_seen
-from fluoromap.segmenter.warm_run import compile_on_drawn_run
+from fluoromap.segmenter.visible_part import visible_part
+from fluoromap.segmenter.warm_up import compile_kernels
 
 _ACCEPTANCE = Acceptance(
-    least_clearness=0.75, carried_clearness=0.6, sure_clearness=1.1, extra_clearness=1.3, least_score=3.5
+    least_clearness=0.75, again_clearness=0.6, sure_clearness=1.1, extra_clearness=1.3, least_score=3.5
 )
 """Scores are contrast over noise."""
 
 
 class CatheterChain:
-    """Electrodes as blobs at three scales, catheters as chains of them that fit the catalogue, the best set of chains.
+    """Segmenter that links blobs at three scales to the best set of chains.
 
-    Every frame is searched on its own; what one frame does not show clearly is carried along the catheter's track. Frames in
-    which no chain stands out are handed to the user, not filled.
+    Every frame is searched on its own. A catheter that one frame does not show clearly is searched again along its track.
+    Frames
+    without a clear chain are left to the user.
     """
 
     name: ClassVar[str] = "catheter-chain"
@@ -38,14 +39,19 @@ class CatheterChain:
 
     @classmethod
     def warm_up(cls) -> None:
-        """Compile the kernels, or load what is kept of them."""
-        compile_on_drawn_run(cls())
+        """Compile the kernels, or load them from the cache."""
+        compile_kernels(cls())
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
-        """Chains of all frames and of the diastolic mean; see :class:`~fluoromap.contracts.Segmenter`."""
-        return as_seen(
+        """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
+        return visible_part(
             segment_run(
-                run, catalogue, marks, context, lambda field: blob_chains(catalogue, field, run.px_per_mm), carry=True
+                run,
+                catalogue,
+                marks,
+                context,
+                lambda field: blob_chains(catalogue, field, run.px_per_mm),
+                search_again=True,
             )
         )
 

@@ -121,7 +121,9 @@ class ElectrodeNetwork:
             taps, bias = weights.get(f"{name}.taps"), weights.get(f"{name}.bias")
             expected = (shape.width, shape.width, shape.inputs, shape.outputs)
             if taps is None or bias is None or taps.shape != expected or bias.shape != (shape.outputs,):
-                raise ValueError(f"the weights have no layer {name!r} of shape {expected}: train them with this version")
+                raise ValueError(
+                    f"the weights have no layer {name!r} of shape {expected}: train them with this version"
+                )
             flat = np.ascontiguousarray(taps, np.float32).reshape(-1, shape.inputs, shape.outputs)
             layers[name] = Layer(shape, flat, np.ascontiguousarray(bias, np.float32))
         return cls(layers)

@@ -29,7 +29,9 @@ _MOST = 120
 _SMOOTH_MM = 0.52
 _CLEAR_LIKENESS = 12.0
 _MOST_OFFSET_CELLS = 1.5
-_HEAT, _OFFSET_U, _OFFSET_V, _LOG_VARIANCE = (HEADS.index(name) for name in ("heat", "offset_u", "offset_v", "log_variance"))
+_HEAT, _OFFSET_U, _OFFSET_V, _LOG_VARIANCE = (
+    HEADS.index(name) for name in ("heat", "offset_u", "offset_v", "log_variance")
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +39,8 @@ class NetworkResponse:
     """Answers of the network to one log image.
 
     probability : (rows, columns) float32 of an electrode's centre in each cell. answers : (rows, columns, heads) float32.
-    found : electrodes in the whole image. cell_px, first_px : frame pixels from cell to cell, and where the first lies. variance_gain : see
+    found : electrodes in the whole image. cell_px, first_px : frame pixels from cell to cell, and where the first lies.
+    variance_gain : see
     :class:`~fluoromap.segmenter.learned_chain.weights.Trained`. smooth, reduction, pixel_noise : see
     :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
     """
@@ -53,7 +56,9 @@ class NetworkResponse:
     pixel_noise: float
 
     @classmethod
-    def of_image(cls, x: Image, inside: BoolArray, trained: Trained, px_per_mm: float, least_noise: float) -> NetworkResponse:
+    def of_image(
+        cls, x: Image, inside: BoolArray, trained: Trained, px_per_mm: float, least_noise: float
+    ) -> NetworkResponse:
         """Ask the network about a log image, reduced to the network's scale."""
         scale = network_scale(px_per_mm)
         picture = normalise(resampled(x, scale))
@@ -67,7 +72,15 @@ class NetworkResponse:
         cell_px, first_px = CELL_PX / scale, 0.5 / scale - 0.5
         found = _peaks(probability, answers, cell_px, first_px, trained.variance_gain)
         return cls(
-            probability, answers, found, cell_px, first_px, trained.variance_gain, smooth, reduction, max(noise, least_noise)
+            probability,
+            answers,
+            found,
+            cell_px,
+            first_px,
+            trained.variance_gain,
+            smooth,
+            reduction,
+            max(noise, least_noise),
         )
 
     @property
@@ -146,7 +159,9 @@ def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, 
     kept = np.flatnonzero(_apart(cells))
     variance = _variance_px2(said[kept, _LOG_VARIANCE], variance_gain, cell_px)
     return Proposals(
-        cells[kept] * cell_px + first_px, probability[v, u][kept].astype(np.float64), variance[:, None, None] * np.eye(2)
+        cells[kept] * cell_px + first_px,
+        probability[v, u][kept].astype(np.float64),
+        variance[:, None, None] * np.eye(2),
     )
 
 

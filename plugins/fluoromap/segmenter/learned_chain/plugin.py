@@ -16,16 +16,16 @@ from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.linking import Trust
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run
-from fluoromap.segmenter.seen_part import as_seen
-from fluoromap.segmenter.warm_run import compile_on_drawn_run
+from fluoromap.segmenter.visible_part import visible_part
+from fluoromap.segmenter.warm_up import compile_kernels
 
 _TRUST = Trust(share=0.25, chain=0.6)
 _IN_A_RUN = Acceptance(
-    least_clearness=0.1, carried_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.2, seen_score=0.02,
+    least_clearness=0.1, again_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.2, seen_score=0.02,
     least_seen=0.75, unseen_evidence=-1.5, strict=True, trust=_TRUST,
 )  # fmt: skip
 _ALONE = Acceptance(
-    least_clearness=0.3, carried_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.6, seen_score=0.1,
+    least_clearness=0.3, again_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.6, seen_score=0.1,
     least_seen=0.75, unseen_evidence=-1.5, strict=True, trust=_TRUST,
 )  # fmt: skip
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
@@ -38,7 +38,9 @@ class LearnedChainParams(BaseModel, extra="forbid"):
     """Parameters of the learned segmenter."""
 
     weights: str | None = Field(
-        None, max_length=1024, description="Path of a weights file of ``python -m fluoromap.training``; the shipped one by default."
+        None,
+        max_length=1024,
+        description="Path of a weights file of ``python -m fluoromap.training``; the shipped one by default.",
     )
 
 
@@ -58,11 +60,11 @@ class LearnedChain:
 
     @classmethod
     def warm_up(cls) -> None:
-        """Compile the kernels, or load what is kept of them."""
-        compile_on_drawn_run(cls())
+        """Compile the kernels, or load them from the cache."""
+        compile_kernels(cls())
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
-        """Chains of all frames and of the diastolic mean; see :class:`~fluoromap.contracts.Segmenter`."""
+        """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
         acceptance = _IN_A_RUN if len(run.frames) > 1 else _ALONE
         least_noise = _COARSE_NOISE if run.pixels.bits_stored <= _COARSE_BITS else 0.0
@@ -73,4 +75,4 @@ class LearnedChain:
 
             return ChainDetector(catalogue, field, run.px_per_mm, ask, acceptance)
 
-        return as_seen(segment_run(run, catalogue, marks, context, detector_of, carry=True))
+        return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True))

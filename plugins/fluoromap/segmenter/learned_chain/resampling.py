@@ -34,7 +34,9 @@ def _shares(size: int, count: int, scale: float) -> tuple[np.ndarray[tuple[int],
     first = np.floor(middle - half).astype(np.int64)
     places = first[:, None] + np.arange(taps)
     if scale < 1.0:
-        overlap = np.minimum(places + 0.5, (middle + half)[:, None]) - np.maximum(places - 0.5, (middle - half)[:, None])
+        overlap = np.minimum(places + 0.5, (middle + half)[:, None]) - np.maximum(
+            places - 0.5, (middle - half)[:, None]
+        )
         weights = np.maximum(overlap, 0.0)
     else:
         weights = np.maximum(1.0 - np.abs(places - middle[:, None]), 0.0)
