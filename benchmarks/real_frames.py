@@ -93,7 +93,7 @@ def _labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
         catalogue = _catalogue(given.catheter, facts)
         frames = [np.asarray(Image.open(path.parent / file).convert("L")) for file in files]
         px_per_mm = given.px_per_mm or facts.get("px_per_mm", 3.4)
-        times = np.arange(len(frames)) * float(facts.get("frame_ms", 66.7))
+        times = np.arange(len(frames), dtype=np.float64) * float(facts.get("frame_ms", 66.7))
         pixels = PixelFacts(bool(facts.get("logarithmic", False)), 8, False)
         runs.append(LabelledRun(path.stem, Run(KeptFrames(frames), times, px_per_mm, pixels), catalogue, labels))
     return runs
@@ -112,7 +112,7 @@ def _empty_runs(given: argparse.Namespace) -> list[LabelledRun]:
         px_per_mm = given.px_per_mm or 3.4
         if facts.source_detector_mm and facts.source_isocentre_mm and facts.pixel_spacing_mm:
             px_per_mm = facts.source_detector_mm / facts.source_isocentre_mm / facts.pixel_spacing_mm[0]
-        run = Run(KeptFrames(frames), np.arange(len(frames)) * 66.7, px_per_mm, facts.pixels)
+        run = Run(KeptFrames(frames), np.arange(len(frames), dtype=np.float64) * 66.7, px_per_mm, facts.pixels)
         runs.append(LabelledRun(path.stem, run, _catalogue(given.catheter, {}), [{} for _ in frames]))
     return runs
 
@@ -133,7 +133,7 @@ def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:
     spent = 1000 * (time.process_time() - started) / len(entries)
     sums = np.zeros(5, np.int64)
     for entry, labels in zip(entries, one.labels, strict=True):
-        sums += _score(entry.chains, labels)
+        sums += score(entry.chains, labels)
     found, missed, false, named, numbered = sums.tolist()
     print(
         f"{name + ' ' + one.name:44}{found:>7}/{found + missed:<4}{missed:>8}{false:>7}{named:>7}{numbered:>10}{spent:>7.1f}"
@@ -156,7 +156,7 @@ def _segment(segmenter: Segmenter, one: LabelledRun, single: bool) -> list[Frame
     return entries
 
 
-def _score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDArray[np.int64]:
+def score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDArray[np.int64]:
     """Found, missed, false, named and numbered electrodes of one frame."""
     there = [(name, number, uv) for name, electrodes in labels.items() for number, uv in electrodes.items()]
     seen = [

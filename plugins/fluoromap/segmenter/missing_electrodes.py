@@ -16,10 +16,12 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.linking import CatheterFamily
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES, trace_rows
 from fluoromap.segmenter.refinement import predict_on_curve
 
 _LEAST_KNOWN = 3
-_INNER_SD_MM, _END_SD_MM = 0.4, 0.7
+_INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM = 0.4, 0.7, 0.9
+_TRACED_LEAST = -1.0
 _MOST = 100
 
 
@@ -47,7 +49,7 @@ def complete_chains(
     families: Sequence[CatheterFamily],
     px_per_mm: float,
 ) -> CompletedChains:
-    """Complete all chains of candidates that lack one electrode.
+    """Complete all chains of candidates that lack one electrode, or a few of many.
 
     The missing electrode is predicted on a smooth curve through the others.
 
@@ -70,6 +72,21 @@ def complete_chains(
     for family in families:
         electrodes = family.catheter.electrodes
         of_family = [np.zeros((0, electrodes), np.int64)]
+        if electrodes >= MANY_ELECTRODES:
+            traced, positions = trace_rows(points, weights, np.asarray(family.catheter.spacing_mm) * px_per_mm, _MOST)
+            for row, position in zip(traced, positions, strict=True):
+                lacking = np.flatnonzero(row < 0)
+                # The electrodes on both sides vouch for the place; what shows there may be another catheter.
+                dark = np.clip(evidence_at(position[lacking]), _TRACED_LEAST, 0.0) if len(lacking) else np.zeros(0)
+                numbered = row.copy()
+                numbered[lacking] = count + np.arange(len(lacking))
+                of_family.append(numbered[None])
+                places.append(position[lacking])
+                gained.append(dark)
+                spread.append(np.full(len(lacking), (_TRACED_SD_MM * px_per_mm) ** 2))
+                count += len(lacking)
+            rows.append(np.concatenate(of_family))
+            continue
         for missing in range(electrodes) if electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1 else ():
             arc_mm = np.delete(family.catheter.arc_lengths_mm, missing)
             paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm)

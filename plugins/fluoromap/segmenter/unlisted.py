@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.catheters import Catheter
-from fluoromap.contracts import Array, Chain
+from fluoromap.contracts import Array, BoolArray, Chain
 
 SURE = 0.5
 """Proposals of this probability have to be explained."""
@@ -80,11 +80,12 @@ def not_on(points_uv: Array, chains: Sequence[Chain], px_per_mm: float) -> Array
     if not chains:
         return points_uv
     taken = np.concatenate([chain.pixels_uv for chain in chains])
-    return points_uv[_apart(points_uv, taken, _OWN_MM * px_per_mm)]
+    free: Array = points_uv[_apart(points_uv, taken, _OWN_MM * px_per_mm)]
+    return free
 
 
-def _apart(points_uv: Array, taken_uv: Array, distance: float) -> Array:
+def _apart(points_uv: Array, taken_uv: Array, distance: float) -> BoolArray:
     if not len(points_uv):
         return np.zeros(0, np.bool_)
-    away: Array = np.linalg.norm(points_uv[:, None] - taken_uv[None], axis=2).min(axis=1) > distance
+    away: BoolArray = np.linalg.norm(points_uv[:, None] - taken_uv[None], axis=2).min(axis=1) > distance
     return away

@@ -30,13 +30,17 @@ class Design:
     loop: bool = False
 
 
+def design_of(catheter: Catheter) -> Design:
+    """Return the design of a catalogue's catheter."""
+    lengths = np.full(catheter.electrodes, catheter.ring_mm)
+    lengths[0] = catheter.tip_mm
+    return Design(catheter.arc_lengths_mm + 0.5 * catheter.tip_mm, lengths)
+
+
 def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Design:
     """Draw a catheter: half of them from a lab's own ``catalogue`` where it has one, else of all makers' kinds."""
     if catalogue and chance(random, 0.5):
-        own = catalogue[int(random.integers(len(catalogue)))]
-        lengths = np.full(own.electrodes, own.ring_mm)
-        lengths[0] = own.tip_mm
-        return Design(own.arc_lengths_mm + 0.5 * own.tip_mm, lengths)
+        return design_of(catalogue[int(random.integers(len(catalogue)))])
     kind = random.random()
     ring = between(random, 0.9, 1.4) if chance(random, 0.6) else scaled(random, 0.8, 2.0)
     if kind < 0.30:

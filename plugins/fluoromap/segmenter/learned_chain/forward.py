@@ -36,7 +36,7 @@ class Layer:
         """Apply to (rows, columns, inputs); returns (rows / stride, columns / stride, outputs)."""
         if self.shape.width == 1:
             flat = sgemm(1.0, self.taps[0].T, x.reshape(-1, self.shape.inputs).T).T
-            return _finished(flat, self.bias, *x.shape[:2], x.shape[1], self.shape.rectified)
+            return _finished(flat, self.bias, x.shape[0], x.shape[1], x.shape[1], self.shape.rectified)
         if self.shape.inputs == 1:
             return self._gathered(x)
         return self._tap_by_tap(x)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 from numba import njit
 
+from fluoromap.contracts import IntArray
 from fluoromap.segmenter.log_image import Image
 
 
@@ -25,7 +27,8 @@ def resampled(x: Image, scale: float) -> Image:
     return out
 
 
-def _shares(size: int, count: int, scale: float) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Image]:
+@functools.lru_cache(maxsize=16)
+def _shares(size: int, count: int, scale: float) -> tuple[IntArray, Image]:
     """First pixel of each mean, (count,), and the weights of the pixels from there on, (count, taps); rows add up to 1."""
     middle = (np.arange(count) + 0.5) / scale - 0.5
     # A box as wide as the new pixel; a triangle between pixels where the picture is enlarged.
