@@ -47,7 +47,7 @@ def modules() -> dict[str, Path]:
 
 
 def node_of(module: str) -> str | None:
-    """Return the node that a module is part of; None for a package's ``__init__``."""
+    """Return the node of a module; None for an ``__init__``."""
     package, *rest = module.split(".")
     if package in ONE_NODE:
         return ONE_NODE[package]
