@@ -6,10 +6,13 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
 
+from fluoromap.contracts import Fuser
+from fluoromap.registry import _METHODS, GROUPS, _check
 from fluoromap_service.api.app import create_app
 from fluoromap_service.api.jobs.job_answers import job_answer
 from fluoromap_service.api.results import points, tracks
@@ -261,6 +264,22 @@ def test_glossary_is_in_alphabetical_order() -> None:
     assert len(terms) > 50
     assert terms == sorted(terms, key=lambda term: term.replace("-", " ").casefold())
     assert len({term.casefold() for term in terms}) == len(terms)
+
+
+def test_example_of_a_plugin_is_a_plugin() -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```", (TOP / "CONTRIBUTING.md").read_text(), re.M | re.S)
+    assert len(blocks) == 1
+    names: dict[str, Any] = {}
+    exec(blocks[0], names)
+    _check("fuser", "my-surface", names["MySurface"])
+    assert isinstance(names["MySurface"](names["Params"]()), Fuser)
+
+
+def test_methods_of_plugins_are_listed() -> None:
+    page = (TOP / "CONTRIBUTING.md").read_text()
+    assert dict(re.findall(r"^\| `(fluoromap\.\w+)` \| `(\w+)` \|$", page, re.M)) == {
+        group: _METHODS[kind] for kind, group in GROUPS.items()
+    }
 
 
 @pytest.mark.parametrize("page", PAGES)
