@@ -87,9 +87,11 @@ def test_long_running_services_are_watched_and_may_end_their_work() -> None:
     for name in ("postgres", "redis", "api", "worker"):
         assert "healthcheck" in SERVICES[name]
         assert SERVICES[name]["restart"] == "unless-stopped"
-    from fluoromap_service.jobs.queue import app as celery
+    from fluoromap_service.jobs.queue import celery_app
 
-    assert int(SERVICES["worker"]["stop_grace_period"].removesuffix("s")) > celery.conf.worker_soft_shutdown_timeout
+    assert (
+        int(SERVICES["worker"]["stop_grace_period"].removesuffix("s")) > celery_app().conf.worker_soft_shutdown_timeout
+    )
 
 
 def test_image_does_not_run_as_root_and_starts_a_command() -> None:

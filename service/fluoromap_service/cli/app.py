@@ -124,10 +124,10 @@ def worker(data_dir: DataDir = None) -> None:
     _one_thread_each()
     _keep_compiled_kernels()
     from fluoromap_service import logs
-    from fluoromap_service.jobs.queue import app as celery
+    from fluoromap_service.jobs.queue import celery_app
 
     logs.configure()
-    celery.worker_main(
+    celery_app().worker_main(
         [
             "--quiet", "worker", "--pool", "prefork", "-c", str(settings().workers), "-n", "fluoromap@%h",
             "--without-gossip", "--without-mingle", "--loglevel", "WARNING",
