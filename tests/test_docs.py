@@ -19,6 +19,7 @@ from fluoromap_service.api.results import points, tracks
 from fluoromap_service.cli.app import app as command_line
 from fluoromap_service.dicom.errors import DicomCode
 from fluoromap_service.dicom.facts import HeaderWarning
+from fluoromap_service.jobs.pipeline import PIPELINE
 from fluoromap_service.store.models import Job, JobState, StageRow, StageState
 
 TOP = Path(__file__).parent.parent
@@ -146,6 +147,21 @@ def test_shortcuts_are_left_out() -> None:
     assert without_shortcuts({("a", "b"), ("b", "c"), ("a", "c"), ("a", "d")}) == {("a", "b"), ("b", "c"), ("a", "d")}
 
 
+def test_table_of_stages_is_the_pipeline() -> None:
+    rows = table_under(DOCS / "architecture.md", "How a study passes through")
+    listed = [(name, kind, subject, depends, fails) for name, kind, subject, depends, fails, _ in rows]
+    assert listed == [
+        (
+            f"`{stage.name}`",
+            stage.kind or "",
+            stage.subject,
+            ", ".join(f"`{name}`" for name in stage.depends_on),
+            f"the {stage.subject if stage.fails == 'subject' else 'job'}",
+        )
+        for stage in PIPELINE
+    ]
+
+
 # --- the contract at the doors -----------------------------------------------------------------------------------------
 
 
@@ -219,9 +235,7 @@ def table_under(page: Path, heading: str) -> list[tuple[str, ...]]:
     """Return the rows of the table under a heading, without its head."""
     section = re.split(r"^## ", page.read_text(), flags=re.M)
     text = next(part for part in section if part.startswith(heading))
-    rows = [
-        tuple(cell.strip() for cell in line.strip("|").split(" | ")) for line in re.findall(r"^\|.*\|$", text, re.M)
-    ]
+    rows = [tuple(cell.strip() for cell in line[1:-1].split("|")) for line in re.findall(r"^\|.*\|$", text, re.M)]
     return rows[2:]
 
 
