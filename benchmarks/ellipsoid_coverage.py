@@ -5,7 +5,7 @@ and feet) and go through the whole pipeline: a study is rendered, segmented by `
 With ``--given`` nothing is rendered: true pixels with 0.5 px of noise go into matching, which is fast enough for hundreds of
 hearts, and hearts whose gantry is exact or worse than assumed are counted as well. Electrodes graded A to C count;
 misidentified ones (farther than 5 px from their place in a view) are counted apart. The interval is a bootstrap over
-hearts: the electrodes of one heart share their errors. Errors are RMS in 3D, beside what the covariances say. Below stand
+hearts: the electrodes of one heart share their errors. Errors are RMS in 3D, beside what the covariances say. Below are
 the mean error budget and in how many hearts the gantry was calibrated.
 """
 
@@ -63,7 +63,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Heart:
-    """One simulated study on its way through the pipeline: truth, and what matching and triangulation made of it."""
+    """One simulated study: truth, and the results of matching and triangulation."""
 
     study: SimulatedStudy
     matching: Matching
@@ -77,7 +77,7 @@ class Heart:
 
 
 def rendered(run: SimulatedRun, seed: int) -> Segmentation:
-    """The run as ``catheter-chain`` sees it."""
+    """Segment a rendered run with ``catheter-chain``."""
     camera = camera_from_gantry(run.gantry)
     kept = KeptFrames(run.frames)
     return CatheterChain().segment(
@@ -86,7 +86,10 @@ def rendered(run: SimulatedRun, seed: int) -> Segmentation:
 
 
 def given(run: SimulatedRun, seed: int) -> Segmentation:
-    """The run's true pixels with noise, as an ideal segmenter would give them; diastole by the segmenters' own rule."""
+    """Return the true pixels of a run with noise, as a segmentation.
+
+    Diastole follows the segmenters' own rule.
+    """
     rng = np.random.default_rng([seed, int(run.start_seconds * 1000)])
     names = DEFAULT_CATALOGUE.names
     n = len(run.frame_times_ms)
@@ -138,7 +141,7 @@ def heart_of(spec: StudySpec, segment: Callable[[SimulatedRun, int], Segmentatio
 
 
 def of_points(heart: Heart) -> Iterator[Sample]:
-    """Every electrode located at diastole, from the isocentre and from the reference catheter.
+    """Return samples of every electrode located at diastole, from both origins.
 
     What tracks state can be counted in the same table by another function of this form.
     """
@@ -159,7 +162,7 @@ def of_points(heart: Heart) -> Iterator[Sample]:
 
 
 def misidentified(matched: MatchedSite, truth: SimulatedSite, label: tuple[str, int]) -> bool:
-    """Whether either view took something else for this electrode at diastole."""
+    """Return whether a view took something else for this electrode at diastole."""
     for seen, run in zip((matched.diastole.a, matched.diastole.b), truth.runs, strict=True):
         for chain in seen.chains:
             if chain.catheter == label[0] and label[1] in chain.electrodes:
@@ -206,7 +209,7 @@ class Coverage:
 
 
 def _sums(samples: list[Sample]) -> list[float]:
-    """Inside, counted, squared error, stated variance, misidentified."""
+    """Sum what is inside, counted, squared error, stated variance, misidentified."""
     counted = [sample for sample in samples if not sample.misidentified]
     errors = np.array([sample.error_mm for sample in counted]).reshape(-1, 3)
     covariances = np.array([sample.covariance_mm2 for sample in counted]).reshape(-1, 3, 3)

@@ -53,7 +53,7 @@ class Truth:
     velocity_m_per_s: float
 
     def times_at(self, places_mm: Array) -> Array:
-        """True time (m,) at the nearest wall, between its three nearest points."""
+        """Interpolate the true times (m,) at the nearest wall from three points."""
         distance, nearest = cKDTree(self.points_mm).query(places_mm, k=3)
         weight: Array = 1 / (np.asarray(distance) + 1e-3)
         times: Array = (weight * self.lat_ms[nearest]).sum(axis=1) / weight.sum(axis=1)
@@ -87,7 +87,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def spread(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
-    """Wall points far from each other, as an operator who wants the whole chamber places them."""
+    """Choose wall points far from each other.
+
+    An operator who wants the whole chamber places them so.
+    """
     candidates = rng.permutation(truth.wall)
     chosen = [int(candidates[0])]
     nearest = np.full(len(candidates), np.inf)
@@ -98,7 +101,7 @@ def spread(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
 
 
 def scattered(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
-    """Wall points by chance: some walls crowded, some empty."""
+    """Choose wall points by chance: some walls crowded, some empty."""
     return rng.choice(truth.wall, count, replace=False)
 
 
@@ -148,7 +151,7 @@ def _weighted_median(values: Array, weight: Array) -> float:
 
 
 def _show(table: dict[str, list[dict[str, float]]]) -> None:
-    """One line a figure, one column a setting and fuser."""
+    """Print a line for each figure, a column for each setting."""
     headings = list(table)
     for line in zip(*(heading.split(", ") for heading in headings), strict=True):
         print(" " * 13 + "".join(f"{cell:>23}" for cell in line))
@@ -175,7 +178,7 @@ SETTINGS: dict[str, tuple[Placing, float]] = {
 
 
 def main(first: int, chambers: int) -> None:
-    """All tables, on seeds ``first`` to ``first + chambers - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + chambers - 1``."""
     print(
         f"{chambers} chambers from seed {first}, 20 sites with that noise an axis, times read to {TIME_SD_MS} ms; "
         "mean (95 % interval)"
@@ -205,7 +208,7 @@ def main(first: int, chambers: int) -> None:
             ratio, low, high = np.array(found).T
             inside = np.mean((low <= 1) & (high >= 1))
             print(
-                f"velocity, {count} scattered sites: told in {len(found)} of {chambers // 4}, median over truth "
+                f"velocity, {count} scattered sites: stated in {len(found)} of {chambers // 4}, median over truth "
                 f"{ratio.mean():.3f} (sd {ratio.std():.3f}), truth in the interval {inside:.2f}"
             )
     for name in FUSERS:
@@ -216,7 +219,7 @@ def main(first: int, chambers: int) -> None:
 
 
 def _overlays(seed: int) -> None:
-    """Milliseconds to draw the map of 20 sites into a frame and to make the PNG of it, medians."""
+    """Measure the milliseconds of an overlay of 20 sites and its PNG."""
     rng = np.random.default_rng(seed)
     truth = draw_chamber(rng)
     sites = sites_at(truth, spread(truth, 20, rng), 0.7, rng)
@@ -239,7 +242,10 @@ def _overlays(seed: int) -> None:
 
 
 def _cost(seed: int, name: str, count: int) -> tuple[float, float, float]:
-    """Seconds, most MB of arrays at one time, and highest MB of a process of its own that imports all plugins."""
+    """Measure seconds, peak MB of arrays, and peak MB of the process.
+
+    The process is a new one that imports all plugins.
+    """
     rng = np.random.default_rng(seed)
     truth = draw_chamber(rng)
     sites = sites_at(truth, spread(truth, count, rng), 0.7, rng)

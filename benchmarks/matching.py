@@ -70,8 +70,11 @@ class Study:
 
 @dataclass(frozen=True)
 class Design:
-    """What kind of study. bad : share of chains of which some electrodes are grossly wrong all through the run, as where
-    catheters cross. wrong_tips : share of frames in which the tip speaks for another catheter."""
+    """The kind of study.
+
+    bad : share of chains of which some electrodes are grossly wrong all through the run, as where catheters cross.
+    wrong_tips : share of frames in which the tip suggests another catheter.
+    """
 
     sites: int = 8
     irregular: bool = False
@@ -81,7 +84,10 @@ class Design:
 
 
 def true_chains(seed: int, design: Design) -> Study:
-    """A study without pictures: a lateral and a frontal view, or any two at least 60 degrees apart."""
+    """Simulate a study without pictures.
+
+    The views are lateral and frontal, or any two at least 60 degrees apart.
+    """
     rng = np.random.default_rng([seed, 20])
     heart: HeartKind = "human" if seed % 2 else "dog"
     anatomy = draw_anatomy(heart, design.sites, rng)
@@ -141,7 +147,7 @@ def _run(
 def _segmentation(
     truth: Truth, phases: Array, rate_hz: float, design: Design, rng: np.random.Generator
 ) -> Segmentation:
-    """What a good segmenter would make of it."""
+    """Return the segmentation that a good segmenter would give."""
     n = len(phases)
     order = list(rng.permutation(len(NAMES)))
     first = {name: int(name == "mapping" and rng.random() < WITHOUT_TIP) for name in NAMES}
@@ -182,7 +188,7 @@ def _segmentation(
 DESIGNS = {
     "true chains, regular rhythm": Design(),
     "true chains, irregular rhythm": Design(irregular=True),
-    "one site alone, any two views, bad chains, tips that tell nothing": Design(1, False, True, 0.4, 0.5),
+    "one site alone, any two views, bad chains, tips without a clear length": Design(1, False, True, 0.4, 0.5),
 }
 
 
@@ -208,7 +214,10 @@ class Score:
 
 
 def score(study: Study) -> Score:
-    """Match a study and compare with its truth: those catheters that the runs of both views hold."""
+    """Match a study and compare the result with its truth.
+
+    Only catheters that the runs of both views show are counted.
+    """
     offered = _offered(study)
     result = Score(catheters=sum(map(len, offered.values())))
     before = time.process_time()
@@ -222,7 +231,7 @@ def score(study: Study) -> Score:
 
 
 def _offered(study: Study) -> dict[str, set[str]]:
-    """Site -> catheters that are there to be paired."""
+    """Return the catheters that can be paired at each site."""
     offered = {}
     for runs, truths in zip(study.sites, study.pixels, strict=True):
         views = ((runs.segmentation_a, runs.camera_a), (runs.segmentation_b, runs.camera_b))
@@ -271,7 +280,7 @@ def _score_pairs(result: Score, matching: Matching, study: Study, offered: Mappi
 
 
 def _really(pair: PhasePair, pixels: tuple[Truth, Truth]) -> dict[str, tuple[str, str]]:
-    """Name given -> the catheter it really is in view a and in view b."""
+    """Return the true catheters in both views for each name."""
     views = [
         {chain.catheter: _nearest(chain.electrodes, chain.pixels_uv, truth, seen.frame) for chain in seen.chains}
         for seen, truth in zip((pair.a, pair.b), pixels, strict=True)
@@ -289,7 +298,10 @@ def _apart_px(electrodes: Sequence[int], pixels_uv: Array, truth: Array) -> floa
 
 
 def phase_errors(study: Study) -> list[float]:
-    """Squared error of each frame's phase, the mean offset of its run (where zero lies) taken off; 0.25 where unknown."""
+    """Return the squared errors of the frames' phases.
+
+    The mean offset of each run is subtracted, because zero may lie anywhere. An unknown phase counts 0.25.
+    """
     squares: list[float] = []
     for runs, truths in zip(study.sites, study.phases, strict=True):
         views = ((runs.segmentation_a, runs.camera_a), (runs.segmentation_b, runs.camera_b))
@@ -306,7 +318,7 @@ def phase_errors(study: Study) -> list[float]:
 
 
 def _share(counts: Sequence[tuple[int, int]]) -> str:
-    """Share with its 95 % bootstrap interval over studies."""
+    """Return a share with its 95 % bootstrap interval over studies."""
     sums = np.array(counts, dtype=np.float64)
     drawn = np.random.default_rng(0).integers(0, len(sums), (2000, len(sums)))
     again = sums[drawn].sum(axis=1)
@@ -316,7 +328,7 @@ def _share(counts: Sequence[tuple[int, int]]) -> str:
 
 
 def show(heading: str, scores: Sequence[Score]) -> None:
-    """One block of the report."""
+    """Print one block of the report."""
     total = {name: sum(getattr(one, name) for one in scores) for name in
              ("catheters", "missing", "wrong_pair", "wrong_name", "flagged", "kept", "noted")}  # fmt: skip
     cost = np.mean([ms for one in scores for ms in one.milliseconds])
@@ -342,7 +354,7 @@ def show(heading: str, scores: Sequence[Score]) -> None:
 
 
 def main(first: int, studies: int, rendered: int) -> None:
-    """All tables, on seeds ``first`` to ``first + studies - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + studies - 1``."""
     print(f"seeds {first} to {first + studies - 1}; 95 % bootstrap intervals over studies")
     for heading, design in DESIGNS.items():
         scores, squares = [], []
@@ -357,7 +369,10 @@ def main(first: int, studies: int, rendered: int) -> None:
 
 
 def segmented(seed: int) -> Study:
-    """A rendered study of 8 sites, a lateral and a postero-anterior view of 2 s at 15 frames/s, through the segmenter."""
+    """Render a study of 8 sites and segment its runs.
+
+    Each site has a lateral and a postero-anterior view of 2 s at 15 frames/s.
+    """
     spec = StudySpec(seed, sites=8, contrast=("LAT", "PA"), gantry_error_deg=GANTRY_ERROR_DEG)
     simulated = simulate_study(spec)
     segmenter = CatheterChain()

@@ -58,7 +58,10 @@ class Simulation:
 
 
 def helix(name: str) -> Array:
-    """30 points over two turns, both ends included: (30, 3) mm from the isocentre."""
+    """Return 30 points over two turns, both ends included.
+
+    The shape is (30, 3), mm from the isocentre.
+    """
     radius, length, axis, centre = {
         "H18": (18.0, 60.0, 1, (-12, -13, -16)),
         "H77": (77.0, 250.0, 2, (-12, -15, -19)),
@@ -70,7 +73,10 @@ def helix(name: str) -> Array:
 
 
 def simulated(name: str, view: str, frames: int) -> Simulation:
-    """The paper's motion, X' = Rz Ry Rx X + (1, 1, 1) mm, in a right-handed camera 500 mm from the isocentre."""
+    """Simulate the motion of the paper.
+
+    X' = Rz Ry Rx X + (1, 1, 1) mm. The camera is right-handed and 500 mm from the isocentre.
+    """
     intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])
     camera = Camera(intrinsic @ np.column_stack([ROTATIONS[view], [0, 0, 500]]), 512, 512)
     about = rotation_of(np.radians(0.5) * np.eye(3))
@@ -81,7 +87,7 @@ def simulated(name: str, view: str, frames: int) -> Simulation:
 
 
 def bound_mm(camera: Camera, points_mm: Array) -> float:
-    """Cramer-Rao bound of one frame's points (m, 3), RMS 3D."""
+    """Compute the Cramer-Rao bound of one frame's points (m, 3), RMS 3D."""
     m = len(points_mm)
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (m, 2, 2))
     covariance = pose_covariance_mm2(camera, points_mm, points_mm.mean(axis=0), noise, np.ones(m, dtype=bool))
@@ -93,7 +99,10 @@ def rms(errors: Array) -> float:
 
 
 def accuracy(rng: np.random.Generator) -> Iterator[str]:
-    """A-priori positions exact: RMS 3D and depth alone beside the bound; the last frame's RMS over its own bound."""
+    """Print errors beside the bound where a-priori positions are exact.
+
+    The columns are RMS 3D, depth alone, and the last frame's RMS over its own bound.
+    """
     yield f"A body whose shape is known, {POSES} frames a row. RMS 3D over frames 2..n, mm; ratios to the bound"
     yield f"{'':10}{'frames':>7}{'RMS':>9}{'depth':>9}{'bound':>9}{'ratio':>8}{'last frame':>12}{'noise-free, dz 0..5':>22}"
     for name in ("H18", "H77"):
@@ -118,7 +127,10 @@ def accuracy(rng: np.random.Generator) -> Iterator[str]:
 
 
 def noise_free_mm(s: Simulation) -> float:
-    """Largest error from exact pixels over starts of 0 to 5 mm too deep a frame."""
+    """Return the largest error from exact pixels over six starts.
+
+    The starts are 0 to 5 mm too deep for each frame.
+    """
     seen = np.ones(s.pixels_uv.shape[:2], dtype=bool)
     body = s.points_mm[0] - s.points_mm[0].mean(axis=0)
     largest = 0.0
@@ -130,7 +142,10 @@ def noise_free_mm(s: Simulation) -> float:
 
 
 def view_of(s: Simulation, pixels: Array, a_priori: Array, covariance_mm2: Array) -> MonoplaneView:
-    """A simulation as the solver gets it; positions of frame 1 known with these errors."""
+    """Return a simulation as the solver gets it.
+
+    The positions of frame 1 are known with these errors.
+    """
     electrodes = tuple(range(1, 31))
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (30, 2, 2))
     return MonoplaneView(
@@ -144,7 +159,10 @@ def view_of(s: Simulation, pixels: Array, a_priori: Array, covariance_mm2: Array
 
 
 def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
-    """A-priori positions exact or wrong: the pose that believes them, and what is adjusted together with them."""
+    """Print errors where a-priori positions are exact or wrong.
+
+    One solver trusts them; the other adjusts them together with the poses.
+    """
     yield f"\nA-priori positions wrong by up to so much an axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
     yield (
         f"{'wrong by':>9}{'frames':>10}{'believed':>10}{'adjusted':>10}{'bound':>8}{'ratio':>7}{'in 95 %':>9}"
@@ -186,7 +204,10 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
 
 
 def opencv_poses(cv2: Any, s: Simulation) -> dict[str, Callable[[Array], tuple[Array, Array]]]:
-    """OpenCV's ways to a pose: pixels (30, 2) to rotation vector and translation in the camera's axes."""
+    """Return OpenCV's pose solvers.
+
+    Each takes pixels (30, 2) and returns rotation vector and translation in the camera's axes.
+    """
     body = np.ascontiguousarray(s.points_mm[0] - s.points_mm[0].mean(axis=0))
     intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])
     view = np.linalg.solve(intrinsic, s.camera.matrix)
@@ -214,7 +235,10 @@ def opencv_poses(cv2: Any, s: Simulation) -> dict[str, Callable[[Array], tuple[A
 
 
 def speed(rng: np.random.Generator) -> Iterator[str]:
-    """Accuracy and poses a second on the same images, from the pose of the frame before."""
+    """Print accuracy and poses a second on the same images.
+
+    Each solver starts from the pose of the frame before.
+    """
     yield f"\nThe same {SPEED_POSES} images of 30 points (LAT), each from the pose of the frame before; one thread"
     yield f"{'':32}{'RMS mm':>9}{'to best':>9}{'poses/s':>10}{'rigid-pose is':>16}"
     try:
@@ -256,7 +280,7 @@ def speed(rng: np.random.Generator) -> Iterator[str]:
 
 
 def one_catheter(_: np.random.Generator) -> Iterator[str]:
-    """Bound of the mapping catheter's four electrodes as a rigid body of known shape."""
+    """Print the bound of the mapping catheter as a rigid body."""
     yield "\nOne catheter of four electrodes, shape exactly known: bound of a frame, RMS 3D, mm"
     yield f"{'bend radius':>12}" + "".join(f"{f'tilt {tilt} deg':>14}" for tilt in (0, 30, 60))
     camera = simulated("H18", "AP", 1).camera
@@ -271,13 +295,16 @@ def one_catheter(_: np.random.Generator) -> Iterator[str]:
 
 
 def beating_hearts(rng: np.random.Generator) -> Iterator[str]:
-    """Whether three catheters in a beating heart pass for one rigid body: where somebody says so, and by their cycle."""
+    """Print whether three catheters of a heart pass for one body.
+
+    Two cases are tried: a parameter says so, and their cycle decides.
+    """
     yield (
         f"\nThree catheters in {HEARTS} beating hearts, two views, 30 frames at 15/s; a-priori positions within 0.15 mm an axis.\n"
         "What rigid-pose refuses of hearts that move all they do, or less, and RMS 3D of what it does not refuse, mm.\n"
-        "Without a cycle it refuses all of them, unless it is told that they are rigid"
+        "Without a cycle it refuses all of them, unless a parameter says that they are rigid"
     )
-    yield f"{'':8}{'told that they are rigid':^36}{'cycle known':^36}"
+    yield f"{'':8}{'declared rigid':^36}{'cycle known':^36}"
     yield f"{'motion':>8}" + 2 * f"{'refused':>14}{'RMS':>11}{'stated':>11}"
     first = int(rng.integers(1_000_000))
     studies = [
@@ -316,7 +343,10 @@ def heart_view(
     cycle_known: bool,
     rng: np.random.Generator,
 ) -> MonoplaneView:
-    """Catheters of four electrodes each, points (n, m, 3), as one view shows them; frame 1, or all of a cycle, known from two."""
+    """Return one view of catheters with four electrodes each.
+
+    Their points are (n, m, 3). Frame 1, or all of a cycle, is known from two views.
+    """
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (4, 2, 2))
     pixels = camera.project(points_mm) + rng.normal(0, NOISE_PX, (*points_mm.shape[:2], 2))
     measured = points_mm + rng.normal(0, 0.15, points_mm.shape)

@@ -1,9 +1,9 @@
 """Depth over the cardiac cycle from one view: ``python benchmarks/motion_prior.py [first seed] [hearts] [hearts for coverage]``.
 
 Dog hearts at 30 frames/s (14 to 19 frames a cycle), runs of 48 frames, 12 electrodes, true pixels with 0.5 px of noise;
-nothing is rendered. Every table names what the two views of the site, or of 19 other sites, had told before. Errors are 3D
+nothing is rendered. Every table names what the two views of the site, or of 19 other sites, had shown before. Errors are 3D
 RMS in mm over all frames and electrodes, lateral ; frontal view; "worst phase" is the RMS over hearts in the worst
-of 15 parts of the cycle. Where a row says so the geometry is exact and the solver is told (its parameters are 0); the
+of 15 parts of the cycle. Where a row says so the geometry is exact and the solver knows it (its parameters are 0); the
 coverage table draws gantry and breathing as the default parameters say. Seeds below 5000 were used while it was made.
 """
 
@@ -98,7 +98,7 @@ class Scores:
 
 @contextmanager
 def stressed(factor: float) -> Iterator[None]:
-    """Hearts whose catheters move more on their own and whose beats differ more."""
+    """Simulate hearts with larger motion of single catheters and between beats."""
     from fluoromap.phantom import motion
 
     with patch.multiple(motion, **{name: factor * getattr(motion, name) for name in STRESSED}):
@@ -106,7 +106,7 @@ def stressed(factor: float) -> Iterator[None]:
 
 
 def biplane(scene: Scene, seed: int) -> tuple[tuple[MatchedSite, ...], Triangulation, SimulatedRun, SimulatedRun]:
-    """The followed site first, as matched and located, with its two runs as they are followed."""
+    """Return the followed site first, matched and located, with its two runs."""
 
     def study(breathing_mm: float) -> tuple[tuple[MatchedSite, ...], tuple[SimulatedRun, SimulatedRun]]:
         spec = StudySpec(
@@ -126,7 +126,10 @@ def biplane(scene: Scene, seed: int) -> tuple[tuple[MatchedSite, ...], Triangula
 
 
 def monoplane_view(matched: MatchedSite, located: LocatedSite, a: bool, others: Sequence[LocatedSite]) -> MonoplaneView:
-    """What the solver gets to follow view a or b; the site's own cycle only without ``others``."""
+    """Return the solver's input for view a or b.
+
+    It has the site's own cycle only without ``others``.
+    """
     return MonoplaneView(
         site=matched.site,
         view="a" if a else "b",
@@ -203,7 +206,7 @@ def worst_phase(view: Sequence[Score]) -> float:
 
 
 def share(of: Sequence[NDArray[np.bool_]]) -> str:
-    """Percentage with a 95 % bootstrap interval over hearts."""
+    """Format a percentage with a 95 % bootstrap interval over hearts."""
     means = np.array([one.mean() for one in of])
     drawn = np.random.default_rng(0).choice(means, (2000, len(means))).mean(axis=1)
     low, high = np.percentile(drawn, [2.5, 97.5])
@@ -247,7 +250,7 @@ def main(first: int, hearts: int, coverage_hearts: int) -> None:
 
 
 def frame_rates(seeds: Sequence[int]) -> None:
-    """The error at lower frame rates, and what it is times the error at 60 frames/s."""
+    """Print the error at lower frame rates, and over 60 frames/s."""
     print("\nhuman hearts, runs of 2 s, own cycle, breath held: 12 electrodes (times the error at 60 frames/s)")
     print(f"frames/s{'true phases':>30}{'R waves to the frame':>30}{'no R waves':>30}")
     told: dict[bool | None, list[list[float]]] = {True: [], False: [], None: []}
@@ -266,7 +269,10 @@ def frame_rates(seeds: Sequence[int]) -> None:
 
 
 def coverage(seeds: range) -> None:
-    """Shares of ellipsoids that hold the truth; the field of other sites takes 20 times as long, so on an eighth of the hearts."""
+    """Print the shares of ellipsoids that contain the truth.
+
+    The field of other sites takes 20 times as long, so it is computed on an eighth of the hearts.
+    """
     default = Scene("defaults: breathing, gantry 0.5 deg and 0.5 mm", True, 4.0, 4.0, 0.5)
     own = Scene("own cycle, breath held")
     apart = Scene("own cycle, every run breathes on its own", biplane_breathing_mm=4.0, breathing_mm=4.0)

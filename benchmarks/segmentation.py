@@ -102,7 +102,7 @@ def _ratio(sums: Array, name: str) -> float:
 
 
 def main(first: int, seeds: int, frames: int) -> None:
-    """All tables, on seeds ``first`` to ``first + seeds - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + seeds - 1``."""
     table = Table()
     spent = {name: [0.0, 0] for name in SEGMENTERS}
     for seed in range(first, first + seeds):
@@ -120,7 +120,7 @@ def main(first: int, seeds: int, frames: int) -> None:
 
 
 def _without_catheters(first: int, seeds: int) -> None:
-    """Single frames of the phantom's torso alone: none should be accepted."""
+    """Print how many frames without catheters are accepted: none should be."""
     for name, segmenter in SEGMENTERS.items():
         accepted = count = 0
         for seed in range(first, first + seeds):
@@ -200,7 +200,7 @@ def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -
 
 
 def _matched(points: Array, truth: Array) -> Array:
-    """Distances of the detections that are right, each true electrode taken once."""
+    """Return the distances of right detections, each true electrode taken once."""
     if not len(points):
         return np.zeros(0)
     distance = np.linalg.norm(points[:, None] - truth[None], axis=2)
@@ -210,7 +210,10 @@ def _matched(points: Array, truth: Array) -> Array:
 
 
 def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array], frames: NDArray[np.int64]) -> None:
-    """A catheter-frame is right when the track that is this catheter's in most of the run lies on all its electrodes."""
+    """Count the catheter-frames that are on the right track.
+
+    A catheter-frame is right when the track that is this catheter's in most of the run lies on all its electrodes.
+    """
     of_track: dict[int, dict[str, list[int]]] = {}
     for entry in found.frames:
         for chain in entry.chains:

@@ -87,7 +87,7 @@ def main(sites: int, frames: int, seed: int) -> None:
 
 
 def milliseconds(work: Work, repeats: int = 9) -> float:
-    """Median over ``repeats`` after one for warming."""
+    """Return the median over ``repeats`` after one for warming."""
     work()
     times = []
     for _ in range(repeats):
@@ -184,7 +184,10 @@ def decoding() -> None:
 
 
 def starting() -> None:
-    """The byte code of all modules is there beforehand, as after any first start."""
+    """Measure the start of a process.
+
+    The byte code of all modules exists, as after any first start.
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
         environment["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "code")
@@ -242,7 +245,7 @@ def _write(path: Path, run: SimulatedRun, name: str) -> None:
 
 
 def _twins() -> Any:
-    """The plain filters of the tests."""
+    """Import the plain filters of the tests."""
     path = Path(__file__).parents[1] / "tests" / "plugins" / "segmenter" / "test_filters.py"
     spec = importlib.util.spec_from_file_location("plain_filters", path)
     assert spec is not None
@@ -253,7 +256,7 @@ def _twins() -> Any:
 
 
 def _peer(name: str) -> Any:
-    """A peer's module, limited to one thread; None where it is not installed."""
+    """Import a peer's module, limited to one thread; None where not installed."""
     try:
         module: Any = importlib.import_module(name)
     except ImportError:

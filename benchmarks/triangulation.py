@@ -41,7 +41,7 @@ def camera(primary_deg: float) -> Camera:
 
 
 def bound_mm(cameras: tuple[Camera, Camera], points: Array) -> float:
-    """RMS of the Cramer-Rao bound of points (n, 3)."""
+    """Return the RMS of the Cramer-Rao bound of points (n, 3)."""
     jacobian = np.concatenate([one.jacobian(points) for one in cameras], axis=1)
     information = np.einsum("nki,nkj->nij", jacobian, jacobian) / NOISE_PX**2
     return float(np.sqrt(np.trace(np.linalg.inv(information), axis1=1, axis2=2).mean()))
@@ -110,7 +110,7 @@ def calibration(first_seed: int, hearts: int) -> None:
 
 
 def _wrong_catalogue() -> Catalogue:
-    """The mapping catheter described with its middle gap 2 mm too long."""
+    """Return a catalogue with a gap that is 2 mm too long."""
     mapping = DEFAULT_CATALOGUE["mapping"]
     first, second, third = mapping.spacing_mm
     wrong = replace(mapping, spacing_mm=(first, second + 2.0, third))
@@ -141,7 +141,10 @@ def _calibration_row(
 def still_sites(
     study: SimulatedStudy, angle_deg: float, offset_mm: float, rng: np.random.Generator
 ) -> tuple[tuple[MatchedSite, ...], Array]:
-    """The diastolic electrodes of all sites, seen at once by view a and by a view b that its header misstates; their truth."""
+    """Return the diastolic electrodes in both views, and their truth.
+
+    The header of view b is wrong.
+    """
     turn, offset = rng.normal(size=3), rng.normal(size=3)
     displaced = np.eye(4)
     displaced[:3, :3] = Rotation.from_rotvec(angle_deg * turn / np.linalg.norm(turn), degrees=True).as_matrix()
