@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 import yaml
 
 from fluoromap.reasons import Reason
-from fluoromap_service.cli.app import app
+from fluoromap_service.cli.app import program
 from fluoromap_service.settings import Settings
 
 TOP = Path(__file__).parent.parent
@@ -27,8 +26,8 @@ PROJECT: dict[str, Any] = tomllib.loads((TOP / "pyproject.toml").read_text())["p
 
 
 def _parse(arguments: list[str]) -> None:
-    """Let the command line read the arguments without doing what they say; raises where they are wrong."""
-    command = typer.main.get_command(app)
+    """Parse the arguments as the program does, without running the command; raise where they are wrong."""
+    command = program
     context = command.make_context("fluoromap", list(arguments))
     while hasattr(command, "resolve_command"):
         rest = [*context._protected_args, *context.args]

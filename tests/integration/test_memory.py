@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from processes import environment_of, process, wait_until_ready
 
 from fluoromap.geometry import Gantry
-from fluoromap_service.cli.client import Client, inputs_of
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port
 from fluoromap_service.dicom import write_cine
 
@@ -73,7 +74,7 @@ def _peaks_of_a_job(tmp_path: Path, frames: int) -> tuple[float, float]:
         server = next(child.pid for child in children if "fluoromap api" in " ".join(child.cmdline()))
         client = stack.enter_context(Client(url))
         study = client.make_study("memory")
-        inputs = inputs_of(_study(tmp_path / f"study-{frames}", frames))
+        inputs = find_files(_study(tmp_path / f"study-{frames}", frames))
         assert [client.upload(study, path) for path in inputs.runs] == [[], []]
         client.put_activation_times(study, inputs.activation_times)
         *_, ended = client.follow(client.start_job(study))

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from processes import Fresh, Kill, embedded, environment_of, wait_until_ready, with_servers
 
-from fluoromap_service.cli.client import Client, inputs_of
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port
 
 pytestmark = pytest.mark.timeout(900)
@@ -22,7 +23,7 @@ def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any],
     """Send the study, run a job, kill the worker while a run is being searched; the ended job and its points."""
     with Client(url) as client:
         study = client.make_study("stack")
-        inputs = inputs_of(folder)
+        inputs = find_files(folder)
         assert [client.upload(study, path) for path in inputs.runs] == [[]] * len(inputs.runs)
         assert client.put_activation_times(study, inputs.activation_times) == []
         job: dict[str, Any] = {}

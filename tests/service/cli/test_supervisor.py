@@ -14,7 +14,8 @@ import psutil
 import pytest
 
 from fluoromap_service.cli import supervisor
-from fluoromap_service.cli.supervisor import CommandFailed, Supervisor, check_port, free_port
+from fluoromap_service.cli.failures import CommandFailed
+from fluoromap_service.cli.supervisor import Supervisor, check_port, free_port
 
 PROGRAM = """#!/bin/sh
 echo $$ >> "$FLUOROMAP_DATA_DIR/$1.pids"
