@@ -21,7 +21,7 @@ from fluoromap_service.dicom import write_cine
 
 LARGEST_DIFFERENCE_MIB = 64
 PIXELS = 256
-"""1000 such frames are 125 MiB: held at once, they would be seen."""
+"""Rows and columns of a frame. 1000 such frames take 125 MiB, so a process that holds all of them exceeds the limit."""
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -33,7 +33,7 @@ def _noise(frames: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def _study(folder: Path, frames: int) -> Path:
-    """A site of two runs that show nothing but noise."""
+    """Write a site of two runs that contain noise only."""
     folder.mkdir()
     for number, primary_deg in enumerate((90.0, 0.0)):
         write_cine(
@@ -52,7 +52,7 @@ def _study(folder: Path, frames: int) -> Path:
 
 
 def _peak_mib(pid: int) -> float:
-    """Largest resident memory any process of a tree had so far."""
+    """Return the largest resident memory, so far, of any process of a tree."""
     root = psutil.Process(pid)
     peaks = []
     for member in (root, *root.children(recursive=True)):

@@ -1,4 +1,4 @@
-"""The supervisor, with small programs in the place of API and worker."""
+"""The supervisor, with small programs instead of the API and the worker."""
 
 from __future__ import annotations
 
@@ -90,14 +90,14 @@ def test_dead_api_is_an_error_that_says_where_to_look(running: Supervisor, tmp_p
     _eventually(lambda: bool(_pids(tmp_path, "api")))
     os.killpg(_pids(tmp_path, "api")[0], signal.SIGKILL)
 
-    def told() -> bool:
+    def reported() -> bool:
         try:
             running.tend()
         except CommandFailed as error:
             return str(tmp_path) in str(error)
         return False
 
-    _eventually(told)
+    _eventually(reported)
 
 
 def test_stop_leaves_nothing_running(running: Supervisor, tmp_path: Path) -> None:

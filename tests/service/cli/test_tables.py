@@ -1,4 +1,4 @@
-"""The command ``fluoromap tables``: its shapes and exit codes, on made-up rows."""
+"""The command ``fluoromap tables``: its formats and exit codes, on invented rows."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_wrong_usage_ends_with_2(arguments: tuple[str, ...], monkeypatch: pytest
 
 
 def test_all_tables_come_about(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The real thing, small; the solver that is tested elsewhere is left out."""
+    """The real computation, on few hearts and without the slowest solver, which has tests of its own."""
     monkeypatch.setattr(made, "whole_cycle_rows", lambda scenario, runs: iter(()))
     monkeypatch.setattr(made, "rigid_pose_rows", lambda: iter(()))
     reported: list[float] = []
