@@ -37,9 +37,9 @@ def accuracy(points: list[dict[str, Any]], truth: dict[str, Any], catheter: str 
         if tip is None:
             rows.append(SiteAccuracy(site["site"], None, "rejected", (), None))
             continue
-        located = tip["x_mm"] is not None
+        has_position = tip["x_mm"] is not None
         position_mm = [tip["x_mm"], tip["y_mm"], tip["z_mm"]]
-        error_mm = math.dist(position_mm, site["relative_mm"][catheter][0]) if located else None
+        error_mm = math.dist(position_mm, site["relative_mm"][catheter][0]) if has_position else None
         rows.append(SiteAccuracy(site["site"], error_mm, tip["grade"], tuple(tip["reasons"]), tip["lat_ms"]))
     return rows
 

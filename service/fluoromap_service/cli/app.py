@@ -18,7 +18,7 @@ from fluoromap_service.cli.failures import sentence_of
 
 COMMANDS = {
     "demo": "Simulate a study, run it through the real service and compare the results with the truth.",
-    "up": "Run the API and a worker on SQLite and files; no server is needed.",
+    "up": "Run the API and a worker; by default they use SQLite and files, no server.",
     "run": "Run the pipeline over a folder, on a private service.",
     "simulate": "Simulate a study: DICOM runs, activation times and the truth.",
     "tables": "Print the paper's tables beside our own, computed on simulated data.",
@@ -40,8 +40,8 @@ class CommandGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Return the name, the imported command and the remaining arguments."""
-        name, listed, rest = super().resolve_command(ctx, args)
-        return name, listed if name is None else load(name), rest
+        name, entry, rest = super().resolve_command(ctx, args)
+        return name, entry if name is None else load(name), rest
 
 
 def load(name: str) -> Any:

@@ -42,9 +42,9 @@ def _demonstrate(folder: Path, out: Path, console: Console, keep: bool) -> None:
     with progress_bars(console) as progress:
         bar = progress.add_task("simulate", total=2 * SPEC.sites)
         files = simulate(folder / "simulated", SPEC, on_run=lambda: progress.advance(bar))
-        starting = progress.add_task("start service", total=None)
+        service_bar = progress.add_task("start service", total=None)
         with private_service(folder / "service") as url, Client(url) as client:
-            progress.update(starting, total=1, completed=1)
+            progress.update(service_bar, total=1, completed=1)
             study, notes = upload(client, StudyFiles(files.runs, files.activation_times), "Demonstration", progress)
             job = run_job(client, study, progress)
             points, chamber = client.points(job["id"]), client.fetch(job["id"], out)

@@ -30,10 +30,10 @@ def figures(
     _check_writable(folder)
     try:
         with one_bar("simulate, follow") as context:
-            made = paper_figures(seed, context)
+            result = paper_figures(seed, context)
     except Refusal as refusal:
         raise CommandFailed(f"There are no figures of the heart {seed}: {refusal} Choose another --seed.") from refusal
-    for name, content in made.files().items():
+    for name, content in result.files().items():
         (folder / name).write_bytes(content)
         typer.echo(folder / name)
 

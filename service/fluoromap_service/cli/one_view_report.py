@@ -68,11 +68,11 @@ def show(tables: OneViewTables, console: Console) -> None:
 def _show_table_1(tables: OneViewTables, console: Console) -> None:
     for view in ("LAT", "AP"):
         rows = [row for row in tables.table1 if row.view == view]
-        shown = Table(title=f"{_TABLES['table1']}; {view}, mm (mean min max RMS)", title_justify="left")
+        table = Table(title=f"{_TABLES['table1']}; {view}, mm (mean min max RMS)", title_justify="left")
         for column in ("dz", "images", "paper", "H77", "H18"):
-            shown.add_column(column, justify="right")
+            table.add_column(column, justify="right")
         if view == "LAT":
-            shown.add_column("H77 fitted", justify="right")
+            table.add_column("H77 fitted", justify="right")
         for row in rows:
             if row.helix != "H77":
                 continue
@@ -80,8 +80,8 @@ def _show_table_1(tables: OneViewTables, console: Console) -> None:
                 other for other in rows if (other.helix, other.dz_mm, other.images) == ("H18", row.dz_mm, row.images)
             )
             cells = [str(row.dz_mm), str(row.images), _four(row.paper), _four(row.ours), _four(small.ours)]
-            shown.add_row(*cells, *([_four(row.fitted)] if view == "LAT" else []), end_section=row.images == 6)
-        console.print(shown)
+            table.add_row(*cells, *([_four(row.fitted)] if view == "LAT" else []), end_section=row.images == 6)
+        console.print(table)
         ours = [_difference(row.ours, row.paper) for row in rows if row.helix == "H77"]
         console.print(f"{view}: the 3D RMS of H77 differs from the paper's by {sum(ours) / len(ours):.1%} on average.")
         fitted = [_difference(row.fitted, row.paper) for row in rows if row.fitted is not None]
@@ -91,16 +91,16 @@ def _show_table_1(tables: OneViewTables, console: Console) -> None:
 
 
 def _show_table_2(tables: OneViewTables, console: Console) -> None:
-    shown = Table(title=f"{_TABLES['table2']}, mm", title_justify="left")
+    table = Table(title=f"{_TABLES['table2']}, mm", title_justify="left")
     for column in ("view", "electrodes", "dz", "images", "ours: mean min max RMS", "RMS/mean", "the paper's"):
-        shown.add_column(column, justify="right")
+        table.add_column(column, justify="right")
     for row in tables.table2:
         known = "" if row.paper_rms_over_mean is None else f"{row.paper_rms_over_mean:.3f}"
-        shown.add_row(
+        table.add_row(
             row.view, row.electrodes, str(row.dz_mm), str(row.images), _four(row.ours),
             f"{row.ours_rms_over_mean:.3f}", known, end_section=row.dz_mm == 5 and row.images == 6,
         )  # fmt: skip
-    console.print(shown)
+    console.print(table)
     console.print(_UNKNOWN_TABLE_2)
     console.print()
 
@@ -136,21 +136,21 @@ def _show_cycle(tables: OneViewTables, console: Console) -> None:
     if not tables.motion_prior:
         console.print("The solver motion-prior does not load; 'fluoromap plugins' shows the reason.")
         return
-    shown = Table(title=f"{_TABLES['motion_prior']}, mm", title_justify="left")
+    table = Table(title=f"{_TABLES['motion_prior']}, mm", title_justify="left")
     for column in (
         "data", "view", "electrodes", "solver", "3D RMS", "along the ray", "lateral", "to reference", "worst heart",
         "images < 2 mm",
     ):  # fmt: skip
-        shown.add_column(column, justify="left" if column in ("data", "solver") else "right")
+        table.add_column(column, justify="left" if column in ("data", "solver") else "right")
     for row in tables.motion_prior:
         figures = (row.rms_mm, row.along_ray_mm, row.lateral_mm, row.relative_rms_mm, row.largest_heart_rms_mm)
         solver = f"{row.solver} (refused {row.refused} of {row.runs})" if row.refused else row.solver
-        shown.add_row(
+        table.add_row(
             row.scenario, row.view, row.electrodes, solver,
             *("refused" if figure is None else f"{figure:.2f}" for figure in figures),
             f"{row.images_below_2_mm} of {row.images - 1}", end_section=row.solver == "motion-prior",
         )  # fmt: skip
-    console.print(shown)
+    console.print(table)
     first = tables.motion_prior[0]
     console.print(f"{first.hearts} hearts, {first.runs} runs for each row, pixel noise {first.noise_px} px.")
 

@@ -14,12 +14,12 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def plugins() -> None:
     """List the installed plugins, and why a broken plugin does not load."""
-    installed = registry.plugins()
+    rows = registry.plugins()
     table = Table("kind", "name", "version", "from", "default")
-    for row in installed:
+    for row in rows:
         version = "does not load" if row.error is not None else row.version
         table.add_row(row.kind, row.name, version, row.distribution, "yes" if row.default else "")
     Console().print(table)
-    for row in installed:
+    for row in rows:
         if row.error is not None:
             typer.echo(f"\n{row.kind} {row.name}:\n{row.error}")

@@ -43,8 +43,8 @@ def find_files(folder: Path) -> StudyFiles:
     runs = tuple(sorted(path for path in folder.rglob("*") if path.is_file() and _is_dicom(path)))
     if not runs:
         raise CommandFailed(f"There is no DICOM file in {folder}; copy the runs there.")
-    preferred = folder / "activation_times.csv"
-    tables = [preferred] if preferred.is_file() else sorted(folder.glob("*.csv"))
+    default = folder / "activation_times.csv"
+    tables = [default] if default.is_file() else sorted(folder.glob("*.csv"))
     if not tables:
         raise CommandFailed(f"There is no activation-time table in {folder}; add activation_times.csv (site,lat_ms).")
     if len(tables) > 1:

@@ -22,8 +22,11 @@ import httpx
 from fluoromap_service.cli.failures import CommandFailed
 
 STOP_SECONDS = 30.0
+"""Longest time that the children get to stop."""
 READY_SECONDS = 180.0
+"""Longest time until the service must be ready. The first start compiles kernels."""
 LONGEST_BACKOFF_SECONDS = 30.0
+"""Longest wait before a worker that dies again and again is restarted."""
 STEADY_SECONDS = 60.0
 """A worker that dies after this time is restarted at once."""
 
@@ -71,7 +74,7 @@ class _Child:
     log: Path | None
     environment: dict[str, str]
     process: subprocess.Popen[bytes] = field(init=False)
-    started: float = field(init=False)
+    start_time: float = field(init=False)
     deaths: int = 0
     restart_at: float | None = None
 
@@ -88,7 +91,7 @@ class _Child:
         )
         if output is not None:
             output.close()
-        self.started = time.monotonic()
+        self.start_time = time.monotonic()
         self.restart_at = None
 
     @property
@@ -119,8 +122,9 @@ class Supervisor:
         self._worker = _Child(["worker"], log_folder and log_folder / "worker.log", settings)
         self._api = _Child(["api"], log_folder and log_folder / "api.log", settings)
         self._log_folder = log_folder
-        shown = f"[{host}]" if ":" in host else host
-        self.url = f"http://{shown}:{port}"
+        # An IPv6 address has brackets in a URL.
+        address = f"[{host}]" if ":" in host else host
+        self.url = f"http://{address}:{port}"
 
     def start(self) -> None:
         """Start the worker and the API."""
@@ -143,7 +147,7 @@ class Supervisor:
         end = time.monotonic() + READY_SECONDS
         with httpx.Client(trust_env=False, timeout=5) as client:
             while time.monotonic() < end and not (stop and stop.is_set()):
-                self.tend()
+                self.check_children()
                 with suppress(httpx.HTTPError):
                     if client.get(f"{self.url}/v1/ready").status_code == 200:
                         return
@@ -151,7 +155,7 @@ class Supervisor:
         if not (stop and stop.is_set()):
             raise CommandFailed(f"The service was not ready within {READY_SECONDS:.0f} s; {self._where_to_look()}.")
 
-    def tend(self) -> None:
+    def check_children(self) -> None:
         """Check the children once and restart a dead worker.
 
         A worker that dies again and again is restarted after a longer and longer time.
@@ -170,7 +174,7 @@ class Supervisor:
         if worker.restart_at is None:
             # The pool processes of a dead worker would compute beside the new worker.
             worker.kill_group()
-            steady = now - worker.started > STEADY_SECONDS
+            steady = now - worker.start_time > STEADY_SECONDS
             worker.deaths = 1 if steady else worker.deaths + 1
             delay = 0.0 if worker.deaths == 1 else min(2.0 ** (worker.deaths - 2), LONGEST_BACKOFF_SECONDS)
             worker.restart_at = now + delay
@@ -216,7 +220,7 @@ def run_until_stopped(supervisor: Supervisor, stop: threading.Event, on_ready: C
         if not stop.is_set():
             on_ready()
         while not stop.wait(0.2):
-            supervisor.tend()
+            supervisor.check_children()
     finally:
         supervisor.stop()
 
@@ -254,12 +258,12 @@ def private_service(data_dir: Path) -> Iterator[str]:
     data_dir.mkdir(parents=True, exist_ok=True)
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
     environment["FLUOROMAP_DATA_DIR"] = str(data_dir.resolve())
-    migrated = subprocess.run(
+    migration = subprocess.run(
         [program(), "db", "upgrade"], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
     )
-    if migrated.returncode != 0:
+    if migration.returncode != 0:
         raise CommandFailed(
-            migrated.stderr.strip().removeprefix("fluoromap: ") or f"The database in {data_dir} cannot be made."
+            migration.stderr.strip().removeprefix("fluoromap: ") or f"The database in {data_dir} cannot be made."
         )
     supervisor = Supervisor("127.0.0.1", free_port(), environment, log_folder=data_dir)
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
@@ -283,4 +287,4 @@ def _watch(supervisor: Supervisor, stop: threading.Event) -> None:
     # A client of a dead API fails by its own connection error.
     with suppress(CommandFailed):
         while not stop.wait(0.2):
-            supervisor.tend()
+            supervisor.check_children()

@@ -26,10 +26,10 @@ def tables(
     if as_json and as_csv:
         raise typer.BadParameter("--json and --csv exclude each other")
     with one_bar("simulate, follow") as context:
-        computed = one_view_tables(context)
+        result = one_view_tables(context)
     if as_json:
-        typer.echo(one_view_report.as_json(computed))
+        typer.echo(one_view_report.as_json(result))
     elif as_csv:
-        typer.echo(one_view_report.as_csv(computed), nl=False)
+        typer.echo(one_view_report.as_csv(result), nl=False)
     else:
-        one_view_report.show(computed, Console())
+        one_view_report.show(result, Console())

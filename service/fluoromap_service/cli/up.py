@@ -19,20 +19,20 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
-    """Run the API and a worker on SQLite and files; no server is needed.
+    """Run the API and a worker; by default they use SQLite and files, no server.
 
     A worker that dies is started again.
     """
     apply_options(host, port, data_dir)
-    configured = settings()
+    host, port = settings().host, settings().port
     with explain_database_failures():
         schema.upgrade()
-        auth.check_may_start(configured.host)
-        needs_token = auth.any_token()
-    check_port(configured.host, configured.port)
-    supervisor = Supervisor(configured.host, configured.port, os.environ)
-    typer.echo(f"fluoromap: starting with the data in {configured.data_dir}")
-    if not needs_token:
+        auth.check_may_start(host)
+        has_token = auth.any_token()
+    check_port(host, port)
+    supervisor = Supervisor(host, port, os.environ)
+    typer.echo(f"fluoromap: starting with the data in {settings().data_dir}")
+    if not has_token:
         typer.echo("fluoromap: open to every user of this machine, because no access token exists yet")
     run_until_stopped(
         supervisor, stop_on_signals(), lambda: typer.echo(f"fluoromap: ready at {supervisor.url}; Ctrl-C ends it")

@@ -62,7 +62,7 @@ def test_dead_worker_is_replaced_and_its_children_are_not_left(running: Supervis
     os.kill(first, signal.SIGKILL)
 
     def replaced() -> bool:
-        running.tend()
+        running.check_children()
         return len(_pids(tmp_path, "worker")) == 2
 
     _eventually(replaced)
@@ -76,7 +76,7 @@ def test_worker_that_keeps_dying_is_restarted_ever_later(running: Supervisor, tm
     waits = set()
 
     def thrice() -> bool:
-        running.tend()
+        running.check_children()
         child = running._worker
         if child.restart_at is not None:
             waits.add(child.deaths)
@@ -92,7 +92,7 @@ def test_dead_api_is_an_error_that_says_where_to_look(running: Supervisor, tmp_p
 
     def reported() -> bool:
         try:
-            running.tend()
+            running.check_children()
         except CommandFailed as error:
             return str(tmp_path) in str(error)
         return False
