@@ -104,7 +104,15 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
 
 
 def _is_frozen(array: NDArray[Any]) -> bool:
-    return array.base is None and array.flags.c_contiguous and not array.flags.writeable
+    """Return whether nobody can write to the array, neither through it nor through the memory that it shows."""
+    if array.flags.writeable or not array.flags.c_contiguous:
+        return False
+    owner = array.base
+    while isinstance(owner, np.ndarray):
+        if owner.base is None:
+            return False
+        owner = owner.base
+    return owner is None or isinstance(owner, bytes)
 
 
 # --- what a segmenter gets and gives ---------------------------------------------------------------------------------

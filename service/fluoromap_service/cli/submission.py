@@ -11,15 +11,7 @@ from rich.progress import Progress
 
 from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.failures import CommandFailed
-
-STAGES = {
-    "segment": "find electrodes",
-    "match": "name catheters",
-    "triangulate": "locate in 3D",
-    "fuse": "make the map",
-    "monoplane": "follow one view",
-}
-"""Title of the progress bar of each kind of stage, in the order of the pipeline."""
+from fluoromap_service.jobs.pipeline import PIPELINE
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +84,7 @@ def run_job(client: Client, study: str, progress: Progress) -> dict[str, Any]:
     CommandFailed
         When the job fails.
     """
-    bars = {name: progress.add_task(title, total=1.0) for name, title in STAGES.items()}
+    bars = {stage.name: progress.add_task(stage.title, total=1.0) for stage in PIPELINE}
     job: dict[str, Any] = {}
     for job in client.follow(client.start_job(study)):
         for name, bar in bars.items():
