@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
+from fluoromap.geometry.gantry import UPRIGHT, ImageAxes, view_axes
 from fluoromap_service.dicom.facts import InstanceFacts
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.problem import Problem
@@ -90,8 +90,8 @@ def central_ray(run: StudyRun) -> tuple[float, float, float] | None:
     primary, secondary = run.gantry["primary_deg"], run.gantry["secondary_deg"]
     if primary is None or secondary is None:
         return None
-    a, b = math.radians(primary), math.radians(secondary)
-    return math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)
+    x, y, z = view_axes(primary, secondary)[2].tolist()
+    return x, y, z
 
 
 def runs_of(session: Session, study_id: str) -> list[StudyRun]:
