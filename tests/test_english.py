@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import io
 import re
+import shutil
 import subprocess
 import sys
 import tokenize
@@ -101,9 +102,10 @@ class Passage:
 
 def tracked(*patterns: str) -> list[str]:
     """Return the project's own files that match a pattern."""
-    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=TOP, capture_output=True, text=True)
-    if listed.returncode == 0:
-        names = listed.stdout.splitlines()
+    git = shutil.which("git")
+    if git is not None and (TOP / ".git").exists():
+        list_files = [git, "ls-files", "-co", "--exclude-standard"]
+        names = subprocess.run(list_files, cwd=TOP, capture_output=True, text=True, check=True).stdout.splitlines()
     else:
         names = [str(path.relative_to(TOP)) for path in TOP.rglob("*") if path.is_file() and ".venv" not in path.parts]
     own = [name for name in names if "/web/three/" not in name and (TOP / name).exists()]
