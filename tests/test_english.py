@@ -236,7 +236,8 @@ def _is_exempt(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
 
 
 def _wrong_first_line(line: str) -> str | None:
-    words = [word for word in re.sub(r"\([^()]*\)", "", line).split() if re.search(r"\w", word)]
+    counted = re.sub(r"\([^()]*\)|\b([Aa]n?|the)\b", "", line)
+    words = [word for word in counted.split() if re.search(r"\w", word)]
     verb = re.sub(r"[^\w-]", "", words[0]).lower() if words else ""
     if verb not in VERBS or (len(words) > 1 and words[1] == "of"):
         return "open with an imperative verb"
