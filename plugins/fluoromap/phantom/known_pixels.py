@@ -76,7 +76,7 @@ def _phases(
         if rhythm is None:
             return [None, None]
         phases.append(rhythm.phases)
-        folded.append(fold(catheters, rhythm.phases, rhythm.unsure))
+        folded.append(fold(catheters, rhythm.phases, rhythm.phase_uncertainty))
     alike = [(k, k) for k in range(len(folded[0].paths))]
     return [phases[0], (phases[1] + phase_shift(cameras, (folded[0], folded[1]), alike)) % 1.0]
 

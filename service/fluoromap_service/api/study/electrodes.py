@@ -153,8 +153,8 @@ def _detected(session: Session, study_id: str, uid: str, frame: int) -> list[Ele
 
 def _names(session: Session, job_id: str, uid: str, frame: int, chains: tuple[Chain, ...]) -> list[str | None]:
     """A catheter for each chain, none twice: as the job's matching named it, else its most probable kind."""
-    named = {chain.pixels_uv.tobytes(): chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
-    names = [named.get(chain.pixels_uv.tobytes()) for chain in chains]
+    of_track = {chain.track: chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
+    names = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
     likely = sorted(
         ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
         key=lambda item: (-item[0], item[1]),
