@@ -37,8 +37,8 @@ from fluoromap.matching import SiteRuns, match_study
 from fluoromap.matching.phase import cardiac_phases
 from fluoromap.matching.run_catheters import gather
 from fluoromap.phantom import FRONTAL, LATERAL, HeartKind, StudySpec, simulate_study
+from fluoromap.phantom.anatomy import Anatomy, draw_anatomy
 from fluoromap.phantom.motion import DIASTOLIC_PHASE, Beats, Breathing
-from fluoromap.phantom.placement import Anatomy, draw_anatomy
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 
@@ -132,7 +132,7 @@ def _run(
     pulses, rest = beats.pulses(times), beats.rest_mm(times)
     truth = {}
     for number, resident in enumerate(residents):
-        line = resident.shaft.moved(pulses @ resident.vectors_mm + rest[:, number])
+        line = resident.shaft.lines_mm(pulses @ resident.vectors_mm + rest[:, number])
         truth[resident.shaft.catheter.name] = camera.project(resident.shaft.electrodes_mm(line) + breath)
     phases = np.interp(times, r_waves, np.arange(len(r_waves))) % 1.0
     return _segmentation(truth, phases, rate_hz, design, rng), truth, phases

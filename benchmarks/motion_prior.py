@@ -32,7 +32,7 @@ from fluoromap.contracts import (
 from fluoromap.monoplane.a_priori_lm import APrioriLM
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.phantom import HeartKind, SimulatedRun, StudySpec, simulate_study
-from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_triangulator
 

@@ -102,7 +102,7 @@ def test_all_tables_come_about(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(made, "whole_cycle_rows", lambda scenario, runs: iter(()))
     monkeypatch.setattr(made, "rigid_pose_rows", lambda: iter(()))
     told: list[float] = []
-    tables = made.one_view_tables(one_view_report.Bar(told.append), hearts=(7,), sites=2, followed_sites=1)
+    tables = made.one_view_tables(one_view_report.Bar(told.append), hearts=(7,), sites=2, tracked_sites=1)
     assert len(tables.table1) == 96
     assert len(tables.table2) == 48
     assert {row.runs for row in tables.rigid_pose_phantom} == {1}
