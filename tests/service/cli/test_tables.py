@@ -105,7 +105,7 @@ def test_all_tables_come_about(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(made, "whole_cycle_rows", lambda scenario, runs: iter(()))
     monkeypatch.setattr(made, "rigid_pose_rows", lambda: iter(()))
     reported: list[float] = []
-    tables = made.one_view_tables(BarContext(reported.append), hearts=(7,), sites=2, followed_sites=1)
+    tables = made.one_view_tables(BarContext(reported.append), hearts=(7,), sites=2, tracked_sites=1)
     assert len(tables.table1) == 96
     assert len(tables.table2) == 48
     assert {row.runs for row in tables.rigid_pose_phantom} == {1}

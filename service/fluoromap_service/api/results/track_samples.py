@@ -36,7 +36,8 @@ class Sample:
 class FrameOrigins:
     """What is subtracted in each frame: positions_mm (n, 3) from the isocentre; known (n,), False where there is none;
     borrowed (n,), True where it is the mean over the other sites; same_frame (n,), True where it is the reference
-    catheter's mean in that very frame, which shares its errors with the position it is subtracted from."""
+    catheter's mean in that very frame, which shares its errors with the position it is subtracted from.
+    """
 
     positions_mm: Array
     known: BoolArray
