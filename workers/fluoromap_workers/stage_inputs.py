@@ -252,7 +252,10 @@ def _monoplane_view(
 
 
 def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
-    """Remove doubts about names: they move no electrode, and naming a catheter at one site must not redo the others."""
+    """Return the point without doubts about its name.
+
+    They move no electrode, and naming a catheter at one site must not redo the others.
+    """
     return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
 
 
