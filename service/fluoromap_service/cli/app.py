@@ -336,10 +336,10 @@ def _sentence(error: Exception) -> str | None:
         return f"A setting is wrong: {fields}."
     from sqlalchemy.exc import DBAPIError
 
-    from fluoromap_service.auth import StartRefused, TokenProblem
     from fluoromap_service.cli.supervisor import CommandFailed
+    from fluoromap_service.problem import Problem
 
-    if isinstance(error, CommandFailed | StartRefused | TokenProblem):
+    if isinstance(error, CommandFailed | Problem):
         return str(error)
     if isinstance(error, DBAPIError):
         return f"The database cannot be used ({str(error.orig).splitlines()[0]}); see FLUOROMAP_DATABASE_URL."

@@ -13,7 +13,7 @@ from sqlalchemy import select, tuple_
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap_service.api.http.etags import known, not_modified
+from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.problems import responses
@@ -135,12 +135,12 @@ async def get_job(
     conditional = "if-none-match" in request.headers
     end = time.monotonic() + wait
     while state not in ENDED_JOB and time.monotonic() < end:
-        if (not known(request, etag)) if conditional else (state != first_state):
+        if (not is_known(request, etag)) if conditional else (state != first_state):
             break
         await asyncio.sleep(min(LOOK_SECONDS, max(end - time.monotonic(), 0.0)))
         state, etag = await run_in_threadpool(_look, job_id)
     answer, etag = await run_in_threadpool(_answer, job_id)
-    if known(request, etag):
+    if is_known(request, etag):
         return not_modified(etag)
     response.headers["ETag"] = etag
     response.headers["Cache-Control"] = "private, no-cache"

@@ -16,7 +16,7 @@ from starlette.background import BackgroundTask
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
 from fluoromap.drawing.png import encode_png
-from fluoromap_service.api.http.file_names import plain
+from fluoromap_service.api.http.file_names import plain_name
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.jobs.finished import job_of, map_of, snapshot_of
@@ -128,9 +128,9 @@ def _map(job_id: str) -> Iterator[tuple[str, bytes, bool]]:
         yield f"mesh/chamber.{mesh_format}", mesh.path.read_bytes(), True
     taken: set[str] = set()
     for overlay, fusion in overlays:
-        name = f"overlays/{plain(overlay.site)}-{overlay.view}.png"
+        name = f"overlays/{plain_name(overlay.site)}-{overlay.view}.png"
         if name in taken:
-            name = f"overlays/{plain(overlay.site)}-{overlay.view}-{len(taken) + 1}.png"
+            name = f"overlays/{plain_name(overlay.site)}-{overlay.view}-{len(taken) + 1}.png"
         taken.add(name)
         try:
             picture = picture_of(job_id, fusion, Look())

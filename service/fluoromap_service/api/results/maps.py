@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap.contracts import ChamberMap, SurfaceSite
 from fluoromap.reasons import Reason
-from fluoromap_service.api.http.etags import file_response, known, not_modified
+from fluoromap_service.api.http.etags import file_response, is_known, not_modified
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.jobs.finished import job_of, map_of
@@ -221,7 +221,7 @@ def get_map(
     with reading() as session:
         outcome, stage = map_of(session, job_of(session, job_id))
     etag = f'"{stage.result}-{origin}"'
-    if known(request, etag):
+    if is_known(request, etag):
         return not_modified(etag)
     response.headers["ETag"] = etag
     return activation_map(outcome, chamber_of(outcome), origin)

@@ -18,9 +18,9 @@ from fluoromap.drawing.colours import Palette
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.drawing.png import encode_png
 from fluoromap.geometry import Camera
-from fluoromap_service.api.http.drawing_pool import drawn
 from fluoromap_service.api.http.etags import file_response
-from fluoromap_service.api.http.file_names import plain
+from fluoromap_service.api.http.file_names import plain_name
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.jobs.finished import done_stage, job_of, map_of, snapshot_of
@@ -169,7 +169,7 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
         path = files.path_of(fusion.sha256)
         if not path.exists():
             raise Problem(409, "run_deleted", "This run was deleted; its overlay can no longer be drawn.")
-        return drawn(draw, path, fusion, look, moving)
+        return run_in_pool(Task.DRAW_PICTURE, draw, path, fusion, look, moving)
 
     return rendered(job_id, fusion.asked(look, moving), "image/gif" if moving else "image/png", make)
 
@@ -345,7 +345,7 @@ def get_overlay(
         fusion = fusion_of(session, job_of(session, job_id), uid, frame)
     look = replace(_look(fusion, scale, colours, step_ms, ellipses), until_ms=until_ms)
     picture = picture_of(job_id, fusion, look)
-    name = f"overlay-{plain(fusion.site)}-{fusion.frame + 1}.png"
+    name = f"overlay-{plain_name(fusion.site)}-{fusion.frame + 1}.png"
     return file_response(request, picture.path, picture.sha256, "image/png", name, inline=True)
 
 
@@ -370,5 +370,5 @@ def get_propagation(
     with reading() as session:
         fusion = fusion_of(session, job_of(session, job_id), uid, frame)
     picture = picture_of(job_id, fusion, _look(fusion, scale, colours, step_ms, ellipses), moving=True)
-    name = f"propagation-{plain(fusion.site)}-{fusion.frame + 1}.gif"
+    name = f"propagation-{plain_name(fusion.site)}-{fusion.frame + 1}.gif"
     return file_response(request, picture.path, picture.sha256, "image/gif", name, inline=True)

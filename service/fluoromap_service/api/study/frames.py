@@ -9,8 +9,8 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from fluoromap.drawing.png import encode_png
-from fluoromap_service.api.http.drawing_pool import drawn
-from fluoromap_service.api.http.etags import known, not_modified
+from fluoromap_service.api.http.etags import is_known, not_modified
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.study.instances import InstanceUid
@@ -54,9 +54,9 @@ def get_frame(
         raise not_found("frame")
     shown = "" if chosen is None else f"-{chosen[0]:g}-{chosen[1]:g}"
     etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
-    if known(request, etag):
+    if is_known(request, etag):
         return not_modified(etag)
-    picture = drawn(frame_png, files.path_of(run.instance.sha256), run.facts, n - 1, chosen)
+    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, files.path_of(run.instance.sha256), run.facts, n - 1, chosen)
     # A stored file never changes.
     return Response(
         picture, media_type="image/png", headers={"ETag": etag, "Cache-Control": "private, max-age=3600, immutable"}

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from fluoromap.geometry import Gantry
-from fluoromap_service.api.http.drawing_pool import drawn
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
@@ -205,7 +205,7 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
 def _read(part: Part) -> InstanceFacts | Problem:
     # In a process of its own: a hostile file can crash a decoder.
     try:
-        return drawn(read_instance, part.path)
+        return run_in_pool(Task.READ_FILE, read_instance, part.path)
     except Problem as problem:
         if problem.status == 429:
             raise

@@ -38,7 +38,7 @@ from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Job, Rendering, StudyInstance
 
-pytestmark = pytest.mark.usefixtures("drawing_processes")
+pytestmark = pytest.mark.usefixtures("file_processes")
 
 
 def _fusion(study: FinishedStudy, view: str, frame: int | None) -> overlay_routes.Fusion:
@@ -69,7 +69,7 @@ def test_size_and_cache(client: TestClient, study: FinishedStudy, monkeypatch: p
     def never(*_: object) -> bytes:
         raise AssertionError("drawn again")
 
-    monkeypatch.setattr(overlay_routes, "drawn", never)
+    monkeypatch.setattr(overlay_routes, "run_in_pool", never)
     assert client.get(path).content == first.content
     assert client.get(f"{path}?frame={DIASTOLE + 1}").content == first.content
     assert client.get(path, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
