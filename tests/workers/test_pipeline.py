@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
-from fluoromap_service.api.results.overlays import fusion_of
+from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 

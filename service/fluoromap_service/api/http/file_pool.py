@@ -21,7 +21,7 @@ PROCESSES = 2
 LONGEST_SECONDS = 20.0
 START_SECONDS = 120.0
 LONGEST_WAIT_SECONDS = 60.0
-_PRELOADED = ("fluoromap_service.dicom", "fluoromap_service.api.results.overlays")
+_PRELOADED = ("fluoromap_service.dicom", "fluoromap_service.results.fusion")
 
 Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")

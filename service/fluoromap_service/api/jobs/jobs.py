@@ -18,10 +18,10 @@ from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
-from fluoromap_service.api.jobs.finished import job_of
 from fluoromap_service.api.jobs.job_answers import JobAnswer, etag_of, read_job, read_jobs
 from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.problem import Problem, not_found
+from fluoromap_service.results.finished import job_of
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import ENDED_JOB, Job, Study
 from fluoromap_service.study.freeze import PipelineRequest, freeze
