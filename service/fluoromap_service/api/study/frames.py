@@ -6,15 +6,14 @@ import math
 from pathlib import Path as FilePath
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from fluoromap.drawing.png import encode_png
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.study.instances import InstanceUid
-from fluoromap_service.api.study.studies import StudyId
 from fluoromap_service.dicom import InstanceFacts, frame_to_8bit, open_frames
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
@@ -22,8 +21,6 @@ from fluoromap_service.store.engine import reading
 from fluoromap_service.study import instances
 
 router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
-
-FrameNumber = Annotated[int, Path(ge=1, description="Counted from 1.")]
 
 
 def frame_png(path: FilePath, facts: InstanceFacts, frame: int, window: tuple[float, float] | None) -> bytes:
