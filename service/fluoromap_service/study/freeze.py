@@ -135,7 +135,7 @@ def _no_ready_site(bound: list[BoundSite]) -> Problem:
         for site in bound
     ]
     errors = [
-        (f"sites.{site.site}", ", ".join([*site.missing, *([site.refused.sentence] if site.refused else [])]))
+        (f"sites.{site.site}", ", ".join([*site.missing, *([site.unusable.sentence] if site.unusable else [])]))
         for site in bound
     ]
     detail = (

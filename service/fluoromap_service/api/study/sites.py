@@ -89,4 +89,4 @@ def put_site(study_id: StudyId, site: SiteName, body: SitePut, caller: Writer) -
             row.lat_by = None if body.lat_ms is None else "explicit"
         views = body.model_dump(include={"view_a", "view_b"}, exclude_unset=True)
         sites.put_views(session, study, site, views)
-        return _shape(sites.as_it_stands(session, study, site))
+        return _shape(sites.one_or_empty(session, study, site))
