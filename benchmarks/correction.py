@@ -19,8 +19,10 @@ from typing import Any
 import httpx
 from rich.console import Console
 
-from fluoromap_service.cli.client import Client, inputs_of, progress_bars, send
-from fluoromap_service.cli.demonstration import SPEC
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.demo import SPEC
+from fluoromap_service.cli.progress import progress_bars
+from fluoromap_service.cli.submission import find_files, upload
 from fluoromap_service.cli.supervisor import private_service
 from fluoromap_service.dicom.simulation import simulate
 
@@ -33,7 +35,7 @@ def main(corrections: int) -> None:
         simulate(Path(folder) / "study", SPEC)
         with private_service(Path(folder) / "service") as url, httpx.Client(base_url=url, timeout=120) as http:
             with Client(url) as client, progress_bars(Console(stderr=True)) as progress:
-                study, _ = send(client, inputs_of(Path(folder) / "study"), "correction", progress)
+                study, _ = upload(client, find_files(Path(folder) / "study"), "correction", progress)
             first_s, job = _until_map(http, study)
             print(f"first job, up to the map: {first_s:.2f} s ({len(job['stages'])} stages)")
             _ended(http, job["id"])

@@ -31,7 +31,7 @@ from fluoromap.contracts import (
     SiteCycle,
 )
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.body_pose import follow_body, pose_covariance_mm2, rotation_of, solve_poses
+from fluoromap.monoplane.body_pose import pose_covariance_mm2, rotation_of, solve_poses, track_body
 from fluoromap.monoplane.rigid_pose import RigidPose
 from fluoromap.phantom import StudySpec, simulate_study
 
@@ -123,7 +123,7 @@ def noise_free_mm(s: Simulation) -> float:
     body = s.points_mm[0] - s.points_mm[0].mean(axis=0)
     largest = 0.0
     for depth_step_mm in range(6):
-        rotations, centres = follow_body(s.camera, s.points_mm[0], s.pixels_uv, seen, 0, float(depth_step_mm), 6)
+        rotations, centres = track_body(s.camera, s.points_mm[0], s.pixels_uv, seen, 0, float(depth_step_mm), 6)
         errors = body @ np.swapaxes(rotations, 1, 2) + centres[:, None] - s.points_mm
         largest = max(largest, float(np.abs(errors).max()))
     return largest
@@ -166,7 +166,7 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
                 for _ in range(BODIES):
                     pixels = s.pixels_uv + rng.normal(0, NOISE_PX, s.pixels_uv.shape)
                     a_priori = s.points_mm[0] + rng.uniform(-wrong_mm, wrong_mm, (30, 3))
-                    poses = follow_body(s.camera, a_priori, pixels, np.ones(pixels.shape[:2], dtype=bool), 0, 0.0, 10)
+                    poses = track_body(s.camera, a_priori, pixels, np.ones(pixels.shape[:2], dtype=bool), 0, 0.0, 10)
                     body = a_priori - a_priori.mean(axis=0)
                     believed.append((body @ np.swapaxes(poses[0], 1, 2) + poses[1][:, None] - s.points_mm)[1:])
                     view = view_of(s, pixels, a_priori, wrong_mm**2 / 3 * np.eye(3))

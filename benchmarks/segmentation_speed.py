@@ -31,6 +31,7 @@ from kept_frames import KeptFrames
 from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
 from skimage.measure import label, regionprops
+from skimage.morphology import disk
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
@@ -43,7 +44,7 @@ from fluoromap.segmenter.four_step.blobs import find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.four_step.frame_chains import FourStepDetector, FourStepParams
 from fluoromap.segmenter.four_step.homomorphic import homomorphic
-from fluoromap.segmenter.four_step.morphology import disk, disk_morphology
+from fluoromap.segmenter.four_step.morphology import disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.four_step.plugin import FourStep
 from fluoromap.segmenter.log_image import Image, LogTransform
@@ -143,8 +144,8 @@ def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
         print(f"  {name:30}{mine:8.2f}{theirs:10.1f}{theirs / mine:6.0f}x   {beside}")
     chain = milliseconds(lambda: steps.blobs(x))
     print(f"  {'four steps and labels':30}{chain:8.2f}{twins:10.1f}{twins / chain:6.0f}x   goal 14 ms, 30x")
-    print(f"  {'four-step, chains':30}{milliseconds(lambda: steps.chains(x, 0)):8.2f}")
-    print(f"  {'catheter-chain, chains':30}{milliseconds(lambda: blobs.chains(x, 0)):8.2f}")
+    print(f"  {'four-step, chains':30}{milliseconds(lambda: steps.find_chains(x, 0)):8.2f}")
+    print(f"  {'catheter-chain, chains':30}{milliseconds(lambda: blobs.find_chains(x, 0)):8.2f}")
     print(f"  {'field mask, once a run':30}{milliseconds(lambda: find_field(run.frames, run.pixels)):8.2f}")
 
 
@@ -289,7 +290,7 @@ def _disk_peers(x: Image) -> dict[str, Work]:
 
         peers["SimpleITK"] = by_sitk
     if cv2 is not None:
-        large, small = disk(14).astype(np.uint8), disk(2).astype(np.uint8)
+        large, small = disk(14), disk(2)  # type: ignore[no-untyped-call]
 
         def by_cv2() -> object:
             return cv2.morphologyEx(cv2.morphologyEx(x, cv2.MORPH_BLACKHAT, large), cv2.MORPH_OPEN, small)

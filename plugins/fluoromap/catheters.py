@@ -1,4 +1,4 @@
-"""The catheter catalogue of a study: electrodes, spacings, tip, and how a shaft follows its tip."""
+"""The catheter catalogue of a study, and the motion of a catheter's shaft."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ class Catheter:
     def from_edge_spacing(
         cls, name: str, electrodes: int, edge_spacing_mm: tuple[float, ...], tip_mm: float, ring_mm: float
     ) -> Catheter:
-        """Build from the gaps between electrode edges, as catheter labels (2-5-2) give them."""
+        """Build a catheter from the gaps between electrode edges.
+
+        Catheter labels (2-5-2) give these gaps.
+        """
         centres = tuple(
             gap + (tip_mm + ring_mm) / 2 if index == 0 else gap + ring_mm for index, gap in enumerate(edge_spacing_mm)
         )
@@ -66,7 +69,7 @@ class Catheter:
         return np.concatenate([[0.0], np.cumsum(self.spacing_mm)])
 
     def looks_like(self, other: Catheter) -> bool:
-        """Whether fluoroscopy cannot tell the two apart by lengths (all within 0.5 mm)."""
+        """Return whether the two look alike in fluoroscopy (all lengths within 0.5 mm)."""
         if self.electrodes != other.electrodes:
             return False
         mine = (*self.spacing_mm, self.tip_mm, self.ring_mm)
@@ -76,7 +79,9 @@ class Catheter:
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """The catheters of one study; which of them is the origin of coordinates and which one maps.
+    """The catheters of one study, and the roles of reference and mapping catheter.
+
+    The reference catheter is the origin of coordinates.
 
     Raises
     ------
@@ -106,6 +111,7 @@ class Catalogue:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the catheters, in the order of the catalogue."""
         return tuple(catheter.name for catheter in self.catheters)
 
 
@@ -127,10 +133,11 @@ BENDS_OVER_MM = 25.0
 def follows_tip(
     points_mm: NDArray[np.float64], labels: Sequence[tuple[str, int]], catalogue: Catalogue
 ) -> NDArray[np.float64]:
-    """Displacement of each electrode when its catheter's tip is displaced, (..., N, 3, 3).
+    """Return each electrode's displacement for a displaced tip, (..., N, 3, 3).
 
-    The shaft is not stretched: along it all electrodes go with the tip. It is held in its vessel and bends: across, they
-    follow the less the farther back they are.
+    The shaft is not stretched: along it all electrodes move with the tip. The vessel holds the shaft, which bends: across
+    it,
+    electrodes farther back move less.
     """
     follows = np.empty((*points_mm.shape, 3))
     for catheter in {name for name, _ in labels}:

@@ -1,9 +1,10 @@
-"""What travels between stages, and the four stage protocols.
+"""The data that travels between stages, and the four stage protocols.
 
-Everything here is a frozen dataclass, validated once when built: whoever holds one holds a whole one. Frames are counted
+Everything here is a frozen dataclass that is validated once when built: an object that exists is valid. Frames are counted
 from 0 inside the project (from 1 in files and in the API). Pixels are (u, v) = (column, row), (0, 0) the centre of the
-top-left pixel. World points are millimetres along DICOM patient axes (LPS) from the isocentre unless a name says
-``relative``: then the mean of the reference catheter's electrodes in the same frames has been subtracted.
+top-left pixel. World points are millimetres along DICOM patient axes (LPS) from the isocentre. Where a name says
+``relative``,
+the mean of the reference catheter's electrodes in the same frames has been subtracted.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,11 +32,17 @@ CHI2_95_3D = 7.814727903251179
 
 
 class StageStopped(Exception):
-    """Raised by :meth:`Context.check` when the job was cancelled or taken over; a stage lets it pass."""
+    """Raised by :meth:`Context.check` when the job was cancelled or taken over.
+
+    A stage must not catch it.
+    """
 
 
 class Refusal(Exception):
-    """A stage's whole answer is that the data cannot support one. ``reason`` is its code, the message says what to do."""
+    """Raised by a stage when the data cannot support a result.
+
+    ``reason`` is the code; the message describes the remedy to the user.
+    """
 
     def __init__(self, reason: Reason, message: str | None = None) -> None:
         super().__init__(message or reason.sentence)
@@ -43,17 +50,20 @@ class Refusal(Exception):
 
 
 class Context(Protocol):
-    """The one line a running stage has to the outside."""
+    """The connection of a running stage to its worker."""
 
     def progress(self, fraction: float) -> None:
-        """Tell how much is done, 0 to 1. Cheap: call it as often as you like."""
+        """Report the finished share of the work, 0 to 1.
+
+        Frequent calls are cheap.
+        """
 
     def check(self) -> None:
         """Raise :class:`StageStopped` when the work is no longer wanted."""
 
 
 class Silent:
-    """A :class:`Context` for notebooks and tests: tells nobody, never stops."""
+    """A :class:`Context` for notebooks and tests: it reports nothing and never stops."""
 
     def progress(self, fraction: float) -> None:
         pass
@@ -72,46 +82,63 @@ class Grade(StrEnum):
 
 
 def grade_of(covariance_mm2: ArrayLike) -> Grade:
-    """Grade of a 3x3 position covariance: A up to 2 mm, B up to 4 mm, C beyond (largest 95 % semi-axis)."""
+    """Return the grade of a 3x3 position covariance.
+
+    A up to 2 mm, B up to 4 mm, C beyond (largest semi-axis of the 95 % ellipsoid).
+    """
     largest = float(np.linalg.eigvalsh(np.asarray(covariance_mm2, dtype=np.float64))[-1])
     semi_axis_mm = float(np.sqrt(CHI2_95_3D * max(largest, 0.0)))
     return Grade.A if semi_axis_mm <= 2.0 else Grade.B if semi_axis_mm <= 4.0 else Grade.C
 
 
 def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: type = np.float64) -> NDArray[Any]:
-    """A read-only copy of ``value`` after checking its shape (None: any length) and that it is finite; what is such a copy
-    already is not copied again.
+    """Return a read-only copy of ``value`` after checking shape and numbers.
+
+    A length of None in ``shape`` allows any length. Floating-point values must be finite. An array that is already a
+    read-only copy
+    is returned unchanged.
 
     Raises
     ------
     ValueError
-        Naming the field, when shape or numbers are wrong.
+        When shape or numbers are wrong. The message has the name of the field.
     """
     array: NDArray[Any]
     if isinstance(value, np.ndarray) and _is_frozen(value) and value.dtype == dtype:
         array = value
     else:
-        # Row by row, however it came: what is read back from the store is then the same in memory as well.
+        # The order in memory is always by rows, so that an array read from the store equals the original in memory too.
         array = np.array(value, dtype=dtype, order="C")
     if array.ndim != len(shape) or any(
         want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
     ):
-        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+        raise ValueError(f"{name} has shape {array.shape}; it must have shape {shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite")
+        raise ValueError(f"{name} contains numbers that are not finite")
     array.setflags(write=False)
     return array
 
 
 def _is_frozen(array: NDArray[Any]) -> bool:
-    return array.base is None and array.flags.c_contiguous and not array.flags.writeable
+    """Return whether nobody can write to the array, neither through it nor through the memory that it shows."""
+    if array.flags.writeable or not array.flags.c_contiguous:
+        return False
+    owner = array.base
+    while isinstance(owner, np.ndarray):
+        if owner.base is None:
+            return False
+        owner = owner.base
+    return owner is None or isinstance(owner, bytes)
 
 
-# --- what a segmenter gets and gives ---------------------------------------------------------------------------------
+# --- input and result of a segmenter -----------------------------------------------------------------------------------
 
 
 class FrameSource(Protocol):
-    """The frames of one run, decoded one at a time; can be indexed and iterated again and again."""
+    """The frames of one run, decoded one at a time.
+
+    Indexing and iteration can be repeated.
+    """
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -120,17 +147,21 @@ class FrameSource(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> NDArray[np.generic]:
-        """Stored pixels of frame ``index`` (from 0), shape (rows, columns), an unsigned integer type."""
+        """Return the stored pixels of frame ``index`` (from 0).
+
+        The array has shape (rows, columns) and an unsigned integer type.
+        """
 
     def __iter__(self) -> Iterator[NDArray[np.generic]]: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
-    """The part of the image that was exposed, as shutter or collimator attributes tell; pixels (u, v).
+    """The exposed part of the image, from the shutter or collimator attributes.
 
-    rectangle : (left, right, upper, lower) edges; circle : (centre_u, centre_v, radius); polygon : vertices (u, v).
-    The field is what lies inside all that are given.
+    rectangle : (left, right, upper, lower) edges; circle : (centre_u, centre_v, radius); polygon : vertices (u, v); all in
+    pixels.
+    The field is the intersection of all given shapes.
     """
 
     rectangle: tuple[float, float, float, float] | None = None
@@ -140,10 +171,10 @@ class Shutter:
 
 @dataclass(frozen=True, slots=True)
 class PixelFacts:
-    """What the stored numbers mean.
+    """The meaning of the stored pixel values.
 
-    logarithmic : the logarithm was taken already (PixelIntensityRelationship LOG or DISP).
-    bits_stored : significant bits. monochrome1 : high values are displayed dark, to be inverted first.
+    logarithmic : the logarithm was already applied (PixelIntensityRelationship LOG or DISP).
+    bits_stored : significant bits. monochrome1 : high values are displayed dark and must be inverted first.
     """
 
     logarithmic: bool
@@ -154,10 +185,10 @@ class PixelFacts:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One cine as a segmenter sees it.
+    """One cine as a segmenter gets it.
 
     frames : decoded one at a time. frame_times_ms : (n,), from the first frame on.
-    px_per_mm : at the isocentre. r_wave_frames : frames of R waves where the file tells them.
+    px_per_mm : at the isocentre. r_wave_frames : frames with R waves, where the file has them.
     """
 
     frames: FrameSource
@@ -169,18 +200,18 @@ class Run:
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (len(self.frames),), "frame_times_ms"))
         if not self.px_per_mm > 0:
-            raise ValueError("px_per_mm must be positive")
+            raise ValueError(f"px_per_mm is {self.px_per_mm}; it must be positive")
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
     """The electrodes of one catheter in one image.
 
-    electrodes : their numbers, 1 = tip, ascending; a chain set by hand may hold only some.
+    electrodes : their numbers, 1 = tip, ascending; a chain set by hand may have only some.
     pixels_uv : (m, 2). covariance_px2 : (m, 2, 2). scores : (m,), contrast over noise.
-    kinds : catheter name -> probability that this is it (sums to at most 1); look-alikes share theirs.
-    track : chains of one run with the same track number are the same catheter in other frames; -1 where unlinked.
-    manual : set by hand (then ``kinds`` holds one name with probability 1).
+    kinds : catheter name -> probability (the sum is at most 1); look-alikes share theirs.
+    track : chains of one run with the same track number are the same catheter in different frames; -1 without a track.
+    manual : set by hand (then ``kinds`` has one name with probability 1).
     """
 
     electrodes: tuple[int, ...]
@@ -194,20 +225,24 @@ class Chain:
     def __post_init__(self) -> None:
         m = len(self.electrodes)
         if m < 1 or list(self.electrodes) != sorted(set(self.electrodes)) or self.electrodes[0] < 1:
-            raise ValueError("electrodes must be different numbers from 1 on, ascending")
+            raise ValueError(f"electrodes are {self.electrodes}; they must be different numbers from 1 on, ascending")
         object.__setattr__(self, "pixels_uv", frozen(self.pixels_uv, (m, 2), "pixels_uv"))
         object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (m, 2, 2), "covariance_px2"))
         object.__setattr__(self, "scores", frozen(self.scores, (m,), "scores"))
         if sum(probability for _, probability in self.kinds) > 1 + 1e-6:
-            raise ValueError("probabilities of kinds add up to more than 1")
+            raise ValueError(f"probabilities of kinds {self.kinds} add up to more than 1")
 
     def probability(self, catheter: str) -> float:
+        """Return the probability that this is ``catheter``."""
         return dict(self.kinds).get(catheter, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameChains:
-    """All chains of one image. ``manual_needed`` tells why there are none, or why they are not to be trusted."""
+    """All chains of one image.
+
+    ``manual_needed`` is the reason why there are none, or why they are uncertain.
+    """
 
     frame: int
     chains: tuple[Chain, ...]
@@ -216,14 +251,16 @@ class FrameChains:
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """What a segmenter found in one run.
+    """A segmenter's result for one run.
 
     frames : one entry per frame of the run, in order.
-    diastole : chains in the mean of the quiet frames round diastole; its ``frame`` is the middle one of them.
-        None where no quiet stretch exists (then single frames stand for themselves).
-    diastole_frames : the frames that were averaged, ascending.
-    motion : (n,) how much the image changed from the frame before, low-passed, arbitrary unit; the first repeats the second.
-    frame_times_ms, r_wave_frames : the run's, carried along for phase matching.
+    diastole : chains in the mean of the quiet frames round diastole; its ``frame`` is the middle one of them. None where
+    there is
+    no quiet stretch: then single frames are used.
+    diastole_frames : the averaged frames, ascending.
+    motion : (n,) change of the image from the previous frame, low-passed, arbitrary unit; the first value repeats the
+    second.
+    frame_times_ms, r_wave_frames : those of the run, for phase matching.
     """
 
     frames: tuple[FrameChains, ...]
@@ -242,15 +279,18 @@ class Segmentation:
 
 
 Marks = Mapping[int, tuple[Chain, ...]]
-"""Chains set by hand: frame -> the chains that stand in it."""
+"""Chains set by hand: frame -> the chains of that frame."""
 
 
-# --- what matching makes of it ---------------------------------------------------------------------------------------
+# --- result of matching ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class NamedChain:
-    """The electrodes of a named catheter in one image; fields as in :class:`Chain`."""
+    """The electrodes of a named catheter in one image.
+
+    Fields as in :class:`Chain`; ``track`` is -1 where the positions are interpolated between frames.
+    """
 
     catheter: str
     electrodes: tuple[int, ...]
@@ -265,8 +305,10 @@ class NamedChain:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one view shows at one moment: a frame, its cardiac phase (0..1 from one R wave, or one start of systole, to the
-    next; None where no cycle is known) and the named catheters in it."""
+    """The named catheters of one view at one moment.
+
+    phase : cardiac phase, 0 to 1 from one R wave, or one start of systole, to the next; None where no cycle is known.
+    """
 
     frame: int
     phase: float | None
@@ -284,14 +326,17 @@ class PhasePair:
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Another way to pair the catheters of a site across its views, with the probability (0 to 0.5) that it is the right one."""
+    """Another way to pair the catheters of a site across its views.
+
+    probability : 0 to 0.5, that this pairing is the right one.
+    """
 
     diastole: PhasePair
     probability: float
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 0.5:
-            raise ValueError("an alternative more probable than not is the answer itself")
+            raise ValueError(f"the probability of an alternative is {self.probability}; it must lie between 0 and 0.5")
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,9 +344,9 @@ class MatchedSite:
     """One site with its catheters named in both views.
 
     diastole : the pair that locates the site. cycle : pairs over the cardiac cycle by rising phase; empty where unknown.
-    track_a, track_b : every frame of each run, for following the single view.
+    track_a, track_b : every frame of each run, for tracking in a single view.
     notes : (catheter, reason) of catheters that are missing or doubtful here.
-    alternative : the next best pairing of the catheters across the views, kept where it cannot be ruled out.
+    alternative : the next best pairing of the catheters across the views, unless it can be ruled out.
     """
 
     site: str
@@ -319,7 +364,7 @@ class MatchedSite:
 
 @dataclass(frozen=True, slots=True)
 class RejectedSite:
-    """A site that could not be located, and why."""
+    """A site that could not be located, with the reasons."""
 
     site: str
     reasons: tuple[Reason, ...]
@@ -327,13 +372,13 @@ class RejectedSite:
 
 @dataclass(frozen=True, slots=True)
 class Matching:
-    """All sites of a study, named and paired, and those that could not be."""
+    """All sites of a study, named and paired, and the rejected ones."""
 
     sites: tuple[MatchedSite, ...]
     rejected: tuple[RejectedSite, ...]
 
 
-# --- what a triangulator gives ---------------------------------------------------------------------------------------
+# --- result of a triangulator ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,10 +387,11 @@ class ElectrodePoint:
 
     position_mm : (3,), covariance_mm2 : (3, 3), from the isocentre.
     relative_mm, relative_covariance_mm2 : the same from the reference catheter's mean; None where that was not located.
-    residual_px : reprojection residual in view a, b, less a
-    shift of the whole heart between the runs where the triangulator estimates one. reasons : what speaks against trusting it fully.
-    alternative_mm : (3,) where it would be, from the isocentre, if the catheters were paired the other way that cannot be
-    ruled out; the covariance contains it, weighted with ``alternative_probability``.
+    residual_px : reprojection residual in view a and b. A shift of the whole heart between the runs is subtracted where the
+    triangulator estimates one. reasons : why the point deserves less trust.
+    alternative_mm : (3,) position from the isocentre for the other possible pairing of the catheters; None where it was
+    ruled
+    out. The covariance contains it, weighted with ``alternative_probability``.
     """
 
     catheter: str
@@ -395,7 +441,7 @@ class SiteCycle:
 
 @dataclass(frozen=True, eq=False)
 class LocatedSite:
-    """A site in 3D: its points at diastole, its cycle, and the cameras it ended with (self-calibrated or not).
+    """A site in 3D: points at diastole, cycle and final cameras (self-calibrated or not).
 
     frame_a, frame_b : the diastolic frames. reference_mm : (3,) the reference catheter's mean, None where not located.
     """
@@ -415,6 +461,7 @@ class LocatedSite:
             object.__setattr__(self, "reference_mm", frozen(self.reference_mm, (3,), "reference_mm"))
 
     def point(self, catheter: str, electrode: int) -> ElectrodePoint | None:
+        """Return the point of an electrode, or None where it was not located."""
         for point in self.points:
             if point.catheter == catheter and point.electrode == electrode:
                 return point
@@ -431,8 +478,9 @@ class LocatedSite:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What the electrodes of a study say about the gantry: how view b's camera was turned and shifted against the header.
+    """Rotation and shift of view b's camera against its header.
 
+    They are estimated from the study's electrodes.
     applied : whether the cameras of the located sites contain it. rotation_deg : (3,) rotation vector about the isocentre;
     offset_mm : (3,), both in the world frame. epipolar_before_px, epipolar_after_px : Sampson RMS over the study.
     """
@@ -450,7 +498,10 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class ErrorBudget:
-    """How many millimetres (RMS, 3D, of a located electrode at diastole) each source of error contributes in this study."""
+    """Contribution of each source of error to the study's located electrodes.
+
+    Millimetres, RMS, 3D, at diastole.
+    """
 
     pixels_mm: float
     angles_mm: float
@@ -461,7 +512,7 @@ class ErrorBudget:
 
 @dataclass(frozen=True, slots=True)
 class Triangulation:
-    """All sites of a study in 3D, and those that could not be located.
+    """All sites of a study in 3D, and the rejected ones.
 
     notes : sentences for the report. calibration, budget : None where the triangulator makes none.
     """
@@ -473,15 +524,16 @@ class Triangulation:
     budget: ErrorBudget | None = None
 
 
-# --- what a monoplane solver gets and gives --------------------------------------------------------------------------
+# --- input and result of a monoplane solver ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class MonoplaneView:
-    """One view of one site, to be followed in 3D.
+    """One view of one site, to be tracked in 3D.
 
     frame_times_ms : (n,). observations : one per frame, in order. a_priori : points known from two views, valid in
-    ``a_priori_frame``. cycle : the site's own biplane cycle or None. others : cycles of other sites, empty when ``cycle`` is valid.
+    ``a_priori_frame``. cycle : the site's own biplane cycle or None. others : cycles of other sites, empty when ``cycle``
+    is valid.
     """
 
     site: str
@@ -499,7 +551,7 @@ class MonoplaneView:
         n = len(self.observations)
         object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (n,), "frame_times_ms"))
         if not 0 <= self.a_priori_frame < n:
-            raise ValueError("a_priori_frame must be a frame of the run")
+            raise ValueError(f"a_priori_frame is {self.a_priori_frame}, but the run has {n} frames")
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,10 +559,10 @@ class Track:
     """Electrodes in 3D in every frame of one view.
 
     labels : (catheter, electrode) of each of the m electrodes. located : (n, m), False where there is no position; the
-    arrays hold 0 there. positions_mm, baseline_mm : (n, m, 3), the baseline being the plain back-projection at the
+    arrays contain 0 there. positions_mm, baseline_mm : (n, m, 3), the baseline being the plain back-projection at the
     prior's depth. covariance_mm2 : (n, m, 3, 3), from the isocentre. relative_covariance_mm2 : (n, m, 3, 3) of the position
-    less the mean of the reference catheter's electrodes in the same frame; None where the solver does not tell.
-    pixels_uv : (n, m, 2) as seen. reasons : one tuple an electrode.
+    less the mean of the reference catheter's electrodes in the same frame; None where the solver does not compute it.
+    pixels_uv : (n, m, 2) observed. reasons : one tuple for each electrode.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -534,19 +586,21 @@ class Track:
             relative = frozen(self.relative_covariance_mm2, (n, m, 3, 3), "relative_covariance_mm2")
             object.__setattr__(self, "relative_covariance_mm2", relative)
         if len(self.reasons) != m:
-            raise ValueError("reasons need one tuple an electrode")
+            raise ValueError(
+                f"there are {len(self.reasons)} tuples of reasons for {m} electrodes; one is needed for each"
+            )
 
 
-# --- what a fuser gets and gives -------------------------------------------------------------------------------------
+# --- input and result of a fuser ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class MappedSite:
-    """A located site with its activation time, as a fuser gets it.
+    """A located site with its activation time: the input of a fuser.
 
     tip_mm, covariance_mm2 : the mapping tip relative to the reference catheter. axis : (3,) unit vector along the
     catheter from electrode 2 to the tip. tip_length_mm : of the tip electrode. lat_ms, lat_sd_ms : activation time.
-    reasons : what speaks against its place.
+    reasons : why the position deserves less trust.
     """
 
     site: str
@@ -563,12 +617,17 @@ class MappedSite:
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3, 3), "covariance_mm2"))
         object.__setattr__(self, "axis", frozen(self.axis, (3,), "axis"))
         if not (np.isfinite(self.lat_ms) and np.isfinite(self.lat_sd_ms) and self.lat_sd_ms >= 0):
-            raise ValueError("lat_ms must be finite and lat_sd_ms finite and not negative")
+            raise ValueError(
+                f"lat_ms {self.lat_ms} and lat_sd_ms {self.lat_sd_ms} must be finite, lat_sd_ms not negative"
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSite:
-    """A site on the map: where it lies (position_mm), where on the surface it counts (surface_mm), how far that is."""
+    """A site on the map.
+
+    position_mm : (3,) the site. surface_mm : (3,) its point on the surface. distance_mm : between the two.
+    """
 
     site: str
     position_mm: Array
@@ -585,7 +644,10 @@ class SurfaceSite:
 
 @dataclass(frozen=True, slots=True)
 class ConductionVelocity:
-    """Median speed of activation along the wall where sites lie close together, with its 95 % interval; metres a second."""
+    """Median speed of activation along the wall, with its 95 % interval; metres a second.
+
+    It is measured between sites that lie close together.
+    """
 
     median_m_per_s: float
     low_m_per_s: float
@@ -596,7 +658,7 @@ class ConductionVelocity:
 class ChamberMap:
     """The chamber's surface with activation times, relative to the reference catheter.
 
-    vertices_mm : (n, 3). faces : (f, 3), outward by the right-hand rule, watertight. lat_ms, lat_sd_ms : (n,), where
+    vertices_mm : (n, 3). faces : (f, 3), outward by the right-hand rule, watertight. lat_ms, lat_sd_ms : (n,), valid where
     ``covered`` (n,); elsewhere no site is near enough and the numbers are 0. earliest : (site, probability), most probable
     first. coverage : covered share of the area, 0..1. conduction_velocity : None where no sites lie close enough.
     cycle_length_ms : of a re-entry: times repeat after it, so that early meets late; None where they do not.
@@ -623,30 +685,27 @@ class ChamberMap:
         n = len(self.vertices_mm)
         object.__setattr__(self, "faces", frozen(self.faces, (None, 3), "faces", dtype=np.int64))
         if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < n):
-            raise ValueError("faces must name vertices")
+            raise ValueError(
+                f"faces name vertices {self.faces.min()} to {self.faces.max()}, but there are {n} vertices"
+            )
         object.__setattr__(self, "lat_ms", frozen(self.lat_ms, (n,), "lat_ms"))
         object.__setattr__(self, "lat_sd_ms", frozen(self.lat_sd_ms, (n,), "lat_sd_ms"))
         object.__setattr__(self, "covered", frozen(self.covered, (n,), "covered", dtype=np.bool_))
 
 
-# --- the four kinds of stage -----------------------------------------------------------------------------------------
+# --- the four kinds of stage -------------------------------------------------------------------------------------------
 
 
 class NoParams(BaseModel, extra="forbid"):
     """The ``Params`` of a stage that has none."""
 
 
-class Stage(Protocol):
-    """What every plugin class has. It is built as ``PluginClass(params)`` and used for one subject at a time.
-
-    name : as clients write it. version : raise it whenever the answer to the same input changes; results are kept by it.
-    Params : a pydantic model with ``extra="forbid"``, a default and a description for each field.
-    A plugin with kernels to compile may have a class method ``warm_up()``: a worker process calls it before it takes work.
-    """
-
-    name: ClassVar[str]
-    version: ClassVar[str]
-    Params: ClassVar[type[BaseModel]]
+# A plugin is a class ``PluginClass(params)`` with the method of one of these protocols, used for one subject at a time. It has
+# name : as clients write it.
+# version : a string that changes whenever the result of the same input changes; results are stored under it.
+# Params : a pydantic model with ``extra="forbid"``, and a default and a description for each field.
+# A plugin with kernels to compile may have a class method ``warm_up()``: a worker process calls it before it takes work.
+# A stage may raise :class:`Refusal`.
 
 
 @runtime_checkable
@@ -665,13 +724,13 @@ class Triangulator(Protocol):
 
 @runtime_checkable
 class MonoplaneSolver(Protocol):
-    """Follows the electrodes in 3D through one view; raises :class:`Refusal` where the view cannot tell."""
+    """Tracks the electrodes in 3D through one view."""
 
     def track(self, view: MonoplaneView, context: Context) -> Track: ...
 
 
 @runtime_checkable
 class Fuser(Protocol):
-    """Makes surface and map of the located sites; raises :class:`Refusal` where there are too few."""
+    """Makes surface and map of the located sites."""
 
     def fuse(self, sites: tuple[MappedSite, ...], context: Context) -> ChamberMap: ...

@@ -1,4 +1,4 @@
-"""Why an answer is graded down or refused: the closed list of reason codes, each with its sentence."""
+"""Reason codes for lower grades and refusals: the closed list, each with its sentence."""
 
 from enum import StrEnum
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 class Reason(StrEnum):
     """A reason code as it appears in points, tracks and maps.
 
-    ``Reason.sentence`` tells an electrophysiologist what happened and what to do about it.
+    Its ``sentence`` explains the event and the remedy to an electrophysiologist.
     """
 
     NO_ELECTRODES = "no_electrodes"
@@ -45,25 +45,26 @@ class Reason(StrEnum):
 
     @property
     def sentence(self) -> str:
+        """Explanation for the user."""
         return _SENTENCES[self]
 
 
 _SENTENCES: dict[Reason, str] = {
     Reason.NO_ELECTRODES: "No electrodes were found in this run; mark them by hand on one frame or check the contrast.",
-    Reason.MANUAL_NEEDED: "The electrodes could not be told from the background; mark them by hand on one frame.",
+    Reason.MANUAL_NEEDED: "The electrodes could not be distinguished from the background; mark them by hand on one frame.",
     Reason.CATHETER_NOT_FOUND: "This catheter was not found in one of the views; mark it by hand on one frame.",
-    Reason.IDENTITY_BY_MOTION: "The reference catheter was told from look-alikes by moving least between the sites.",
+    Reason.IDENTITY_BY_MOTION: "The reference catheter was chosen among look-alikes because it moves least between the sites.",
     Reason.IDENTITY_UNCERTAIN: "Two catheters could be exchanged; name one of them by hand on one frame.",
     Reason.NO_REFERENCE: "The reference catheter was not located here; its mean position over the other sites was used.",
     Reason.NO_ACTIVATION_TIME: "This site has no activation time; send one with the activation-time table.",
     Reason.ONE_VIEW_ONLY: "This site has only one run; a second view at least 30 degrees away is needed.",
-    Reason.VIEWS_PARALLEL: "The two views are less than 20 degrees apart; depth cannot be had from them.",
+    Reason.VIEWS_PARALLEL: "The two views are less than 20 degrees apart, which gives no depth; record a view farther away.",
     Reason.NO_GEOMETRY: "The gantry geometry is incomplete; complete the instance's missing values.",
-    Reason.NO_A_PRIORI: "No biplane position is known here; a single view alone cannot tell depth.",
-    Reason.PAIRING_FAILED: "The catheters of the two views do not belong together; check the binding of runs to the site.",
+    Reason.NO_A_PRIORI: "No biplane position is known here; a single view gives no depth.",
+    Reason.PAIRING_FAILED: "The catheters of the two views do not belong together; check which runs are paired at this site.",
     Reason.SPACING_MISMATCH: "The electrode spacing found differs from the catalogue's; check the catheter's description.",
     Reason.TABLE_MOVED: "The table moved between the two views; repeat one of them.",
-    Reason.DEPTH_UNOBSERVABLE: "One view cannot tell the depth of this catheter to a useful accuracy.",
+    Reason.DEPTH_UNOBSERVABLE: "One view does not give the depth of this catheter to a useful accuracy.",
     Reason.DEPTH_ASSUMED: "The depth along the ray comes from the solver's start value, not from the image.",
     Reason.TRACK_INTERRUPTED: "The catheter was not seen in this frame.",
     Reason.PHASE_UNKNOWN: "No cardiac cycle could be recognised in this run; the quietest frames were used.",
@@ -81,5 +82,5 @@ _SENTENCES: dict[Reason, str] = {
     Reason.SITES_COINCIDE: "All located sites lie in one place; a chamber surface needs sites on several walls.",
     Reason.TIMES_EQUAL: "All activation times are equal; there is no order of activation to show.",
     Reason.OUTSIDE_WINDOW: "This activation time lies outside the window of interest and was brought into it by whole cycles.",
-    Reason.PLUGIN_FAILED: "The plugin for this stage failed; its message stands with the job's stage.",
+    Reason.PLUGIN_FAILED: "The plugin for this stage failed; the job's stage shows its message.",
 }

@@ -1,4 +1,7 @@
-"""Entry points -> stages. A plugin that fails to load is a row with its traceback, never a crash."""
+"""The registry: entry points become stages.
+
+A plugin that fails to load is a row with its traceback; it never stops the program.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ DEFAULTS: dict[Kind, str] = {
     "monoplane": "motion-prior",
     "fuser": "smooth-surface",
 }
-"""The plugin that stands in for a stage a client does not name."""
+"""The plugin of a stage for which a client names none."""
 
 
 class UnknownPlugin(LookupError):
@@ -42,7 +45,7 @@ class UnknownPlugin(LookupError):
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """One row of the registry: a plugin class, or the traceback of why there is none."""
+    """One row of the registry: a plugin class, or the traceback of its failure."""
 
     kind: Kind
     name: str
@@ -53,6 +56,7 @@ class Plugin:
 
     @property
     def default(self) -> bool:
+        """Whether this plugin is used when a client names none."""
         return DEFAULTS[self.kind] == self.name
 
     @property
@@ -73,7 +77,7 @@ def _load(kind: Kind, entry_point: EntryPoint) -> Plugin:
 
 def _check(kind: Kind, name: str, stage: Any) -> None:
     if not isinstance(stage, type):
-        raise TypeError(f"{kind} {name!r} must be a class")
+        raise TypeError(f"{kind} {name!r} is no class; the entry point must name a class")
     for attribute in ("name", "version", "Params", _METHODS[kind]):
         if not hasattr(stage, attribute):
             raise TypeError(f"{kind} {name!r} has no {attribute!r}")
@@ -85,7 +89,10 @@ def _check(kind: Kind, name: str, stage: Any) -> None:
 
 
 def discover(kind: Kind, found: Iterable[EntryPoint]) -> tuple[Plugin, ...]:
-    """Load the entry points of one kind; of two with the same name the first is used, the other told as broken."""
+    """Load the entry points of one kind.
+
+    Of two plugins with the same name the first is used; the other becomes a broken row.
+    """
     rows: dict[str, Plugin] = {}
     doubled: list[Plugin] = []
     for entry_point in sorted(found, key=lambda item: (item.name, item.value)):
@@ -100,17 +107,17 @@ def discover(kind: Kind, found: Iterable[EntryPoint]) -> tuple[Plugin, ...]:
 
 @functools.cache
 def plugins() -> tuple[Plugin, ...]:
-    """All installed plugins of all kinds, loaded once a process."""
+    """Return all installed plugins of all kinds, loaded once a process."""
     return tuple(row for kind, group in GROUPS.items() for row in discover(kind, entry_points(group=group)))
 
 
 def plugin(kind: Kind, name: str) -> Plugin:
-    """The working plugin of that kind and name.
+    """Return the working plugin of that kind and name.
 
     Raises
     ------
     UnknownPlugin
-        Saying which names there are, or that this one did not load.
+        With the installed names, or the fact that this one did not load.
     """
     known = [row for row in plugins() if row.kind == kind and row.stage is not None]
     for row in known:
@@ -122,21 +129,25 @@ def plugin(kind: Kind, name: str) -> Plugin:
 
 
 def build_segmenter(name: str, parameters: dict[str, Any]) -> Segmenter:
+    """Return a segmenter with these parameters."""
     built: Segmenter = _build("segmenter", name, parameters)
     return built
 
 
 def build_triangulator(name: str, parameters: dict[str, Any]) -> Triangulator:
+    """Return a triangulator with these parameters."""
     built: Triangulator = _build("triangulator", name, parameters)
     return built
 
 
 def build_monoplane(name: str, parameters: dict[str, Any]) -> MonoplaneSolver:
+    """Return a monoplane solver with these parameters."""
     built: MonoplaneSolver = _build("monoplane", name, parameters)
     return built
 
 
 def build_fuser(name: str, parameters: dict[str, Any]) -> Fuser:
+    """Return a fuser with these parameters."""
     built: Fuser = _build("fuser", name, parameters)
     return built
 

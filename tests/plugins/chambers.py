@@ -1,4 +1,4 @@
-"""Chambers whose truth is known: sites on an ellipsoid with a plane or a spherical wave over it."""
+"""Chambers of known truth: sites on an ellipsoid with a plane or a spherical wave over it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 def directions(count: int) -> Array:
-    """Evenly spread unit vectors (count, 3): Fibonacci's sphere."""
+    """Return evenly spread unit vectors (count, 3): Fibonacci's sphere."""
     index = np.arange(count) + 0.5
     z, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
     around = np.sqrt(1 - z**2)
@@ -30,13 +30,13 @@ def sites_at(tips_mm: Array, lat_ms: Array, lat_sd_ms: float = 1.0) -> tuple[Map
 
 
 def sphere(count: int, radius_mm: float = 25.0, slope_ms_per_mm: float = 1.0) -> tuple[MappedSite, ...]:
-    """A plane wave along X over a sphere about (10, -20, 5), from negative to positive times."""
+    """Return a plane wave along X over a sphere about (10, -20, 5), from negative to positive times."""
     tips = radius_mm * directions(count) + [10.0, -20.0, 5.0]
     return sites_at(tips, slope_ms_per_mm * (tips[:, 0] - 10.0))
 
 
 def wave(count: int, seed: int, lat_sd_ms: float = 1.5) -> tuple[tuple[MappedSite, ...], Array]:
-    """A wave from one focus over a ventricle-like ellipsoid, irregular sites, noise; and the times without noise."""
+    """Return a wave from one focus over an ellipsoid with irregular sites and noise, and the times without noise."""
     rng = np.random.default_rng(seed)
     spread = directions(count) + 0.2 * rng.normal(size=(count, 3))
     spread /= np.linalg.norm(spread, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Fixtures of the science: maps that several tests look at, made once a process."""
+"""Fixtures of the science: maps for several tests, made once a process."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ settings.load_profile("science")
 
 @pytest.fixture(scope="session")
 def ball() -> ChamberMap:
-    """40 sites on a sphere of 25 mm about (10, -20, 5), a plane wave of 1 ms/mm along X, -25 to 25 ms."""
+    """Return 40 sites on a sphere of 25 mm about (10, -20, 5), a plane wave of 1 ms/mm along X, -25 to 25 ms."""
     return fused(sphere(40), edge_mm=4)
 
 
 @pytest.fixture(scope="session")
 def sparse_ball() -> ChamberMap:
-    """10 sites on the same sphere: part of it is not covered."""
+    """Return 10 sites on the same sphere, which leave part of it uncovered."""
     return fused(sphere(10), fill_mm=10.0)

@@ -14,8 +14,12 @@ import pydicom
 import pytest
 from fastapi.testclient import TestClient
 
-from fluoromap.contracts import Context, Marks, Run, Segmentation
+from fluoromap.contracts import Context, Marks, Refusal, Run, Segmentation
+from fluoromap.fuser.smooth_surface import SmoothSurface
+from fluoromap.monoplane.motion_prior import MotionPrior
+from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
@@ -172,6 +176,43 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     points = [p for p in service.get(f"/v1/jobs/{job['id']}/points").json()["points"] if p["site"] == site]
     assert {p["grade"] for p in points} == {"rejected"}
     assert {tuple(p["reasons"]) for p in points} == {("plugin_failed",)}
+
+
+REFUSALS = {
+    "segmenter": (CatheterChain, "segment", Reason.MANUAL_NEEDED),
+    "triangulator": (MaximumLikelihood, "triangulate", Reason.TABLE_MOVED),
+    "monoplane": (MotionPrior, "track", Reason.DEPTH_UNOBSERVABLE),
+    "fuser": (SmoothSurface, "fuse", Reason.TOO_FEW_SITES),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSALS)
+def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
+    service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    plugin, method, reason = REFUSALS[kind]
+
+    def refuse(*arguments: Any) -> Any:
+        raise Refusal(reason, "The plugin says why.")
+
+    monkeypatch.setattr(plugin, method, refuse)
+    job = _job(service, sent)
+    assert job["state"] == "succeeded", job["error"]
+    assert {row["state"] for row in job["stages"]} == {"done"}
+    base = f"/v1/jobs/{job['id']}"
+    if kind in ("segmenter", "triangulator"):
+        points = service.get(f"{base}/points").json()["points"]
+        assert len(points) == 5 * 12
+        assert {tuple(point["reasons"]) for point in points} == {(str(reason),)}
+    elif kind == "monoplane":
+        answer = service.get(f"{base}/tracks").json()
+        assert answer["tracks"] == []
+        assert {tuple(view["reasons"]) for view in answer["rejected"]} == {(str(reason),)}
+    else:
+        refused = service.get(f"{base}/map")
+        assert (refused.status_code, refused.json()["code"]) == (409, "no_map")
+        assert refused.json()["reasons"] == [str(reason)]
+        assert refused.json()["detail"] == "The plugin says why."
 
 
 def test_a_real_cine_without_electrodes_is_rejected_and_the_job_succeeds(

@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from fluoromap.contracts import Context
+from fluoromap.contracts import Context, Refusal
+from fluoromap.reasons import Reason
 from fluoromap_service.jobs import queue
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.store import files
+from fluoromap_service.store.codec import decode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Event, Job, JobState, StageRow, StageState, Study
 from fluoromap_workers import runner, tasks
@@ -37,7 +39,7 @@ def stage(data_dir: Path) -> int:
 
 
 def _run(stage: int, monkeypatch: pytest.MonkeyPatch, compute: Callable[[Context], Any]) -> StageRow:
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, compute))
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, compute, str))
     runner.run(stage, "test")
     with reading() as session:
         return session.get_one(StageRow, stage)
@@ -54,7 +56,7 @@ def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.Mon
     row = _run(stage, monkeypatch, lambda context: ("answer", 42))
     assert row.state == StageState.DONE
     assert row.result is not None
-    assert files.path_of(row.result).read_bytes() == b'["answer",42]'
+    assert decode(tuple[str, int], files.path_of(row.result).read_bytes()) == ("answer", 42)  # type: ignore[arg-type]
     with reading() as session:
         assert session.get_one(Job, "j").state == JobState.SUCCEEDED
 
@@ -75,7 +77,7 @@ def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monk
                 state=state,
             )
             session.add(row)
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, lambda context: ()))
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, lambda context: (), str))
     # Nobody else hears of what got ready.
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
     tasks.run_stage(stage)
@@ -104,7 +106,9 @@ def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.M
     computed = []
 
     def work(held: Claim) -> Work:
-        return Work(keys[held.stage_id] * 64, tuple, lambda context: (computed.append(held.stage_id), held.stage_id))
+        return Work(
+            keys[held.stage_id] * 64, tuple, lambda context: (computed.append(held.stage_id), held.stage_id), str
+        )
 
     monkeypatch.setattr(runner, "_prepare", work)
     runner.run(stage, "test")
@@ -138,7 +142,7 @@ def test_a_stage_that_cannot_be_prepared_does_not_keep_the_worker_from_the_other
     def work(held: Claim) -> Work:
         if held.stage_id == broken:
             raise ValueError("a stored result is damaged")
-        return Work("0" * 64, tuple, lambda context: ())
+        return Work("0" * 64, tuple, lambda context: (), str)
 
     monkeypatch.setattr(runner, "_prepare", work)
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
@@ -180,6 +184,39 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
     assert row.error is not None
     assert row.error["code"] == "internal"
     assert "name" not in row.error["detail"]
+
+
+def test_a_reused_result_is_not_copied(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    (again,) = _more_stages(1)
+    monkeypatch.setattr(runner, "_prepare", lambda claim: Work("0" * 64, tuple, lambda context: (1,), str))
+    runner.run(stage, "test")
+    with reading() as session:
+        path = files.path_of(str(session.get_one(StageRow, stage).result))
+    before = path.stat()
+
+    def copied(*arguments: Any) -> str:
+        raise AssertionError("a stored result was written again")
+
+    monkeypatch.setattr(files, "keep", copied)
+    runner.run(again, "test")
+    with reading() as session:
+        row = session.get_one(StageRow, again)
+    assert (row.state, row.reused) == (StageState.DONE, True)
+    assert path.stat() == before
+
+
+def test_a_refusal_is_a_result_like_any_other(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(context: Context) -> Any:
+        raise Refusal(Reason.NO_ELECTRODES, "Nothing to see.")
+
+    work = Work("0" * 64, tuple, refuse, lambda refusal: (str(refusal.reason), str(refusal)))
+    monkeypatch.setattr(runner, "_prepare", lambda claim: work)
+    runner.run(stage, "test")
+    with reading() as session:
+        row = session.get_one(StageRow, stage)
+    assert row.state == StageState.DONE
+    content = files.path_of(str(row.result)).read_bytes()
+    assert decode(tuple[str, str], content) == ("no_electrodes", "Nothing to see.")  # type: ignore[arg-type]
 
 
 def test_a_result_that_comes_late_is_thrown_away(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The sign of life of a running stage, beside the stage itself: kernels release the interpreter lock."""
+"""The sign of life of a running stage, sent by a thread beside it. Kernels release the interpreter lock."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ log = structlog.get_logger(__name__)
 class Heartbeat:
     """A stage's :class:`fluoromap.contracts.Context`, whose thread extends the lease while the stage runs.
 
-    Progress is told when it changed, at most twice a second; the lease is extended at least every
-    ``heartbeat_seconds``. When the job is cancelled or the claim lost, the stage's next check raises.
+    The thread stores progress when it changed, at most twice a second. It extends the lease at least every
+    ``heartbeat_seconds``. When the job is cancelled or the claim is lost, the stage's next check raises.
     """
 
     def __init__(self, held: job_life.Claim) -> None:
@@ -55,10 +55,10 @@ class Heartbeat:
         self._thread.join()
 
     def _beat(self) -> None:
-        told, since = 0.0, 0.0
+        stored, since = 0.0, 0.0
         while not self._end.wait(LOOK_SECONDS):
             since += LOOK_SECONDS
-            if since < settings().heartbeat_seconds and self._fraction == told:
+            if since < settings().heartbeat_seconds and self._fraction == stored:
                 continue
             try:
                 with writing() as session:
@@ -66,7 +66,7 @@ class Heartbeat:
             except SQLAlchemyError as error:
                 log.warning("heartbeat_missed", stage=self._held.stage_id, error=type(error).__name__)
                 continue
-            told, since = self._fraction, 0.0
+            stored, since = self._fraction, 0.0
             if answer != "alive":
                 self._unwanted = answer
                 return

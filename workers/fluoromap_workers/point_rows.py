@@ -1,4 +1,4 @@
-"""The rows of a job's points: every electrode of every site, located or rejected, so that nothing is lost."""
+"""The database rows of a job's points: every electrode of every site, located or rejected."""
 
 from __future__ import annotations
 
@@ -15,22 +15,25 @@ _UPPER = np.triu_indices(3)
 
 
 def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulation: Triangulation) -> list[Point]:
-    """All points of a job: sites that were not ready, sites that could not be located, and located electrodes."""
+    """Return the rows of all points of a job, located or rejected.
+
+    Sites that were not ready and sites that could not be located have rows too, with their reasons.
+    """
     rows: list[Point] = []
     notes = {site.site: site.notes for site in matching.sites}
     located = {site.site: site for site in triangulation.sites}
     refused = {site.site: site.reasons for site in triangulation.rejected}
-    for plan in snapshot.sites:
-        site = located.get(plan.site)
+    for planned in snapshot.sites:
+        site = located.get(planned.site)
         for catheter in snapshot.catalogue().catheters:
-            doubts = tuple(reason for name, reason in notes.get(plan.site, ()) if name == catheter.name)
+            doubts = tuple(reason for name, reason in notes.get(planned.site, ()) if name == catheter.name)
             for electrode in range(1, catheter.electrodes + 1):
                 point = site.point(catheter.name, electrode) if site else None
                 if point is None or site is None:
-                    reasons = refused.get(plan.site) or doubts or (Reason.CATHETER_NOT_FOUND,)
-                    rows.append(_rejected(job_id, plan, catheter.name, electrode, reasons))
+                    reasons = refused.get(planned.site) or doubts or (Reason.CATHETER_NOT_FOUND,)
+                    rows.append(_rejected(job_id, planned, catheter.name, electrode, reasons))
                 else:
-                    rows.append(_located(job_id, plan, site, point, doubts))
+                    rows.append(_located(job_id, planned, site, point, doubts))
     for not_ready in snapshot.rejected:
         for catheter in snapshot.catalogue().catheters:
             for electrode in range(1, catheter.electrodes + 1):
@@ -39,7 +42,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
 
 
 def _located(
-    job_id: str, plan: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...]
+    job_id: str, planned: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...]
 ) -> Point:
     relative = point.relative_mm is not None and point.relative_covariance_mm2 is not None
     reasons = dict.fromkeys((*point.reasons, *site.reasons, *doubts))
@@ -47,21 +50,21 @@ def _located(
         reasons[Reason.NO_REFERENCE] = None
     return Point(
         job_id=job_id,
-        site=plan.site,
+        site=planned.site,
         catheter=point.catheter,
         electrode=point.electrode,
         position_mm=point.position_mm.tolist(),
         covariance_mm2=_six(point.covariance_mm2),
         relative_mm=point.relative_mm.tolist() if point.relative_mm is not None else None,
         relative_covariance_mm2=_six(point.relative_covariance_mm2) if relative else None,
-        view_a=plan.view_a,
-        view_b=plan.view_b,
+        view_a=planned.view_a,
+        view_b=planned.view_b,
         frame_a=site.frame_a + 1,
         frame_b=site.frame_b + 1,
         residual_a_px=point.residual_px[0],
         residual_b_px=point.residual_px[1],
         ray_angle_deg=point.ray_angle_deg,
-        lat_ms=plan.lat_ms,
+        lat_ms=planned.lat_ms,
         grade=grade_of(point.covariance_mm2),
         relative_grade=grade_of(point.relative_covariance_mm2) if relative else Grade.REJECTED,  # type: ignore[arg-type]
         reasons=[str(reason) for reason in reasons],
@@ -69,16 +72,20 @@ def _located(
 
 
 def _rejected(
-    job_id: str, plan: SiteSnapshot | RejectedSiteSnapshot, catheter: str, electrode: int, reasons: tuple[Reason, ...]
+    job_id: str,
+    planned: SiteSnapshot | RejectedSiteSnapshot,
+    catheter: str,
+    electrode: int,
+    reasons: tuple[Reason, ...],
 ) -> Point:
     return Point(
         job_id=job_id,
-        site=plan.site,
+        site=planned.site,
         catheter=catheter,
         electrode=electrode,
-        view_a=plan.view_a,
-        view_b=plan.view_b,
-        lat_ms=plan.lat_ms,
+        view_a=planned.view_a,
+        view_b=planned.view_b,
+        lat_ms=planned.lat_ms,
         grade=Grade.REJECTED,
         relative_grade=Grade.REJECTED,
         reasons=[str(reason) for reason in reasons],
@@ -86,6 +93,6 @@ def _rejected(
 
 
 def _six(covariance: Any) -> list[float]:
-    """The upper triangle row by row: xx, xy, xz, yy, yz, zz."""
+    """Return the upper triangle row by row: xx, xy, xz, yy, yz, zz."""
     values: list[float] = np.asarray(covariance)[_UPPER].tolist()
     return values

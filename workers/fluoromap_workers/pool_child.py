@@ -1,4 +1,4 @@
-"""What a pool child does before its first stage."""
+"""The preparation of a pool child before its first stage."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ log = structlog.get_logger(__name__)
 
 
 def limit_memory() -> None:
-    """Bound the address space, so that a runaway stage fails alone instead of taking the machine down."""
+    """Bound the address space, so that a stage that grows without end fails alone."""
     limit = settings().worker_memory_mib * 2**20
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
 
 
 def warm_up() -> None:
-    """Load the plugins and let the default ones compile their kernels, so that the first run does not wait for it.
+    """Load the plugins and compile the kernels of the default ones, so that the first run does not wait.
 
-    A plugin that has something to prepare has a class method ``warm_up()``; one that fails is told in the log, and its
-    stage will tell the user.
+    A plugin may offer a class method ``warm_up()``. A failure there is logged; later the stage reports it to the user.
     """
     for row in plugins():
         if row.error is not None:

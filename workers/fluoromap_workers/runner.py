@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import structlog
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
 from structlog.typing import FilteringBoundLogger as BoundLogger
 
-from fluoromap.contracts import StageStopped
+from fluoromap.contracts import Refusal, StageStopped
 from fluoromap_service.jobs import job_life
-from fluoromap_service.jobs.stage_results import remember
+from fluoromap_service.jobs.job_life import Claim, StoredResult
+from fluoromap_service.jobs.stage_results import load_file, remember
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import decode, encode
+from fluoromap_service.store.codec import MEDIA_TYPE, encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
@@ -23,14 +26,20 @@ LONGEST_MESSAGE = 500
 
 
 class PluginFailed(Exception):
-    """The plugin raised; the message is what the job's reader is told."""
+    """The plugin raised. The message reaches the reader of the job."""
 
 
 log = structlog.get_logger(__name__)
 
 
 def run(stage_id: int, worker: str) -> str | None:
-    """Claim a stage, run its plugin, store the result; returns its job, or None when the claim is not to be had."""
+    """Claim a stage, run its plugin and store the result.
+
+    Returns
+    -------
+    str or None
+        The stage's job; None when the stage could not be claimed.
+    """
     with writing() as session:
         held = job_life.claim(session, stage_id, worker)
     if held is None:
@@ -46,7 +55,7 @@ def run(stage_id: int, worker: str) -> str | None:
                     job_life.stopped(session, held)
             bound.info("stage_stopped")
         except (OperationalError, OSError) as error:
-            # The machine's fault, not the plugin's: the lease runs out and the stage is tried again.
+            # The machine failed, not the plugin: the lease runs out and another attempt follows.
             bound.warning("stage_interrupted", error=type(error).__name__)
         except PluginFailed as failure:
             bound.warning("stage_failed", exc_info=failure.__cause__)
@@ -54,57 +63,55 @@ def run(stage_id: int, worker: str) -> str | None:
                 job_life.fail(session, held, {"code": "plugin_failed", "detail": str(failure)})
         except Exception as error:
             bound.error("stage_broken", error=type(error).__name__, exc_info=error)
-            detail = "The service could not prepare or store this stage's work; its log tells more."
+            detail = "The service could not prepare or store the work of this stage. Look at the worker's log."
             with writing() as session:
                 job_life.fail(session, held, {"code": "internal", "detail": detail})
     return held.job_id
 
 
 def finish_known(job_id: str) -> None:
-    """End at once what is ready of a job and was computed before: after a correction nearly all of its runs."""
+    """End all ready stages of a job whose results are stored: after a correction nearly all of its runs."""
     try:
         with reading() as session:
             ready = job_life.ready(session, job_id)
-        works = [(stage.stage_id, _prepare(stage)) for stage in ready]
-        kept = [(stage_id, _kept_result(work.key)) for stage_id, work in works if work.rows is None]
-        known = {stage_id: sha256 for stage_id, sha256 in kept if sha256 is not None}
+        stored = [(claim, _stored(_prepare(claim))) for claim in ready]
+        known = [(claim, result) for claim, result in stored if result is not None]
         if known:
             with writing() as session:
-                files.lock(session)
-                # Nobody can remove them from here on; what was removed a moment ago is computed again.
-                stored = {stage_id: sha256 for stage_id, sha256 in known.items() if session.get(File, sha256)}
-                job_life.finish_ready(session, job_id, stored)
+                job_life.finish_ready(session, job_id, [entry for entry in known if _holds(session, entry[1])])
     except Exception as error:
-        # Each stage says for itself what is wrong with it when its turn comes.
+        # A stage that cannot be prepared fails with its own reason when its turn comes.
         log.warning("nothing_finished_at_once", job=job_id, error=type(error).__name__)
 
 
-def _run(held: job_life.Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
+def _run(held: Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
     work = _prepare(held)
-    kept = _kept_result(work.key)
-    if kept:
-        content = files.path_of(kept).read_bytes()
-        result = decode(work.kind, content) if work.rows else None
-    else:
-        result, content = _computed(held, work, heartbeat)
-    rows = list(work.rows(result)) if work.rows else []
+    stored = _stored(work)
+    if stored is not None:
+        with writing() as session:
+            taken = _holds(session, stored) and job_life.finish(session, held, stored, reused=True)
+        if taken:
+            bound.info("stage_done", reused=True)
+            return
+    result, content = _computed(held, work, heartbeat)
+    rows = tuple(work.rows(result)) if work.rows else ()
     heartbeat.check()
-    # Kept again even when it was kept before: then nobody can have removed it since.
     with files.incoming() as path, writing() as session:
         path.write_bytes(content)
-        sha256 = files.keep(session, path, "application/json")
-        if session.get(StageResult, work.key) is None:
-            session.add(StageResult(key=work.key, sha256=sha256))
-        if not job_life.finish(session, held, sha256, reused=kept is not None, rows=rows):
+        sha256 = files.keep(session, path, MEDIA_TYPE)
+        session.merge(StageResult(key=work.key, sha256=sha256))
+        if not job_life.finish(session, held, StoredResult(sha256, rows), reused=False):
             raise StageStopped("the claim was lost while the result was stored")
-    if result is not None:
-        remember(sha256, result, len(content))
-    bound.info("stage_done", reused=kept is not None)
+    remember(sha256, result, len(content))
+    bound.info("stage_done", reused=False)
 
 
-def _computed(held: job_life.Claim, work: Work, heartbeat: Heartbeat) -> tuple[Any, bytes]:
+def _computed(held: Claim, work: Work, heartbeat: Heartbeat) -> tuple[Any, bytes]:
     try:
-        result = work.compute(heartbeat)
+        try:
+            result = work.compute(heartbeat)
+        except Refusal as refusal:
+            result = work.refused(refusal)
         return result, encode(result)
     except StageStopped:
         raise
@@ -114,13 +121,28 @@ def _computed(held: job_life.Claim, work: Work, heartbeat: Heartbeat) -> tuple[A
         raise PluginFailed(sentence[:LONGEST_MESSAGE]) from error
 
 
-def _prepare(held: job_life.Claim) -> Work:
+def _prepare(claim: Claim) -> Work:
     with reading() as session:
-        job = session.get_one(Job, held.job_id)
-        return prepare(session, held, Snapshot.model_validate(job.snapshot))
+        return prepare(session, claim, _snapshot(claim.job_id))
 
 
-def _kept_result(key: str) -> str | None:
+@functools.lru_cache(maxsize=2)
+def _snapshot(job_id: str) -> Snapshot:
+    """Return a job's snapshot. It never changes, and a worker takes many stages of one job in a row."""
     with reading() as session:
-        kept = session.get(StageResult, key)
-        return kept.sha256 if kept is not None and files.path_of(kept.sha256).exists() else None
+        return Snapshot.model_validate(session.get_one(Job, job_id).snapshot)
+
+
+def _stored(work: Work) -> StoredResult | None:
+    """Return the result that an earlier job stored for the same work."""
+    with reading() as session:
+        row = session.get(StageResult, work.key)
+    if row is None or not files.path_of(row.sha256).exists():
+        return None
+    return StoredResult(row.sha256, tuple(work.rows(load_file(work.kind, row.sha256))) if work.rows else ())
+
+
+def _holds(session: Session, stored: StoredResult) -> bool:
+    """Return whether the store still holds a result; nobody can remove it until this transaction ends."""
+    files.lock(session)
+    return session.get(File, stored.sha256) is not None

@@ -1,7 +1,7 @@
-"""Hands stored inputs to a stage, which itself reads no store.
+"""Give stored inputs to a stage, which itself reads no store.
 
-A result is kept under the hash of plugin, version, parameters and exactly what the stage reads, so that a correction
-redoes only what hangs on it.
+There is one function for each row of the pipeline. A result is stored under the hash of plugin, version, parameters and
+exactly the inputs that the stage reads, so that a correction repeats only the work that depends on it.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from typing import Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from fluoromap import matching as study_matching
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
     Chain,
     Context,
     ElectrodePoint,
+    FrameChains,
     LocatedSite,
     MatchedSite,
     Matching,
     MonoplaneView,
     Refusal,
+    RejectedSite,
     Run,
     Segmentation,
     Triangulation,
@@ -37,11 +38,12 @@ from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
 from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
+from fluoromap_service.jobs.pipeline import STAGES, StageName, plugin_of
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, stage_of, stages_of
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import encode
+from fluoromap_service.store.codec import encode, form_of
 from fluoromap_service.store.models import Base, StageRow
-from fluoromap_service.study.snapshot import CorrectedElectrode, PluginSnapshot, Snapshot
+from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
 from fluoromap_workers.point_rows import point_rows
 
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
@@ -49,53 +51,79 @@ NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A stage ready to run: the key of its result and its kind, how to compute it, and the rows that belong to it."""
+    """A stage ready to run.
+
+    Parameters
+    ----------
+    key : str
+        Hash of everything that the result depends on.
+    kind : type
+        The dataclass of the result.
+    compute : callable
+        Computes the result.
+    refused : callable
+        Makes the result that says why the plugin refused.
+    rows : callable, optional
+        Makes the database rows that belong to a result.
+    """
 
     key: str
     kind: type[Any]
     compute: Callable[[Context], Any]
+    refused: Callable[[Refusal], Any]
     rows: Callable[[Any], Iterable[Base]] | None = None
 
 
-def prepare(session: Session, held: Claim, snapshot: Snapshot) -> Work:
-    """Gather the inputs of a claimed stage."""
-    if held.name == "segment":
-        return _segment(snapshot, held.subject)
-    if held.name == "match":
-        return _match(snapshot, {row.subject: row for row in stages_of(session, held.job_id, "segment")})
-    match = stage_of(session, held.job_id, "match")
-    assert match is not None, "every job has one"
-    if held.name == "triangulate":
-        return _triangulate(held.job_id, snapshot, match)
-    triangulate = stage_of(session, held.job_id, "triangulate")
-    assert triangulate is not None, "every job has one"
-    triangulation = load(Triangulation, triangulate)
-    if held.name == "fuse":
-        return _fuse(snapshot, triangulation)
-    return _monoplane(snapshot, held.subject, load(Matching, match), triangulation)
+@dataclass(frozen=True, slots=True)
+class StoredJob:
+    """A job as its stages read it, inside one transaction."""
+
+    session: Session
+    job_id: str
+    snapshot: Snapshot
+
+    @property
+    def catalogue(self) -> Catalogue:
+        return self.snapshot.catalogue()
+
+    def stage(self, name: StageName) -> StageRow:
+        """Return the job's one stage of that name."""
+        row = stage_of(self.session, self.job_id, name)
+        assert row is not None, "every job has one"
+        return row
 
 
-def _segment(snapshot: Snapshot, uid: str) -> Work:
-    plan, catalogue = snapshot.runs[uid], snapshot.catalogue()
-    facts = InstanceFacts.from_json(plan.facts)
-    px_per_mm = plan.gantry.camera().px_per_mm
-    corrections = {frame - 1: _chains(electrodes) for frame, electrodes in plan.corrections.items()}
-    key = _key(
-        "segment", snapshot.segmenter, plan.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames,
-        px_per_mm, asdict(catalogue), plan.model_dump(include={"corrections"}),
-    )  # fmt: skip
+def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
+    """Gather the inputs of a stage that may begin."""
+    return _PREPARE[STAGES[claim.name].name](StoredJob(session, claim.job_id, snapshot), claim.subject)
+
+
+def _segment(job: StoredJob, uid: str) -> Work:
+    run, catalogue = job.snapshot.runs[uid], job.catalogue
+    facts = InstanceFacts.from_json(run.facts)
+    px_per_mm = run.gantry.camera().px_per_mm
+    marks = {frame - 1: _chains(electrodes) for frame, electrodes in run.corrections.items()}
+    plugin = job.snapshot.segmenter
 
     def compute(context: Context) -> Segmentation:
-        frames = open_frames(files.path_of(plan.sha256), facts)
-        run = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
-        segmenter = build_segmenter(snapshot.segmenter.name, snapshot.segmenter.params)
-        return segmenter.segment(run, catalogue, corrections, context)
+        frames = open_frames(files.path_of(run.sha256), facts)
+        shown = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
+        return build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
 
-    return Work(key, Segmentation, compute)
+    def refused(refusal: Refusal) -> Segmentation:
+        frames = tuple(FrameChains(frame, (), refusal.reason) for frame in range(facts.frames))
+        motion, times_ms = np.zeros(facts.frames), np.array(facts.frame_times_ms)
+        return Segmentation(frames, None, (), motion, times_ms, facts.r_wave_frames)
+
+    key = _key(
+        job, "segment", run.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames, px_per_mm,
+        asdict(catalogue), run.model_dump(include={"corrections"}),
+    )  # fmt: skip
+    return Work(key, Segmentation, compute, refused)
 
 
 def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
-    """Return the chains that a person set in one frame, one a catheter."""
+    """Return the chains that a person set in one frame, one for each catheter."""
     chains = []
     for catheter in sorted({electrode.catheter for electrode in electrodes}):
         own = sorted((each for each in electrodes if each.catheter == catheter), key=lambda each: each.electrode)
@@ -112,83 +140,91 @@ def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
     return tuple(chains)
 
 
-def _match(snapshot: Snapshot, segments: Mapping[str, StageRow]) -> Work:
-    catalogue = snapshot.catalogue()
+def _match(job: StoredJob, study: str) -> Work:
+    snapshot, catalogue = job.snapshot, job.catalogue
+    segments = {row.subject: row for row in stages_of(job.session, job.job_id, "segment")}
     cameras = {uid: snapshot.runs[uid].gantry.camera() for uid in segments}
-    own = PluginSnapshot(name="fluoromap", version=study_matching.VERSION, params={})
     views = [(site.site, uid) for site in snapshot.sites for uid in (site.view_a, site.view_b)]
-    # A stored result is named by its hash: what it says need not be read to tell whether it changed.
-    key = _key(
-        "match", own, asdict(catalogue), *([s, encode(cameras[uid]).decode(), segments[uid].result] for s, uid in views)
-    )
 
     def compute(context: Context) -> Matching:
-        seen = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
+        found = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
-            SiteRuns(site.site, cameras[site.view_a], cameras[site.view_b], seen[site.view_a], seen[site.view_b])
+            SiteRuns(site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b])
             for site in snapshot.sites
         )
         return match_study(sites, catalogue, context)
 
-    return Work(key, Matching, compute)
+    def refused(refusal: Refusal) -> Matching:
+        return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
+
+    # A result's hash says whether it changed: the result itself is not read for the key.
+    results = ((site, encode(cameras[uid]), segments[uid].result) for site, uid in views)
+    key = _key(job, "match", asdict(catalogue), *(part for view in results for part in view))
+    return Work(key, Matching, compute, refused)
 
 
-def _triangulate(job_id: str, snapshot: Snapshot, match: StageRow) -> Work:
-    catalogue = snapshot.catalogue()
+def _triangulate(job: StoredJob, study: str) -> Work:
+    match, catalogue, plugin = job.stage("match"), job.catalogue, job.snapshot.triangulator
 
     def compute(context: Context) -> Triangulation:
         matching = load(Matching, match)
-        triangulator = build_triangulator(snapshot.triangulator.name, snapshot.triangulator.params)
-        located = triangulator.triangulate(matching.sites, catalogue, context)
+        located = build_triangulator(plugin.name, plugin.params).triangulate(matching.sites, catalogue, context)
         return replace(located, rejected=(*matching.rejected, *located.rejected))
 
+    def refused(refusal: Refusal) -> Triangulation:
+        matching = load(Matching, match)
+        sites = tuple(RejectedSite(site.site, (refusal.reason,)) for site in matching.sites)
+        return Triangulation((), (*matching.rejected, *sites), (str(refusal),))
+
     def rows(located: Triangulation) -> Iterable[Base]:
-        return point_rows(job_id, snapshot, load(Matching, match), located)
+        return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
-    return Work(
-        _key("triangulate", snapshot.triangulator, asdict(catalogue), match.result), Triangulation, compute, rows
-    )
+    return Work(_key(job, "triangulate", asdict(catalogue), match.result), Triangulation, compute, refused, rows)
 
 
-def _fuse(snapshot: Snapshot, triangulation: Triangulation) -> Work:
-    catalogue = snapshot.catalogue()
-    times = {site.site: (site.lat_ms, site.lat_sd_ms) for site in snapshot.sites}
-    sites = mapped_sites(triangulation, catalogue, times)
+def _fuse(job: StoredJob, study: str) -> Work:
+    triangulation, plugin = load(Triangulation, job.stage("triangulate")), job.snapshot.fuser
+    times = {site.site: (site.lat_ms, site.lat_sd_ms) for site in job.snapshot.sites}
+    sites = mapped_sites(triangulation, job.catalogue, times)
     origin = map_origin(triangulation)
 
     def compute(context: Context) -> MapResult:
-        fuser = build_fuser(snapshot.fuser.name, snapshot.fuser.params)
-        try:
-            return MapResult(fuser.fuse(sites, context), None, "", origin)
-        except Refusal as refusal:
-            return MapResult(None, refusal.reason, str(refusal), origin)
+        return MapResult(build_fuser(plugin.name, plugin.params).fuse(sites, context), None, "", origin)
 
-    key = _key("fuse", snapshot.fuser, list(origin or ()), *(encode(site) for site in sites))
-    return Work(key, MapResult, compute)
+    def refused(refusal: Refusal) -> MapResult:
+        return MapResult(None, refusal.reason, str(refusal), origin)
+
+    key = _key(job, "fuse", list(origin or ()), *(encode(site) for site in sites))
+    return Work(key, MapResult, compute, refused)
 
 
-def _monoplane(snapshot: Snapshot, name: str, matching: Matching, triangulation: Triangulation) -> Work:
-    catalogue = snapshot.catalogue()
+def _monoplane(job: StoredJob, name: str) -> Work:
+    matching, triangulation = load(Matching, job.stage("match")), load(Triangulation, job.stage("triangulate"))
+    plugin = job.snapshot.monoplane
     matched = next((site for site in matching.sites if site.site == name), None)
     located = next((site for site in triangulation.sites if site.site == name), None)
-    views: list[tuple[View, MonoplaneView]] = []
+    views: list[MonoplaneView] = []
     if matched is not None and located is not None:
         others = () if located.cycle else tuple(site.cycle for site in triangulation.sites if site.cycle)
-        views = [(view, _monoplane_view(view, matched, located, catalogue, others)) for view in snapshot.views]
-    refused = [] if views else [_rejected_view(view, name, triangulation) for view in snapshot.views]
-    key = _key("monoplane", snapshot.monoplane, name, encode(refused), *(encode(view) for _, view in views))
+        views = [_monoplane_view(view, matched, located, job.catalogue, others) for view in job.snapshot.views]
+    rejected = [] if views else [_rejected_view(view, name, triangulation) for view in job.snapshot.views]
 
     def compute(context: Context) -> SiteTracks:
-        followed = list(refused)
-        for view, seen in views:
-            solver = build_monoplane(snapshot.monoplane.name, snapshot.monoplane.params)
+        tracks = list(rejected)
+        for view in views:
+            solver = build_monoplane(plugin.name, plugin.params)
+            # One view may support a track where the other does not.
             try:
-                followed.append(ViewTrack(view, solver.track(seen, context), None, ""))
+                tracks.append(ViewTrack(view.view, solver.track(view, context), None, ""))
             except Refusal as refusal:
-                followed.append(ViewTrack(view, None, refusal.reason, str(refusal)))
-        return SiteTracks(name, tuple(followed))
+                tracks.append(ViewTrack(view.view, None, refusal.reason, str(refusal)))
+        return SiteTracks(name, tuple(tracks))
 
-    return Work(key, SiteTracks, compute)
+    def refused(refusal: Refusal) -> SiteTracks:
+        return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
+
+    key = _key(job, "monoplane", name, *(encode(view) for view in rejected), *(encode(view) for view in views))
+    return Work(key, SiteTracks, compute, refused)
 
 
 def _monoplane_view(
@@ -210,7 +246,7 @@ def _monoplane_view(
 
 
 def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
-    """How sure a name is does not move an electrode: naming a catheter at one site must not redo the others."""
+    """Remove doubts about names: they move no electrode, and naming a catheter at one site must not redo the others."""
     return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
 
 
@@ -220,9 +256,21 @@ def _rejected_view(view: View, name: str, triangulation: Triangulation) -> ViewT
     return ViewTrack(view, None, Reason.NO_A_PRIORI, f"{Reason.NO_A_PRIORI.sentence} {sentences}".strip())
 
 
-def _key(stage: str, plan: PluginSnapshot, *inputs: Any) -> str:
+_PREPARE: Mapping[StageName, Callable[[StoredJob, str], Work]] = {
+    "segment": _segment,
+    "match": _match,
+    "triangulate": _triangulate,
+    "fuse": _fuse,
+    "monoplane": _monoplane,
+}
+
+
+def _key(job: StoredJob, name: StageName, *inputs: Any) -> str:
+    """Return the hash of a stage's plugin, the form of its result, and its inputs."""
+    stage = STAGES[name]
+    plugin = plugin_of(stage, job.snapshot)
     digest = hashlib.sha256()
-    for item in (stage, plan.name, plan.version, plan.params, *inputs):
+    for item in (name, plugin.name, plugin.version, plugin.params, form_of(stage.result), *inputs):
         content = item if isinstance(item, bytes) else json.dumps(item, sort_keys=True, allow_nan=False).encode()
         digest.update(len(content).to_bytes(8, "big"))
         digest.update(content)

@@ -1,4 +1,4 @@
-"""What Celery registers: one task, and what a worker does besides."""
+"""The one task that Celery registers, and the sweeper that each worker runs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import time
 from typing import Any
 
 import structlog
-from celery import bootsteps
-from celery.signals import worker_process_init
+from celery import bootsteps, shared_task
+from celery.signals import celeryd_init, worker_process_init
 from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap_service.jobs import job_life, queue
@@ -24,11 +24,11 @@ SWEEP_SECONDS = 1.0
 log = structlog.get_logger(__name__)
 
 
-@queue.app.task(name=queue.RUN_STAGE)
+@shared_task(name=queue.RUN_STAGE)  # type: ignore[untyped-decorator,unused-ignore]
 def run_stage(stage_id: int) -> None:
-    """Run the stage of that row, if it is still to be had, and for a while what is ready of the same job.
+    """Run the stage of that row if it can be claimed, then for a while more stages of the same job.
 
-    So a chain of short stages does not wait for a message each; the messages find their stages taken.
+    So the stages of a chain need no message each. Their messages find them claimed.
     """
     worker = f"{socket.gethostname()}:{os.getpid()}"
     end = time.monotonic() + queue.STAYS_SECONDS
@@ -47,16 +47,16 @@ def run_stage(stage_id: int) -> None:
 
 @worker_process_init.connect
 def prepare_child(**_: Any) -> None:
-    """Make a pool child ready: own connections, bounded memory, plugins loaded and kernels compiled."""
+    """Make a pool child ready: its own connections, bounded memory, plugins loaded and kernels compiled."""
     forget_connections()
     limit_memory()
     warm_up()
-    # What is loaded now stays: the collector would walk through it again and again while a stage makes its many small objects.
+    # The loaded code stays. Else the collector would walk through it again while a stage makes its small objects.
     gc.freeze()
 
 
 class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
-    """Sweeps every second from the worker's own timer, and tells that the worker lives."""
+    """Sweeps every second from the worker's own timer, and stores that the worker lives."""
 
     requires = frozenset({"celery.worker.components:Timer"})
 
@@ -71,11 +71,14 @@ class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
             self.entry.cancel()
 
     def sweep(self, name: str) -> None:
-        # A database that is away for a moment must not end the worker: the next sweep finds it again.
+        # The worker outlives a database that is away for a moment: the next sweep finds it again.
         with contextlib.suppress(SQLAlchemyError):
             with writing() as session:
                 job_life.worker_seen(session, name)
             queue.sweep()
 
 
-queue.app.steps["worker"].add(Sweeper)
+@celeryd_init.connect
+def add_sweeper(instance: Any, **_: Any) -> None:
+    """Give the worker that starts a sweeper."""
+    instance.app.steps["worker"].add(Sweeper)

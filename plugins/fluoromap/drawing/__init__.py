@@ -1,6 +1,6 @@
-"""Pictures of the map: overlays on fluoroscopy, the map from six sides, the running activation."""
+"""Pictures of the map: overlays on fluoroscopy, the map from six directions, the propagation as an animation."""
 
 from typing import Final
 
-VERSION: Final[str] = "1"
-"""Raise it when a picture of the same map changes: pictures that the service keeps are then drawn again."""
+VERSION: Final = "1"
+"""Version of the drawing code: kept pictures depend on it. Raise it with every change of a drawn pixel."""

@@ -1,4 +1,4 @@
-"""The activation running over the wall, as a moving picture."""
+"""Animation of the activation that propagates over the wall."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def draw_propagation(
     tip_uv: ArrayLike | None,
     look: Look,
 ) -> bytes:
-    """A GIF that runs through the map's times, from the earliest to the latest, and starts again.
+    """Draw a GIF that runs through the map's times from the earliest to the latest, again and again.
 
-    Parameters as of :func:`fluoromap.drawing.overlay.draw_overlay`; ``look.until_ms`` is not read. Every picture is the overlay
-    with its time written in the corner, the wall coloured as far as it is activated by then.
+    The parameters are those of :func:`fluoromap.drawing.overlay.draw_overlay`; ``look.until_ms`` is not used. Each picture
+    is the overlay at one time, which is written in the corner. The wall is coloured where it is activated by that time.
     """
     times = look.times or scale_of(chamber, look.step_ms, look.palette)
     pictures = [
@@ -43,7 +43,7 @@ def draw_propagation(
         )
         for until_ms in np.linspace(times.start_ms, times.stop_ms, PICTURES)
     ]
-    # One palette for all pictures, of the last one, which has every colour: what does not change is not stored again.
+    # All pictures share the palette of the last, which has every colour; unchanged pixels are then stored only once.
     palette = pictures[-1].quantize(COLOURS, dither=Image.Dither.NONE)
     reduced = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     stream = io.BytesIO()

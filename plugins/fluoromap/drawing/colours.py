@@ -1,8 +1,8 @@
 """Colours of activation times: steps, bands, and two colour maps.
 
-In the palette ``safe`` early is warm and light, late is cold and dark: colour-blind readers can order it, and the order
-survives in grey too. ``red-early`` is what mapping systems show: red is early, violet late. Where no site is near enough there
-is a hatched neutral grey, which no band has.
+In the palette ``safe`` early is warm and light, late is cold and dark. Colour-blind readers can order it, and so can
+readers of a grey print. The palette ``red-early`` is that of mapping systems: red is early, violet is late. Places without a
+near site get a hatched neutral grey, which is not the colour of any band.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ANCHORS_RGB: dict[Palette, Array] = {
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Iso-time steps of one map: ``bands`` bands of ``step_ms``, the first one from ``start_ms`` on, and their colours."""
+    """Iso-time steps of one map: ``bands`` bands of ``step_ms`` from ``start_ms`` on, and their colours."""
 
     start_ms: float
     step_ms: float
@@ -52,6 +52,7 @@ class Scale:
 
     @property
     def stop_ms(self) -> float:
+        """End of the last band, ms."""
         return self.start_ms + self.bands * self.step_ms
 
     @property
@@ -60,22 +61,22 @@ class Scale:
         return self.start_ms + self.step_ms * np.arange(self.bands + 1, dtype=np.float64)
 
     def band(self, lat_ms: Array) -> NDArray[np.int64]:
-        """Band of each time; times outside the scale count to the first or last one."""
+        """Return the band of each time; times outside the scale belong to the first or last band."""
         bands = (lat_ms - self.start_ms) / self.step_ms
-        # Clipped first, so that cutting the fraction off rounds down.
+        # Conversion to an integer rounds towards 0, which is downwards only after clipping.
         return np.clip(bands, 0, self.bands - 1).astype(np.int64)
 
     def band_colours(self) -> Colours:
-        """RGB of each band, (bands, 3)."""
+        """Return the RGB of each band, (bands, 3)."""
         return colour_map((np.arange(self.bands) + 0.5) / self.bands, self.palette)
 
     def colours(self, lat_ms: Array) -> Colours:
-        """Continuous RGB (k, 3) of times (k,), without bands: what mesh files carry."""
+        """Return continuous RGB (k, 3) of times (k,), without bands, as mesh files need it."""
         return colour_map((lat_ms - self.start_ms) / (self.stop_ms - self.start_ms), self.palette)
 
 
 def colour_map(fraction: Array, palette: Palette = "safe") -> Colours:
-    """RGB (k, 3) of fractions (k,) of the scale, 0 early, 1 late; beyond is clipped."""
+    """Return the RGB (k, 3) of fractions (k,) of the scale, 0 early, 1 late; values outside are clipped."""
     anchors = _ANCHORS_RGB[palette]
     position = np.clip(fraction, 0, 1) * (len(anchors) - 1)
     channels = [np.interp(position, np.arange(len(anchors)), channel) for channel in anchors.T]
@@ -83,15 +84,15 @@ def colour_map(fraction: Array, palette: Palette = "safe") -> Colours:
 
 
 def scale_of(chamber: ChamberMap, step_ms: float | None = None, palette: Palette = "safe") -> Scale:
-    """Iso-time steps for a map.
+    """Return the iso-time steps of a map.
 
-    Covers every coloured vertex and every site that agrees with its neighbours; edges are multiples of the step.
+    They cover every coloured vertex and every site that agrees with its neighbours. Edges are multiples of the step.
 
     Parameters
     ----------
     chamber : ChamberMap
     step_ms : float or None
-        None takes 5 or 10 ms, 20 or 50 only where those would be too many to tell apart.
+        None chooses 5 or 10 ms; 20 or 50 ms where there would be too many bands to distinguish.
     palette : {"safe", "red-early"}
     """
     at_sites = [site.lat_ms for site in chamber.sites if Reason.LAT_OUTLIER not in site.reasons]
@@ -107,12 +108,12 @@ def scale_of(chamber: ChamberMap, step_ms: float | None = None, palette: Palette
 
 
 def vertex_colours(chamber: ChamberMap) -> Colours:
-    """RGB (n, 3) of the map's vertices, grey where no site is near enough."""
+    """Return the RGB (n, 3) of the map's vertices, grey where no site is near enough."""
     colours = scale_of(chamber).colours(chamber.lat_ms)
     colours[~chamber.covered] = NO_DATA_RGB
     return colours
 
 
 def milliseconds(lat_ms: float) -> str:
-    """A time as it is written beside a site: whole milliseconds. (Pillow's typeface has no true minus sign.)"""
+    """Return a time in whole milliseconds, as written beside a site. (Pillow's typeface has no true minus sign.)"""
     return str(round(lat_ms))

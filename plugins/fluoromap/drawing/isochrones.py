@@ -14,8 +14,8 @@ from fluoromap.fuser.reentry_cycle import around
 class Isochrone:
     """One connected line of equal time.
 
-    points_mm : (m, 3) in the map's frame, first and last equal where the line is closed. faces : (m - 1,) the face each
-    segment lies in.
+    points_mm : (m, 3) in the map's frame, first and last equal where the line is closed. faces : (m - 1,) the face of each
+    segment.
     """
 
     lat_ms: float
@@ -24,10 +24,11 @@ class Isochrone:
 
 
 def isochrones(chamber: ChamberMap, levels_ms: Array) -> tuple[Isochrone, ...]:
-    """Lines at the given times through the covered faces, times being linear within a face.
+    """Return the lines of the given times through the covered faces.
 
-    Where times repeat after a cycle they are taken by the shorter way round from corner to corner, so that no lines crowd
-    where early meets late; a line ends where activation turns about a point.
+    Times are linear within a face. Where they repeat after a cycle, the difference between two corners is taken by the
+    shorter way around, so that lines do not crowd where early meets late. A line ends where activation rotates about a
+    point.
     """
     covered = np.flatnonzero(chamber.covered[chamber.faces].all(axis=1))
     corners = chamber.faces[covered].T
@@ -35,11 +36,11 @@ def isochrones(chamber: ChamberMap, levels_ms: Array) -> tuple[Isochrone, ...]:
 
 
 def _lines(chamber: ChamberMap, covered: IntArray, corners: IntArray, level: float) -> list[Isochrone]:
-    """Of one time: ``corners`` (3, c) of the covered faces."""
+    """Return the lines of one time; ``corners`` (3, c) are those of the covered faces."""
     after, cycle = chamber.lat_ms - level, chamber.cycle_length_ms
     if cycle is not None:
         after = around(after, cycle)
-    # A vertex exactly on the level counts as later, so that a crossed face has exactly two crossed edges.
+    # A vertex exactly on the level counts as later, so that a crossed face always has two crossed edges.
     first, second, third = (after >= 0)[corners]
     crossed = np.flatnonzero((first != second) | (second != third))
     corners, opposite = corners[:, crossed], np.roll(corners[:, crossed], -1, axis=0)
@@ -50,24 +51,24 @@ def _lines(chamber: ChamberMap, covered: IntArray, corners: IntArray, level: flo
         crossed, corners, opposite, cut = crossed[whole], corners[:, whole], opposite[:, whole], cut[:, whole]
     if not len(crossed):
         return []
-    # An edge as one number, the same from both its faces.
+    # One number for each edge, the same from both its faces.
     vertices = len(chamber.vertices_mm)
     edges = np.minimum(corners, opposite) * vertices + np.maximum(corners, opposite)
     lines = []
-    for passed, used in _chains(edges.T[cut.T].reshape(-1, 2)):
-        a, b = np.divmod(passed, vertices)
+    for edge_chain, segment_chain in _chains(edges.T[cut.T].reshape(-1, 2)):
+        a, b = np.divmod(edge_chain, vertices)
         share = (after[a] / (after[a] - after[b]))[:, None]
         points = (1 - share) * chamber.vertices_mm[a] + share * chamber.vertices_mm[b]
-        lines.append(Isochrone(level, points, covered[crossed[used]]))
+        lines.append(Isochrone(level, points, covered[crossed[segment_chain]]))
     return lines
 
 
 def _chains(segments: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Join segments (s, 2) end to end where two meet in a node. Returns (nodes, segments) of each chain."""
+    """Join segments (s, 2) end to end where two meet in a node; return (nodes, segments) of each chain."""
     ends, nodes = np.unique(segments, return_inverse=True)
     nodes = nodes.reshape(-1, 2)
     numbers = np.arange(1, len(segments) + 1)
-    # A node's two segments, counted from 1, and a segment's nodes as sums: coming from one, the rest is the other.
+    # Sums of a node's two segments (counted from 1) and of a segment's two nodes: the sum minus one is the other.
     at = np.bincount(nodes.ravel(), np.repeat(numbers, 2)).astype(np.int64).tolist()
     passable = (np.bincount(nodes.ravel()) == 2).tolist()
     across = [0, *nodes.sum(axis=1).tolist()]
@@ -75,16 +76,16 @@ def _chains(segments: IntArray) -> list[tuple[IntArray, IntArray]]:
     chains = []
 
     def walk(node: int, segment: int) -> None:
-        walked, passed = [node], list[int]()
+        chain_nodes, chain_segments = [node], list[int]()
         while left[segment]:
             left[segment] = False
-            passed.append(segment)
+            chain_segments.append(segment)
             node = across[segment] - node
-            walked.append(node)
+            chain_nodes.append(node)
             segment = at[node] - segment if passable[node] else 0
-        chains.append((ends[walked], np.array(passed) - 1))
+        chains.append((ends[chain_nodes], np.array(chain_segments) - 1))
 
-    # Open chains from their ends first; what remains is closed.
+    # Open chains first, from their ends; all remaining chains are closed.
     pairs = list(zip(numbers.tolist(), nodes.tolist(), strict=True))
     starts = [(node, number) for number, pair in pairs for node in pair if not passable[node]]
     for node, number in [*starts, *((pair[0], number) for number, pair in pairs)]:

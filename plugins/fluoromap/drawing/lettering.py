@@ -1,4 +1,4 @@
-"""Text and colour bar of the pictures."""
+"""Text, labels and colour bar of the pictures."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ RGB = tuple[int, int, int]
 WHITE: RGB = (255, 255, 255)
 BLACK: RGB = (0, 0, 0)
 BAR_SHARE = 0.42
-"""Height of the colour bar's bands over the height of the picture."""
+"""Height of the colour bar's bands, as a share of the picture's height."""
 
 
 @functools.cache
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own typeface, so that pictures are the same on every machine."""
+    """Return Pillow's own typeface, so that pictures are the same on every machine."""
     return ImageFont.load_default(size=size)
 
 
 def text_size(text: str, size: int) -> tuple[int, int]:
+    """Return width and height of a text, px."""
     left, top, right, bottom = font(size).getbbox(text)
     return round(right - left), round(bottom - top)
 
 
 def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, ink: RGB, halo: RGB) -> None:
-    """Text round a point with a rim that keeps it legible on any background."""
+    """Draw a text centred on a point, with a rim that keeps it legible on any background."""
     stroke = max(1, size // 9)
     draw.text(middle, text, fill=ink, font=font(size), anchor="mm", stroke_width=stroke, stroke_fill=halo)
 
@@ -42,14 +43,14 @@ _DIRECTIONS = np.concatenate([_NEAR, 1.7 * _NEAR])
 
 
 class Labels:
-    """Places labels beside their points, close where there is room, without covering one another where that can be had."""
+    """Labels of one picture, placed close beside their points with as little overlap as possible."""
 
     def __init__(self, width: int, height: int, taken: Iterable[Box] = ()) -> None:
         self._field = np.array([[0.0, 0.0, width, height]])
         self._taken = np.array(list(taken), dtype=np.float64).reshape(-1, 4)
 
     def place(self, point: Point, text: str, size: int, distance: float) -> Point:
-        """Middle of the label, in the direction where it overlaps least, the first of those that are as good."""
+        """Place a label and return its middle: the first of the directions with the least overlap."""
         box = np.array(text_size(text, size)) + size // 3
         middles = point + _DIRECTIONS * (distance + box / 2)
         boxes = np.concatenate([middles - box / 2, middles + box / 2], axis=1)
@@ -61,14 +62,14 @@ class Labels:
 
 
 def _overlaps(a: Array, b: Array) -> Array:
-    """Areas (j, k) that boxes (j, 4) share with boxes (k, 4)."""
+    """Return the areas (j, k) that boxes (j, 4) share with boxes (k, 4)."""
     low, high = np.maximum(a[:, None, :2], b[:, :2]), np.minimum(a[:, None, 2:], b[:, 2:])
     areas: Array = np.maximum(high - low, 0.0).prod(axis=2)
     return areas
 
 
 def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:
-    """Where :func:`draw_colour_bar` draws in a picture (width, height): its panel at the right edge."""
+    """Return the panel of :func:`draw_colour_bar` at the right edge of a picture (width, height)."""
     width, height = picture
     widest = max(text_size(milliseconds(edge), size)[0] for edge in scale.edges_ms)
     panel_width = max(1.1 * size + 0.6 * size + widest + size, text_size("no data", size)[0] + size)
@@ -78,7 +79,7 @@ def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:
 
 
 def draw_colour_bar(image: Image.Image, scale: Scale, size: int, *, dark: bool, mark_ms: float | None = None) -> None:
-    """Bands with their times in ms, earliest on top, and the hatch that means "no data"; optionally a mark at a time."""
+    """Draw the bands with their times in ms, earliest on top, and the hatch "no data"; optionally a mark at a time."""
     ink, ground = (WHITE, (0, 0, 0, 150)) if dark else ((40, 40, 40), (255, 255, 255, 255))
     left, top, right, bottom = bar_box(scale, image.size, size)
     panel = Image.new("RGBA", (round(right - left), round(bottom - top)), (0, 0, 0, 0))

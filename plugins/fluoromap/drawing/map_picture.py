@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,8 +14,9 @@ from fluoromap.drawing.isochrones import Isochrone, isochrones
 from fluoromap.drawing.lettering import Labels, Point, draw_colour_bar, font
 from fluoromap.drawing.raster import rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_time, is_outlier
-from fluoromap.drawing.wall import bands_shown, colour_table, outline_edges, runs
+from fluoromap.drawing.wall import colour_table, line_parts, outline_edges, pixel_bands
 from fluoromap.fuser.surface import face_normals
+from fluoromap.geometry import view_axes
 
 Direction = tuple[str, float, float, tuple[str, str, str, str]]
 
@@ -28,7 +28,7 @@ VIEWS: tuple[Direction, ...] = (
     ("RAO 30", -30, 0, ("RP", "LA", "H", "F")),
     ("from the feet", 0, -90, ("R", "L", "A", "P")),
 )
-"""Name, primary and secondary angle as of a C-arm, letters of the patient's directions left, right, top, bottom."""
+"""Name, primary and secondary C-arm angle in degrees, letters of the patient's directions left, right, top, bottom."""
 
 PANELS_A_ROW = 3
 PANEL_PX = 340
@@ -39,7 +39,7 @@ LETTERS_PX = 12
 BACKGROUND = (250, 250, 248)
 INK = (45, 45, 50)
 SMOOTH = 2
-"""Panels are drawn this much larger and averaged: smooth edges."""
+"""Factor by which panels are drawn larger and then averaged, for smooth edges."""
 
 
 def draw_map_views(
@@ -48,19 +48,20 @@ def draw_map_views(
     like: ChamberMap | None = None,
     times: Scale | None = None,
 ) -> NDArray[np.uint8]:
-    """The map from several directions, all at one scale, with its sites, isochrones, colour bar and figures of merit.
+    """Draw the map from several directions, with sites, isochrones, colour bar and figures of merit.
 
-    Orthographic; the viewer stands where a C-arm's detector would. Sites on the far wall are not drawn.
+    All panels are orthographic and have one scale. The viewer is at the place of a C-arm's detector. Sites on the far wall
+    are not drawn.
 
     Parameters
     ----------
     chamber : ChamberMap
     views : sequence of Direction
-        As in :data:`VIEWS`, three a row.
+        As in :data:`VIEWS`; a row has three.
     like : ChamberMap or None
-        The map whose middle and size place this one in its panels: pictures of two maps then can be laid side by side.
+        Another map whose middle and size place this one in its panels, so that pictures of both can be compared.
     times : Scale or None
-        Colour scale that several pictures share; None takes the one that suits the map.
+        Colour scale that several pictures share; None chooses the map's own.
 
     Returns
     -------
@@ -69,14 +70,14 @@ def draw_map_views(
     """
     times = times or scale_of(chamber)
     lines = isochrones(chamber, times.edges_ms)
-    placed = (like or chamber).vertices_mm
-    middle = (placed.max(axis=0) + placed.min(axis=0)) / 2
-    radius = float(np.linalg.norm(placed - middle, axis=1).max())
+    extent = (like or chamber).vertices_mm
+    middle = (extent.max(axis=0) + extent.min(axis=0)) / 2
+    radius = float(np.linalg.norm(extent - middle, axis=1).max())
     px_per_mm = (PANEL_PX / 2 - MARGIN_PX) / radius
     width, height = PANELS_A_ROW * PANEL_PX, -(-len(views) // PANELS_A_ROW) * PANEL_PX
     picture = Image.new("RGB", (width + BAR_PX, height + FOOTER_PX), BACKGROUND)
     for index, (name, primary, secondary, letters) in enumerate(views):
-        panel = _Panel(primary, secondary, middle, px_per_mm).drawn(chamber, lines, times)
+        panel = _Panel(primary, secondary, middle, px_per_mm).draw(chamber, lines, times)
         _caption(panel, name, letters)
         picture.paste(panel, (PANEL_PX * (index % PANELS_A_ROW), PANEL_PX * (index // PANELS_A_ROW)))
     _scale_bar(ImageDraw.Draw(picture), px_per_mm, (width + 14.0, height + 0.55 * FOOTER_PX))
@@ -87,24 +88,21 @@ def draw_map_views(
 
 
 class _Panel:
-    """One direction: an orthographic camera whose image axes are those of a C-arm at the same angles."""
+    """One direction: an orthographic camera with the image axes of a C-arm at the same angles."""
 
     def __init__(self, primary_deg: float, secondary_deg: float, middle_mm: Array, px_per_mm: float) -> None:
-        a, b = math.radians(primary_deg), math.radians(secondary_deg)
-        e_u = (math.cos(a), math.sin(a), 0.0)
-        e_v = (math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b))
-        self._axes = np.array([e_u, e_v])
-        self._to_viewer = np.array([math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)])
+        axes = view_axes(primary_deg, secondary_deg)
+        self._axes, self._to_viewer = axes[:2], axes[2]
         self._middle = middle_mm
         self._px_per_mm = px_per_mm
 
     def project(self, points_mm: Array, factor: int) -> tuple[Array, Array]:
-        """Picture coordinates (k, 2) in a panel ``factor`` times as large, and nearness to the viewer (k,)."""
+        """Return picture coordinates (k, 2) in a panel ``factor`` times as large, and nearness to the viewer (k,), mm."""
         offset = points_mm - self._middle
         uv = (offset @ self._axes.T * self._px_per_mm + PANEL_PX / 2) * factor - 0.5
         return uv, offset @ self._to_viewer
 
-    def drawn(self, chamber: ChamberMap, lines: tuple[Isochrone, ...], times: Scale) -> Image.Image:
+    def draw(self, chamber: ChamberMap, lines: tuple[Isochrone, ...], times: Scale) -> Image.Image:
         normals = face_normals(chamber.vertices_mm, chamber.faces)
         lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
         towards = normals @ self._to_viewer / lengths
@@ -112,20 +110,20 @@ class _Panel:
         uv, nearness = self.project(chamber.vertices_mm, SMOOTH)
         side = PANEL_PX * SMOOTH
         raster = rasterise(uv, nearness, chamber.faces, facing, (side, side))
-        colours = colour_table(times, BACKGROUND)[bands_shown(raster, chamber, times, SMOOTH)]
-        # Light from the viewer, weak enough that a colour is still found again on the bar; none on the background.
+        colours = colour_table(times, BACKGROUND)[pixel_bands(raster, chamber, times, SMOOTH)]
+        # Light from the viewer, so weak that each colour can still be found on the bar. The background has none.
         light = np.append(0.78 + 0.22 * np.clip(towards, 0, 1), 1.0).astype(np.float32)
         pixels = (colours * light[raster.face][..., None]).round().astype(np.uint8)
 
         image = Image.fromarray(pixels)
-        draw = ImageDraw.Draw(image)
+        pen = ImageDraw.Draw(image)
         for line in lines:
             at, near = self.project(line.points_mm, SMOOTH)
-            seen = facing[line.faces] & raster.visible((at[1:] + at[:-1]) / 2, (near[1:] + near[:-1]) / 2)
-            for run in runs(seen):
-                draw.line((at[run] + 0.5).ravel().tolist(), fill=(255, 255, 255), width=SMOOTH, joint="curve")
+            in_front = facing[line.faces] & raster.visible((at[1:] + at[:-1]) / 2, (near[1:] + near[:-1]) / 2)
+            for part in line_parts(in_front):
+                pen.line((at[part] + 0.5).ravel().tolist(), fill=(255, 255, 255), width=SMOOTH, joint="curve")
         for edge in outline_edges(chamber.faces, facing):
-            draw.line((uv[edge] + 0.5).ravel().tolist(), fill=INK, width=SMOOTH)
+            pen.line((uv[edge] + 0.5).ravel().tolist(), fill=INK, width=SMOOTH)
         image = image.reduce(SMOOTH)
 
         visible = raster.visible(*self.project(np.array([site.surface_mm for site in chamber.sites]), SMOOTH))
@@ -173,7 +171,7 @@ def _figures(chamber: ChamberMap) -> str:
     ]
     if chamber.leave_one_out_rms_ms is not None:
         parts.insert(2, f"leave-one-site-out error {chamber.leave_one_out_rms_ms:.1f} ms")
-    doubted = sum(is_outlier(site) for site in chamber.sites)
-    if doubted:
-        parts.append(f"{doubted} doubtful (?)")
+    outliers = sum(is_outlier(site) for site in chamber.sites)
+    if outliers:
+        parts.append(f"{outliers} doubtful (?)")
     return "   ·   ".join(parts)

@@ -1,4 +1,4 @@
-"""The map fused on a fluoroscopy frame."""
+"""Overlay of the map on a fluoroscopy frame."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from fluoromap.drawing.isochrones import isochrones
 from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, bar_box, draw_colour_bar, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
-from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, bands_shown, colour_table, outline_edges, runs
+from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, colour_table, line_parts, outline_edges, pixel_bands
 from fluoromap.fuser.surface import face_normals
 from fluoromap.geometry import Camera
 
 Picture = NDArray[np.uint8]
 
 TINT = 0.32
-"""Share of the map's colour in a pixel: electrodes keep two thirds of their contrast."""
+"""Share of the map's colour in a pixel; electrodes keep two thirds of their contrast."""
 
 HATCH_TINT = 0.4
 LINE_SHARE = 0.5
@@ -36,12 +36,12 @@ ELLIPSE_RGB = (255, 255, 120)
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """How an overlay is drawn.
+    """Options of an overlay.
 
-    scale : pixels of the picture per pixel of the frame, along each side. palette, step_ms : of the isochrones, None being
-    the step that suits the map. covariances_mm2 : site -> (3, 3) of its position, drawn as the 95 % ellipse. until_ms : the
-    wall is coloured only where it is activated by then, its front a thick line; None colours all. times : colour scale that
-    several pictures share, in place of palette and step.
+    scale : pixels of the picture per pixel of the frame, along each side. palette, step_ms : of the isochrones; a step of
+    None suits the map. covariances_mm2 : site -> (3, 3) of its position, drawn as the 95 % ellipse. until_ms : the wall is
+    coloured only where it is activated by this time, and the front is a thick line; None colours all. times : colour scale
+    that several pictures share, instead of palette and step.
     """
 
     scale: int = 1
@@ -53,9 +53,9 @@ class Look:
 
     def __post_init__(self) -> None:
         if self.scale < 1:
-            raise ValueError("scale must be 1 or more")
+            raise ValueError(f"scale must be 1 or more, not {self.scale}")
         if self.step_ms is not None and not self.step_ms > 0:
-            raise ValueError("step_ms must be positive")
+            raise ValueError(f"step_ms must be positive, not {self.step_ms}")
 
 
 def draw_overlay(
@@ -67,27 +67,32 @@ def draw_overlay(
     tip_uv: ArrayLike | None,
     look: Look | None = None,
 ) -> Picture:
-    """The map projected into a frame, as the paper fuses it.
+    """Draw the map projected into a frame, as the paper fuses it.
 
-    Drawn are the bands and lines of equal time on the wall that faces the viewer, who looks from the detector as the
-    displayed image does; a hatch where no site is near; the hull's outline; every site with its time in ms (filled: on
-    the wall facing the viewer, ring: on the far wall; amber with a question mark: contradicted by its neighbours); a star
-    at the highlighted site's tip; a colour bar.
+    The viewer looks from the detector, as in the displayed image. The overlay shows:
+
+    - the bands and lines of equal time on the wall that faces the viewer,
+    - a hatch where no site is near,
+    - the outline of the surface,
+    - every site with its time in ms: a dot on the wall that faces the viewer, a ring on the far wall, in amber with a
+      question mark where its neighbours contradict it,
+    - a star at the highlighted site's tip,
+    - a colour bar.
 
     Parameters
     ----------
     frame : (rows, columns) uint8
         Stored pixels after windowing.
     camera : Camera
-        Of this run, for stored pixels.
+        Camera of this run, for stored pixels.
     chamber : ChamberMap
-        Relative to the reference catheter.
+        Map relative to the reference catheter.
     shift_world_mm : (3,)
         Position of the reference catheter in this run: world = map + shift.
     highlight_site : str
-        The site this run belongs to; a name that is not in the map draws no time.
+        The site of this run; for a name that is not in the map no time is drawn.
     tip_uv : (2,) or None
-        Where the tip was seen in this frame; None takes the site's position from the map.
+        Pixel of the tip in this frame; None uses the site's position in the map.
     look : Look
 
     Returns
@@ -98,10 +103,13 @@ def draw_overlay(
     Raises
     ------
     ValueError
-        When the frame is not of the camera's size.
+        Where the frame does not have the camera's size.
     """
     if frame.dtype != np.uint8 or frame.shape != (camera.rows, camera.columns):
-        raise ValueError(f"the frame must be uint8 of shape {(camera.rows, camera.columns)}, not {frame.shape}")
+        raise ValueError(
+            f"the frame must be uint8 of the camera's shape {(camera.rows, camera.columns)}, "
+            f"not {frame.dtype} of shape {frame.shape}"
+        )
     look = look or Look()
     canvas = _Canvas(camera.translated(shift_world_mm), look.scale)
     times = look.times or scale_of(chamber, look.step_ms, look.palette)
@@ -111,7 +119,7 @@ def draw_overlay(
 
     facing = canvas.facing(chamber)
     raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
-    _tint(image, bands_shown(raster, chamber, times, canvas.unit, look.until_ms), times)
+    _tint(image, pixel_bands(raster, chamber, times, canvas.unit, look.until_ms), times)
     _draw_lines(image, canvas, chamber, facing, times, look)
     _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms)
     if look.until_ms is not None:
@@ -121,7 +129,7 @@ def draw_overlay(
 
 
 class _Canvas:
-    """Where map coordinates lie in the picture, and how thick a line or a letter is there."""
+    """Projection of the map into the picture, and the sizes of lines and letters."""
 
     def __init__(self, camera: Camera, scale: int) -> None:
         self._camera = camera
@@ -130,19 +138,20 @@ class _Canvas:
         self.letters = max(9, round(12 * self.unit))
 
     def to_picture(self, uv: Array) -> Array:
-        placed: Array = (uv + 0.5) * self._scale - 0.5
-        return placed
+        """Return picture coordinates (..., 2) of frame pixels (..., 2)."""
+        picture_uv: Array = (uv + 0.5) * self._scale - 0.5
+        return picture_uv
 
     def project(self, points_mm: Array) -> tuple[Array, Array]:
-        """Picture coordinates (k, 2) and nearness to the detector (k,): the depth from the source."""
+        """Return picture coordinates (k, 2) and nearness to the detector (k,): the depth from the source, mm."""
         depth = self._camera.depth_mm(points_mm)
-        # What lies behind the source would come out mirrored.
+        # The projection of a point behind the source would be mirrored.
         behind = depth < LEAST_DEPTH_MM
         uv = self._camera.project(np.where(behind[:, None], self._camera.axis_world * 1e3, points_mm))
         return self.to_picture(np.where(behind[:, None], OUT_OF_SIGHT_PX, uv)), depth
 
     def ellipse(self, point_mm: Array, covariance_mm2: Array) -> Array:
-        """Outline (k, 2) in the picture of the 95 % ellipse of a point's projection, to first order."""
+        """Return the outline (k, 2) in the picture of the 95 % ellipse of a point's projection, to first order."""
         step = 1e-3
         ends = self.project(point_mm + step * np.concatenate([np.eye(3), -np.eye(3)]))[0]
         jacobian = (ends[:3] - ends[3:]).T / (2 * step)
@@ -153,26 +162,26 @@ class _Canvas:
         return outline
 
     def facing(self, chamber: ChamberMap) -> BoolArray:
-        """Faces whose outer side looks at the detector: the ray from the source leaves the chamber through them."""
+        """Return True for faces that face the detector: the ray from the source leaves the chamber through them."""
         normals = face_normals(chamber.vertices_mm, chamber.faces)
         rays = chamber.vertices_mm[chamber.faces].mean(axis=1) - self._camera.source_world_mm
         outward: BoolArray = (normals * rays).sum(axis=1) > 0
         return outward
 
 
-def _tint(image: Image.Image, shown: NDArray[np.int32], times: Scale) -> None:
+def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale) -> None:
     shares = np.full(times.bands + 3, TINT)
     shares[[NOTHING, HATCH, NO_DATA]] = 0.0, HATCH_TINT, 0.0
     table = np.column_stack([colour_table(times, BLACK), (255 * shares).round().astype(np.uint8)])
-    # One number a pixel is taken several times faster than four.
-    layer = Image.fromarray(table.view(np.uint32)[:, 0][shown].view(np.uint8).reshape(*shown.shape, 4))
+    # Indexing one number a pixel is several times faster than indexing four.
+    layer = Image.fromarray(table.view(np.uint32)[:, 0][bands].view(np.uint8).reshape(*bands.shape, 4))
     image.paste(layer, mask=layer)
 
 
 def _draw_lines(
     image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale, look: Look
 ) -> None:
-    """Isochrones, outline and ellipses, drawn at twice the size and averaged: smooth lines."""
+    """Draw isochrones, outline and ellipses at twice the size and average them, for smooth lines."""
     thickness = max(2, round(2 * canvas.unit))
 
     def draw(lines: Sequence[Array], colour: RGB, share: float, width: int) -> None:
@@ -186,19 +195,19 @@ def _draw_lines(
         mask = Image.new("L", tuple((2 * (high - low)).tolist()))
         pen = ImageDraw.Draw(mask)
         for line in lines:
-            # Pillow cuts coordinates to whole numbers; half a pixel more rounds them.
+            # Pillow truncates coordinates; adding half a pixel rounds them.
             pen.line(((line - low + 0.5) * 2).ravel().tolist(), fill=round(255 * share), width=width, joint="curve")
         image.paste(colour, (*low.tolist(), *high.tolist()), mask.reduce(2))
 
     def near(levels_ms: Array) -> list[Array]:
-        """The parts of the isochrones on the wall that faces the viewer."""
+        """Return the parts of the isochrones on the wall that faces the viewer."""
         lines = isochrones(chamber, levels_ms)
         if not lines:
             return []
-        # All in one, with a gap after each.
+        # All lines go through one call, with a gap after each.
         at = canvas.project(np.concatenate([line.points_mm for line in lines]))[0]
-        seen = np.concatenate([np.append(facing[line.faces], False) for line in lines])
-        return [at[run] for run in runs(seen[:-1])]
+        in_front = np.concatenate([np.append(facing[line.faces], False) for line in lines])
+        return [at[part] for part in line_parts(in_front[:-1])]
 
     levels = times.edges_ms
     draw(near(levels if look.until_ms is None else levels[levels < look.until_ms]), WHITE, LINE_SHARE, thickness)

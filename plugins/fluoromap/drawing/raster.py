@@ -1,4 +1,4 @@
-"""Which face of a surface each pixel of a picture shows."""
+"""Rasterisation: the face of a surface that each pixel of a picture shows."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from fluoromap.fuser.reentry_cycle import around
 class Raster:
     """The nearest face of each pixel.
 
-    face : (rows, columns), -1 where there is none. uv : (n, 2) the vertices in the picture, (0, 0) the centre of the
-    top-left pixel. faces : (f, 3). nearness : (n,), larger is nearer to the viewer, in mm.
+    face : (rows, columns), -1 where there is none. uv : (n, 2) the vertices in the picture; (0, 0) is the centre of the
+    top-left pixel. faces : (f, 3). nearness : (n,) mm, larger is nearer to the viewer.
     """
 
     face: NDArray[np.int32]
@@ -25,17 +25,17 @@ class Raster:
     nearness: Array
 
     def sample(self, pixels: IntArray, values: Array, cycle: float | None = None) -> Array:
-        """Values (n,) of the vertices at pixels (p,), counted in row-major order, linear within each face; (p,).
+        """Interpolate values (n,) of the vertices at pixels (p,), linearly within each face.
 
-        Values that repeat after ``cycle`` are taken by the shorter way round from corner to corner, and answered from the
-        least of them on. Each pixel must show a face.
+        Pixels are counted in row-major order; each must show a face. Where values repeat after ``cycle``, the difference
+        between two corners is taken by the shorter way around; the result is within one cycle from the smallest value.
         """
         uv = np.stack(np.divmod(pixels, self.face.shape[1])[::-1], axis=1).astype(np.float64)
         sampled = self._inside(self.face.ravel()[pixels], uv, values, cycle)
         return sampled if cycle is None else values.min() + (sampled - values.min()) % cycle
 
     def visible(self, uv: Array, nearness: Array, tolerance_mm: float = 1.5) -> BoolArray:
-        """Whether points (k, 2) at their nearness (k,) are not behind the surface by more than the tolerance."""
+        """Return True for points (k, 2) of nearness (k,) that are not behind the surface by more than the tolerance."""
         rows, columns = self.face.shape
         pixel = np.rint(uv).astype(np.int64)
         u, v = np.clip(pixel[:, 0], 0, columns - 1), np.clip(pixel[:, 1], 0, rows - 1)
@@ -59,30 +59,32 @@ class Raster:
         slope_v = (climb * first[:, 0] - rise * second[:, 0]) / determinant
         offset = uv - corners[face, 0]
         value = at_corners[face, 0] + slope_u[face] * offset[:, 0] + slope_v[face] * offset[:, 1]
-        # A pixel on the rim of a face seen edge-on must not take a value from far beyond it.
+        # A pixel on the rim of a face that is nearly edge-on must not get a value extrapolated far beyond the face.
         clipped: Array = np.clip(value, at_corners.min(axis=1)[face], at_corners.max(axis=1)[face])
         return clipped
 
 
 def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, shape: tuple[int, int]) -> Raster:
-    """Paint the facing faces from the farthest to the nearest (painter's algorithm), each the pixels whose centre it holds.
+    """Paint the facing faces from the farthest to the nearest (painter's algorithm).
+
+    A face covers the pixels whose centre lies in it.
 
     Parameters
     ----------
     uv, nearness : (n, 2), (n,)
-        Vertices in the picture, and how near each is to the viewer in mm.
+        Vertices in the picture, and the nearness of each to the viewer in mm.
     faces, facing : (f, 3), (f,)
-        Triangles, and which of them turn their outer side to the viewer.
+        Triangles, and True for those whose outer side faces the viewer.
     shape : (rows, columns)
     """
     rows, columns = shape
     corners = uv[faces]
     in_field = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) <= [columns - 1, rows - 1]).all(axis=1)
-    painted = np.flatnonzero(facing & in_field)
-    painted = painted[np.argsort(nearness[faces[painted]].mean(axis=1), kind="stable")]
-    # From the top corner down. An edge gives the same number to both its faces: no pixel between them is missed or shared.
-    order = np.argsort(corners[painted, :, 1], axis=1, kind="stable")
-    top, middle, bottom = np.take_along_axis(corners[painted], order[..., None], axis=1).transpose(1, 0, 2)
+    front = np.flatnonzero(facing & in_field)
+    front = front[np.argsort(nearness[faces[front]].mean(axis=1), kind="stable")]
+    # From the top corner down. Both faces of an edge compute the same crossing: no pixel between them is missed or shared.
+    order = np.argsort(corners[front, :, 1], axis=1, kind="stable")
+    top, middle, bottom = np.take_along_axis(corners[front], order[..., None], axis=1).transpose(1, 0, 2)
     of_triangle, row = _ranges(top[:, 1], bottom[:, 1], rows)
     top, middle, bottom = (np.repeat(corner, of_triangle, axis=0) for corner in (top, middle, bottom))
     below = (row >= middle[:, 1])[:, None]
@@ -90,15 +92,13 @@ def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, sh
     short = _crossing(np.where(below, middle, top), np.where(below, bottom, middle), row)
     of_row, column = _ranges(np.minimum(long, short), np.maximum(long, short), columns)
     face = np.full(rows * columns, -1, dtype=np.int32)
-    # Of values for the same pixel the last one stays.
-    face[np.repeat(row * columns, of_row) + column] = np.repeat(
-        np.repeat(painted.astype(np.int32), of_triangle), of_row
-    )
+    # NumPy keeps the last value assigned to a repeated index.
+    face[np.repeat(row * columns, of_row) + column] = np.repeat(np.repeat(front.astype(np.int32), of_triangle), of_row)
     return Raster(face.reshape(shape), uv, faces, nearness)
 
 
 def _ranges(first: Array, last: Array, end: int) -> tuple[IntArray, IntArray]:
-    """The whole numbers from ``first`` (k,) to before ``last`` (k,) within 0 to ``end``: how many of each (k,), and all."""
+    """Return the integers from ``first`` (k,) to below ``last`` (k,) within 0 to ``end``: count of each (k,), and all."""
     start, stop = (np.ceil(np.clip(bound, 0, end)).astype(np.int64) for bound in (first, last))
     count = stop - start
     past = np.cumsum(count)
@@ -106,7 +106,7 @@ def _ranges(first: Array, last: Array, end: int) -> tuple[IntArray, IntArray]:
 
 
 def _crossing(upper: Array, lower: Array, row: IntArray) -> Array:
-    """Columns (k,) where the lines from ``upper`` to ``lower`` (k, 2) cross rows (k,)."""
+    """Return the columns (k,) where the lines from ``upper`` to ``lower`` (k, 2) cross rows (k,)."""
     along = (row - upper[:, 1]) / np.maximum(lower[:, 1] - upper[:, 1], 1e-12)
     column: Array = upper[:, 0] + along * (lower[:, 0] - upper[:, 0])
     return column

@@ -1,4 +1,4 @@
-"""How a site is drawn: a dot with its time, or the star of the site one looks at."""
+"""Symbols of sites: a dot with its time, and the star of the highlighted site."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ DARK_OUTLIER_RGB: RGB = (168, 84, 0)
 
 
 def is_outlier(site: SurfaceSite) -> bool:
+    """Return True where the neighbours of a site contradict its time."""
     return Reason.LAT_OUTLIER in site.reasons
 
 
 def time_text(site: SurfaceSite) -> str:
-    """The site's time, with a question mark where its neighbours contradict it."""
+    """Return the site's time in ms, with a question mark where its neighbours contradict it."""
     return milliseconds(site.lat_ms) + ("?" if is_outlier(site) else "")
 
 
 def draw_dot(image: Image.Image, place: Point, site: SurfaceSite, times: Scale, unit: float, *, near: bool) -> None:
-    """A dot in the colour of the site's time, filled on the near wall, a ring on the far one; amber for an outlier."""
+    """Draw a site as a dot in the colour of its time: filled on the near wall, a ring on the far wall, amber for an outlier."""
     band = tuple(times.band_colours()[times.band(np.array(site.lat_ms))].tolist())
     colour = OUTLIER_RGB if is_outlier(site) else band
     radius = (DOT_RADIUS if near else RING_RADIUS) * unit
@@ -45,7 +46,7 @@ def draw_time(
     draw: ImageDraw.ImageDraw, labels: Labels, place: Point, site: SurfaceSite, unit: float, size: int, *,
     near: bool, on_light: bool = False,
 ) -> None:  # fmt: skip
-    """The site's time beside its dot, in dark letters where the picture's ground is light."""
+    """Draw the site's time beside its dot, in dark letters where the picture's background is light."""
     text = time_text(site)
     if on_light:
         ink, halo = DARK_OUTLIER_RGB if is_outlier(site) else DARK_RGB, WHITE
@@ -55,7 +56,7 @@ def draw_time(
 
 
 def draw_star(image: Image.Image, place: Point, radius: float) -> None:
-    """A white star with a dark rim, its centre at ``place``."""
+    """Draw a white star with a dark rim, its centre at ``place``."""
     angles = np.radians(-90 + 36 * np.arange(10))
     star = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = (np.arange(10) % 2 == 0)[:, None]
@@ -64,13 +65,13 @@ def draw_star(image: Image.Image, place: Point, radius: float) -> None:
 
 
 def _stamp(image: Image.Image, place: Point, shapes: list[tuple[Array, RGB]]) -> None:
-    """Polygons round ``place``, drawn larger and averaged: their centre is right to a tenth of a pixel."""
+    """Draw polygons around ``place`` larger and average them: their centre is correct to a tenth of a pixel."""
     reach = int(np.ceil(max(float(np.abs(shape).max()) for shape, _ in shapes))) + 2
     corner = (round(place[0]) - reach, round(place[1]) - reach)
     patch = Image.new("RGBA", ((2 * reach + 1) * FINER, (2 * reach + 1) * FINER), (0, 0, 0, 0))
     draw = ImageDraw.Draw(patch)
     for shape, colour in shapes:
-        # Pillow cuts coordinates to whole numbers; half a pixel more rounds them.
+        # Pillow truncates coordinates; adding half a pixel rounds them.
         fine = (shape + np.subtract(place, corner) + 0.5) * FINER
         draw.polygon(fine.ravel().tolist(), fill=(*colour, 255))
     small = patch.reduce(FINER)

@@ -1,4 +1,4 @@
-"""What the pictures share of the chamber's wall: its colours in a raster, its outline, the lit parts of a line."""
+"""The chamber's wall in a picture: the band of each pixel, the outline, and the visible parts of a line."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from fluoromap.drawing.colours import NO_DATA_HATCH_RGB, NO_DATA_RGB, Scale
 from fluoromap.drawing.raster import Raster
 
 NO_DATA, HATCH, NOTHING = -1, -2, -3
-"""Where there is no band: no site is near, the hatch that says so, no wall or one that is not to be coloured yet."""
+"""Values of pixels without a band: no site is near; the hatch there; no wall, or a wall that is not coloured yet."""
 
 _WITHIN = -4
-"""Of a face that crosses a limit, until its pixels were looked at."""
+"""Value of pixels whose face crosses a limit, until each pixel gets its own band."""
 
 
-def bands_shown(
+def pixel_bands(
     raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None = None
 ) -> NDArray[np.int32]:
-    """Band of ``times`` that each pixel (rows, columns) shows; ``NO_DATA``, ``HATCH`` or ``NOTHING`` where none.
+    """Return the band of ``times`` of each pixel (rows, columns); ``NO_DATA``, ``HATCH`` or ``NOTHING`` without a band.
 
-    Only what is activated by ``until_ms``, where given, has a band. ``unit`` is the size of the picture's details, 1 for a
-    picture of 512 pixels. The negative values count a colour table, as :func:`colour_table` makes it, from its end.
+    With ``until_ms``, only the wall that is activated by that time has a band. ``unit`` is the size of the picture's
+    details, 1 for a picture of 512 pixels. The negative values index the table of :func:`colour_table` from its end.
     """
     lat, cycle = _times_past_rim(chamber), chamber.cycle_length_ms
 
@@ -31,26 +31,27 @@ def bands_shown(
 
     covered, at_corners = chamber.covered[chamber.faces], band(lat)[chamber.faces]
     corners_covered: IntArray = covered.sum(axis=1)
-    # Faces that cross no limit need no look at their pixels; round a cycle equal corners may lie on either side of it.
+    # All pixels of a face that crosses no limit have one band. Around a cycle, corners with equal bands may still differ
+    # by nearly a cycle.
     one_band = (corners_covered == 3) & (np.ptp(at_corners, axis=1) == 0)
     if cycle is not None:
         one_band &= np.ptp(lat[chamber.faces], axis=1) < cycle / 2
     of_face = np.where(one_band, at_corners[:, 0], np.where(corners_covered > 0, _WITHIN, NO_DATA))
-    shown = np.append(of_face, NOTHING).astype(np.int32)[raster.face]
+    bands = np.append(of_face, NOTHING).astype(np.int32)[raster.face]
 
-    flat = shown.ravel()
+    flat = bands.ravel()
     within = np.flatnonzero(flat == _WITHIN)
     flat[within] = band(raster.sample(within, lat, cycle))
     rim = within[corners_covered[raster.face.ravel()[within]] < 3]
     flat[rim[raster.sample(rim, chamber.covered.astype(np.float64)) <= 0.5]] = NO_DATA
     far = np.flatnonzero(flat == NO_DATA)
-    v, u = np.divmod(far, shown.shape[1])
+    v, u = np.divmod(far, bands.shape[1])
     flat[far[(u + v) % max(4, round(7 * unit)) < max(1, round(unit))]] = HATCH
-    return shown
+    return bands
 
 
 def colour_table(times: Scale, nothing: tuple[int, int, int]) -> NDArray[np.uint8]:
-    """RGB (bands + 3, 3) that :func:`bands_shown` counts."""
+    """Return the RGB table (bands + 3, 3) that :func:`pixel_bands` indexes."""
     table: NDArray[np.uint8] = np.concatenate(
         [times.band_colours(), np.array([nothing, NO_DATA_HATCH_RGB, NO_DATA_RGB], dtype=np.uint8)]
     )
@@ -58,8 +59,11 @@ def colour_table(times: Scale, nothing: tuple[int, int, int]) -> NDArray[np.uint
 
 
 def _times_past_rim(chamber: ChamberMap) -> Array:
-    """Times at the vertices within one cycle, those just past the covered part taking the mean of their covered
-    neighbours: else a face on the rim would run through all bands down to 0."""
+    """Return the times at the vertices within one cycle, extended past the rim of the covered part.
+
+    Vertices just past the rim get the mean of their covered neighbours. Otherwise a face on the rim would run through all
+    bands down to 0.
+    """
     lat, faces, cycle = chamber.lat_ms.copy(), chamber.faces, chamber.cycle_length_ms
     if not chamber.covered.any():
         return lat
@@ -67,7 +71,7 @@ def _times_past_rim(chamber: ChamberMap) -> Array:
     if cycle is not None:
         lat = low + (lat - low) % cycle
     known = chamber.covered[faces].astype(np.float64)
-    # Round a cycle times have no mean but their directions on a circle have.
+    # Times around a cycle have no mean, but their directions on a circle have one.
     turns = lat[faces].astype(np.complex128) if cycle is None else np.exp(2j * np.pi * (lat[faces] - low) / cycle)
     of_face = (known * turns).sum(axis=1)
     parts = [
@@ -84,16 +88,16 @@ def _times_past_rim(chamber: ChamberMap) -> Array:
 
 
 def outline_edges(faces: IntArray, facing: BoolArray) -> IntArray:
-    """Edges (e, 2) between a face that faces the viewer and one that does not."""
+    """Return the edges (e, 2) between a face that faces the viewer and a face that does not."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     vertices = int(faces.max()) + 1
-    # One number an edge sorts several times faster than a pair.
+    # Sorting one number an edge is several times faster than sorting pairs.
     unique, of_edge = np.unique(edges[:, 0] * vertices + edges[:, 1], return_inverse=True)
     rim = unique[np.bincount(of_edge, np.repeat(facing, 3), minlength=len(unique)) == 1]
     return np.stack(np.divmod(rim, vertices), axis=1)
 
 
-def runs(flags: BoolArray) -> list[slice]:
-    """Slices of a line's points, one for each run of segments whose flag is set."""
+def line_parts(flags: BoolArray) -> list[slice]:
+    """Return slices of a line's points, one for each connected part of segments whose flag is set."""
     changes = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in changes.reshape(-1, 2)]

@@ -1,1 +1,1 @@
-"""From located sites and activation times to the chamber's map, its pictures and its mesh files."""
+"""Fusers: the chamber's surface and activation map from located sites and their times."""

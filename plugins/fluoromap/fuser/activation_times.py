@@ -1,4 +1,4 @@
-"""Activation times over the wall from those at the sites, with their standard deviation; with or without a cycle."""
+"""Activation times over the wall, with standard deviation, from the times at the sites; with or without a cycle."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from fluoromap.fuser.surface import SurfacePoints
 from fluoromap.fuser.surface_field import FieldPrior, Regression, SurfaceField
 
 LEAST_SD_MS = 0.41
-"""Error of a difference of two times read at 1000 samples/s: sqrt(2/12) ms. No activation time is better than that."""
+"""Smallest error of an activation time, ms: a difference of two times read at 1000 samples/s has sqrt(2/12) ms."""
 
 TIME_PRIOR = FieldPrior((1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0), (12.0, 1.2), level_sd=200.0, slope_sd_per_mm=1.0)
-# Cosine and sine of a phase that takes every value have a standard deviation of 0.7, and less where it does not.
+# Cosine and sine of a phase with all values have a standard deviation of 0.7; with fewer values it is smaller.
 PHASE_PRIOR = FieldPrior((0.1, 0.2, 0.4, 0.7, 1.0), (0.5, 0.7), level_sd=1.0, slope_sd_per_mm=0.02)
 
 
 @dataclass(frozen=True, eq=False)
 class LeaveOneOut:
-    """What the other sites say about each site: predicted_ms (k,) and sd_ms (k,), that of the measurement included."""
+    """Prediction of each site's time from the other sites: predicted_ms (k,), sd_ms (k,) with the measurement's error."""
 
     predicted_ms: Array
     sd_ms: Array
 
 
 class ActivationTimes:
-    """Times at k sites and what they say about the rest of the surface.
+    """The times of k sites, interpolated over the surface.
 
-    With a cycle the field is that of the phase's cosine and sine, so that early meets late without a jump; its times lie in
+    With a cycle the field is that of the phase's cosine and sine, so that early meets late without a jump. Its times lie in
     the window of interest.
 
     Parameters
@@ -40,12 +40,14 @@ class ActivationTimes:
     vertices_mm : (n, 3)
         The surface's vertices.
     points : SurfacePoints
-        Where the sites count.
+        The sites' points on the surface.
     lat_ms, lat_sd_ms : (k,)
-        Within the window where there is a cycle.
+        Times and their standard deviations; times within the window where there is a cycle.
     covariance_mm2 : (k, 3, 3)
-        Of the sites' places. Along the surface it is turned into time by the slope of the times there: McHutchon &
-        Rasmussen, Gaussian Process Training with Input Noise, NIPS 24 (2011), equation (4).
+        Covariances of the sites' positions. The slope of the times along the surface turns them into errors of time:
+        McHutchon & Rasmussen, Gaussian Process Training with Input Noise, NIPS 24 (2011), equation (4).
+    cycle : Cycle or None
+        The cycle of a re-entry.
     """
 
     def __init__(
@@ -68,20 +70,21 @@ class ActivationTimes:
 
     @property
     def sd_ms(self) -> Array:
-        """Standard deviation (k,) of each site's time for the place it counts at."""
+        """Standard deviation (k,) of each site's time at its point on the surface, ms."""
         sd: Array = np.sqrt(self._variance)
         return sd
 
     def at_vertices(self) -> tuple[Array, Array]:
-        """Mean and standard deviation (n,), (n,) in ms."""
+        """Return mean and standard deviation at the vertices, (n,), (n,) in ms."""
         return self._in_ms(*self._regression.at_vertices())
 
     def at(self, points: SurfacePoints) -> Array:
-        """Mean (m,) in ms at other points."""
+        """Return the mean (m,) in ms at other points."""
         mean = self._regression.mean_at(self._field.rows(points))
         return self._in_ms(mean, np.zeros_like(mean))[0]
 
     def leave_one_out(self) -> LeaveOneOut:
+        """Predict each site's time from the other sites."""
         return LeaveOneOut(*self._in_ms(*self._regression.leave_one_out()))
 
     def _regress(self, variance_ms2: Array) -> Regression:
@@ -97,7 +100,7 @@ class ActivationTimes:
         return self._cycle.times(mean, variance)
 
     def _slopes(self, regression: Regression, vertices_mm: Array) -> Array:
-        """Gradient (k, 3) of the mean time in the face of each site, ms/mm."""
+        """Return the gradient (k, 3) of the mean time in the face of each site, ms/mm."""
         corners = self._field.faces[self._points.faces]
         k = len(corners)
         where = (np.arange(3 * k), corners.ravel())
@@ -109,6 +112,6 @@ class ActivationTimes:
             rise = self._cycle.difference(times[:, 1:], times[:, :1])
         places = vertices_mm[corners]
         sides = places[:, 1:] - places[:, :1]
-        # The least-norm solution of the two differences lies in the face's plane, needles included.
+        # The least-norm solution of the two differences lies in the face's plane, also for needle-shaped faces.
         slope: Array = np.einsum("kij,kj->ki", np.linalg.pinv(sides, rcond=1e-3), rise)
         return slope

@@ -1,4 +1,4 @@
-"""What all fusers do once they have a surface: sites on it, activation times over it, and what these say."""
+"""The chamber's map on a given surface, shared by all fusers: sites, activation times, and figures of merit."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from fluoromap.fuser.surface_field import SurfaceField
 from fluoromap.reasons import Reason
 
 LEAST_EXTENT_MM = 2.0
-"""Sites that all lie within this of their mean are one place: the tips' own position error is as large."""
+"""Sites that all lie within this distance of their mean coincide: the position error of the tips is as large."""
 
 LEAST_THICKNESS_MM = 0.5
-"""Sites that span less than this across their common plane are one plane."""
+"""Sites that span less than this across their common plane are coplanar."""
 
 LEAST_SPAN_MS = 1.0
-"""Times that differ by less, one sample at 1000 samples/s, are equal."""
+"""Times that span less than this, one sample at 1000 samples/s, are equal."""
 
 
 class MapParams(BaseModel, extra="forbid"):
@@ -45,46 +45,47 @@ class MapParams(BaseModel, extra="forbid"):
     )
     tip_point: Literal["centre", "end"] = Field(
         "centre",
-        description="Point of the tip electrode that stands for the wall: its centre, or its end (half a tip further).",
+        description="Point of the tip electrode that touches the wall: its centre, or its end (half a tip further).",
     )
     edge_mm: float = Field(3.0, ge=1.0, le=7.0, description="Longest triangle edge of the surface, about, in mm.")
     outlier_sigma: float = Field(
         5.0,
         ge=3.0,
         le=20.0,
-        description="An activation time this many standard deviations from what the other sites predict is kept out, "
-        "where conduction at 0.5 m/s from the nearest of them cannot explain it either.",
+        description="An activation time this many standard deviations from the other sites' prediction is an outlier, "
+        "unless conduction at 0.5 m/s from the nearest of them explains it.",
     )
     cycle_length_ms: float | None = Field(
         None,
         ge=50.0,
         le=2000.0,
         description="Cycle length of a re-entry, in ms: times repeat after it and early meets late. Without it times "
-        "are taken as they are.",
+        "do not repeat.",
     )
     window_start_ms: float | None = Field(
         None,
         ge=-2000.0,
         le=2000.0,
         description="Start of the window of interest, one cycle long, in ms; half a cycle before the reference where "
-        "not given. Times outside are brought in by whole cycles. Needs cycle_length_ms.",
+        "not given. Times outside are moved into the window by whole cycles. Needs cycle_length_ms.",
     )
 
     @model_validator(mode="after")
-    def _window_has_a_cycle(self) -> MapParams:
+    def _check_window_has_cycle(self) -> MapParams:
         if self.window_start_ms is not None and self.cycle_length_ms is None:
-            raise ValueError("window_start_ms needs cycle_length_ms")
+            raise ValueError("window_start_ms is given without cycle_length_ms; give both or neither")
         return self
 
     @property
     def cycle(self) -> Cycle | None:
+        """Cycle of the re-entry with its window of interest, None without one."""
         if self.cycle_length_ms is None:
             return None
         start = self.window_start_ms
         return Cycle(self.cycle_length_ms, -self.cycle_length_ms / 2 if start is None else start)
 
     def tips_mm(self, sites: tuple[MappedSite, ...]) -> Array:
-        """The points (k, 3) that stand for the wall, in the sites' frame."""
+        """Return the points (k, 3) that touch the wall, in the sites' frame, mm."""
         tips = np.array([site.tip_mm for site in sites])
         if self.tip_point == "end":
             tips += np.array([site.axis * site.tip_length_mm / 2 for site in sites])
@@ -92,7 +93,7 @@ class MapParams(BaseModel, extra="forbid"):
 
 
 def refuse_without_volume(tips_mm: Array) -> None:
-    """Let pass only points (k, 3) that can enclose a chamber.
+    """Raise Refusal where points (k, 3), mm, cannot enclose a chamber.
 
     Raises
     ------
@@ -112,17 +113,17 @@ def refuse_without_volume(tips_mm: Array) -> None:
 def chamber_map(
     vertices_mm: Array, faces: IntArray, sites: tuple[MappedSite, ...], params: MapParams, context: Context
 ) -> ChamberMap:
-    """The map of ``sites`` on a closed outward surface (n, 3), (f, 3) in their frame.
+    """Make the map of ``sites`` on a closed outward surface (n, 3), (f, 3) in their frame.
 
-    Every site stays in the map: it counts at the nearest point of the surface, and the distance is told. A time that the
-    other sites contradict keeps its place with the reason ``lat_outlier``, but colours nothing and counts neither for the
-    earliest sites nor for the total activation time. No time is clamped.
+    Every site stays in the map, at the nearest point of the surface; the map holds its distance. A time that the other
+    sites contradict stays too, with the reason ``lat_outlier``. It colours nothing and counts neither for the earliest
+    sites nor for the total activation time. No time is clamped.
     """
     tips, cycle = params.tips_mm(sites), params.cycle
     measured = np.array([site.lat_ms for site in sites])
     sd = np.array([site.lat_sd_ms for site in sites])
     covariance = np.array([site.covariance_mm2 for site in sites])
-    lat = measured if cycle is None else cycle.bring_in(measured)
+    lat = measured if cycle is None else cycle.into_window(measured)
     outside = np.zeros(len(sites), dtype=np.bool_) if cycle is None else cycle.outside(measured)
     difference = np.subtract if cycle is None else cycle.difference
 
@@ -133,30 +134,30 @@ def chamber_map(
 
     def times_of(used: BoolArray) -> ActivationTimes:
         context.check()
-        points = _chosen(on_surface, used)
+        points = _select(on_surface, used)
         return ActivationTimes(field, vertices_mm, points, lat[used], sd[used], covariance[used], cycle)
 
     def without_each(used: BoolArray) -> LeaveOneOut:
         return times_of(used).leave_one_out()
 
     used = agreeing_sites(on_surface.positions_mm, lat, params.outlier_sigma, difference, without_each)
-    times, kept = times_of(used), _chosen(on_surface, used)
+    times, used_points = times_of(used), _select(on_surface, used)
     predicted = np.empty(len(sites))
     predicted[used] = times.leave_one_out().predicted_ms
-    predicted[~used] = times.at(_chosen(on_surface, ~used))
+    predicted[~used] = times.at(_select(on_surface, ~used))
     errors = difference(predicted, lat)
     context.progress(0.7)
     context.check()
     mean, spread = times.at_vertices()
-    covered = distance_along_surface(vertices_mm, faces, kept, params.fill_mm) <= params.fill_mm
+    covered = distance_along_surface(vertices_mm, faces, used_points, params.fill_mm) <= params.fill_mm
     areas = face_areas_mm2(vertices_mm, faces)
-    normals = face_normals(vertices_mm, faces)[kept.faces]
+    normals = face_normals(vertices_mm, faces)[used_points.faces]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     equal = bool(np.ptp(lat[used]) < LEAST_SPAN_MS)
     velocity = None
     if not equal:
-        velocity = conduction_velocity(kept.positions_mm, normals, lat[used], times.sd_ms, difference)
-    told = {Reason.LAT_OUTLIER: not used.all(), Reason.OUTSIDE_WINDOW: outside.any(), Reason.TIMES_EQUAL: equal}
+        velocity = conduction_velocity(used_points.positions_mm, normals, lat[used], times.sd_ms, difference)
+    warnings = {Reason.LAT_OUTLIER: not used.all(), Reason.OUTSIDE_WINDOW: outside.any(), Reason.TIMES_EQUAL: equal}
     context.progress(1.0)
 
     return ChamberMap(
@@ -189,13 +190,13 @@ def chamber_map(
         volume_ml=volume_mm3(vertices_mm, faces) / 1e3,
         area_cm2=float(areas.sum()) / 1e2,
         coverage=float((areas * covered[faces].mean(axis=1)).sum() / areas.sum()),
-        warnings=tuple(reason for reason, holds in told.items() if holds),
+        warnings=tuple(reason for reason, holds in warnings.items() if holds),
         conduction_velocity=velocity,
         cycle_length_ms=params.cycle_length_ms,
     )
 
 
-def _chosen(points: SurfacePoints, which: BoolArray) -> SurfacePoints:
+def _select(points: SurfacePoints, which: BoolArray) -> SurfacePoints:
     return SurfacePoints(
         points.positions_mm[which], points.faces[which], points.weights[which], points.distance_mm[which]
     )

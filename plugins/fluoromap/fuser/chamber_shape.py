@@ -1,9 +1,9 @@
-"""The shape of a chamber's wall from few places on it: an ellipsoid and what the wall departs from it.
+"""Shape of a chamber's wall from few places on it: an ellipsoid and departures from it.
 
 Both come from Bayesian regression. The ellipsoid is the most probable one under a prior for the size and roundness of heart
-chambers; the departures along its normals are a Gaussian process over the ellipsoid (Rasmussen & Williams, Gaussian
+chambers. The departures along its normals are a Gaussian process over the ellipsoid (Rasmussen & Williams, Gaussian
 Processes for Machine Learning, 2006, chapter 2), averaged over its length and amplitude by evidence. Between two sites the
-wall then bulges beyond the chord as a chamber's does, and it may be concave where sites say so. Implicit surfaces by
+wall therefore bulges beyond the chord as a chamber does; it is concave where the sites show that. Implicit surfaces by
 Gaussian processes: Williams & Fitzgibbon, Gaussian Process Implicit Surfaces, 2007.
 """
 
@@ -19,7 +19,8 @@ from scipy.special import logsumexp
 from fluoromap.contracts import Array, IntArray
 from fluoromap.fuser.surface import hull_surface, refine
 
-# A ventricle or atrium of 15 to 45 mm mean radius, up to about twice as long as wide; wide priors, so that 20 sites decide.
+# A ventricle or atrium has 15 to 45 mm mean radius and is up to about twice as long as wide. The priors are wide, so that
+# 20 sites outweigh them.
 LOG_RADIUS_PRIOR = (np.log(26.0), 0.35)
 ELONGATION_SD = 0.35
 CENTRE_SD_MM = 15.0
@@ -29,7 +30,7 @@ LENGTHS_MM = (15.0, 25.0, 40.0)
 AMPLITUDES_MM = (0.5, 1.0, 2.0, 4.0, 8.0)
 AMPLITUDE_PRIOR = (DEPARTURE_SD_MM, 0.7)
 LEAST_RADIUS = 0.2
-"""Of the ellipsoid's, in any direction: departures never turn the surface inside out."""
+"""Smallest radius as a share of the ellipsoid's, so that departures never turn the surface inside out."""
 
 _DIRECTIONS = 600
 _SQRT_HALF = float(np.sqrt(0.5))
@@ -37,27 +38,33 @@ _SQRT_HALF = float(np.sqrt(0.5))
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """centre_mm (3,); shape_mm (3, 3), symmetric, maps the unit sphere onto the ellipsoid about the centre."""
+    """An ellipsoid: centre_mm (3,); shape_mm (3, 3), symmetric, maps the unit sphere onto it about the centre."""
 
     centre_mm: Array
     shape_mm: Array
 
     def to_sphere(self, points_mm: Array) -> Array:
-        """Points (k, 3) in the axes where the ellipsoid is the unit sphere."""
+        """Return points (k, 3) in the axes where the ellipsoid is the unit sphere."""
         return np.linalg.solve(self.shape_mm, (points_mm - self.centre_mm).T).T.astype(np.float64)
 
     def normals(self, directions: Array) -> tuple[Array, Array]:
-        """Unit normals (k, 3) where unit directions (k, 3) of the sphere meet the ellipsoid, and how many radii of the
-        sphere one millimetre along each is (k,)."""
+        """Return the ellipsoid's unit normals in unit directions (k, 3) of the sphere.
+
+        Returns
+        -------
+        ndarray (k, 3), ndarray (k,)
+            The normals, and the length of one millimetre along each in radii of the sphere.
+        """
         gradient = np.linalg.solve(self.shape_mm, directions.T).T
         per_mm: Array = np.linalg.norm(gradient, axis=1).astype(np.float64)
         return gradient / per_mm[:, None], per_mm
 
 
 def wall_surface(points_mm: Array, covariance_mm2: Array, edge_mm: float) -> tuple[Array, IntArray]:
-    """Closed outward surface through or near points (k, 3) with covariances (k, 3, 3), k >= 4, not all in one plane.
+    """Make a closed outward surface through or near points (k, 3) with covariances (k, 3, 3).
 
-    It is star-shaped about the ellipsoid's centre, so that it never cuts itself; edges are about ``edge_mm`` at most.
+    There are at least four points, not all in one plane. The surface is star-shaped about the ellipsoid's centre, so that
+    it never cuts itself. Its edges are about ``edge_mm`` at most.
     """
     shape = _ChamberShape(points_mm, covariance_mm2)
     directions, faces = hull_surface(_even_directions(_DIRECTIONS))
@@ -82,7 +89,7 @@ class _ChamberShape:
         )
 
     def at(self, directions: Array) -> Array:
-        """Wall points (n, 3) in unit directions (n, 3) of the ellipsoid's sphere, mm."""
+        """Return wall points (n, 3), mm, in unit directions (n, 3) of the ellipsoid's sphere."""
         _, per_mm = self.ellipsoid.normals(directions)
         departure = self._departures.mean(directions @ self.ellipsoid.shape_mm)
         radius = np.maximum(1 + departure * per_mm, LEAST_RADIUS)
@@ -91,10 +98,10 @@ class _ChamberShape:
 
 
 def fit_ellipsoid(points_mm: Array, covariance_mm2: Array) -> Ellipsoid:
-    """Most probable ellipsoid of a chamber whose wall passes near points (k, 3) with covariances (k, 3, 3).
+    """Fit the most probable ellipsoid of a chamber to points (k, 3) with covariances (k, 3, 3).
 
     Distances are to first order: the implicit function over its gradient (Taubin, IEEE PAMI 13 (1991) 1115). The shape is
-    the exponential of a symmetric matrix, so that every parameter is free and no axis comes first.
+    the exponential of a symmetric matrix, so that all parameters are unbounded and all axes are equivalent.
     """
     start = points_mm.mean(axis=0)
     log_radius, log_radius_sd = LOG_RADIUS_PRIOR
@@ -118,7 +125,7 @@ def fit_ellipsoid(points_mm: Array, covariance_mm2: Array) -> Ellipsoid:
 
 def _ellipsoid(parameters: Array, start: Array) -> Ellipsoid:
     xx, yy, zz, yz, xz, xy = parameters[3:]
-    # Off-diagonals are scaled so that turning the axes leaves the sum of squares, and with it the prior, as it is.
+    # Off-diagonals are scaled so that a rotation of the axes changes neither the sum of squares nor the prior.
     yz, xz, xy = _SQRT_HALF * yz, _SQRT_HALF * xz, _SQRT_HALF * xy
     values, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     return Ellipsoid(start + parameters[:3], (axes * np.exp(np.clip(values, 0.0, 6.0))) @ axes.T)
@@ -130,8 +137,9 @@ class _Departures:
     Parameters
     ----------
     places_mm : (k, 3)
-        On the ellipsoid, from its centre.
+        Places on the ellipsoid, from its centre.
     values_mm, variances_mm2 : (k,)
+        Departures and their variances.
     """
 
     def __init__(self, places_mm: Array, values_mm: Array, variances_mm2: Array) -> None:
@@ -149,12 +157,12 @@ class _Departures:
                 )
                 solved.append(amplitude**2 * weights)
         share = np.exp(np.array(evidence) - logsumexp(evidence))
-        # The mean is linear in the weights: those of one length add up over its amplitudes.
+        # The mean is linear in the weights, so that the weights of one length add up over its amplitudes.
         self._weights = np.einsum("la,lak->lk", share.reshape(len(LENGTHS_MM), -1),
                                   np.array(solved).reshape(len(LENGTHS_MM), -1, len(values_mm)))  # fmt: skip
 
     def mean(self, places_mm: Array) -> Array:
-        """Expected departure (n,) at places (n, 3) on the ellipsoid, from its centre."""
+        """Return the expected departure (n,), mm, at places (n, 3) on the ellipsoid, from its centre."""
         total = np.zeros(len(places_mm))
         for length, weights in zip(LENGTHS_MM, self._weights, strict=True):
             total += _matern(places_mm, self._places, length) @ weights
@@ -162,14 +170,14 @@ class _Departures:
 
 
 def _matern(a_mm: Array, b_mm: Array, length_mm: float) -> Array:
-    """Matern 5/2 correlation (n, k), Rasmussen & Williams equation (4.17)."""
+    """Return the Matern 5/2 correlation (n, k), Rasmussen & Williams equation (4.17)."""
     distance = np.sqrt(5.0) * np.linalg.norm(a_mm[:, None] - b_mm[None], axis=2) / length_mm
     correlation: Array = (1 + distance + distance**2 / 3) * np.exp(-distance)
     return correlation
 
 
 def _even_directions(count: int) -> Array:
-    """Evenly spread unit vectors (count, 3) on Fibonacci's spiral."""
+    """Return evenly spread unit vectors (count, 3) on Fibonacci's spiral."""
     index = np.arange(count) + 0.5
     height, angle = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5.0)) * index
     around = np.sqrt(1 - height**2)

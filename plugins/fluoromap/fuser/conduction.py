@@ -1,4 +1,4 @@
-"""How fast activation runs along the wall where sites lie close enough together to tell."""
+"""Conduction velocity along the wall where enough sites lie close together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fluoromap.contracts import Array, ConductionVelocity, IntArray
 NEAR_MM = 15.0
 LEAST_SITES = 4
 LARGEST_RELATIVE_SD = 0.3
-"""Of a local slowness: what is known less well says nothing about speed."""
+"""Largest relative standard deviation of a local slowness that still determines a speed."""
 
 MISFIT_LEVEL = 0.99
 _DRAWS = 1000
@@ -21,7 +21,7 @@ _DRAWS = 1000
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _PlaneWave:
-    """Slowness (2,) in ms/mm along two tangents and the matrix (2, m) that makes it of the times of ``sites`` (m,)."""
+    """Slowness (2,) in ms/mm along two tangents, and the matrix (2, m) that computes it from the times of ``sites`` (m,)."""
 
     sites: IntArray
     slowness: Array
@@ -35,43 +35,44 @@ def conduction_velocity(
     sd_ms: Array,
     difference: Callable[[Array, Array], Array],
 ) -> ConductionVelocity | None:
-    """Median speed of plane waves fitted wherever at least four sites lie within 15 mm, and its 95 % interval.
+    """Return the median speed of local plane waves and its 95 % interval.
 
-    Times round each site are fitted by least squares as a plane over the wall (Bayly et al., IEEE Trans. Biomed. Eng. 45
-    (1998) 563), unfolded into the tangent plane there. Fits that a plane wave does not explain (a focus, a collision) and
-    those that leave the slowness open are left out. Noise lengthens a fitted slowness vector; its expected square is taken
-    off. The interval comes from drawing the times' errors, the same for all fits that share a site, and the fits anew.
+    A plane wave is fitted wherever at least four sites lie within 15 mm of a site. The times around that site are fitted by
+    least squares as a plane over the wall (Bayly et al., IEEE Trans. Biomed. Eng. 45 (1998) 563), unfolded into the tangent
+    plane. A fit is left out where a plane wave does not explain the times (a focus, a collision) or where the slowness is
+    too uncertain. Noise lengthens a fitted slowness vector; its expected square is subtracted. The interval comes from
+    redrawing the times' errors, the same for all fits that share a site, and from resampling the fits.
 
     Parameters
     ----------
     places_mm, normals : (k, 3)
         Sites on the surface and the wall's unit normals there.
     lat_ms, sd_ms : (k,)
-        Times and their standard deviations, the places' errors included.
+        Times and their standard deviations, the positions' errors included.
     difference : callable
-        Of two arrays of times; round the cycle where there is one.
+        Difference of two arrays of times; around the cycle where there is one.
 
     Returns
     -------
     ConductionVelocity or None
-        In m/s; None where no sites lie close enough or none of the fits holds.
+        In m/s; None where no sites lie close enough or all fits are left out.
     """
     waves = _plane_waves(places_mm, normals, lat_ms, sd_ms, difference)
     if not waves:
         return None
-    # The generator starts the same each time: the same sites always give the same interval.
+    # The seed is fixed, so that the same sites always give the same interval.
     rng = np.random.default_rng(0)
     errors = sd_ms * rng.normal(size=(_DRAWS, len(sd_ms)))
-    drawn = np.empty((_DRAWS, len(waves)))
+    samples = np.empty((_DRAWS, len(waves)))
     local = np.empty(len(waves))
     for column, wave in enumerate(waves):
         excess = float(((wave.of_times * sd_ms[wave.sites]) ** 2).sum())
         square = float(wave.slowness @ wave.slowness)
         moved = wave.slowness + errors[:, wave.sites] @ wave.of_times.T
         local[column] = _speed(np.array(square - excess), square)
-        drawn[:, column] = _speed((moved**2).sum(axis=1) - 2 * excess, square)
-    again = rng.integers(len(waves), size=(_DRAWS, len(waves)))
-    medians = np.median(np.take_along_axis(drawn, again, axis=1), axis=1)
+        samples[:, column] = _speed((moved**2).sum(axis=1) - 2 * excess, square)
+    resampled = rng.integers(len(waves), size=(_DRAWS, len(waves)))
+    medians = np.median(np.take_along_axis(samples, resampled, axis=1), axis=1)
     low, high = np.percentile(medians, [2.5, 97.5])
     median = float(np.median(local))
     return ConductionVelocity(median, min(float(low), median), max(float(high), median))
@@ -80,17 +81,17 @@ def conduction_velocity(
 def _plane_waves(
     places_mm: Array, normals: Array, lat_ms: Array, sd_ms: Array, difference: Callable[[Array, Array], Array]
 ) -> list[_PlaneWave]:
-    waves, seen = [], set()
+    waves, neighbourhoods = [], set()
     for centre, normal, own_lat in zip(places_mm, normals, lat_ms, strict=True):
         offset = places_mm - centre
         distance = np.linalg.norm(offset, axis=1)
         # A site on the opposite wall of a thin chamber is near in space only.
         sites = np.flatnonzero((distance <= NEAR_MM) & (normals @ normal > 0))
-        if len(sites) < LEAST_SITES or sites.tobytes() in seen:
+        if len(sites) < LEAST_SITES or sites.tobytes() in neighbourhoods:
             continue
-        seen.add(sites.tobytes())
+        neighbourhoods.add(sites.tobytes())
         wave = _plane_wave(
-            _unfolded(offset[sites], distance[sites], normal),
+            _unfold(offset[sites], distance[sites], normal),
             difference(lat_ms[sites], np.full(len(sites), own_lat)),
             sd_ms[sites],
             sites,
@@ -100,9 +101,12 @@ def _plane_waves(
     return waves
 
 
-def _unfolded(offset_mm: Array, distance_mm: Array, normal: Array) -> Array:
-    """Offsets (m, 3) laid into the tangent plane (m, 2): direction by projection, length as in space, which on a wall of
-    25 mm radius is 1.5 % short at 15 mm."""
+def _unfold(offset_mm: Array, distance_mm: Array, normal: Array) -> Array:
+    """Unfold offsets (m, 3) into the tangent plane (m, 2).
+
+    The direction comes from projection, the length is the straight distance. On a wall of 25 mm radius that is 1.5 % too
+    short at 15 mm.
+    """
     _, _, axes = np.linalg.svd(normal[None])
     flat = offset_mm @ axes[1:].T
     stretch = distance_mm / np.maximum(np.linalg.norm(flat, axis=1), 1e-9)
@@ -119,7 +123,7 @@ def _plane_wave(flat_mm: Array, times_ms: Array, sd_ms: Array, sites: IntArray) 
     misfit = float(((design @ fitted - times_ms / sd_ms) ** 2).sum())
     slowness, covariance = fitted[:2], (inverse @ inverse.T)[:2, :2]
     square = float(slowness @ slowness)
-    # The slowness has to stand out in every direction, not just along itself: else its length is mostly noise.
+    # The slowness must exceed its error in every direction, not only along itself; else its length is mostly noise.
     if misfit > chi2.ppf(MISFIT_LEVEL, len(sites) - 3) or not np.linalg.eigvalsh(covariance)[-1] < (
         LARGEST_RELATIVE_SD**2 * square
     ):
@@ -128,6 +132,9 @@ def _plane_wave(flat_mm: Array, times_ms: Array, sd_ms: Array, sites: IntArray) 
 
 
 def _speed(square: Array, fitted_square: float) -> Array:
-    """mm/ms, that is m/s, of a squared slowness; a tenth of the fitted one at least, below which noise has taken all."""
+    """Return the speed in mm/ms, that is m/s, of a squared slowness.
+
+    The square is at least a tenth of the fitted one; below that it is noise.
+    """
     speed: Array = 1 / np.sqrt(np.maximum(square, 0.1 * fitted_square))
     return speed

@@ -16,7 +16,7 @@ class ConvexHullParams(MapParams):
 
 
 class ConvexHull:
-    """Fuser ``convex-hull``: flat between the outermost sites, so that it holds less than the chamber does."""
+    """Fuser ``convex-hull``: flat between the outermost sites, so that its volume is smaller than the chamber's."""
 
     name: ClassVar[str] = "convex-hull"
     version: ClassVar[str] = "2"
@@ -26,7 +26,7 @@ class ConvexHull:
         self._params = params
 
     def fuse(self, sites: tuple[MappedSite, ...], context: Context) -> ChamberMap:
-        """Surface and activation times of the located sites; see :func:`fluoromap.fuser.chamber_map.chamber_map`.
+        """Make surface and map of the located sites; see :func:`fluoromap.fuser.chamber_map.chamber_map`.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""From located sites and activation times to what a fuser gets."""
+"""Input of a fuser: located sites joined with their activation times."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from fluoromap.reasons import Reason
 
 
 def map_origin(triangulation: Triangulation) -> tuple[float, float, float] | None:
-    """Mean position of the reference catheter over the sites, mm from the isocentre; None where it was never located."""
+    """Return the mean position of the reference catheter over the sites, mm from the isocentre.
+
+    None where no site locates it.
+    """
     references = _references(triangulation)
     if not len(references):
         return None
@@ -23,23 +26,23 @@ def map_origin(triangulation: Triangulation) -> tuple[float, float, float] | Non
 def mapped_sites(
     triangulation: Triangulation, catalogue: Catalogue, times_ms: Mapping[str, tuple[float, float]]
 ) -> tuple[MappedSite, ...]:
-    """The mapping tip of every located site, relative to the reference catheter, with its activation time.
+    """Return the mapping tip of every located site, relative to the reference catheter, with its activation time.
 
     Parameters
     ----------
     triangulation : Triangulation
         Sites in 3D, mm from the isocentre.
     catalogue : Catalogue
-        Says which catheter maps and how long its tip is.
+        Gives the mapping catheter's name and tip length.
     times_ms : mapping of site to (activation time, standard deviation)
-        In ms.
+        Both in ms.
 
     Returns
     -------
     tuple of MappedSite
-        In the order of ``triangulation.sites``. A site whose reference catheter was not located takes the mean
-        reference of the other sites, with the spread of those added to its covariance; where no site has one, the
-        isocentre is the origin. Sites without a mapping tip or without a time are left out.
+        In the order of ``triangulation.sites``. A site without a located reference catheter gets the mean reference of the
+        other sites; their spread is added to its covariance. Where no site has a reference, the isocentre is the origin.
+        Sites without a mapping tip or without a time are left out.
     """
     mapping = catalogue[catalogue.mapping]
     references = _references(triangulation)
@@ -70,7 +73,10 @@ def _references(triangulation: Triangulation) -> Array:
 
 
 def _axis(site: LocatedSite, catheter: str) -> Array:
-    """Unit vector from electrode 2 to the tip; zero where electrode 2 was not located, so that no tip is extended."""
+    """Return the unit vector from electrode 2 to the tip.
+
+    It is zero where electrode 2 was not located, so that the tip is not extended.
+    """
     tip, second = site.point(catheter, 1), site.point(catheter, 2)
     if tip is None or second is None:
         return np.zeros(3)

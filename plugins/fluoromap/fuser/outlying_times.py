@@ -11,16 +11,16 @@ from fluoromap.contracts import Array, BoolArray
 from fluoromap.fuser.activation_times import LeaveOneOut
 
 LEAST_SITES_TO_JUDGE = 8
-"""With fewer other sites only a time that no wave explains can be called an outlier."""
+"""With fewer sites, only a time that no wave explains is an outlier."""
 
 SLOWEST_MM_PER_MS = 0.5
-"""A time that a wave as slow as this explains from the nearest other site may be a focus; it is no outlier."""
+"""A time that a wave of this speed or faster explains from the nearest site may be a focus; it is no outlier."""
 
 NO_WAVE_MM_PER_MS = 0.2
-"""Over the straight distance between sites no wave is as slow as this, not even through scar."""
+"""No wave is slower than this over the straight distance between sites, not even through scar."""
 
 LEAST_APART_MM = 10.0
-"""Nearer sites are judged as if they lay this far apart: 20 ms between neighbours is not yet a wrong annotation."""
+"""Smallest distance with which sites are judged: 20 ms between neighbours is not yet a wrong annotation."""
 
 
 def agreeing_sites(
@@ -30,18 +30,20 @@ def agreeing_sites(
     difference: Callable[[Array, Array], Array],
     leave_one_out: Callable[[BoolArray], LeaveOneOut],
 ) -> BoolArray:
-    """Which sites (k,) the others do not contradict; the worst goes first, at most a fifth of all (at least one).
+    """Return the sites (k,) that the others do not contradict.
+
+    The worst site is removed first, then the next, at most a fifth of all sites (but at least one).
 
     Parameters
     ----------
     points_mm : (k, 3)
     lat_ms : (k,)
     outlier_sigma : float
-        Deviation from what the others predict, in standard deviations, that is too much.
+        Largest deviation from the prediction of the others, in standard deviations.
     difference : callable
-        Of two arrays of times; round the cycle where there is one.
+        Difference of two arrays of times; around the cycle where there is one.
     leave_one_out : callable
-        What the others say about each of the sites used, (k,) of them True.
+        Predicts each site in use (k,) from the other sites in use.
     """
     used = np.ones(len(lat_ms), dtype=np.bool_)
     apart = np.maximum(cdist(points_mm, points_mm), LEAST_APART_MM)
@@ -66,7 +68,7 @@ def agreeing_sites(
 
 
 def _alone(between_ms: Array, apart_mm: Array) -> int | None:
-    """The one site whose time no wave explains from any other, where waves connect all the others."""
+    """Return the only site whose time no wave explains from any other site; None without exactly one such site."""
     connected = between_ms <= apart_mm / NO_WAVE_MM_PER_MS
     np.fill_diagonal(connected, False)
     neighbours = connected.sum(axis=1)

@@ -1,4 +1,4 @@
-"""The chamber as a smooth wall through or near the mapping tips, with activation times interpolated along it."""
+"""The chamber as a smooth wall near the mapping tips, with activation times interpolated along it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ class SmoothSurfaceParams(MapParams):
 
 
 class SmoothSurface:
-    """Fuser ``smooth-surface``: bulges between sites as chambers do, may be concave, and nears each site as closely as its
-    covariance asks."""
+    """Fuser ``smooth-surface``: a wall that bulges between sites as chambers do.
+
+    The wall may be concave. Its distance from each site agrees with the site's covariance.
+    """
 
     name: ClassVar[str] = "smooth-surface"
     version: ClassVar[str] = "1"
@@ -28,7 +30,7 @@ class SmoothSurface:
         self._params = params
 
     def fuse(self, sites: tuple[MappedSite, ...], context: Context) -> ChamberMap:
-        """Surface and activation times of the located sites; see :func:`fluoromap.fuser.chamber_map.chamber_map`.
+        """Make surface and map of the located sites; see :func:`fluoromap.fuser.chamber_map.chamber_map`.
 
         Raises
         ------

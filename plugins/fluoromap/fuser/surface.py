@@ -15,13 +15,16 @@ from scipy.spatial import ConvexHull
 from fluoromap.contracts import Array, BoolArray, IntArray
 
 MOST_FACES = 40_000
-"""More than a chamber ever needs at 1 mm; coordinates that are far off must not eat the memory."""
+"""Limit of a surface's faces, above the need of any chamber at 1 mm: wrong coordinates must not exhaust the memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on a surface: positions_mm (k, 3), in faces (k,) with barycentric weights (k, 3), distance_mm (k,) from
-    the points they were projected from."""
+    """Points on a surface, projected from points in space.
+
+    positions_mm : (k, 3). faces : (k,), weights : (k, 3), the face of each and barycentric weights in it. distance_mm :
+    (k,), from the point in space.
+    """
 
     positions_mm: Array
     faces: IntArray
@@ -29,17 +32,20 @@ class SurfacePoints:
     distance_mm: Array
 
     def rows(self, faces: IntArray, vertices: int) -> csr_array:
-        """Sparse (k, n) matrix that interpolates vertex values at the points."""
+        """Return the sparse (k, n) matrix that interpolates vertex values at the points."""
         k = len(self.faces)
         where = (np.repeat(np.arange(k), 3), faces[self.faces].ravel())
         return coo_array((self.weights.ravel(), where), shape=(k, vertices)).tocsr()
 
 
 def hull_surface(points_mm: Array) -> tuple[Array, IntArray]:
-    """Convex hull of points (k, 3), k >= 4 and not coplanar, as a closed outward surface of its extreme points only."""
+    """Return the convex hull of points (k, 3) as a closed outward surface of its extreme points.
+
+    There are at least four points, not all in one plane.
+    """
     hull = ConvexHull(points_mm)
     if not is_watertight(np.asarray(hull.simplices, dtype=np.int64)):
-        # Qhull's triangulation of facets with many coplanar points can leave holes; jogging the input never does.
+        # Qhull's triangulation of facets with many coplanar points can leave holes; joggled input (QJ) never does.
         hull = ConvexHull(points_mm, qhull_options="QJ")
     faces: IntArray = np.array(hull.simplices, dtype=np.int64)
     corners = points_mm[faces]
@@ -51,42 +57,43 @@ def hull_surface(points_mm: Array) -> tuple[Array, IntArray]:
 
 
 def is_watertight(faces: IntArray) -> bool:
-    """Whether every edge belongs to exactly two faces."""
+    """Return True where every edge belongs to exactly two faces."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     return bool((counts == 2).all())
 
 
 def face_normals(vertices_mm: Array, faces: IntArray) -> Array:
-    """Outward normals (f, 3), each as long as twice its face's area in mm²."""
+    """Return the outward normals (f, 3); the length of each is twice its face's area in mm²."""
     corners = vertices_mm[faces]
     normals: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals
 
 
 def face_areas_mm2(vertices_mm: Array, faces: IntArray) -> Array:
+    """Return the areas (f,) of the faces, mm²."""
     areas: Array = np.linalg.norm(face_normals(vertices_mm, faces), axis=1) / 2
     return areas
 
 
 def volume_mm3(vertices_mm: Array, faces: IntArray) -> float:
-    """Enclosed volume by the divergence theorem; positive where faces are outward."""
+    """Return the enclosed volume by the divergence theorem; positive where faces are outward."""
     corners = vertices_mm[faces] - vertices_mm.mean(axis=0)
     return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
 
 
 def refine(vertices_mm: Array, faces: IntArray, edge_mm: float) -> tuple[Array, IntArray]:
-    """Split edges until none is longer than ``edge_mm``; the shape, closedness and given vertices stay.
+    """Split edges until none is longer than ``edge_mm``.
 
-    Longest edges go first, so that triangles do not become needles. Where that would give more than ``MOST_FACES``,
-    the edges stay longer.
+    The shape, the closedness and the given vertices stay. The longest edges are split first, so that triangles do not
+    become needles. Where the result would have more than ``MOST_FACES`` faces, the edges stay longer.
     """
     area = float(face_areas_mm2(vertices_mm, faces).sum())
-    # Halved edges end between 1/2 and 1 of the target: a triangle then measures about a fifth of its square.
+    # Halving leaves edges of 1/2 to 1 of the target, so that a triangle's area is about a fifth of the target's square.
     target = max(edge_mm, float(np.sqrt(area / (0.2 * MOST_FACES))))
     while len(faces) < MOST_FACES:
         edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        # One number an edge sorts several times faster than a pair.
+        # Sorting one number an edge is several times faster than sorting pairs.
         numbers, of_edge = np.unique(edges[:, 0] * len(vertices_mm) + edges[:, 1], return_inverse=True)
         unique = np.stack(np.divmod(numbers, len(vertices_mm)), axis=1)
         lengths = np.linalg.norm(vertices_mm[unique[:, 0]] - vertices_mm[unique[:, 1]], axis=1)
@@ -106,12 +113,12 @@ def _split_faces(vertices_mm: Array, faces: IntArray, middles: IntArray) -> IntA
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
 
-    # One split edge: turned to be edge 01.
-    a, b, c, m, _, _ = _turned(faces, middles, count == 1, np.argmax(middles >= 0, axis=1))
+    # One split edge: rotate the corners so that it is edge 01.
+    a, b, c, m, _, _ = _rotate_corners(faces, middles, count == 1, np.argmax(middles >= 0, axis=1))
     parts += [np.stack([a, m, c], 1), np.stack([m, b, c], 1)]
 
-    # Two: turned so that the whole edge is 20; of the quadrilateral's diagonals the shorter one.
-    a, b, c, m, k, _ = _turned(faces, middles, count == 2, (np.argmin(middles, axis=1) + 1) % 3)
+    # Two split edges: rotate the corners so that the whole edge is 20; use the quadrilateral's shorter diagonal.
+    a, b, c, m, k, _ = _rotate_corners(faces, middles, count == 2, (np.argmin(middles, axis=1) + 1) % 3)
     parts.append(np.stack([m, b, k], 1))
     first = np.linalg.norm(vertices_mm[a] - vertices_mm[k], axis=1)
     second = np.linalg.norm(vertices_mm[m] - vertices_mm[c], axis=1)
@@ -119,12 +126,12 @@ def _split_faces(vertices_mm: Array, faces: IntArray, middles: IntArray) -> IntA
     parts.append(np.where(near, np.stack([a, m, k], 1), np.stack([a, m, c], 1)))
     parts.append(np.where(near, np.stack([a, k, c], 1), np.stack([m, k, c], 1)))
 
-    a, b, c, m, k, j = _turned(faces, middles, count == 3, np.zeros(len(faces), dtype=np.int64))
+    a, b, c, m, k, j = _rotate_corners(faces, middles, count == 3, np.zeros(len(faces), dtype=np.int64))
     parts += [np.stack(corner, 1) for corner in ((a, m, j), (m, b, k), (j, k, c), (m, k, j))]
     return np.concatenate(parts).astype(np.int64)
 
 
-def _turned(faces: IntArray, middles: IntArray, which: BoolArray, turn: IntArray) -> tuple[IntArray, ...]:
+def _rotate_corners(faces: IntArray, middles: IntArray, which: BoolArray, turn: IntArray) -> tuple[IntArray, ...]:
     order = (turn[which][:, None] + np.arange(3)) % 3
     corners = np.take_along_axis(faces[which], order, axis=1)
     halves = np.take_along_axis(middles[which], order, axis=1)
@@ -132,25 +139,25 @@ def _turned(faces: IntArray, middles: IntArray, which: BoolArray, turn: IntArray
 
 
 def nearest_on_surface(vertices_mm: Array, faces: IntArray, points_mm: Array) -> SurfacePoints:
-    """Nearest surface point of each of the points (k, 3)."""
+    """Return the nearest surface point of each of the points (k, 3)."""
     corners = vertices_mm[faces]
     middles = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-    chosen, weights = [], []
+    nearest_faces, weights = [], []
     for point in points_mm:
         away = np.linalg.norm(middles - point, axis=1)
-        # Only a face whose circle comes nearer than the nearest middle can hold the nearest point.
+        # Only a face whose circle is nearer than the nearest face middle can contain the nearest point.
         candidates = np.flatnonzero(away - reach <= away.min())
         face, weight = _nearest_in_faces(corners[candidates], point)
-        chosen.append(int(candidates[face]))
+        nearest_faces.append(int(candidates[face]))
         weights.append(weight)
-    index, weight = np.array(chosen, dtype=np.int64), np.array(weights).reshape(-1, 3)
+    index, weight = np.array(nearest_faces, dtype=np.int64), np.array(weights).reshape(-1, 3)
     positions = np.einsum("kc,kcx->kx", weight, vertices_mm[faces[index]])
     return SurfacePoints(positions, index, weight, np.linalg.norm(positions - points_mm, axis=1))
 
 
 def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
-    """Which of the faces with corners (f, 3, 3) is nearest to a point, and the barycentric weights (3,) there."""
+    """Return the face nearest to a point, of faces with corners (f, 3, 3), and the barycentric weights (3,) there."""
     a, ab, ac = corners_mm[:, 0], corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     bc = corners_mm[:, 2] - corners_mm[:, 1]
     aa, bb, cc = (np.maximum((edge**2).sum(axis=1), 1e-12) for edge in (ab, ac, bc))
@@ -163,7 +170,7 @@ def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
     t_ab, t_ac = np.clip(along_ab / aa, 0, 1), np.clip(along_ac / bb, 0, 1)
     t_bc = np.clip(((point_mm - corners_mm[:, 1]) * bc).sum(axis=1) / cc, 0, 1)
     zero = np.zeros_like(v)
-    # The foot of the perpendicular where it lies inside the face, else the nearest point of the three edges.
+    # The foot of the perpendicular counts where it lies inside the face, else the nearest point of the three edges.
     outside = (v < 0) | (w < 0) | (v + w > 1)
     inner = np.where(outside[:, None], [1.0, 0.0, 0.0], np.stack([1 - v - w, v, w], 1))
     candidates = np.stack([
@@ -176,18 +183,19 @@ def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
 
 
 def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfacePoints, limit_mm: float) -> Array:
-    """Distance (n,) along the surface from each vertex to the nearest of the points, infinite beyond ``limit_mm``.
+    """Return the distance (n,) along the surface from each vertex to the nearest of the points.
 
-    Dijkstra's shortest paths over the mesh edges and, across each edge, the straight line between its two opposite
-    vertices with both faces laid flat: never shorter than the true geodesic, 2 to 3 % longer on average and up to a
-    fifth where triangles are needles, so colour ends a little early rather than late.
+    It is infinite beyond ``limit_mm``. Dijkstra's shortest paths use the mesh edges and, across each edge, the straight
+    line between its two opposite vertices with both faces laid flat. They are never shorter than the true geodesic, 2 to
+    3 % longer on average and up to a fifth longer where triangles are needles. Colour therefore ends a little early rather
+    than late.
     """
     n, k = len(vertices_mm), len(points.faces)
     edges, lengths = _edges_and_shortcuts(vertices_mm, faces)
     to_corner = np.linalg.norm(vertices_mm[faces[points.faces]] - points.positions_mm[:, None], axis=2)
     row = np.concatenate([edges[:, 0], n + np.repeat(np.arange(k), 3)])
     column = np.concatenate([edges[:, 1], faces[points.faces].ravel()])
-    # A point that is a vertex has distance 0, which a sparse graph would take for no connection.
+    # A point on a vertex has distance 0, which means "no connection" in a sparse graph.
     weight = np.maximum(np.concatenate([lengths, to_corner.ravel()]), 1e-9)
     graph = coo_array((weight, (row, column)), shape=(n + k, n + k)).tocsr()
     distance: Array = dijkstra(graph, directed=False, indices=n + np.arange(k), limit=limit_mm, min_only=True)
@@ -195,7 +203,7 @@ def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfaceP
 
 
 def _edges_and_shortcuts(vertices_mm: Array, faces: IntArray) -> tuple[IntArray, Array]:
-    """Each edge once with its length, and each straight line across an edge that stays within its two faces."""
+    """Return each edge with its length, and each straight line across an edge that stays within its two faces."""
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     opposite = faces[:, [2, 0, 1]].ravel()
     order = np.lexsort((np.sort(half, axis=1)[:, 1], np.sort(half, axis=1)[:, 0]))

@@ -1,4 +1,4 @@
-"""A quantity over a closed surface as a Gaussian process along it, averaged over its length and amplitude.
+"""A quantity over a closed surface as a Gaussian process, averaged over its length and amplitude.
 
 The covariance is Matern 3/2 built from eigenfunctions of the surface's Laplace-Beltrami operator, so that distance counts
 along the wall and not through the cavity. Coveney et al., "Gaussian process manifold interpolation for probabilistic atrial
@@ -19,7 +19,7 @@ from fluoromap.contracts import Array, IntArray
 from fluoromap.fuser.surface import SurfacePoints, face_areas_mm2
 
 LENGTHS_MM = (8.0, 12.0, 18.0, 27.0, 40.0, 60.0)
-# Conduction of 0.5 to 1 m/s over chambers of 3 to 8 cm gives bumps of this length; the prior is wide.
+# Conduction of 0.5 to 1 m/s over chambers of 3 to 8 cm makes variations of this length; the prior is wide.
 LENGTH_PRIOR = (25.0, 0.6)
 _SHIFT = -1e-4
 _LEAST_WEIGHT = 1e-4
@@ -27,10 +27,10 @@ _LEAST_WEIGHT = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class FieldPrior:
-    """What is known of a quantity before it is measured, in its own unit.
+    """Prior of a quantity, in its own unit.
 
-    amplitudes : standard deviations about the mean to be tried; amplitude_prior : the most likely of them, and its spread in
-    logarithms. level_sd, slope_sd_per_mm : of the mean's value and slope.
+    amplitudes : candidates of the standard deviation about the mean. amplitude_prior : the most likely amplitude, and its
+    spread in logarithms. level_sd, slope_sd_per_mm : standard deviations of the mean's value and slope.
     """
 
     amplitudes: tuple[float, ...]
@@ -40,7 +40,7 @@ class FieldPrior:
 
 
 class SurfaceField:
-    """The Gaussian process of one surface; :meth:`regress` says what measurements make of it.
+    """The Gaussian process of one surface; :meth:`regress` conditions it on measurements.
 
     Parameters
     ----------
@@ -63,15 +63,16 @@ class SurfaceField:
         self.trend = np.column_stack([np.ones(len(centred)), centred])
 
     def rows(self, points: SurfacePoints) -> csr_array:
+        """Return the sparse (k, n) matrix that interpolates vertex values at the points."""
         return points.rows(self.faces, len(self.modes))
 
     def regress(self, points: SurfacePoints, values: Array, variance: Array, prior: FieldPrior) -> Regression:
-        """Condition on values (k, c) of c quantities alike, with variances (k,), at k points."""
+        """Condition on values (k, c) of c quantities with the same prior and variances (k,), at k points."""
         return Regression(self, points, values, variance, prior)
 
 
 class Regression:
-    """A field after k measurements; length and amplitude are weighted by their evidence."""
+    """A field conditioned on k measurements; the evidence weights length and amplitude."""
 
     def __init__(
         self, field: SurfaceField, points: SurfacePoints, values: Array, variance: Array, prior: FieldPrior
@@ -96,18 +97,18 @@ class Regression:
                 self._fits.append(_Fit(index, amplitude, (inverse + inverse.T) / 2, solved, evidence))
 
     def at_vertices(self) -> tuple[Array, Array]:
-        """Posterior mean (n, c) and variance (n, c)."""
+        """Return posterior mean (n, c) and variance (n, c) at the vertices."""
         return self._posterior(self._field.modes, self._trend)
 
     def mean_at(self, rows: csr_array) -> Array:
-        """Posterior mean (m, c) where ``rows`` (m, n) interpolate the vertices."""
+        """Return the posterior mean (m, c) where ``rows`` (m, n) interpolate the vertices."""
         return self._posterior(rows @ self._field.modes, rows @ self._trend)[0]
 
     def leave_one_out(self) -> tuple[Array, Array]:
-        """Mean (k, c) and variance (k, c), the measurement's included, of each value as all others predict it.
+        """Predict each value from all others: mean (k, c) and variance (k, c), the measurement's error included.
 
-        Length and amplitude are judged without it as well. Closed form: Rasmussen & Williams, Gaussian Processes for
-        Machine Learning, equations (5.10) to (5.12).
+        The weights of length and amplitude are also computed without that value. Closed form: Rasmussen & Williams,
+        Gaussian Processes for Machine Learning, equations (5.10) to (5.12).
         """
         variance = np.array([1 / np.diag(fit.inverse) for fit in self._fits])[..., None]
         offset = np.array([fit.solved for fit in self._fits]) * variance
@@ -158,12 +159,15 @@ def _log_prior(value: float, prior: tuple[float, float]) -> float:
 
 
 def _laplace_beltrami(vertices_mm: Array, faces: IntArray, modes: int) -> tuple[Array, Array]:
-    """Lowest eigenvalues (m,) in 1/mm² and eigenfunctions (n, m), of unit square integral, by linear finite elements."""
+    """Return the lowest eigenvalues (m,), 1/mm², and eigenfunctions (n, m) by linear finite elements.
+
+    The eigenfunctions have unit square integral.
+    """
     n = len(vertices_mm)
     corners = vertices_mm[faces]
     edges = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
     doubled = 2 * face_areas_mm2(vertices_mm, faces)
-    # Needles that a hull of nearly coplanar sites contains would otherwise make the matrix useless.
+    # Needle-shaped faces, as in a hull of nearly coplanar sites, would otherwise make the matrix ill-conditioned.
     doubled = np.maximum(doubled, 1e-3 * (edges**2).sum(axis=2).max(axis=1))
     stiffness = np.einsum("fix,fjx->fij", edges, edges) / (2 * doubled)[:, None, None]
     where = (np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel())
@@ -171,7 +175,7 @@ def _laplace_beltrami(vertices_mm: Array, faces: IntArray, modes: int) -> tuple[
     mass = np.bincount(faces.ravel(), np.repeat(doubled / 6, 3), minlength=n)
     scale = 1 / np.sqrt(mass)
     symmetric = csc_array(diags_array(scale) @ matrix @ diags_array(scale))
-    # An ordering for symmetric matrices leaves half the fill of the general one that eigsh would use.
+    # An ordering for symmetric matrices has half the fill-in of the general ordering in eigsh.
     factor = splu(
         csc_array(symmetric - _SHIFT * diags_array(np.ones(n))),
         permc_spec="MMD_AT_PLUS_A",
@@ -179,7 +183,7 @@ def _laplace_beltrami(vertices_mm: Array, faces: IntArray, modes: int) -> tuple[
         options={"SymmetricMode": True},
     )
     inverse = LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
-    # The start vector is given so that the same sites always make the same map.
+    # A fixed start vector, so that the same sites always give the same map.
     values, vectors = eigsh(symmetric, k=modes, sigma=_SHIFT, which="LM", v0=np.sqrt(mass), OPinv=inverse)
     order = np.argsort(values)
     return np.maximum(values[order], 0.0), vectors[:, order] * scale[:, None]

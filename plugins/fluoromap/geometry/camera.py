@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A perspective camera ``w (u, v, 1)' = M (X, Y, Z, 1)'`` with ``w`` the depth in mm.
+    """A perspective camera ``w (u, v, 1)' = M (X, Y, Z, 1)'``, ``w`` being the depth.
 
     The 12 numbers of ``matrix`` row by row are m1..m12 of the paper's equation (8).
 
@@ -32,7 +32,7 @@ class Camera:
     Raises
     ------
     ValueError
-        When the matrix has not the shape, is not finite or has no centre of projection.
+        When the matrix is not 3x4, is not finite or has no centre of projection.
     """
 
     matrix: Array
@@ -69,31 +69,43 @@ class Camera:
         return float(np.sqrt(np.linalg.norm(jacobian[0]) * np.linalg.norm(jacobian[1])))
 
     def depth_mm(self, points_world_mm: ArrayLike) -> Array:
-        """Depth of points ``(..., 3)`` along the central ray from the source, shape (...)."""
+        """Return the depth of points along the central ray, from the source.
+
+        points_world_mm : ``(..., 3)``. The result has shape (...).
+        """
         points = np.asarray(points_world_mm, dtype=np.float64)
         depth: Array = points @ self.matrix[2, :3] + self.matrix[2, 3]
         return depth
 
     def project(self, points_world_mm: ArrayLike) -> Array:
-        """Full perspective projection, eq. (1) of the paper: points ``(..., 3)`` to pixels ``(..., 2)``."""
+        """Project points to pixels: full perspective, eq. (1) of the paper.
+
+        points_world_mm : ``(..., 3)``. The result has shape (..., 2).
+        """
         points = np.asarray(points_world_mm, dtype=np.float64)
         homogeneous = points @ self.matrix[:, :3].T + self.matrix[:, 3]
         pixels: Array = homogeneous[..., :2] / homogeneous[..., 2:]
         return pixels
 
     def project_parallel(self, points_world_mm: ArrayLike) -> Array:
-        """Parallel projection, eq. (2) of the paper: the scale of the isocentre for every point, no depth."""
+        """Project in parallel, eq. (2) of the paper.
+
+        Every point has the scale of the isocentre; there is no depth.
+        """
         return self._project_at_depth(points_world_mm, self.matrix[2, 3])
 
     def project_weak(self, points_world_mm: ArrayLike) -> Array:
-        """Weak perspective, eq. (3) of the paper: the depth of the cloud's centroid for every point."""
+        """Project by weak perspective, eq. (3) of the paper.
+
+        Every point has the depth of the cloud's centroid.
+        """
         points = np.asarray(points_world_mm, dtype=np.float64)
         return self._project_at_depth(points, float(self.depth_mm(points.reshape(-1, 3).mean(axis=0))))
 
     def _project_at_depth(self, points_world_mm: ArrayLike, depth_mm: float) -> Array:
         points = np.asarray(points_world_mm, dtype=np.float64)
         principal = self.principal_point_uv
-        # The two image rows without their share of the depth: lengths across the central ray, times focal length.
+        # Without their share of the depth the two image rows are lengths across the central ray, times focal length.
         across = self.matrix[:2] - principal[:, None] * self.matrix[2]
         pixels: Array = (points @ across[:, :3].T + across[:, 3]) / depth_mm + principal
         return pixels
@@ -106,7 +118,10 @@ class Camera:
         return principal
 
     def jacobian(self, points_world_mm: ArrayLike) -> Array:
-        """d(u, v)/d(X, Y, Z) in px/mm at points ``(..., 3)``, shape (..., 2, 3)."""
+        """Return the derivative d(u, v)/d(X, Y, Z) at points, px/mm.
+
+        points_world_mm : ``(..., 3)``. The result has shape (..., 2, 3).
+        """
         points = np.asarray(points_world_mm, dtype=np.float64)
         pixels = self.project(points)
         depth = self.depth_mm(points)
@@ -115,7 +130,10 @@ class Camera:
         return scaled
 
     def rays(self, pixels_uv: ArrayLike) -> Array:
-        """Unit directions in the world from the source through pixels ``(..., 2)``, shape (..., 3)."""
+        """Return unit directions from the source through pixels, in the world.
+
+        pixels_uv : ``(..., 2)``. The result has shape (..., 3).
+        """
         pixels = np.asarray(pixels_uv, dtype=np.float64)
         homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
         directions = homogeneous @ np.linalg.inv(self.matrix[:, :3]).T
@@ -123,14 +141,20 @@ class Camera:
         return unit
 
     def back_project(self, pixels_uv: ArrayLike, depth_mm: ArrayLike) -> Array:
-        """Points on the rays of pixels ``(..., 2)`` at depths ``(...)`` in mm along the central ray, shape (..., 3)."""
+        """Return the points on the rays of pixels at these depths, shape (..., 3).
+
+        pixels_uv : ``(..., 2)``. depth_mm : ``(...)``, along the central ray.
+        """
         directions = self.rays(pixels_uv)
         along = directions @ self.matrix[2, :3]
         points: Array = self.source_world_mm + directions * (np.asarray(depth_mm, dtype=np.float64) / along)[..., None]
         return points
 
     def translated(self, shift_world_mm: ArrayLike) -> Camera:
-        """The camera for coordinates whose origin lies at ``shift_world_mm`` in this camera's world."""
+        """Return the camera for coordinates with another origin.
+
+        The new origin lies at ``shift_world_mm`` in this camera's world.
+        """
         shift = np.asarray(shift_world_mm, dtype=np.float64)
         matrix = self.matrix.copy()
         matrix[:, 3] += matrix[:, :3] @ shift
@@ -138,6 +162,6 @@ class Camera:
 
 
 def ray_angle_deg(first: Camera, second: Camera) -> float:
-    """Angle between two views' central rays, folded to 0..90 degrees."""
+    """Return the angle between two views' central rays, folded to 0..90 degrees."""
     cosine = abs(float(first.axis_world @ second.axis_world))
     return float(np.degrees(np.arccos(min(cosine, 1.0))))

@@ -1,4 +1,4 @@
-"""The C-arm's gantry and the camera that belongs to it."""
+"""The position of a C-arm's gantry, and the camera that belongs to it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from fluoromap.geometry.camera import Array, Camera
 ImageAxes = tuple[tuple[int, int], tuple[int, int]]
 UPRIGHT: ImageAxes = ((1, 0), (0, 1))
 
+LEAST_SOURCE_MM = 200.0
+"""Shortest distance of the X-ray source from isocentre and detector that a C-arm can have."""
+
 
 @dataclass(frozen=True, slots=True)
 class Gantry:
-    """Where source and detector stood for a run.
+    """Position of source and detector during a run.
 
     Parameters
     ----------
@@ -34,12 +37,13 @@ class Gantry:
         Size of the stored image.
     image_axes : tuple
         Integer matrix that takes (u, v) offsets of the upright image, seen from the detector, to offsets of the stored
-        image; what FieldOfViewRotation, FieldOfViewHorizontalFlip or PatientOrientation tell. The identity by default.
+        image. It follows from FieldOfViewRotation, FieldOfViewHorizontalFlip or PatientOrientation. The identity by
+        default.
 
     Raises
     ------
     ValueError
-        When a number is outside what a C-arm can do.
+        When a number is outside the range of a C-arm.
     """
 
     primary_deg: float
@@ -60,8 +64,11 @@ class Gantry:
             raise ValueError("gantry values must be finite numbers")
         if abs(self.primary_deg) > 180 or abs(self.secondary_deg) > 90:
             raise ValueError("PositionerPrimaryAngle lies within 180 degrees, PositionerSecondaryAngle within 90")
-        if not 100 <= self.source_isocentre_mm < self.source_detector_mm <= 3000:
-            raise ValueError("the source lies 100 mm or more from the isocentre, and the detector behind it")
+        if not LEAST_SOURCE_MM <= self.source_isocentre_mm < self.source_detector_mm <= 3000:
+            raise ValueError(
+                f"the source distances are {self.source_isocentre_mm:g} mm to the isocentre and {self.source_detector_mm:g} mm "
+                f"to the detector; both must be {LEAST_SOURCE_MM:g} to 3000 mm, the detector being farther"
+            )
         if not all(0.01 <= spacing <= 5 for spacing in self.pixel_spacing_mm):
             raise ValueError("ImagerPixelSpacing must be between 0.01 and 5 mm")
         if self.rows < 1 or self.columns < 1:
@@ -70,26 +77,50 @@ class Gantry:
             raise ValueError("image_axes must be a flip, a quarter turn or both")
 
 
+def view_axes(primary_deg: float, secondary_deg: float) -> Array:
+    """Return the axes e_u, e_v and n of a view, (3, 3).
+
+    The rows are unit vectors in the world (LPS). e_u and e_v are the directions of +u and +v in the upright image, n points
+    from the isocentre to the detector. The displayed image looks at the patient from the detector: a frontal view shows the
+    patient's left on the image's right. With a the primary and b the secondary angle::
+
+        e_u = (cos a, sin a, 0)
+        e_v = (sin a sin b, -cos a sin b, -cos b)
+        n = (sin a cos b, -cos a cos b, sin b)
+
+    (e_u, e_v, n) is left-handed. DICOM PS3.3 C.8.7.5.1.2.
+
+    Parameters
+    ----------
+    primary_deg, secondary_deg : float
+        See :class:`Gantry`.
+    """
+    a, b = math.radians(primary_deg), math.radians(secondary_deg)
+    return np.array(
+        [
+            [math.cos(a), math.sin(a), 0.0],
+            [math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b)],
+            [math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)],
+        ]
+    )
+
+
 @functools.lru_cache(maxsize=256)
 def camera_from_gantry(gantry: Gantry) -> Camera:
-    """Perspective camera of a gantry position, for stored pixels; the same object for the same position.
+    """Return the perspective camera of a gantry position, for stored pixels.
 
-    The displayed image looks at the patient from the detector: a frontal view shows the patient's left on the image's
-    right. With a the primary and b the secondary angle, n = (sin a cos b, -cos a cos b, sin b) points from the
-    isocentre to the detector, e_u = (cos a, sin a, 0), e_v = (sin a sin b, -cos a sin b, -cos b); (e_u, e_v, n) is
-    left-handed. DICOM PS3.3 C.8.7.5.1.2; the isocentre projects to the middle of the field, PS3.17 FFF.2.1.5.2.
+    The same position returns the same object. The axes are those of :func:`view_axes`; the isocentre projects to the middle
+    of the
+    field (DICOM PS3.17 FFF.2.1.5.2).
     """
-    a, b = math.radians(gantry.primary_deg), math.radians(gantry.secondary_deg)
-    e_u = np.array([math.cos(a), math.sin(a), 0.0])
-    e_v = np.array([math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b)])
-    n = np.array([math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)])
-    # Lengths across the ray come out on the detector in mm, are turned as the image was, then counted in stored pixels.
-    across: Array = np.array(gantry.image_axes, dtype=np.float64) @ np.stack([e_u, e_v])
+    axes = view_axes(gantry.primary_deg, gantry.secondary_deg)
+    # Millimetres on the detector are turned like the image, then converted to stored pixels.
+    across: Array = np.array(gantry.image_axes, dtype=np.float64) @ axes[:2]
     row_spacing, column_spacing = gantry.pixel_spacing_mm
     focal = gantry.source_detector_mm / np.array([column_spacing, row_spacing])
     centre = np.array([(gantry.columns - 1) / 2, (gantry.rows - 1) / 2])
     matrix = np.empty((3, 4))
-    matrix[2] = [*n, gantry.source_isocentre_mm]
+    matrix[2] = [*axes[2], gantry.source_isocentre_mm]
     matrix[:2, :3] = focal[:, None] * across
     matrix[:2, 3] = 0.0
     matrix[:2] += centre[:, None] * matrix[2]

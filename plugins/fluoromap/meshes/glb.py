@@ -18,11 +18,11 @@ JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
 def glb_bytes(chamber: ChamberMap, vertices_mm: Array, statement: str) -> bytes:
-    """One mesh with colours, scalars and, as ``extras``, unit, axes and sites."""
+    """Return the file: one mesh with colours and scalars; unit and axes as ``extras``."""
     n = len(vertices_mm)
     colours = np.full((n, 4), 255, dtype=np.uint8)
     colours[:, :3] = vertex_colours(chamber)
-    # Vertex attributes are aligned to 4 bytes, hence a float for a yes or no.
+    # Vertex attributes must be aligned to 4 bytes, hence a float for a truth value.
     attributes: dict[str, NDArray[Any]] = {
         "POSITION": vertices_mm.astype("<f4"),
         "COLOR_0": colours,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,20 +19,22 @@ STATEMENT = "fluoromap chamber, unit mm, axes LPS (DICOM patient)"
 
 
 def mesh_bytes(chamber: ChamberMap, format: MeshFormat, origin_shift_mm: ArrayLike = (0.0, 0.0, 0.0)) -> bytes:  # noqa: A002
-    """The chamber as a file.
+    """Return the chamber as a mesh file.
 
     Parameters
     ----------
     chamber : ChamberMap
-        Relative to the reference catheter.
+        Map relative to the reference catheter.
     format : {"ply", "stl", "glb", "vtp", "mat", "csv"}
-        PLY: binary, colours and the scalars ``lat_ms``, ``lat_sd_ms`` (NaN where not covered), ``covered``. STL: binary,
-        the shape alone. GLB: colours, the same scalars as ``_LAT_MS``, ``_LAT_SD_MS`` (0 where not covered) and
-        ``_COVERED``; its numbers are millimetres and LPS too, though glTF assumes metres. VTP: the scalars, NaN where not
-        covered, and the sites as field data. MAT: OpenEP's structure. CSV: a line a vertex, the scalars empty where not
-        covered.
+        - PLY: binary, colours and the scalars ``lat_ms``, ``lat_sd_ms`` (NaN where not covered), ``covered``.
+        - STL: binary, the shape alone.
+        - GLB: colours, the same scalars as ``_LAT_MS``, ``_LAT_SD_MS`` (0 where not covered) and ``_COVERED``. Its numbers
+          are millimetres and LPS too, although glTF assumes metres.
+        - VTP: the scalars, NaN where not covered, and the sites as field data.
+        - MAT: OpenEP's structure.
+        - CSV: a line for each vertex, the scalars empty where not covered.
     origin_shift_mm : (3,)
-        Added to all positions: where the reference catheter lies in the coordinates that are wanted.
+        Added to all positions: the reference catheter's position in the coordinates of the file.
 
     Raises
     ------
@@ -56,7 +58,7 @@ def mesh_bytes(chamber: ChamberMap, format: MeshFormat, origin_shift_mm: ArrayLi
             return openep_bytes(chamber, vertices, shift, STATEMENT)
         case "csv":
             return _csv(chamber, vertices)
-    raise ValueError(f"no mesh format is called {format!r}")
+    raise ValueError(f"unknown mesh format {format!r}; use one of {', '.join(get_args(MeshFormat))}")
 
 
 def _ply(chamber: ChamberMap, vertices_mm: Array) -> bytes:
@@ -103,5 +105,5 @@ def _stl(chamber: ChamberMap, vertices_mm: Array) -> bytes:
     triangles["normal"] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     triangles["corners"] = vertices_mm[chamber.faces]
     count = np.array(len(triangles), dtype="<u4")
-    # 80 bytes that must not begin with "solid", which means the ASCII variant.
+    # The header has 80 bytes and must not begin with "solid", which marks the ASCII variant.
     return STATEMENT.encode("ascii").ljust(80)[:80] + count.tobytes() + triangles.tobytes()

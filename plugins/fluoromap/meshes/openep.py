@@ -1,4 +1,4 @@
-"""The map as OpenEP's MATLAB structure ``userdata``, for its users' analyses."""
+"""The map as OpenEP's MATLAB structure ``userdata``."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from fluoromap.fuser.surface import face_normals
 SAMPLES_PER_S = 1000.0
 WINDOW_MARGIN_MS = 50
 _TEXT_BYTES = 116
-"""Length of the descriptive text at the head of a MAT-file, level 5."""
+"""Length of the descriptive text at the start of a MAT-file, level 5."""
 
 
 def openep_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, statement: str) -> bytes:
-    """The map as a MAT-file (level 5) that holds one variable, ``userdata``, as OpenEP names its fields.
+    """Return the map as a MAT-file (level 5) with one variable, ``userdata``, in OpenEP's structure.
 
-    ``surface.triRep`` is a struct with ``X`` and ``Triangulation`` (from 1); ``surface.act_bip`` holds activation time in
-    ms and bipolar voltage, which is not known here: NaN; where no site is near the time is NaN too. ``electric`` holds one
-    mapping point a site: ``egmX`` where it lies, ``egmSurfX`` where it counts on the surface, and its annotation in samples
-    (1 ms) from the reference's. Electrograms are not part of a map: ``egm`` is NaN over the window of interest. Beyond
-    OpenEP's fields there are ``surface.lat_sd_ms`` and ``surface.covered``.
+    - ``surface.triRep`` is a struct with ``X`` and ``Triangulation`` (from 1).
+    - ``surface.act_bip`` holds activation time in ms, NaN where no site is near, and bipolar voltage, which is unknown: NaN.
+    - ``electric`` holds one mapping point for each site: ``egmX`` its position, ``egmSurfX`` its point on the surface, and
+      its annotation in samples (1 ms) from the reference's.
+    - ``egm`` is NaN over the window of interest: electrograms are not part of a map.
+    - ``surface.lat_sd_ms`` and ``surface.covered`` are additions to OpenEP's fields.
 
     Parameters
     ----------
     chamber : ChamberMap
     vertices_mm : (n, 3)
-        Its vertices in the wanted coordinates.
+        The map's vertices in the coordinates of the file.
     shift_mm : (3,)
-        Added to the sites' positions likewise.
+        Added to the sites' positions, for the same coordinates.
     statement : str
-        Unit and axes, written at the head of the file and into ``notes``.
+        Unit and axes, written at the start of the file and into ``notes``.
 
     References
     ----------
@@ -51,7 +52,7 @@ def openep_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, state
     }
     options: dict[str, Any] = {"format": "5", "long_field_names": True, "oned_as": "column", "do_compression": True}
     savemat(stream, {"userdata": userdata}, **options)  # type: ignore[arg-type]
-    # scipy writes the time of day here; the same map must give the same bytes.
+    # SciPy writes the time of day here, but the same map must give the same bytes.
     text = f"MATLAB 5.0 MAT-file, {statement}".encode("ascii").ljust(_TEXT_BYTES)[:_TEXT_BYTES]
     return text + stream.getvalue()[_TEXT_BYTES:]
 
@@ -75,7 +76,7 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
     names = _cells([site.site for site in sites])
     lat = np.array([site.lat_ms for site in sites])
     window = (np.floor(lat.min()) - WINDOW_MARGIN_MS, np.ceil(lat.max()) + WINDOW_MARGIN_MS)
-    # Samples count from 1 and the window starts with the first one.
+    # Samples are counted from 1; the window starts with the first sample.
     reference = 1 - window[0]
     surface_mm = np.array([site.surface_mm for site in sites]) + shift_mm
     nearest = cKDTree(vertices_mm).query(surface_mm)[1]
@@ -104,7 +105,7 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
 
 
 def _vertex_normals(vertices_mm: Array, faces: IntArray) -> Array:
-    """Outward unit normals (n, 3), the mean of the faces round a vertex weighted by their area."""
+    """Return outward unit normals (n, 3): the mean over the faces around a vertex, weighted by area."""
     of_faces = face_normals(vertices_mm, faces)
     total = np.zeros_like(vertices_mm)
     for corner in range(3):
@@ -114,7 +115,7 @@ def _vertex_normals(vertices_mm: Array, faces: IntArray) -> Array:
 
 
 def _cells(texts: list[str]) -> np.ndarray[tuple[int, int], np.dtype[np.object_]]:
-    """A MATLAB cell array, one text a row."""
+    """Return a MATLAB cell array with one text a row."""
     cells = np.empty((len(texts), 1), dtype=object)
     cells[:, 0] = texts
     return cells

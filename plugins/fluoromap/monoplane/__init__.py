@@ -1,1 +1,1 @@
-"""Electrodes in 3D through one view."""
+"""Monoplane solvers: electrodes tracked in 3D through one view."""

@@ -1,7 +1,7 @@
 """The paper's monoplane method: electrode by electrode from an a-priori position, by Levenberg's iteration.
 
-The three equations of each electrode and frame have one null direction, along the ray: what the iteration starts with
-along the ray is what it ends with. The method therefore estimates no depth; every answer says ``depth_assumed``.
+The three equations of each electrode and frame have one null direction, along the ray. The iteration never changes the
+start value's component along the ray. The method therefore estimates no depth; every track carries ``depth_assumed``.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from pydantic import BaseModel, Field
 
 from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Track
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.observed_view import (
-    ObservedView,
+from fluoromap.monoplane.view_electrodes import (
+    ViewElectrodes,
+    gantry_angle_covariance_mm2,
+    gather_electrodes,
     isocentre_covariance_mm2,
     lateral_covariance_mm2,
-    observe,
     outwards,
-    turned_covariance_mm2,
 )
 from fluoromap.reasons import Reason
 
@@ -30,10 +30,10 @@ _HARMONICS = np.arange(1, 5)
 
 
 class APrioriLM:
-    """Monoplane solver ``a-priori-lm``, the paper's equations (8), (9), (10); here for comparison."""
+    """Monoplane solver ``a-priori-lm``: the paper's equations (8), (9), (10), for comparison."""
 
     class Params(BaseModel, extra="forbid"):
-        """The start value, and what the covariance along the ray rests on."""
+        """Start value of the iteration, and assumptions behind the covariance along the ray."""
 
         depth_step_mm: float = Field(
             0.0,
@@ -63,38 +63,53 @@ class APrioriLM:
         self._params = params
 
     def track(self, view: MonoplaneView, context: Context) -> Track:
-        """Follow every electrode that has an a-priori position; raises Refusal NO_A_PRIORI where none has."""
-        observed = observe(view)
+        """Track every electrode that has an a-priori position.
+
+        Raises
+        ------
+        Refusal
+            NO_A_PRIORI where no electrode has one.
+        """
+        electrodes = gather_electrodes(view)
         context.check()
-        start_mm = observed.a_priori_mm
-        positions = follow_points(
-            view.camera, start_mm, observed.pixels_uv, observed.seen, view.a_priori_frame, self._params.depth_step_mm
+        start_mm = electrodes.a_priori_mm
+        positions = track_points(
+            view.camera,
+            start_mm,
+            electrodes.pixels_uv,
+            electrodes.visible,
+            view.a_priori_frame,
+            self._params.depth_step_mm,
         )
         context.progress(0.9)
-        baseline = view.camera.back_project(observed.pixels_uv, view.camera.depth_mm(start_mm))
-        covariance = self._covariance(view, observed, positions)
-        shown = observed.seen[..., None]
+        baseline = view.camera.back_project(electrodes.pixels_uv, view.camera.depth_mm(start_mm))
+        covariance = self._covariance(view, electrodes, positions)
+        shown = electrodes.visible[..., None]
         reasons = tuple(
             (Reason.DEPTH_ASSUMED, Reason.TRACK_INTERRUPTED) if interrupted else (Reason.DEPTH_ASSUMED,)
-            for interrupted in observed.interrupted()
+            for interrupted in electrodes.interrupted()
         )
         return Track(
-            labels=observed.labels,
-            located=observed.seen,
+            labels=electrodes.labels,
+            located=electrodes.visible,
             positions_mm=np.where(shown, positions, 0.0),
             baseline_mm=np.where(shown, baseline, 0.0),
             covariance_mm2=np.where(shown[..., None], covariance, 0.0),
-            pixels_uv=observed.pixels_uv,
+            pixels_uv=electrodes.pixels_uv,
             reasons=reasons,
         )
 
-    def _covariance(self, view: MonoplaneView, observed: ObservedView, positions: Array) -> Array:
-        """Pixels across the ray; along it the a-priori position, the heart's motion since, breathing and the start value."""
+    def _covariance(self, view: MonoplaneView, electrodes: ViewElectrodes, positions: Array) -> Array:
+        """Return the covariance (n, m, 3, 3) of the positions.
+
+        Across the ray it comes from the pixels. Along the ray it comes from the a-priori position, the heart's motion
+        since then, breathing and the start value.
+        """
         p = self._params
         jacobians = view.camera.jacobian(positions)
         rays = positions - view.camera.source_world_mm
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        a_priori = np.array([point.covariance_mm2 for point in observed.a_priori])
+        a_priori = np.array([point.covariance_mm2 for point in electrodes.a_priori])
         respiration = (
             np.diag([p.respiration_other_sd_mm, p.respiration_other_sd_mm, p.respiration_head_feet_sd_mm]) ** 2
         )
@@ -102,27 +117,27 @@ class APrioriLM:
         motion_sd = np.array(
             [
                 p.mapping_motion_sd_mm if catheter == view.catalogue.mapping else p.other_motion_sd_mm
-                for catheter in observed.catheters
+                for catheter in electrodes.catheters
             ]
         )
-        along = along + motion_sd**2 * moved_share(observed.phases, view.a_priori_frame)[:, None]
+        along = along + motion_sd**2 * motion_variance_share(electrodes.phases, view.a_priori_frame)[:, None]
         away = np.abs(np.arange(len(positions)) - view.a_priori_frame)
         along = along + ((p.depth_step_mm * away) ** 2)[:, None]
         covariance: Array = (
-            lateral_covariance_mm2(jacobians, observed.covariance_px2)
+            lateral_covariance_mm2(jacobians, electrodes.covariance_px2)
             + along[..., None, None] * rays[..., :, None] * rays[..., None, :]
-            + turned_covariance_mm2(positions, p.gantry_angle_sd_deg)
+            + gantry_angle_covariance_mm2(positions, p.gantry_angle_sd_deg)
             + isocentre_covariance_mm2(view.camera, p.isocentre_sd_mm)
         )
         return covariance
 
 
-def moved_share(phases: Array, start: int) -> Array:
-    """Variance (n,) of an electrode's displacement since frame ``start``, as a share of its mean over the cycle.
+def motion_variance_share(phases: Array, start: int) -> Array:
+    """Return the variance (n,) of the displacement since frame ``start``, as a share of its mean over the cycle.
 
-    A heart's motion as a random sum of the cycle's first harmonics, amplitudes falling as h^-1.5: ``1 - k``, ``k`` its
-    correlation at the difference of phase. 0 at the start and at its phase in other beats, largest half a cycle away;
-    1 where phases are unknown.
+    The heart's motion is modelled as a random sum of the cycle's first harmonics whose amplitudes fall as h^-1.5. The
+    share is ``1 - k`` with ``k`` the motion's correlation at the difference of phase. It is 0 at the start and at the same
+    phase of other beats, and largest half a cycle away. It is 1 where phases are unknown.
     """
     weights = _HARMONICS**-3.0
     apart = phases - phases[start]
@@ -132,23 +147,24 @@ def moved_share(phases: Array, start: int) -> Array:
     return share
 
 
-def follow_points(
-    camera: Camera, a_priori_mm: Array, pixels_uv: Array, seen: BoolArray, start: int, depth_step_mm: float
+def track_points(
+    camera: Camera, a_priori_mm: Array, pixels_uv: Array, visible: BoolArray, start: int, depth_step_mm: float
 ) -> Array:
-    """Positions of m points through n frames of one view by equations (8), (9), (10).
+    """Track m points through n frames of one view by equations (8), (9), (10).
 
     Parameters
     ----------
     a_priori_mm : ndarray, shape (m, 3)
         World positions at frame ``start``.
     pixels_uv : ndarray, shape (n, m, 2)
-        As seen; ignored where not ``seen``.
-    seen : ndarray of bool, shape (n, m)
-        A point that is not seen stays where it was and goes on from there when it is seen again.
+        Pixels (u, v); ignored where ``visible`` is False.
+    visible : ndarray of bool, shape (n, m)
+        A hidden point keeps its last position and continues from there in the next frame that shows it.
     start : int
-        The a-priori frame; the sequence runs from it to both ends.
+        The a-priori frame; tracking runs from it to both ends.
     depth_step_mm : float
-        Start value of the displacement along the central ray for each frame (the paper's dz), the other way backwards.
+        Start value of the displacement along the central ray for each frame (the paper's dz); negated for frames before
+        ``start``.
 
     Returns
     -------
@@ -159,13 +175,13 @@ def follow_points(
     positions = np.empty((n, m, 3))
     last_uv = np.empty((n, m, 2))
     waiting = np.zeros((n, m))
-    last_uv[start] = np.where(seen[start][:, None], pixels_uv[start], camera.project(a_priori_mm))
+    last_uv[start] = np.where(visible[start][:, None], pixels_uv[start], camera.project(a_priori_mm))
     positions[start] = levenberg(camera, a_priori_mm, last_uv[start], last_uv[start])
     for frame, before in outwards(n, start):
-        shown = seen[frame][:, None]
+        shown = visible[frame][:, None]
         last_uv[frame] = np.where(shown, pixels_uv[frame], last_uv[before])
         frames_gone = waiting[before] + 1
-        waiting[frame] = np.where(seen[frame], 0, frames_gone)
+        waiting[frame] = np.where(visible[frame], 0, frames_gone)
         depth_steps = np.sign(frame - before) * depth_step_mm * frames_gone
         displacement = start_displacement(camera, mean_depth_mm, last_uv[frame] - last_uv[before], depth_steps)
         found = levenberg(camera, positions[before] + displacement, last_uv[frame], last_uv[before])
@@ -174,7 +190,10 @@ def follow_points(
 
 
 def start_displacement(camera: Camera, mean_depth_mm: float, moved_px: Array, depth_steps_mm: Array) -> Array:
-    """Start value of displacements (m, 3): pixels (m, 2) taken back in parallel, du Zavg / f, plus a step in depth (m,)."""
+    """Return the start value of displacements (m, 3), mm.
+
+    The pixel displacements (m, 2) are scaled back to the mean depth, du Zavg / f; a step in depth (m,) is added.
+    """
     principal = camera.principal_point_uv
     across = camera.matrix[:2, :3] - principal[:, None] * camera.matrix[2, :3]
     lateral = moved_px @ np.linalg.pinv(across).T * mean_depth_mm
@@ -183,20 +202,27 @@ def start_displacement(camera: Camera, mean_depth_mm: float, moved_px: Array, de
 
 
 def column_residual(camera: Camera, points_mm: Array, u: Array) -> tuple[Array, Array]:
-    """Eq. (8) of the paper: (m1 X + m2 Y + m3 Z + m4) / (m9 X + m10 Y + m11 Z + m12) - u, with its gradient (m, 3) in px/mm."""
+    """Return residual (m,) and gradient (m, 3) of eq. (8) of the paper, px and px/mm.
+
+    The residual is (m1 X + m2 Y + m3 Z + m4) / (m9 X + m10 Y + m11 Z + m12) - u.
+    """
     return camera.project(points_mm)[:, 0] - u, camera.jacobian(points_mm)[:, 0]
 
 
 def row_residual(camera: Camera, points_mm: Array, v: Array) -> tuple[Array, Array]:
-    """Eq. (9) of the paper: (m5 X + m6 Y + m7 Z + m8) / (m9 X + m10 Y + m11 Z + m12) - v, with its gradient (m, 3) in px/mm."""
+    """Return residual (m,) and gradient (m, 3) of eq. (9) of the paper, px and px/mm.
+
+    The residual is (m5 X + m6 Y + m7 Z + m8) / (m9 X + m10 Y + m11 Z + m12) - v.
+    """
     return camera.project(points_mm)[:, 1] - v, camera.jacobian(points_mm)[:, 1]
 
 
 def distance_residual(camera: Camera, points_mm: Array, before_uv: Array, distance_px: Array) -> tuple[Array, Array]:
-    """Eq. (10) of the paper: length of the projected displacement minus d = sqrt(du^2 + dv^2), with its gradient (m, 3) in px/mm.
+    """Return residual (m,) and gradient (m, 3) of eq. (10) of the paper, px and px/mm.
 
-    The paper prints d^2 for d. Its model side is read as the perspective image displacement from the point's pixel in the
-    frame before: of the readings only this one reproduces the paper's Table 1.
+    The residual is the length of the projected displacement minus d = sqrt(du^2 + dv^2). The paper prints d^2 for d. Its
+    model side is read as the perspective image displacement from the point's pixel in the frame before: only this reading
+    reproduces the paper's Table 1.
     """
     moved = camera.project(points_mm) - before_uv
     length = np.linalg.norm(moved, axis=1)
@@ -205,12 +231,14 @@ def distance_residual(camera: Camera, points_mm: Array, before_uv: Array, distan
 
 
 def levenberg(camera: Camera, start_mm: Array, pixels_uv: Array, before_uv: Array) -> Array:
-    """Solve (8), (9), (10) for every point on its own; damping lambda I in mm (Marquardt's scaling does not fit the paper).
+    """Solve (8), (9), (10) for each point separately.
+
+    The damping is lambda I in mm; Marquardt's scaling does not reproduce the paper.
 
     Parameters
     ----------
     start_mm : ndarray, shape (m, 3)
-        Where the iteration starts; its component along the ray stays.
+        Start of the iteration; its component along the ray stays unchanged.
     pixels_uv, before_uv : ndarray, shape (m, 2)
         Pixels of the points in this frame and the frame before.
 
@@ -236,11 +264,11 @@ def levenberg(camera: Camera, start_mm: Array, pixels_uv: Array, before_uv: Arra
     for _ in range(_ITERATIONS):
         normal = np.einsum("mki,mkj->mij", jacobian, jacobian) + damping[:, None, None] * np.eye(3)
         step = -np.linalg.solve(normal, np.einsum("mki,mk->mi", jacobian, residual)[..., None])[..., 0]
-        tried, tried_jacobian = equations(points + step)
-        better = (tried**2).sum(axis=1) < (residual**2).sum(axis=1)
+        trial, trial_jacobian = equations(points + step)
+        better = (trial**2).sum(axis=1) < (residual**2).sum(axis=1)
         points = np.where(better[:, None], points + step, points)
-        residual = np.where(better[:, None], tried, residual)
-        jacobian = np.where(better[:, None, None], tried_jacobian, jacobian)
+        residual = np.where(better[:, None], trial, residual)
+        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
         damping = np.clip(np.where(better, damping * 0.1, damping * 10), 1e-12, 1e12)
         if len(step) == 0 or np.abs(step).max() < _SETTLED_MM:
             break

@@ -1,8 +1,8 @@
-"""Bundle adjustment of a rigid body: its uncertain points and its pose in every frame of one view, at once.
+"""Bundle adjustment of a rigid body: its uncertain points and its pose in every frame of one view together.
 
 The unknowns are the body's m points in the a-priori frame, each with a prior, and one pose a frame. In the normal equations
-the frames couple to the points only (and, under the acceleration prior, to their two neighbours on either side): they are
-a band that is eliminated first, what remains is a (3 m, 3 m) system of the points (Schur's complement).
+each frame couples to the points, and under the acceleration prior to its two neighbours on either side. The poses thus form
+a band, which is eliminated first. A (3 m, 3 m) system of the points remains (Schur's complement).
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from fluoromap.monoplane.body_pose import VAGUE_POSE, point_jacobian, pose_jacob
 _STEPS = 30
 _CONVERGED = 1e-9
 _FIXED_RAD = 1e-6
-"""Standard deviation of the rotation in the a-priori frame: the points are those of that frame, turned by nothing."""
+"""Standard deviation of the rotation in the a-priori frame, which is the identity by definition of the points."""
 _FIXED_MM2 = 1e-8
-"""Variance that a prior has at least, so that it can be inverted."""
+"""Smallest variance of a prior, so that it can be inverted."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyView:
-    """What is known of a rigid body of m points in the n frames of one view whose poses are wanted.
+    """A rigid body of m points in n frames of one view: pixels and priors.
 
     prior_mm : (m, 3) world positions in frame ``start``. shape_mm2 : (m, 3, 3), their covariance, independent between points.
-    displacement_mm2 : (3, 3), covariance of a displacement that all of them share.
-    frames : (n,), ascending numbers in the run; the frame at ``start`` (an index into these) is where the priors hold.
-    pixels_uv : (n, m, 2). covariance_px2 : (n, m, 2, 2). seen : (n, m).
-    acceleration_sd : rotation (rad) and translation (mm) by which a pose's change from frame to frame changes, one standard
-    deviation; None where nothing is known of it.
+    displacement_mm2 : (3, 3), covariance of a displacement that all points share.
+    frames : (n,), ascending frame numbers of the run. start : index into ``frames`` of the frame of the priors.
+    pixels_uv : (n, m, 2). covariance_px2 : (n, m, 2, 2). visible : (n, m), True where the frame shows the point.
+    acceleration_sd : standard deviations of the change, from frame to frame, of the pose's rotation (rad) and translation
+    (mm); None where they are unknown.
     """
 
     camera: Camera
@@ -44,24 +44,24 @@ class BodyView:
     start: int
     pixels_uv: Array
     covariance_px2: Array
-    seen: BoolArray
+    visible: BoolArray
     acceleration_sd: tuple[float, float] | None = None
 
     @property
     def origin_mm(self) -> Array:
-        """The point of the body, (3,), that it turns about."""
+        """Centre of the body's rotation, (3,), world."""
         origin: Array = self.prior_mm.mean(axis=0)
         return origin
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedBody:
-    """The most probable points and poses, with all that their joint covariance needs.
+    """The most probable points and poses, and the terms of their joint covariance.
 
-    turned_mm : (n, m, 3), the points about the body's origin as turned in each frame. rotations : (n, 3, 3).
-    centres_mm : (n, 3), where the origin is. points_covariance_mm2 : (3 m, 3 m). pose_covariance : (n, 6, 6) with the points
-    known; coupling : (n, 6, 3 m), by which an error of the points makes one of the pose (rotation vector, translation).
-    misfit : root of the cost over its degrees of freedom, ``freedom``; 1 where noise and priors are as stated.
+    turned_mm : (n, m, 3), the points about the body's origin, rotated in each frame. rotations : (n, 3, 3).
+    centres_mm : (n, 3), world positions of the origin. points_covariance_mm2 : (3 m, 3 m). pose_covariance : (n, 6, 6) for
+    known points. coupling : (n, 6, 3 m), change of the pose (rotation vector, translation) with an error of the points.
+    misfit : root of the cost over its degrees of freedom ``freedom``; 1 where noise and priors are as stated.
     """
 
     turned_mm: Array
@@ -75,11 +75,14 @@ class AdjustedBody:
 
     @property
     def positions_mm(self) -> Array:
-        """(n, m, 3) in the world."""
+        """World positions (n, m, 3)."""
         return self.turned_mm + self.centres_mm[:, None]
 
     def covariance_mm2(self, frame: int) -> Array:
-        """Joint covariance of all positions in one of the n frames, shape (m, 3, m, 3): the bound with the priors counted in."""
+        """Return the joint covariance (m, 3, m, 3) of all positions in one of the n frames.
+
+        It is the Cramer-Rao bound with the priors included.
+        """
         m = self.turned_mm.shape[1]
         of_pose = point_jacobian(self.turned_mm[frame]).reshape(3 * m, 6)
         of_points = np.kron(np.eye(m), self.rotations[frame]) - of_pose @ self.coupling[frame]
@@ -108,9 +111,12 @@ class _Normal:
 
 
 def adjust(view: BodyView, rotations: Array, centres_mm: Array) -> AdjustedBody:
-    """Maximum a-posteriori points and poses by Levenberg-Marquardt, from poses (n, 3, 3), (n, 3) about the prior's mean.
+    """Find the maximum a-posteriori points and poses by Levenberg-Marquardt.
 
-    The poses handed in for the a-priori frame are not used.
+    Parameters
+    ----------
+    rotations, centres_mm : ndarray, shape (n, 3, 3), (n, 3)
+        Start poses about the prior's mean. The pose of the a-priori frame is ignored: it is known.
     """
     start_rotations, start_centres = rotations.copy(), centres_mm.copy()
     start_rotations[view.start], start_centres[view.start] = np.eye(3), view.origin_mm
@@ -118,7 +124,7 @@ def adjust(view: BodyView, rotations: Array, centres_mm: Array) -> AdjustedBody:
     neighbours = (
         _second_differences(view.frames) if view.acceleration_sd is not None else np.zeros((0, len(centres_mm)))
     )
-    information = np.asarray(np.linalg.inv(view.covariance_px2) * view.seen[..., None, None], dtype=np.float64)
+    information = np.asarray(np.linalg.inv(view.covariance_px2) * view.visible[..., None, None], dtype=np.float64)
     normal = _linearise(view, information, neighbours, state)
     damping = 1e-6
     for _ in range(_STEPS):
@@ -127,25 +133,25 @@ def adjust(view: BodyView, rotations: Array, centres_mm: Array) -> AdjustedBody:
         of_points = cho_solve(cho_factor(reduced), normal.of_points - normal.coupling.T @ by_poses[:, -1])
         of_poses = by_poses[:, -1] - by_poses[:, :-1] @ of_points
         moved = of_poses.reshape(-1, 6)
-        tried = _State(
+        trial = _State(
             state.points + of_points.reshape(-1, 3),
             rotation_of(moved[:, :3]) @ state.rotations,
             state.centres + moved[:, 3:],
         )
-        tried_normal = _linearise(view, information, neighbours, tried)
-        gained = normal.cost - tried_normal.cost
+        trial_normal = _linearise(view, information, neighbours, trial)
+        gained = normal.cost - trial_normal.cost
         if gained >= 0:
-            state, normal = tried, tried_normal
+            state, normal = trial, trial_normal
             damping *= 0.1
         else:
             damping *= 100
         if abs(gained) <= _CONVERGED * normal.cost:
             break
-    return _answer(view, normal, neighbours, state)
+    return _adjusted_body(view, normal, neighbours, state)
 
 
 def _second_differences(frames: IntArray) -> Array:
-    """(triples, n), rows 1 -2 1 where three frames follow each other without a gap."""
+    """Return the matrix (triples, n) with a row 1 -2 1 for each three consecutive frames."""
     middle = [k for k in range(1, len(frames) - 1) if frames[k + 1] - frames[k - 1] == 2]
     rows = np.zeros((len(middle), len(frames)))
     for row, k in zip(rows, middle, strict=True):
@@ -154,10 +160,10 @@ def _second_differences(frames: IntArray) -> Array:
 
 
 def _linearise(view: BodyView, information: Array, neighbours: Array, state: _State) -> _Normal:
-    n, m = view.seen.shape
+    n, m = view.visible.shape
     turned = state.points @ np.swapaxes(state.rotations, 1, 2)
     positions = turned + state.centres[:, None]
-    residual = np.where(view.seen[..., None], view.pixels_uv - view.camera.project(positions), 0.0)
+    residual = np.where(view.visible[..., None], view.pixels_uv - view.camera.project(positions), 0.0)
     by_pose = pose_jacobian(view.camera, turned, state.centres)
     by_point = view.camera.jacobian(positions) @ state.rotations[:, None]
     weighted = information @ residual[..., None]
@@ -205,8 +211,8 @@ def _stiffness(acceleration_sd: tuple[float, float]) -> Array:
 
 
 def _eliminate(view: BodyView, normal: _Normal, neighbours: Array, damping: float) -> tuple[tuple[Array, bool], Array]:
-    """Cholesky factor of the poses' band, and what the points' (3 m, 3 m) equations are without the poses."""
-    n, m = view.seen.shape
+    """Return the Cholesky factor of the poses' band, and the points' (3 m, 3 m) equations without the poses."""
+    n, m = view.visible.shape
     poses = normal.poses * (1 + damping * np.eye(6))
     reach = 18 if view.acceleration_sd is not None else 6
     band = np.zeros((reach, 6 * n))
@@ -225,8 +231,8 @@ def _eliminate(view: BodyView, normal: _Normal, neighbours: Array, damping: floa
     return factor, reduced
 
 
-def _answer(view: BodyView, normal: _Normal, neighbours: Array, state: _State) -> AdjustedBody:
-    n, m = view.seen.shape
+def _adjusted_body(view: BodyView, normal: _Normal, neighbours: Array, state: _State) -> AdjustedBody:
+    n, m = view.visible.shape
     band, reduced = _eliminate(view, normal, neighbours, 0.0)
     pose_covariance = np.empty((n, 6, 6))
     for frame in range(n):
@@ -234,8 +240,8 @@ def _answer(view: BodyView, normal: _Normal, neighbours: Array, state: _State) -
         unit = np.zeros((6 * n, 6))
         unit[own] = np.eye(6)
         pose_covariance[frame] = cho_solve_banded(band, unit)[own]
-    # Points and the a-priori displacement count as measured, by their priors.
-    freedom = 2 * int(view.seen.sum()) - 6 * (n - 1) + 6 * len(neighbours)
+    # The priors measure the points and the a-priori displacement, so that these cost no degree of freedom.
+    freedom = 2 * int(view.visible.sum()) - 6 * (n - 1) + 6 * len(neighbours)
     return AdjustedBody(
         turned_mm=state.points @ np.swapaxes(state.rotations, 1, 2),
         rotations=state.rotations,

@@ -1,4 +1,4 @@
-"""Distances between a catheter's electrodes that hold in every frame."""
+"""Distances between a catheter's electrodes that are the same in every frame."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ _BELIEVED_MM = 0.5
 
 
 def catheter_lengths(catalogue: Catalogue, labels: tuple[tuple[str, int], ...], expected_mm: Array) -> Lengths:
-    """Lengths between neighbours and next-but-one electrodes of each catheter.
+    """Return the lengths between neighbours and next-but-one electrodes of each catheter.
 
-    Neighbours are as far apart as the catalogue says, where the expected positions (n, m, 3) agree with it to 0.5 mm;
-    else, and for electrodes farther along a shaft that may bend, as far as they are expected to be, less strictly.
+    - Neighbours get the catalogue's distance where the expected positions (n, m, 3) agree with it to 0.5 mm.
+    - Other neighbours, and next-but-one electrodes on a shaft that may bend, get the expected distance with a larger
+      standard deviation.
     """
     first, second, lengths, sds = [], [], [], []
     for name in dict.fromkeys(catheter for catheter, _ in labels):

@@ -1,4 +1,4 @@
-"""A site's biplane cycle as a smooth closed curve: where each electrode is at any phase, how fast, and how surely."""
+"""A site's biplane cycle as a smooth closed curve: position, velocity and uncertainty at any phase."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ class CycleCurve:
     covariance: Array
 
     def positions_mm(self, phases: Array) -> Array:
-        """World positions at phases (n,), shape (n, m, 3)."""
+        """Return world positions at phases (n,), shape (n, m, 3)."""
         found: Array = self.mean_mm + np.einsum("nk,kmi->nmi", _waves(phases), self.coefficients)
         return found
 
     def velocities_mm(self, phases: Array) -> Array:
-        """Derivatives by phase at phases (n,), mm a cycle, shape (n, m, 3)."""
+        """Return derivatives by phase at phases (n,), mm a cycle, shape (n, m, 3)."""
         found: Array = np.einsum("nk,kmi->nmi", _wave_slopes(phases), self.coefficients)
         return found
 
     def sd_mm(self, phases: Array) -> Array:
-        """Standard deviation of one coordinate at phases (n,), from gaps and scatter of the moments, shape (n,)."""
+        """Return the standard deviation (n,) of one coordinate at phases (n,), from gaps and scatter of the moments."""
         waves = _waves(phases)
         found: Array = np.sqrt(np.einsum("nk,kl,nl->n", waves, self.covariance, waves))
         return found
 
 
 def fit_cycle(cycle: SiteCycle) -> CycleCurve:
-    """Fit a cycle's moments by ridge regression on harmonics whose expected strength falls with their order.
+    """Fit a cycle's moments by ridge regression on harmonics.
 
-    How fast it falls and how strongly the moments scatter are those of greatest evidence, so that a dense cycle is
-    averaged over its beats and a sparse one is not overdrawn.
+    The expected strength of the harmonics falls with their order. The evidence chooses how fast it falls and how strongly
+    the moments scatter, so that a dense cycle is averaged over its beats and a sparse one is not overfitted.
     """
     mean = cycle.positions_mm.mean(axis=0)
     flat = (cycle.positions_mm - mean).reshape(len(cycle.phases), -1)
@@ -65,7 +65,13 @@ def fit_cycle(cycle: SiteCycle) -> CycleCurve:
 
 
 def _evidence(waves: Array, flat: Array, width: float) -> tuple[float, float, float, float]:
-    """Greatest log evidence over the ratio of scatter to motion, with the width, that ratio and the motion's variance."""
+    """Return the greatest log evidence over the ratio of scatter to motion.
+
+    Returns
+    -------
+    tuple
+        Log evidence, width, ratio of scatter to motion, variance of the motion in mm^2.
+    """
     moments, columns = flat.shape
     left, sizes, _ = np.linalg.svd(waves, full_matrices=False)
     shares = ((left.T @ flat) ** 2).sum(axis=1)
@@ -79,7 +85,7 @@ def _evidence(waves: Array, flat: Array, width: float) -> tuple[float, float, fl
 
 
 def _strengths(width: float) -> Array:
-    """Expected size of the constant, the cosines and the sines; ``width`` how soon it falls with the order."""
+    """Return the expected size of the constant, the cosines and the sines; it falls faster for a larger ``width``."""
     falling = np.exp(-0.5 * (width * _HARMONICS) ** 2)
     return np.concatenate([[1.0], falling, falling])
 

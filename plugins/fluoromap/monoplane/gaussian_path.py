@@ -1,8 +1,8 @@
-"""Paths of electrodes under a Gaussian prior, and what one view's pixels and the catheters' lengths make of them.
+"""Most probable paths of electrodes under a Gaussian prior, given one view's pixels and the catheters' lengths.
 
-Positions x (n frames, m electrodes, 3) are ``mean + columns @ w + e``: ``w`` (q,) unit normal coefficients of everything that
-lasts longer than a frame, ``e`` what each frame has of its own. Everything is solved frame by frame given ``w``, so the
-cost is linear in the frames.
+Positions x (n frames, m electrodes, 3) are ``mean + columns @ w + e``. The unit normal coefficients ``w`` (q,) describe all
+deviations that last longer than a frame; ``e`` is each frame's own deviation. Given ``w`` the frames are independent, so
+that the cost is linear in their number.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _SETTLED_MM = 0.005
 
 @dataclass(frozen=True, eq=False)
 class PathPrior:
-    """What is expected of the paths before the view is looked at.
+    """Prior of the paths, before the view's pixels are used.
 
-    mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. parts : (q,) the part each column
-    belongs to; the columns of part p > 0 are multiplied by the square root of its gain. white_mm2 : (n, 3 m, 3 m) of each
-    frame's own share.
+    mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. parts : (q,) the part of each
+    column; the columns of part p > 0 are multiplied by the square root of its gain. white_mm2 : (n, 3 m, 3 m) covariance of
+    each frame's own deviation.
     """
 
     mean_mm: Array
@@ -36,7 +36,7 @@ class PathPrior:
     white_mm2: Array
 
     def variance_mm2(self, gains: Array, parts: Sequence[int], directions: Array) -> Array:
-        """Prior variance (n, m) along unit directions (n, m, 3), of some parts and the white share."""
+        """Return the prior variance (n, m) along unit directions (n, m, 3), of some parts and the white share."""
         chosen = np.isin(self.parts, parts)
         along = np.einsum("nmi,nmiq->nmq", directions, self.columns_mm[..., chosen])
         white = np.einsum("nmi,nmij,nmj->nm", directions, _own_blocks(self.white_mm2), directions)
@@ -46,7 +46,10 @@ class PathPrior:
 
 @dataclass(frozen=True, eq=False)
 class Lengths:
-    """Distances that a catheter keeps: between electrodes first (k,) and second (k,), mm (n, k), with their sd (k,)."""
+    """Lengths between electrodes of a catheter.
+
+    first, second : (k,) electrodes. lengths_mm : (n, k). sd_mm : (k,) standard deviations.
+    """
 
     first: IntArray
     second: IntArray
@@ -56,7 +59,7 @@ class Lengths:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What one view shows. pixels_uv : (n, m, 2), covariance_px2 : (n, m, 2, 2), used : (n, m)."""
+    """Data of one view: pixels_uv (n, m, 2), covariance_px2 (n, m, 2, 2), used (n, m), and the catheters' lengths."""
 
     camera: Camera
     pixels_uv: Array
@@ -67,7 +70,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """The evidence about ``positions``: residual (n, r), its slope by position (n, r, 3 m) and its noise (n, r, r)."""
+    """The linearised evidence: residual (n, r), its slope by position (n, r, 3 m) and its noise (n, r, r)."""
 
     residual: Array
     slope: Array
@@ -103,10 +106,10 @@ def _linearise(evidence: Evidence, positions_mm: Array) -> _Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class _Whitened:
-    """The evidence with unit noise, each frame's own share integrated out.
+class _WhiteEvidence:
+    """The evidence with unit noise; each frame's own deviation is integrated out.
 
-    gap : (n, r) from what the prior's mean foretells. by_position : (n, r, 3 m) and by_w : (n, r, q) its slopes.
+    gap : (n, r) difference from the prior mean's prediction. by_position : (n, r, 3 m), by_w : (n, r, q) its slopes.
     """
 
     gap: Array
@@ -114,38 +117,38 @@ class _Whitened:
     by_w: Array
 
     def information(self) -> tuple[Array, Array]:
-        """Of ``w``: matrix (q, q) and vector (q,)."""
+        """Return the information on ``w``: matrix (q, q) and vector (q,)."""
         flat = self.by_w.reshape(-1, self.by_w.shape[2])
         return flat.T @ flat, flat.T @ self.gap.reshape(-1)
 
 
-def _whitened(evidence: Evidence, prior: PathPrior, columns: Array, positions_mm: Array) -> _Whitened:
-    """Linearised at ``positions_mm``; ``columns`` (n, 3 m, q)."""
+def _whiten(evidence: Evidence, prior: PathPrior, columns: Array, positions_mm: Array) -> _WhiteEvidence:
+    """Linearise the evidence at ``positions_mm`` and whiten it; ``columns`` (n, 3 m, q)."""
     linear = _linearise(evidence, positions_mm)
     from_mean = (positions_mm - prior.mean_mm).reshape(len(columns), -1, 1)
     gap = linear.residual[..., None] + linear.slope @ from_mean
     spread = linear.noise + linear.slope @ prior.white_mm2 @ np.swapaxes(linear.slope, 1, 2)
     whiten = np.linalg.inv(np.linalg.cholesky(spread))
     by_position = whiten @ linear.slope
-    return _Whitened((whiten @ gap)[..., 0], by_position, by_position @ columns)
+    return _WhiteEvidence((whiten @ gap)[..., 0], by_position, by_position @ columns)
 
 
 def estimate_gains(prior: PathPrior, evidence: Evidence, at_mm: Array, choices: Sequence[Sequence[float]]) -> Array:
-    """Gains (1 + parts,) of greatest marginal likelihood, by coordinate ascent over ``choices`` of each part from 1 on.
+    """Estimate the gains (1 + parts,) of greatest marginal likelihood.
 
-    A log-normal prior round 1, 1.5 standard deviation, keeps them where the view says nothing. The first entry, of the
-    fixed part, is 1.
+    Coordinate ascent chooses among ``choices`` for each part from 1 on. A log-normal prior around 1 with standard deviation
+    1.5 keeps a gain near 1 where the view shows nothing about it. The first entry, of the fixed part, is 1.
     """
     columns = prior.columns_mm.reshape(len(at_mm), -1, len(prior.parts))
-    information, vector = _whitened(evidence, prior, columns, at_mm).information()
+    information, vector = _whiten(evidence, prior, columns, at_mm).information()
     gains = np.ones(1 + len(choices))
 
-    def likelihood(tried: Array) -> float:
-        scale = np.sqrt(tried)[prior.parts]
+    def likelihood(trial: Array) -> float:
+        scale = np.sqrt(trial)[prior.parts]
         whole = scale[:, None] * information * scale + np.eye(len(scale))
         factor = cho_factor(whole, lower=True, overwrite_a=True, check_finite=False)
         explained = (scale * vector) @ cho_solve(factor, scale * vector, check_finite=False)
-        penalty = (np.log(tried) ** 2).sum() / _GAIN_PRIOR_SD**2
+        penalty = (np.log(trial) ** 2).sum() / _GAIN_PRIOR_SD**2
         return float(0.5 * explained - np.log(np.diag(factor[0])).sum() - 0.5 * penalty)
 
     best = likelihood(gains)
@@ -153,10 +156,10 @@ def estimate_gains(prior: PathPrior, evidence: Evidence, at_mm: Array, choices: 
         before = gains
         for part, values in enumerate(choices, start=1):
             for value in values:
-                tried = gains.copy()
-                tried[part] = value
-                if value != gains[part] and (found := likelihood(tried)) > best:
-                    best, gains = found, tried
+                trial = gains.copy()
+                trial[part] = value
+                if value != gains[part] and (found := likelihood(trial)) > best:
+                    best, gains = found, trial
         if gains is before:
             break
     return gains
@@ -164,39 +167,42 @@ def estimate_gains(prior: PathPrior, evidence: Evidence, at_mm: Array, choices: 
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Most probable positions (n, m, 3) and the joint covariance (n, 3 m, 3 m) of each frame's electrodes, mm^2."""
+    """Most probable positions (n, m, 3), mm, and the joint covariance (n, 3 m, 3 m) of each frame's electrodes, mm^2."""
 
     positions_mm: Array
     covariance_mm2: Array
 
 
 def most_probable(prior: PathPrior, evidence: Evidence, gains: Array, start_mm: Array, steps: int) -> Paths:
-    """Maximum a posteriori by Gauss-Newton from ``start_mm`` on, with the covariance of the last linearisation."""
+    """Find the most probable paths by Gauss-Newton from ``start_mm``.
+
+    The covariance is that of the last linearisation.
+    """
     n, m = start_mm.shape[:2]
     columns = (prior.columns_mm * np.sqrt(gains)[prior.parts]).reshape(n, 3 * m, -1)
     positions = start_mm
     for _ in range(steps):
-        seen = _whitened(evidence, prior, columns, positions)
-        information, vector = seen.information()
+        white = _whiten(evidence, prior, columns, positions)
+        information, vector = white.information()
         factor = np.linalg.cholesky(information + np.eye(len(vector)))
         w = cho_solve((factor, True), vector, check_finite=False)
-        share = prior.white_mm2 @ np.swapaxes(seen.by_position, 1, 2)
-        moved = columns @ w + (share @ (seen.gap - seen.by_w @ w)[..., None])[..., 0]
+        share = prior.white_mm2 @ np.swapaxes(white.by_position, 1, 2)
+        moved = columns @ w + (share @ (white.gap - white.by_w @ w)[..., None])[..., 0]
         found = prior.mean_mm + moved.reshape(n, m, 3)
         settled = np.abs(found - positions).max() < _SETTLED_MM
         positions = found
         if settled:
             break
-    left = (columns - share @ seen.by_w).reshape(n * 3 * m, -1)
+    left = (columns - share @ white.by_w).reshape(n * 3 * m, -1)
     half = solve_triangular(factor, left.T, lower=True, check_finite=False).T.reshape(n, 3 * m, -1)
     covariance = half @ np.swapaxes(half, 1, 2) + prior.white_mm2 - share @ np.swapaxes(share, 1, 2)
     return Paths(positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2)
 
 
 def surprise(prior: PathPrior, evidence: Evidence, at_mm: Array) -> Array:
-    """How far the pixels (n, m) lie from where the prior expects them, in its standard deviations (RMS of both axes).
+    """Return the distance (n, m) of the pixels from the prior's expectation, in standard deviations.
 
-    Linearised at ``at_mm``; 0 for electrodes that are not used.
+    The distance is the RMS of both axes, linearised at ``at_mm``; 0 for electrodes that are not used.
     """
     jacobian = evidence.camera.jacobian(at_mm)
     by_w = np.einsum("nmki,nmiq->nmkq", jacobian, prior.columns_mm)
@@ -210,7 +216,7 @@ def surprise(prior: PathPrior, evidence: Evidence, at_mm: Array) -> Array:
 
 
 def _own_blocks(covariance: Array) -> Array:
-    """The (n, m, 3, 3) blocks on the diagonal of (n, 3 m, 3 m)."""
+    """Return the diagonal blocks (n, m, 3, 3) of (n, 3 m, 3 m)."""
     n, m = len(covariance), covariance.shape[1] // 3
     blocks: Array = np.einsum("nmimj->nmij", covariance.reshape(n, m, 3, m, 3))
     return blocks

@@ -1,4 +1,4 @@
-"""How far the electrodes may be from where they are expected: the parts of the prior's covariance."""
+"""Covariance of the motion prior: all ways in which electrodes deviate from their expected motion."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
-from fluoromap.monoplane.observed_view import isocentre_covariance_mm2
+from fluoromap.monoplane.view_electrodes import isocentre_covariance_mm2
 
 FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29
-"""An R wave, or any moment, is told to the nearest frame: that of an even distribution one frame wide."""
+"""An R wave is timed to the nearest frame: standard deviation of a uniform distribution one frame wide."""
 _SYSTOLE_PHASE = 0.3
 _ALIGNED_SD_CYCLE = 0.01
 _OFFSET_HARMONICS, _SHAPE_HARMONICS = 4, 3
 _LASTING_SHARE = 0.7
 _STRAY_CYCLE_MM, _STRAY_POINT_MM = 0.03, 0.05
-"""An electrode's own error: pixel noise is averaged over a cycle's moments, but whole in a point."""
+"""An electrode's own error from pixel noise: averaged over the moments of a cycle, not averaged in a single point."""
 
 
 class MotionParams(BaseModel, extra="forbid"):
-    """How hearts, breaths, catheters and gantries differ from what was expected of them; standard deviations."""
+    """Deviations of heart, breathing, catheters and gantry from the expectation; standard deviations."""
 
     respiration_head_feet_sd_mm: float = Field(
         4.0, ge=0, le=30, description="Breathing position of the heart in this run along the patient's long axis, mm."
@@ -58,7 +58,7 @@ class MotionParams(BaseModel, extra="forbid"):
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
 
     def respiration_sd_mm(self) -> Array:
-        """(3,) along the patient's axes."""
+        """Return the breathing standard deviations (3,) along the patient's axes, mm."""
         other, head = self.respiration_other_sd_mm, self.respiration_head_feet_sd_mm
         return np.array([other, other, head])
 
@@ -66,7 +66,7 @@ class MotionParams(BaseModel, extra="forbid"):
 class MotionCovariance:
     """The prior of one run, window by window.
 
-    expected : of all its frames. phases : (n,). rays : (n, m, 3) unit directions of the followed view through the mean.
+    expected : for all its frames. phases : (n,). rays : (n, m, 3) unit directions from the source through the mean.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class MotionCovariance:
         self.rays: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def window(self, frames: slice) -> PathPrior:
-        """The prior of consecutive frames, about one beat."""
+        """Return the prior of consecutive frames, about one beat."""
         columns, parts = [], []
         for part, block in self._parts(frames):
             columns.append(block)
@@ -93,7 +93,7 @@ class MotionCovariance:
         return PathPrior(mean, np.concatenate(columns, axis=-1), np.array(parts), self._white(frames))
 
     def _parts(self, frames: slice) -> Iterator[tuple[int, Array]]:
-        """Columns (n, m, 3, k) with the part they belong to."""
+        """Yield columns (n, m, 3, k) with their part."""
         p, expected = self._params, self._expected
         mean = expected.mean_mm[frames]
         n, m = mean.shape[:2]
@@ -101,17 +101,18 @@ class MotionCovariance:
         everywhere = np.ones((n, m, 1, 1))
         isocentre = isocentre_covariance_mm2(self._camera, p.isocentre_sd_mm)
         yield FIXED, everywhere * _root(expected.common_mm2 + np.diag(breath**2) + isocentre)
-        # What two views tell holds for the middle of their runs' breaths. This run's own breath is as far from there as
-        # the other one's, which alone has told the depth: along the ray the error is twice what it is to the middle.
+        # Biplane positions are those at the middle of the two runs' breathing positions. This run's breathing position is
+        # as far from the middle as the other run's. The other run alone measured the depth, so that the error along the
+        # ray is twice the distance to the middle.
         depth = min(self._axis @ expected.common_mm2 @ self._axis, self._axis @ np.diag(breath**2) @ self._axis / 2)
         yield FIXED, everywhere * np.sqrt(depth) * self._axis[:, None]
         if breath.max() > 0:
             drift = p.respiration_drift_sd_mm * breath / breath.max()
             yield FIXED, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
-        # The other view, turned about the isocentre by a wrong angle, has told a depth that is wrong by what it was turned.
+        # The other view measured the depth; its wrong gantry angle rotates that depth about the isocentre.
         turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
         yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
-        # This view is turned as well: what it shows of the turn must not be taken for another size, which would be depth.
+        # This view's wrong angle is a source of its own, else its effect would be taken for another size, that is depth.
         yield FIXED, turned * np.radians(p.gantry_angle_sd_deg)
         yield FIXED, (mean * p.magnification_sd)[..., None]
         yield from self._beats(frames, self.rays[frames])
@@ -119,7 +120,7 @@ class MotionCovariance:
             yield from self._free(frames)
 
     def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, Array]]:
-        """What differs between this beat and the mean one, and between the mean one of this run and of the other view's."""
+        """Yield the differences between this beat and the mean beat, and between the mean beats of the two views."""
         p, expected = self._params, self._expected
         if not expected.beats:
             return
@@ -133,7 +134,7 @@ class MotionCovariance:
         for name in self._catheters:
             yield FIXED, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
         if expected.own_cycle:
-            # Depth comes from the other view's run: its beats differ in what this view cannot show.
+            # Depth comes from the other view's run, and this view cannot show how that run's beats differ.
             yield FIXED, _along(rays, moved * p.beat_amplitude_sd * averaged)
             yield (
                 FIXED,
@@ -141,7 +142,7 @@ class MotionCovariance:
             )
 
     def _free(self, frames: slice) -> Iterator[tuple[int, Array]]:
-        """Each catheter's offset, tilt and bend over the beat, whose sizes the view itself tells."""
+        """Yield each catheter's offset, tilt and bend over the beat; the view itself determines their sizes."""
         offset_sd = np.hypot(self._expected.offset_sd_mm[frames], self._params.beat_sd_mm)
         slow, fast = (_over_cycle(self._phases[frames], k) for k in (_SHAPE_HARMONICS, _OFFSET_HARMONICS))
         for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
@@ -152,13 +153,16 @@ class MotionCovariance:
             yield BEND, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
 
     def _looseness(self, name: str) -> tuple[float, float]:
-        """Tilt in radians and bend in mm at the ends, between what is expected of a catheter's shape and what it is."""
+        """Return a catheter's deviation from its expected shape: tilt in radians, bend in mm at the ends."""
         if self._expected.own_cycle:
             return 0.02, 0.08
         return (0.045, 0.2) if name == self._mapping else (0.02, 0.05)
 
     def _white(self, frames: slice) -> Array:
-        """Each frame's own share (n, 3 m, 3 m): small where a cycle is known, all of the motion where none is."""
+        """Return the covariance (n, 3 m, 3 m) of each frame's own deviation.
+
+        It is small where a cycle is known, and contains all of the motion where none is.
+        """
         known = bool(self._expected.beats)
         offset_sd = self._expected.offset_sd_mm[frames]
         n, m = offset_sd.shape
@@ -179,7 +183,7 @@ class MotionCovariance:
 
 
 def _shapes(catalogue: Catalogue, labels: tuple[tuple[str, int], ...], name: str) -> tuple[Array, Array]:
-    """Patterns (m,) of a catheter's tilt (mm from its middle) and bend (1 at its ends), 0 for other catheters."""
+    """Return patterns (m,) of a catheter's tilt (mm from its middle) and bend (1 at its ends); 0 for other catheters."""
     own = np.array([catheter == name for catheter, _ in labels])
     along = np.array(
         [catalogue[name].arc_lengths_mm[electrode - 1] if catheter == name else 0.0 for catheter, electrode in labels]
@@ -192,7 +196,7 @@ def _shapes(catalogue: Catalogue, labels: tuple[tuple[str, int], ...], name: str
 
 
 def _over_cycle(phases: Array, harmonics: int) -> Array:
-    """Unit-variance courses (n, 1 + 2 h) over the cycle: a lasting one and waves whose strength falls as h^-1.5."""
+    """Return unit-variance courses (n, 1 + 2 h) over the cycle: a constant, and waves whose strength falls as h^-1.5."""
     order = np.arange(1, harmonics + 1)
     shares = order**-3.0 / (order**-3.0).sum() * (1 - _LASTING_SHARE)
     angle = 2 * np.pi * phases[:, None] * order
@@ -201,7 +205,7 @@ def _over_cycle(phases: Array, harmonics: int) -> Array:
 
 
 def _in_time(courses: Array, displacements: Array) -> Array:
-    """Columns (n, m, 3, 3 k): each course (n, k) of each displacement (n, m, 3, 3) or (m, 3, 3)."""
+    """Return columns (n, m, 3, 3 k): each course (n, k) times each displacement (n, m, 3, 3) or (m, 3, 3)."""
     n, m = len(courses), displacements.shape[-3]
     everywhere = np.broadcast_to(displacements, (n, m, 3, 3))
     columns: Array = np.einsum("nk,nmij->nmijk", courses, everywhere).reshape(n, m, 3, -1)
@@ -209,7 +213,7 @@ def _in_time(courses: Array, displacements: Array) -> Array:
 
 
 def _along(rays: Array, columns: Array) -> Array:
-    """The share of columns (n, m, 3, k) along the rays (n, m, 3)."""
+    """Return the part of columns (n, m, 3, k) along the rays (n, m, 3)."""
     share: Array = rays[..., None] * np.einsum("nmi,nmik->nmk", rays, columns)[..., None, :]
     return share
 

@@ -1,4 +1,4 @@
-"""How an electrode moves, told by the cycles of other sites: the heart wall's motion as a field over place and phase."""
+"""Motion of an electrode predicted from the cycles of other sites: a field over place and phase."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _ALONE_SHARE = 0.5
 class Displacements:
     """Displacements of electrodes since one moment of the cycle.
 
-    moved_mm, velocity_mm : (n, m, 3), the latter a cycle. sd_mm : (n, m) an axis, how far sites differ from what the
-    others foretell.
+    moved_mm : (n, m, 3). velocity_mm : (n, m, 3), mm a cycle. sd_mm : (n, m) an axis, deviation of sites from the
+    prediction of the others.
     """
 
     moved_mm: Array
@@ -36,18 +36,18 @@ def displacements(
     start: float,
     roving: str,
 ) -> Displacements:
-    """Foretell how electrodes at ``places_mm`` (m, 3) move from phase ``start`` to ``phases`` (n,).
+    """Predict the displacements of electrodes at ``places_mm`` (m, 3) from phase ``start`` to ``phases`` (n,).
 
-    The roving catheter follows the field d(phase, place) = a + B place, by ridge regression over the roving electrodes
-    of all curves; a catheter that stays in its place moves as it does at the other sites, on average. Their spread is
-    measured by leaving out one site after the other.
+    The roving catheter follows the field d(phase, place) = a + B place, a ridge regression over the roving electrodes
+    of all curves. A resting catheter moves as at the other sites on average. Leaving out each site in turn measures the
+    spread.
 
     Parameters
     ----------
     curves : sequence of CycleCurve
-        Cycles of other sites. A catheter that none of them knows keeps its place, with an infinite ``sd_mm``.
+        Cycles of other sites. A catheter that is in none of them keeps its place, with an infinite ``sd_mm``.
     labels : sequence of (catheter, electrode)
-        Of the m electrodes.
+        Labels of the m electrodes.
     roving : str
         Name of the mapping catheter.
     """
@@ -60,30 +60,31 @@ def displacements(
         sites = [site for curve in curves if (site := _site(curve, catheter, at, wanted)) is not None]
         if not sites:
             continue
-        foretell = _from_field if catheter == roving else _from_average
-        both = foretell(sites, places_mm[own])
+        predict = _predict_from_field if catheter == roving else _predict_from_average
+        both = predict(sites, places_mm[own])
         moved[:, own], velocity[:, own] = both[:n], both[n:]
         if len(sites) > 1:
             misses = [
-                (foretell([*sites[:k], *sites[k + 1 :]], place) - path)[:n].mean(axis=1)
+                (predict([*sites[:k], *sites[k + 1 :]], place) - path)[:n].mean(axis=1)
                 for k, (place, path) in enumerate(sites)
             ]
             spread = np.sqrt(np.mean(np.square(misses), axis=(0, 2)))
         else:
-            # One site alone cannot tell how much sites differ.
+            # A single site does not show how much sites differ.
             spread = _ALONE_SHARE * np.sqrt((both[:n] ** 2).mean(axis=(1, 2)))
         sd[:, own] = spread[:, None]
     return Displacements(moved, velocity, sd)
 
 
 Site = tuple[Array, Array]
-"""Places (k, 3) of a catheter's electrodes and what they do there (t, k, 3)."""
+"""Places (k, 3) of a catheter's electrodes, and their displacements and velocities there (t, k, 3)."""
 
 
 def _site(curve: CycleCurve, catheter: str, at: Array, wanted: Sequence[int] | None) -> Site | None:
-    """A catheter's displacements from the first phase of ``at`` to the others, then its velocities there.
+    """Return a catheter's displacements from the first phase of ``at`` to the others, then its velocities there.
 
-    Of its own electrodes, or of the ``wanted`` numbers: those that this site does not know move as their neighbours do.
+    The electrodes are those of the site, or the numbers ``wanted``; the site's neighbours are interpolated for numbers
+    that it lacks.
     """
     rows = sorted((electrode, row) for row, (name, electrode) in enumerate(curve.labels) if name == catheter)
     if not rows:
@@ -98,8 +99,8 @@ def _site(curve: CycleCurve, catheter: str, at: Array, wanted: Sequence[int] | N
     return np.einsum("km,ki->mi", shares, places[0]), np.einsum("km,tki->tmi", shares, paths)
 
 
-def _from_field(sites: Sequence[Site], places_mm: Array) -> Array:
-    """Ridge regression on place, shape (t, m, 3)."""
+def _predict_from_field(sites: Sequence[Site], places_mm: Array) -> Array:
+    """Predict paths (t, m, 3) by ridge regression on place."""
     known = np.concatenate([place for place, _ in sites])
     done = np.concatenate([path for _, path in sites], axis=1)
     middle = known.mean(axis=0)
@@ -110,8 +111,8 @@ def _from_field(sites: Sequence[Site], places_mm: Array) -> Array:
     return found
 
 
-def _from_average(sites: Sequence[Site], places_mm: Array) -> Array:
-    """The mean path of each electrode over the sites, shape (t, m, 3); where the electrodes are does not matter."""
+def _predict_from_average(sites: Sequence[Site], places_mm: Array) -> Array:
+    """Return the mean path (t, m, 3) of each electrode over the sites; ``places_mm`` is not used."""
     mean: Array = np.mean([path for _, path in sites], axis=0)
     return mean
 

@@ -1,4 +1,4 @@
-"""Depth over the whole cardiac cycle from what two views have told about the motion, refined by what one view shows."""
+"""Depth over the whole cardiac cycle: motion expected from two views, refined by the pixels of one view."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from pydantic import Field
 from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, Track
 from fluoromap.geometry import Camera
 from fluoromap.monoplane.catheter_lengths import catheter_lengths
-from fluoromap.monoplane.expected_motion import expect
+from fluoromap.monoplane.expected_motion import expected_motion
 from fluoromap.monoplane.gaussian_path import Evidence, PathPrior, estimate_gains, most_probable, surprise
 from fluoromap.monoplane.motion_covariance import BEND, FIXED, OFFSET, TILT, MotionCovariance, MotionParams
-from fluoromap.monoplane.observed_view import ObservedView, lateral_covariance_mm2, observe, turned_covariance_mm2
+from fluoromap.monoplane.view_electrodes import (
+    ViewElectrodes,
+    gantry_angle_covariance_mm2,
+    gather_electrodes,
+    lateral_covariance_mm2,
+)
 from fluoromap.reasons import Reason
 
 _STEPS = 5
 _GAINS = ((1.0, 2.0, 4.0), (0.25, 1.0, 4.0, 16.0, 64.0), (0.25, 1.0, 4.0, 16.0, 64.0))
-"""Of offset, tilt and bend. That the view agrees with the cycle across its rays does not make the depth more certain."""
+"""Choices of the gain of offset, tilt and bend. An offset's gain is never below 1: agreement of the view with the cycle across
+its rays does not make the depth more certain."""
 _LOOSER, _LOOSENINGS = 8.0, 3
 _LONGEST_WINDOW = 64
 _IRREGULAR = 0.15
@@ -31,15 +37,20 @@ _MIRRORED_SHARE = 0.5
 class MotionPrior:
     """Monoplane solver ``motion-prior``.
 
-    One view shows no depth; two views have, at other times. The expected path of each electrode is the site's own biplane
-    cycle at the frame's phase, else its diastolic point moved as the other sites' cycles move, else that point. The
-    answer is the most probable path given the pixels, the catheters' lengths and how far beats, breaths and catheters
-    differ from what is expected; how loosely a catheter keeps its shape is estimated from the view itself. Beside it
-    stands the plain back-projection at the expected depth, which also takes over where view and expectation disagree.
+    One view shows no depth; two views showed it at other times. The expected path of each electrode comes from the first
+    source that is known:
+
+    - the site's own biplane cycle at the frame's phase,
+    - the diastolic point, displaced as the other sites' cycles,
+    - the diastolic point.
+
+    The result is the most probable path, given the pixels, the catheters' lengths, and the variation of beats, breathing
+    and catheters. The view itself determines how loosely a catheter keeps its shape. The baseline is the plain
+    back-projection at the expected depth. It replaces the path where view and expectation disagree.
     """
 
     class Params(MotionParams):
-        """What hearts do, and when the view is not believed."""
+        """Variation of hearts, and limits beyond which the view is not believed."""
 
         gate_sd: float = Field(
             2.5, gt=0, le=10, description="A catheter's depth is not moved by more than this many standard deviations."
@@ -58,61 +69,61 @@ class MotionPrior:
         self._params = params
 
     def track(self, view: MonoplaneView, context: Context) -> Track:
-        """Follow every electrode that has an a-priori position.
+        """Track every electrode that has an a-priori position.
 
         Raises
         ------
         Refusal
             NO_A_PRIORI where no electrode has one; VIEW_MIRRORED where the view fits the cycle only as a mirror image.
         """
-        observed = observe(view)
+        electrodes = gather_electrodes(view)
         p = self._params
-        expected = expect(
-            view, observed, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg
+        expected = expected_motion(
+            view, electrodes, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg
         )
-        covariance = MotionCovariance(view, observed.labels, expected, observed.phases, p)
-        baseline = view.camera.back_project(observed.pixels_uv, view.camera.depth_mm(expected.mean_mm))
-        baseline = np.where(observed.seen[..., None], baseline, expected.mean_mm)
-        windows = tuple(_windows(observed.phases))
-        run = _Run(view, observed, baseline, covariance.rays)
-        trusted = self._trusted(run, [(frames, covariance.window(frames)) for frames in windows])
-        n, m = observed.seen.shape
+        covariance = MotionCovariance(view, electrodes.labels, expected, electrodes.phases, p)
+        baseline = view.camera.back_project(electrodes.pixels_uv, view.camera.depth_mm(expected.mean_mm))
+        baseline = np.where(electrodes.visible[..., None], baseline, expected.mean_mm)
+        windows = tuple(_windows(electrodes.phases))
+        run = _Run(view, electrodes, baseline, covariance.rays)
+        trusted = self._trusted_pixels(run, [(frames, covariance.window(frames)) for frames in windows])
+        n, m = electrodes.visible.shape
         positions, joint = baseline.copy(), np.zeros((n, 3 * m, 3 * m))
-        gated = observed.seen & ~trusted
+        gated = electrodes.visible & ~trusted
         for number, frames in enumerate(windows):
             context.check()
             positions[frames], joint[frames], closed = self._window(run, frames, covariance.window(frames), trusted)
-            gated[frames] |= closed & observed.seen[frames]
+            gated[frames] |= closed & electrodes.visible[frames]
             context.progress((number + 1) / len(windows))
         reasons = list(expected.reasons)
         if expected.cycle_spread > _IRREGULAR:
             reasons.append(Reason.IRREGULAR_RHYTHM)
         return self._track(run, positions, joint, gated, reasons)
 
-    def _trusted(self, run: _Run, windows: list[tuple[slice, PathPrior]]) -> BoolArray:
-        """Which pixels (n, m) are near enough to where the prior expects them to be used.
+    def _trusted_pixels(self, run: _Run, windows: list[tuple[slice, PathPrior]]) -> BoolArray:
+        """Return the pixels (n, m) that are near enough to the prior's expectation to be used.
 
         Raises
         ------
         Refusal
-            VIEW_MIRRORED where most are not, but would be in the mirrored image.
+            VIEW_MIRRORED where most pixels are too far away, but would not be in the mirrored image.
         """
-        observed = run.observed
+        electrodes = run.electrodes
         limit = self._params.surprise_sd
-        found = np.concatenate([_by_catheter(observed, run.surprise(f, prior), f) for f, prior in windows])
-        trusted: BoolArray = observed.seen & (found <= limit)
-        if trusted.sum() < _MIRRORED_SHARE * observed.seen.sum():
+        found = np.concatenate([_by_catheter(electrodes, run.surprise(f, prior), f) for f, prior in windows])
+        trusted: BoolArray = electrodes.visible & (found <= limit)
+        if trusted.sum() < _MIRRORED_SHARE * electrodes.visible.sum():
             mirrored = run.mirrored()
-            others = np.concatenate([_by_catheter(observed, mirrored.surprise(f, prior), f) for f, prior in windows])
-            if (observed.seen & (others <= limit)).sum() > 2 * trusted.sum():
+            others = np.concatenate([_by_catheter(electrodes, mirrored.surprise(f, prior), f) for f, prior in windows])
+            if (electrodes.visible & (others <= limit)).sum() > 2 * trusted.sum():
                 raise Refusal(
                     Reason.VIEW_MIRRORED,
-                    "This view fits what two views have told only as a mirror image; check its image orientation.",
+                    "This view agrees with the biplane positions only as a mirror image; check its image orientation.",
                 )
         return trusted
 
     def _window(self, run: _Run, frames: slice, prior: PathPrior, trusted: BoolArray) -> tuple[Array, Array, BoolArray]:
-        """Positions (n, m, 3), joint covariance (n, 3 m, 3 m) and where (n, m) the baseline stands, of one window."""
+        """Return positions (n, m, 3), joint covariance (n, 3 m, 3 m) and gated catheters (n, m) of one window."""
         evidence = run.evidence(frames, trusted[frames])
         start, rays = run.baseline_mm[frames], run.rays[frames]
         free = bool((prior.parts != FIXED).any())
@@ -121,13 +132,13 @@ class MotionPrior:
             paths = most_probable(prior, evidence, gains, start, _STEPS)
             apart = paths.positions_mm - start
             usual = prior.variance_mm2(gains, (FIXED, OFFSET), rays)
-            closed = self._closed(run.observed, evidence.used, np.einsum("nmi,nmi->nm", apart, rays), usual)
+            closed = self._gated_catheters(run.electrodes, evidence.used, np.einsum("nmi,nmi->nm", apart, rays), usual)
             if not free or not closed.any() or attempt == _LOOSENINGS:
                 break
             gains[[TILT, BEND]] *= _LOOSER
-        outside = closed | (run.observed.seen[frames] & ~trusted[frames])
+        outside = closed | (run.electrodes.visible[frames] & ~trusted[frames])
         along = prior.variance_mm2(gains, (FIXED, OFFSET, TILT, BEND), rays)
-        # Where two answers compete, their distance is part of the uncertainty.
+        # Path and baseline compete here, so that their distance is part of the uncertainty.
         alone = (
             run.lateral_mm2(frames, start)
             + along[..., None, None] * rays[..., :, None] * rays[..., None, :]
@@ -136,101 +147,106 @@ class MotionPrior:
         positions = np.where(outside[..., None], start, paths.positions_mm)
         return positions, _with_baseline(paths.covariance_mm2, outside, alone), np.broadcast_to(closed, outside.shape)
 
-    def _closed(self, observed: ObservedView, used: BoolArray, deeper: Array, usual: Array) -> BoolArray:
-        """Catheters (m,) whose depth the view moves farther than the prior can mean."""
+    def _gated_catheters(self, electrodes: ViewElectrodes, used: BoolArray, deeper: Array, usual: Array) -> BoolArray:
+        """Return the electrodes (m,) of catheters whose depth the view changes by more than the prior allows."""
         closed = np.zeros(used.shape[1], dtype=np.bool_)
-        names = np.array(observed.catheters)
-        for name in dict.fromkeys(observed.catheters):
+        names = np.array(electrodes.catheters)
+        for name in dict.fromkeys(electrodes.catheters):
             own = used & (names == name)
             if own.any():
                 closed[names == name] = (deeper[own] ** 2).mean() > self._params.gate_sd**2 * usual[own].mean()
         return closed
 
     def _track(self, run: _Run, positions: Array, joint: Array, gated: BoolArray, reasons: list[Reason]) -> Track:
-        observed = run.observed
-        n, m = observed.seen.shape
+        electrodes = run.electrodes
+        n, m = electrodes.visible.shape
         blocks = np.einsum("nmimj->nmij", joint.reshape(n, m, 3, m, 3))
         across = np.eye(3) - run.rays[..., :, None] * run.rays[..., None, :]
-        # Depth and its gantry error come with the prior; this view's own gantry displaces what it shows across its rays.
-        gantry = turned_covariance_mm2(positions, self._params.gantry_angle_sd_deg)
+        # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
+        gantry = gantry_angle_covariance_mm2(positions, self._params.gantry_angle_sd_deg)
         gantry = across @ (gantry + self._params.isocentre_sd_mm**2 * np.eye(3)) @ across
         absolute = blocks + gantry
         relative = self._relative(run, positions, joint, absolute, across)
-        shown = observed.seen[..., None]
-        told = []
-        for index, interrupted in enumerate(observed.interrupted()):
+        shown = electrodes.visible[..., None]
+        by_electrode = []
+        for index, interrupted in enumerate(electrodes.interrupted()):
             own = [Reason.PRIOR_GATE] if gated[:, index].any() else []
-            told.append((*reasons, *own, *([Reason.TRACK_INTERRUPTED] if interrupted else [])))
+            by_electrode.append((*reasons, *own, *([Reason.TRACK_INTERRUPTED] if interrupted else [])))
         return Track(
-            labels=observed.labels,
-            located=observed.seen,
+            labels=electrodes.labels,
+            located=electrodes.visible,
             positions_mm=np.where(shown, positions, 0.0),
             baseline_mm=np.where(shown, run.baseline_mm, 0.0),
             covariance_mm2=np.where(shown[..., None], absolute, 0.0),
-            pixels_uv=observed.pixels_uv,
-            reasons=tuple(told),
+            pixels_uv=electrodes.pixels_uv,
+            reasons=tuple(by_electrode),
             relative_covariance_mm2=np.where(shown[..., None], relative, 0.0),
         )
 
     def _relative(self, run: _Run, positions: Array, joint: Array, absolute: Array, across: Array) -> Array:
-        """Covariance (n, m, 3, 3) of positions less the reference's mean; the absolute one where that is not seen."""
-        observed = run.observed
-        n, m = observed.seen.shape
-        is_reference = np.array([name == run.view.catalogue.reference for name in observed.catheters])
-        seen = observed.seen & is_reference
-        count = seen.sum(axis=1)
-        mean = seen / np.maximum(count, 1)[:, None]
+        """Return the covariance (n, m, 3, 3) of positions relative to the reference's mean.
+
+        Frames without the reference get the absolute covariance.
+        """
+        electrodes = run.electrodes
+        n, m = electrodes.visible.shape
+        is_reference = np.array([name == run.view.catalogue.reference for name in electrodes.catheters])
+        visible = electrodes.visible & is_reference
+        count = visible.sum(axis=1)
+        mean = visible / np.maximum(count, 1)[:, None]
         weights = np.eye(m) - mean[:, None, :]
         parts = joint.reshape(n, m, 3, m, 3)
         own = np.einsum("nka,naibj,nkb->nkij", weights, parts, weights, optimize=True)
         apart = positions - np.einsum("na,nai->ni", mean, positions)[:, None]
-        turned = across @ turned_covariance_mm2(apart, self._params.gantry_angle_sd_deg) @ across
+        turned = across @ gantry_angle_covariance_mm2(apart, self._params.gantry_angle_sd_deg) @ across
         relative: Array = np.where((count > 0)[:, None, None, None], own + turned, absolute)
         return relative
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One run with its baseline (n, m, 3) and the unit rays (n, m, 3) through the expected places."""
+    """One run with its baseline (n, m, 3) and the unit rays (n, m, 3) through the expected positions."""
 
     view: MonoplaneView
-    observed: ObservedView
+    electrodes: ViewElectrodes
     baseline_mm: Array
     rays: Array
 
     def evidence(self, frames: slice, used: BoolArray) -> Evidence:
-        observed = self.observed
-        lengths = catheter_lengths(self.view.catalogue, observed.labels, self.baseline_mm[frames])
-        return Evidence(self.view.camera, observed.pixels_uv[frames], observed.covariance_px2[frames], used, lengths)
+        electrodes = self.electrodes
+        lengths = catheter_lengths(self.view.catalogue, electrodes.labels, self.baseline_mm[frames])
+        return Evidence(
+            self.view.camera, electrodes.pixels_uv[frames], electrodes.covariance_px2[frames], used, lengths
+        )
 
     def surprise(self, frames: slice, prior: PathPrior) -> Array:
-        return surprise(prior, self.evidence(frames, self.observed.seen[frames]), prior.mean_mm)
+        return surprise(prior, self.evidence(frames, self.electrodes.visible[frames]), prior.mean_mm)
 
     def lateral_mm2(self, frames: slice, positions: Array) -> Array:
         jacobians = self.view.camera.jacobian(positions)
-        return lateral_covariance_mm2(jacobians, self.observed.covariance_px2[frames])
+        return lateral_covariance_mm2(jacobians, self.electrodes.covariance_px2[frames])
 
     def mirrored(self) -> _Run:
-        """The run as a camera would see it whose image is flipped left to right."""
+        """Return the run with a camera whose image is flipped left to right."""
         camera = self.view.camera
         flipped = camera.matrix.copy()
         flipped[0] = 2 * camera.principal_point_uv[0] * camera.matrix[2] - camera.matrix[0]
         return replace(self, view=replace(self.view, camera=Camera(flipped, camera.rows, camera.columns)))
 
 
-def _by_catheter(observed: ObservedView, found: Array, frames: slice) -> Array:
-    """Root mean square over each catheter's seen electrodes, for each of them, shape (n, m)."""
-    names = np.array(observed.catheters)
+def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Array:
+    """Return the root mean square over each catheter's visible electrodes, repeated for each electrode (n, m)."""
+    names = np.array(electrodes.catheters)
     together = np.zeros_like(found)
-    for name in dict.fromkeys(observed.catheters):
-        own = observed.seen[frames] & (names == name)
+    for name in dict.fromkeys(electrodes.catheters):
+        own = electrodes.visible[frames] & (names == name)
         mean = (np.where(own, found, 0.0) ** 2).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
         together[:, names == name] = np.sqrt(mean)[:, None]
     return together
 
 
 def _windows(phases: Array) -> Iterator[slice]:
-    """Stretches of about one beat: from one wrap of the phase to the next, never longer than 64 frames."""
+    """Yield windows of about one beat: from one wrap of the phase to the next, never longer than 64 frames."""
     wraps = np.flatnonzero(np.diff(phases) < -0.5) + 1
     edges = [0, *wraps.tolist(), len(phases)]
     for first, last in pairwise(edges):
@@ -241,7 +257,10 @@ def _windows(phases: Array) -> Iterator[slice]:
 
 
 def _with_baseline(joint: Array, outside: BoolArray, alone: Array) -> Array:
-    """The joint covariance (n, 3 m, 3 m) where some electrodes (n, m) stand at the baseline, each with its own (n, m, 3, 3)."""
+    """Return the joint covariance (n, 3 m, 3 m) with some electrodes (n, m) at the baseline.
+
+    An electrode at the baseline is independent of the others and has the covariance ``alone`` (n, m, 3, 3).
+    """
     if not outside.any():
         return joint
     n, m = outside.shape

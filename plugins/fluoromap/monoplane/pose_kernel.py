@@ -1,7 +1,7 @@
 """The compiled least-squares iteration behind :func:`fluoromap.monoplane.body_pose.solve_poses`.
 
-Float64, because the pose of thirty points is wanted to nanometres where the pixels are exact. Importing this module loads
-numba, the first call compiles: import it where it is used.
+Float64, because exact pixels must give the pose of thirty points to nanometres. Importing this module loads numba and its
+first call compiles: import it where it is used.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ _CONVERGED = 1e-9
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _normal_equations(focal, model, offsets, turn, centre, rows, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill the lower half of the 7x7 ``normal``: J'J, below it J'r, in the corner r'r, which is returned."""
+    """Fill the lower half of the 7x7 ``normal``: J'J, below it J'r, in the corner r'r; return r'r."""
     m = model.shape[1]
     nearest = 2 * _NEAREST_MM
     for i in range(m):
@@ -27,7 +27,7 @@ def _normal_equations(focal, model, offsets, turn, centre, rows, normal):  # typ
         scale = 1.0 / depth
         u = (focal[0] * (x + centre[0]) + focal[1] * (y + centre[1])) * scale
         v = focal[2] * (y + centre[1]) * scale
-        # Gradients of u and v over the translation; over the rotation they are the lever (x, y, z) crossed with these.
+        # Gradients of u and v by translation; the gradients by rotation are the lever (x, y, z) crossed with them.
         ux, uy, uz = focal[0] * scale, focal[1] * scale, -u * scale
         vy, vz = focal[2] * scale, -v * scale
         j = m + i
@@ -50,7 +50,7 @@ def _normal_equations(focal, model, offsets, turn, centre, rows, normal):  # typ
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _step(normal, damping, factor, step):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Solve the damped 6x6 system by Cholesky; returns by how much the cost should fall, or -1 where it is singular."""
+    """Solve the damped 6x6 system by Cholesky; return the expected fall of the cost, or -1 where it is singular."""
     falls = 0.0
     for p in range(7):
         for q in range(min(p + 1, 6)):
@@ -77,8 +77,8 @@ def _step(normal, damping, factor, step):  # type: ignore[no-untyped-def]  # pra
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _moved(step, turn, centre, tried_turn, tried_centre):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """exp([w]x) R and c + t for a step (w, t)."""
+def _apply_step(step, turn, centre, trial_turn, trial_centre):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write exp([w]x) R and c + t of a step (w, t) into ``trial_turn`` and ``trial_centre``."""
     x, y, z = step[0], step[1], step[2]
     squared = x * x + y * y + z * z
     angle = np.sqrt(squared)
@@ -90,40 +90,40 @@ def _moved(step, turn, centre, tried_turn, tried_centre):  # type: ignore[no-unt
         a, b, d = turn[0, k], turn[1, k], turn[2, k]
         along = c * (x * a + y * b + z * d)
         stays = 1.0 - c * squared
-        tried_turn[0, k] = stays * a + s * (y * d - z * b) + along * x
-        tried_turn[1, k] = stays * b + s * (z * a - x * d) + along * y
-        tried_turn[2, k] = stays * d + s * (x * b - y * a) + along * z
-        tried_centre[k] = centre[k] + step[3 + k]
+        trial_turn[0, k] = stays * a + s * (y * d - z * b) + along * x
+        trial_turn[1, k] = stays * b + s * (z * a - x * d) + along * y
+        trial_turn[2, k] = stays * d + s * (x * b - y * a) + along * z
+        trial_centre[k] = centre[k] + step[3 + k]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def solve_batch(focal, model, offsets, turns, centres, iterations):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Levenberg-Marquardt for each of B images; ``turns`` and ``centres`` hold the start and are overwritten.
+    """Run Levenberg-Marquardt for each of B images; overwrite the start in ``turns`` and ``centres`` by the result.
 
-    focal : (3,) of u over x, u over y, v over y, px. model : (3, m) mm. offsets : (B, m, 2) pixels less the principal
-    point. turns : (B, 3, 3) and centres : (B, 3) in the camera's axes, depth last; a turn may be a reflection, and stays one.
+    focal : (3,) of u over x, u over y, v over y, px. model : (3, m) mm. offsets : (B, m, 2) pixels minus the principal
+    point. turns : (B, 3, 3) and centres : (B, 3) in the camera's axes, depth last. A turn that is a reflection stays one.
     """
     rows, factor, step = np.empty((7, 2 * model.shape[1])), np.empty((7, 6)), np.zeros(6)
-    normal, tried_normal = np.empty((7, 7)), np.empty((7, 7))
-    tried_turn, tried_centre = np.empty((3, 3)), np.empty(3)
+    normal, trial_normal = np.empty((7, 7)), np.empty((7, 7))
+    trial_turn, trial_centre = np.empty((3, 3)), np.empty(3)
     for image in range(offsets.shape[0]):
         turn, centre = turns[image], centres[image]
         for p in range(6):
             step[p] = 0.0
         cost, falls, damping = _BEHIND_SOURCE, 0.0, 1e-7
-        # The first round, with no step, is the start's own cost.
+        # The first round has no step: it computes the cost of the start.
         for _ in range(iterations + 1):
-            _moved(step, turn, centre, tried_turn, tried_centre)
-            tried = _normal_equations(focal, model, offsets[image], tried_turn, tried_centre, rows, tried_normal)
-            if tried <= cost and tried < _BEHIND_SOURCE:
+            _apply_step(step, turn, centre, trial_turn, trial_centre)
+            trial = _normal_equations(focal, model, offsets[image], trial_turn, trial_centre, rows, trial_normal)
+            if trial <= cost and trial < _BEHIND_SOURCE:
                 for p in range(3):
-                    centre[p] = tried_centre[p]
+                    centre[p] = trial_centre[p]
                     for q in range(3):
-                        turn[p, q] = tried_turn[p, q]
-                normal, tried_normal = tried_normal, normal
+                        turn[p, q] = trial_turn[p, q]
+                normal, trial_normal = trial_normal, normal
                 if falls > 0.0 and falls <= _CONVERGED * cost:
                     break
-                cost = tried
+                cost = trial
                 damping *= 0.1
             elif cost == _BEHIND_SOURCE:
                 break

@@ -1,7 +1,7 @@
-"""Whether electrodes that two views saw move over a cardiac cycle would pass for one rigid body in a single view.
+"""Error of a rigid-body model over a cardiac cycle known from two views.
 
-The image itself does not tell: a heart that contracts looks like one that moves away from the source, and the electrodes fit
-their wrong places within the pixel noise.
+The single view cannot show this error: a heart that contracts looks like a heart that moves away from the source. The
+electrodes at their wrong places then agree with the pixels within noise.
 """
 
 from __future__ import annotations
@@ -12,29 +12,29 @@ import numpy as np
 
 from fluoromap.contracts import SiteCycle
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.body_pose import solve_poses, spans
+from fluoromap.monoplane.body_pose import determines_pose, solve_poses
 
 _ITERATIONS = 20
 _LONGEST_GAP = 0.25
-"""Of the cycle between moments that were seen, above which systole may lie in it."""
+"""Longest gap between moments, as a share of the cycle; systole may lie in a longer one."""
 
 
 def rigid_error_mm(camera: Camera, cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> float | None:
-    """RMS 3D error that rigid poses in one view would have over a cycle known from two views.
+    """Return the RMS 3D error of rigid poses in one view over a cycle known from two views.
 
     Parameters
     ----------
     labels : collection of (catheter, electrode)
-        The electrodes that make up the body; those the cycle does not hold are left out.
+        The electrodes of the body; electrodes that the cycle lacks are left out.
 
     Returns
     -------
     float or None
-        Millimetres, over all electrodes and the phases after the first, whose positions are taken for the body's shape;
-        None where the cycle has fewer than two phases or too few electrodes for a pose.
+        Millimetres, over all electrodes and all phases after the first; the first phase gives the body's shape. None where
+        the cycle has fewer than two phases or too few electrodes for a pose.
     """
     points = cycle.positions_mm[:, [label in labels for label in cycle.labels]]
-    if len(points) < 2 or not spans(points[0]):
+    if len(points) < 2 or not determines_pose(points[0]):
         return None
     batch = len(points) - 1
     centre = points[0].mean(axis=0)
@@ -51,8 +51,11 @@ def rigid_error_mm(camera: Camera, cycle: SiteCycle, labels: Collection[tuple[st
     return float(np.sqrt((errors**2).sum(axis=2).mean()))
 
 
-def tells_of_body(cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> bool:
-    """Whether a cycle can show that electrodes keep their distances: it holds all of them, and no large part of it is missing."""
+def covers_body(cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> bool:
+    """Return True where a cycle contains all electrodes of the body and has no long gap.
+
+    Only such a cycle can show that the electrodes keep their distances.
+    """
     if not len(cycle.phases) or not set(labels) <= set(cycle.labels):
         return False
     gaps = np.diff(cycle.phases, append=cycle.phases[0] + 1.0)

@@ -1,4 +1,4 @@
-"""Score of a path through candidates as a catheter: its spacings, its bends, and the dark shaft between and behind them.
+"""Score of a path through candidates as a catheter: spacings, bends and shaft.
 
 Every function works on many chains at once; ``places`` are (n, electrodes, 2) pixels from the tip on.
 """
@@ -23,11 +23,15 @@ _BEHIND_MM = 2.4, 5.9
 _BEFORE_MM = 2.1, 3.5
 
 
-def scores(
+def score_paths(
     chosen: IntArray, points: Array, weights: Array, variance_px2: Array, sure: int, lost: float, spacing_px: Array, tip_mm: float,
     px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float, shaft_weight: float, least: float,
 ) -> Array:  # fmt: skip
-    """Score of each path; -inf, without a look at the shaft, where that cannot lift it to ``least``."""
+    """Return the score of each path, (n,).
+
+    The score is -inf for a path that cannot reach ``least`` even with a perfect shaft. The shafts of these paths are not
+    measured.
+    """
     places, variances = np.empty((*chosen.shape, 2)), np.empty(chosen.shape)
     out = np.empty(len(chosen))
     _score_shapes(chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out)
@@ -47,7 +51,7 @@ def scores(
 def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
     chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out
 ):  # fmt: skip
-    """Writes the places and variances of each path, and its score but for spacings and shaft."""
+    """Write places and variances of each path, and its score without spacings and shaft."""
     count, m = chosen.shape
     total = 0.0
     for k in range(m - 1):
@@ -89,11 +93,12 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, px_per_mm: float) -> Array:
-    """Log-likelihood, up to a constant, of the places' spacings as these, one foreshortening free and its change along the
-    catheter as far as catheters bend in depth, (n,).
+    """Return the log-likelihood of these spacings at the places, up to a constant, (n,).
 
-    ``variance_px2`` (n, electrodes) is each place's own; each ratio of seen to true spacing has that of its two ends and of
-    the bend.
+    One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2``
+    (n, electrodes) is the variance of each place. The variance of each ratio between visible and true spacing contains
+    those of
+    its two ends and of the bend.
     """
     out = np.empty(len(places))
     _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)
@@ -125,7 +130,7 @@ def _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # type: ig
             products += weight * place * seen
         mean = total / weights
         rest = squares - total * mean
-        # A bend in depth of this size changes the ratio along the catheter by the sine of its slope to the image.
+        # A bend in depth changes the ratio along the catheter by the sine of its slope to the image.
         slope_sd = min(_TREND_SD_PER_MM * reach / px_per_mm, _MOST_TREND_SD)
         variance = slope_sd * slope_sd * max(1.0 - mean * mean, 0.0)
         spread = place_squares - along * along / weights
@@ -138,10 +143,22 @@ def _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # type: ig
 def shaft_evidence(
     places: Array, widest: int, tip_mm: float, px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float
 ) -> Array:  # fmt: skip
-    """Dark between the electrodes of the widest gap and behind the last electrode, not before the tip: -3 to 3, (n,).
+    """Return how clearly each path shows a shaft, -3 to 3, (n,).
 
-    ``smooth`` is the ``reduction`` times smaller image. ``clear`` is what counts as a clear shaft in it; ``side`` how far
-    beside a shaft, in pixels of the frame, its surroundings are looked at.
+    Dark pixels in the widest gap and behind the last electrode count for a shaft, dark pixels before the tip against it.
+
+    Parameters
+    ----------
+    places : (n, electrodes, 2)
+        Pixels from the tip on.
+    widest : int
+        Index of the widest gap.
+    smooth : (rows, columns) float32
+        The log image, ``reduction`` times smaller than the frame.
+    clear : float
+        Depth of a clearly visible shaft, log units.
+    side : float
+        Distance beside a shaft at which its surroundings are measured, pixels of the frame.
     """
     last = places.shape[1] - 1
     before = 0.5 * tip_mm + _BEFORE_MM[0]
@@ -154,10 +171,11 @@ def shaft_evidence(
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Sums over three pieces of (mean of darker of the two sides - middle); what leaves the image does not count.
+    """Add, over three pieces, the mean of the darker side less the middle.
 
-    A piece runs in the direction from its one electrode to its other, from and to so far beyond that one: in millimetres
-    behind and before the catheter, in parts of the gap between.
+    Pixels outside the image do not count. A piece has the direction from its first to its second electrode. ``reach`` is
+    where it
+    begins and ends beyond the second electrode: in millimetres behind and before the catheter, in parts of the gap between.
     """
     rows, columns = smooth.shape
     shift = 0.5 / reduction - 0.5

@@ -1,7 +1,8 @@
-"""Paths through candidates and the best set of them by branch and bound.
+"""Search for paths through candidates, and for their best set.
 
-Here and in :mod:`~fluoromap.segmenter.chain_scores` kernels are written for the compiler: they call no kernel, sort nothing and
-assign no whole rows or arrays; each of these costs seconds when a worker starts for the first time.
+The kernels here and in :mod:`~fluoromap.segmenter.chain_scores` are written for a short compile time: they call no kernel,
+sort
+nothing and assign no whole rows or arrays. Each of these would add seconds to the first start of a worker.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from numba import njit
 from fluoromap.contracts import Array, IntArray
 
 SHORTEST, LONGEST = 0.35, 1.12
-"""A spacing seen over the same spacing lying across the rays at the isocentre: foreshortened, or nearer to the source."""
+"""Limits of the ratio between the spacing in the image and the same spacing across the rays at the isocentre.
+
+A foreshortened catheter has a smaller ratio, a catheter nearer to the source a larger one.
+"""
 
 _END_SLACK = 0.55, 1.1
 _SPREAD = 0.6
@@ -24,9 +28,16 @@ _GROWN = 60000
 _MOST_TRIES = 300000
 
 
-def paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
-    """All orders of candidates whose spacings and bends a catheter could show, (n, electrodes) indices from the tip on; of
-    each length the 1500 of most evidence go on."""
+def find_paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
+    """Return all paths with spacings and bends that a catheter can show.
+
+    Of each length the search continues with the 1500 paths of the largest weight.
+
+    Returns
+    -------
+    (n, electrodes) int
+        Indices of the candidates from the tip on.
+    """
     kept, ratios = np.empty((len(points), len(spacing_px) + 1), np.int64), np.empty((len(points), len(spacing_px)))
     kept[:, 0] = np.arange(len(points))
     for step in range(len(spacing_px)):
@@ -45,7 +56,7 @@ def paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes all paths of one electrode more, and their spacings seen over the true ones; returns how many."""
+    """Write all paths with one more electrode and their spacing ratios; return their number."""
     count = 0
     spacing = spacing_px[step]
     shortest = SHORTEST * _END_SLACK[0] * spacing
@@ -66,7 +77,7 @@ def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore
                 continue
             fits = True
             if step > 0 and bu * du + bv * dv < straight * length:
-                # Steeply foreshortened, a gentle bend in space is a sharp one in the image.
+                # A steeply foreshortened catheter shows a gentle bend in space as a sharp bend in the image.
                 tu, tv = bu / before - du / spacing, bv / before - dv / spacing
                 fits = tu * tu + tv * tv <= _MOST_TURNED * _MOST_TURNED
             for k in range(step):
@@ -83,9 +94,13 @@ def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore
     return count
 
 
-def shared(chosen: IntArray, points: Array, near_px: float, most: int) -> IntArray:
-    """How many candidates each two chains have in common, (n, n); ``most`` more where as many of the electrodes of one stand
-    within ``near_px`` of the other's: a wide ring may give two candidates. Rows of ``chosen`` are filled up with -1."""
+def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> IntArray:
+    """Return how many candidates each two chains have in common, (n, n).
+
+    ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may give
+    two
+    candidates. Rows of ``chosen`` are filled up with -1.
+    """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)
     member[np.arange(len(chosen))[:, None], chosen] = 1.0
@@ -100,9 +115,26 @@ def shared(chosen: IntArray, points: Array, near_px: float, most: int) -> IntArr
 
 
 def best_set(values: Array, shared: IntArray, family: IntArray, capacity: IntArray, price: float) -> IntArray:
-    """Branch and bound: indices of the chains, at most ``capacity`` of each family, whose values less ``price`` for each
-    shared candidate add up to most. ``values`` fall; two chains share one candidate at most. A catalogue of very many
-    catheters gets the best set of the first 300000 tries."""
+    """Return the indices of the best set of chains by branch and bound.
+
+    The best set has the largest sum of values less ``price`` for each shared candidate. It has at most ``capacity`` chains
+    of each
+    family, and two of its chains share one candidate at most. For a catalogue of very many catheters the search ends after
+    300000
+    tries.
+
+    Parameters
+    ----------
+    values : (n,)
+        Descending.
+    shared : (n, n)
+        See :func:`count_shared`.
+    family : (n,)
+        Family of each chain.
+    capacity : (families,)
+        Largest number of chains of each family.
+    price : float
+    """
     most = int(capacity.sum())
     stack, best = np.zeros((2, most), np.int64)
     return best[: _branch_and_bound(values, shared, family, capacity.copy(), price, stack, np.zeros(most + 1), best)]
@@ -110,7 +142,10 @@ def best_set(values: Array, shared: IntArray, family: IntArray, capacity: IntArr
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _branch_and_bound(values, shared, family, left, price, stack, gained, best):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes the best set to ``best``; returns its size. ``left`` : of each family, how many chains may still be taken."""
+    """Write the best set to ``best`` and return its size.
+
+    ``left`` : how many more chains of each family may be chosen.
+    """
     most = stack.size
     size = 0
     best_value = 0.0

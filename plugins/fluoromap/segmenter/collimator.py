@@ -1,5 +1,7 @@
-"""Edges of a collimator or an image intensifier, fitted to the picture where the header tells none: straight, at any angle,
-and circular."""
+"""Straight and circular edges of a collimator or an image intensifier.
+
+They are fitted to the image where the header has no shutter attributes.
+"""
 
 from __future__ import annotations
 
@@ -28,18 +30,28 @@ _NEAR_CENTRE = 0.1
 
 
 def within_collimator(picture: Image) -> BoolArray:
-    """Pixels inside all collimator edges found, shape of ``picture``.
+    """Return the pixels inside all collimator edges that the image shows.
 
-    Edges are looked for on a picture of about 128 pixels: places where the logarithm falls steeply. A circle is fitted to
-    them by position = centre + radius x direction of the fall, which is linear in its three unknowns; what it leaves is
-    gathered to straight lines by a Hough transform. Either is believed when the level falls across it by 30 % along three
-    quarters of where its inner side is lit, over a fifth of the picture (a third of the rim), and hardly anything beyond it
-    is as bright as what it bounds: an edge of anatomy is gentler, shorter, or has something bright behind it.
+    Edges are searched on an image of about 128 pixels, where the logarithm falls steeply. A circle is fitted to the steep
+    pixels
+    by position = centre + radius x direction of the fall, which is linear in its three unknowns. A Hough transform collects
+    the
+    remaining steep pixels into straight lines. An edge is accepted under three conditions:
+
+    - The level falls by 30 % along three quarters of the edge's bright inner side.
+    - The edge covers a fifth of the image (a circle: a third of its rim).
+    - Hardly any pixel beyond it is as bright as the pixels inside.
+
+    An edge of anatomy is gentler, shorter, or has bright pixels behind it.
 
     Parameters
     ----------
     picture : (rows, columns) float32
-        Detected intensity, of little noise: a median of frames.
+        Detected intensity with little noise: a median of frames.
+
+    Returns
+    -------
+    (rows, columns) bool
     """
     factor = max(1, round(min(picture.shape) / _SIZE))
     small = gaussian(reduce_by(picture, factor), 1.0)
@@ -59,7 +71,10 @@ def within_collimator(picture: Image) -> BoolArray:
 
 
 class _Edges:
-    """Steep places of a reduced picture, and what of them no edge has claimed yet. Coordinates from the picture's centre."""
+    """Steep pixels of a reduced image, and which of them no edge has used.
+
+    Coordinates count from the centre of the image.
+    """
 
     def __init__(self, small: Image) -> None:
         self.small = small
@@ -75,11 +90,14 @@ class _Edges:
         self.points = np.stack([steep_u, steep_v], axis=1) - self.centre
         lengths = steepness[steep_v, steep_u][:, None]
         self.directions = np.stack([fall_u[steep_v, steep_u], fall_v[steep_v, steep_u]], axis=1) / lengths
-        # A fall towards the middle is no edge of a field that holds the middle.
+        # The field contains the middle of the image, so that no edge falls towards it.
         self.free = (self.points * self.directions).sum(axis=1) > _NEAR_CENTRE * self.size
 
     def circle(self) -> BoolArray | None:
-        """Pixels within the circular edge, if there is one; claims the steep places on it."""
+        """Return the pixels inside the circular edge, or None where there is none.
+
+        The steep pixels on the edge are marked as used.
+        """
         points, directions = self.points[self.free], self.directions[self.free]
         if len(points) < _LEAST_RIM * self.size:
             return None
@@ -102,14 +120,17 @@ class _Edges:
         angles = np.arange(count) * (2 * math.pi / count)
         rim = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         distance = np.hypot(self.u - centre[0], self.v - centre[1])
-        if not self._bounds(centre + radius * rim, rim, distance > radius + _LEVER_PX, _LEAST_RIM * count):
+        if not self._is_edge(centre + radius * rim, rim, distance > radius + _LEVER_PX, _LEAST_RIM * count):
             return None
         self._claim(np.abs(np.linalg.norm(self.points - centre, axis=1) - radius) < _LEVER_PX)
         within: BoolArray = distance < radius
         return within
 
     def strongest_line(self, inside: BoolArray) -> bool:
-        """Cut ``inside`` at the line that most free steep places lie on, if it is an edge; False when none is left to try."""
+        """Cut ``inside`` at the line with the most free steep pixels.
+
+        The cut needs an edge there. Returns False when no line is left to try.
+        """
         points, directions = self.points[self.free], self.directions[self.free]
         if len(points) < _LEAST_SIDE * self.size:
             return False
@@ -130,7 +151,7 @@ class _Edges:
         if np.count_nonzero(on_line) < _LEAST_SIDE * self.size:
             return False
         middle = self.points[on_line].mean(axis=0)
-        # The direction of least spread is the normal, up to its sign.
+        # The normal is the direction of least spread, up to its sign.
         fitted = np.linalg.svd(self.points[on_line] - middle, full_matrices=False)[2][1]
         normal = fitted * np.sign(fitted @ normal)
         offset = float(middle @ normal)
@@ -138,7 +159,7 @@ class _Edges:
         steps = np.arange(-self.size, self.size + 1.0)
         beyond = self.u * normal[0] + self.v * normal[1] - offset
         line = offset * normal + steps[:, None] * along
-        if self._bounds(line, normal, beyond > _LEVER_PX, _LEAST_SIDE * self.size):
+        if self._is_edge(line, normal, beyond > _LEVER_PX, _LEAST_SIDE * self.size):
             inside &= beyond < 0
         self._claim((np.abs(self.points @ normal - offset) < _LEVER_PX) & (self.directions @ normal > 0.7) | on_line)
         return True
@@ -146,17 +167,17 @@ class _Edges:
     def _claim(self, on_edge: BoolArray) -> None:
         self.free &= ~on_edge
 
-    def _bounds(self, edge: Array, normals: Array, beyond: BoolArray, least: float) -> bool:
-        """Whether the level falls across an edge (n, 2) wherever its inner side is lit, and stays low beyond."""
-        inner, inner_seen = self._levels(edge - _LEVER_PX * normals)
-        outer, outer_seen = self._levels(edge + _LEVER_PX * normals)
-        seen = inner_seen & outer_seen
-        fallen = seen & (inner - outer > _LEAST_FALL * inner)
-        if np.count_nonzero(fallen) < least:
+    def _is_edge(self, edge: Array, normals: Array, beyond: BoolArray, least: float) -> bool:
+        """Return whether the level falls across ``edge`` (n, 2) and stays low beyond."""
+        inner, inner_in_picture = self._levels(edge - _LEVER_PX * normals)
+        outer, outer_in_picture = self._levels(edge + _LEVER_PX * normals)
+        in_picture = inner_in_picture & outer_in_picture
+        falls = in_picture & (inner - outer > _LEAST_FALL * inner)
+        if np.count_nonzero(falls) < least:
             return False
-        level = float(np.median(inner[fallen]))
-        lit = seen & (inner > 0.5 * level)
-        if np.count_nonzero(fallen & lit) < max(_SHARE * np.count_nonzero(lit), 0.75 * least):
+        level = float(np.median(inner[falls]))
+        bright = in_picture & (inner > 0.5 * level)
+        if np.count_nonzero(falls & bright) < max(_SHARE * np.count_nonzero(bright), 0.75 * least):
             return False
         behind = self.small[beyond]
         return behind.size == 0 or float(np.mean(behind > _BEYOND * level)) < _MOST_BEYOND
@@ -164,6 +185,6 @@ class _Edges:
     def _levels(self, places: Array) -> tuple[NDArray[np.float32], BoolArray]:
         u, v = (places + self.centre).T
         rows, columns = self.small.shape
-        seen = (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
+        in_picture = (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
         levels: NDArray[np.float32] = ndimage.map_coordinates(self.small, [v, u], order=1, mode="nearest")
-        return levels, seen
+        return levels, in_picture

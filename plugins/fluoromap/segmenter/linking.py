@@ -1,4 +1,4 @@
-"""Candidate electrodes -> chains that fit a catheter of the catalogue; the best set of them."""
+"""Linking: candidate electrodes become the best set of chains that fit the catalogue."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shafts:
-    """Where shafts are looked for.
+class ShaftImage:
+    """An image in which the dark shafts of catheters are visible.
 
-    smooth : the log image without most of its noise, ``reduction`` times smaller than the frame. clear : depth in log
-    units that counts as a clear shaft. px_per_mm : of the frame, at the isocentre.
+    smooth : the log image without most of its noise, ``reduction`` times smaller than the frame. clear : depth of a clearly
+    visible shaft, log units. px_per_mm : of the frame, at the isocentre.
     """
 
     smooth: Image
@@ -38,34 +38,43 @@ class Shafts:
 
     @property
     def side_px(self) -> float:
-        """How far beside a shaft its surroundings are looked at."""
+        """Distance beside a shaft at which its surroundings are measured, pixels of the frame."""
         return max(2.0, _SIDE_MM * self.px_per_mm)
 
 
 @dataclass(frozen=True, slots=True)
-class Family:
-    """Catheters that fluoroscopy cannot tell apart; at most ``len(names)`` chains of one frame belong to it."""
+class CatheterFamily:
+    """Catheters that look alike in fluoroscopy.
+
+    At most ``len(names)`` chains of one frame belong to a family.
+    """
 
     names: tuple[str, ...]
     catheter: Catheter
 
     @property
     def floor(self) -> float:
-        """Score below which a chain may be anatomy: two electrodes have no second spacing that could disagree."""
+        """Score below which a chain may be anatomy.
+
+        The floor is higher for two electrodes: there is no second spacing to check.
+        """
         return 1.0 if self.catheter.electrodes > 2 else 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Linked:
-    """A chain of candidates. candidates : their indices from the tip on. family : index. score : higher is better."""
+class CandidateChain:
+    """A chain of candidates.
+
+    candidates : their indices from the tip on. family : index of the family. score : higher is better.
+    """
 
     candidates: tuple[int, ...]
     family: int
     score: float
 
 
-def families(catalogue: Catalogue) -> tuple[Family, ...]:
-    """The catalogue's catheters grouped by :meth:`~fluoromap.catheters.Catheter.looks_like`."""
+def catheter_families(catalogue: Catalogue) -> tuple[CatheterFamily, ...]:
+    """Group the catalogue's catheters by :meth:`~fluoromap.catheters.Catheter.looks_like`."""
     groups: list[list[Catheter]] = []
     for catheter in catalogue.catheters:
         for group in groups:
@@ -74,33 +83,43 @@ def families(catalogue: Catalogue) -> tuple[Family, ...]:
                 break
         else:
             groups.append([catheter])
-    return tuple(Family(tuple(member.name for member in group), group[0]) for group in groups)
+    return tuple(CatheterFamily(tuple(member.name for member in group), group[0]) for group in groups)
 
 
 def evidence(contrast_over_noise: Array) -> Array:
-    """What a candidate adds to a chain's score: 0 at 4 sigma, growing with the logarithm, at most 2.2."""
+    """Return the weight of candidates with these contrasts in a chain's score.
+
+    The weight is 0 at 4 sigma, grows with the logarithm, and lies between -1 and 2.2.
+    """
     rising: Array = np.log(np.maximum(contrast_over_noise, 1e-3) / _EVIDENCE_FROM)
     return np.clip(rising, -1.0, _EVIDENCE_MOST)
 
 
-def link(
+def link_candidates(
     points_uv: Array,
     weights: Array,
     variance_px2: Array,
-    shafts: Shafts,
-    kinds: Sequence[Family],
+    shaft_image: ShaftImage,
+    families: Sequence[CatheterFamily],
     sure: int | None = None,
     slack: float = 0.0,
     completed: Sequence[IntArray] = (),
-) -> tuple[Linked, ...]:
-    """The best set of chains: ordered from the tip, at most as many of a family as the catalogue has.
+) -> tuple[CandidateChain, ...]:
+    """Return the best set of chains, each ordered from the tip.
 
-    A chain's score is the sum of its candidates' weights, less penalties for spacings whose foreshortening differs by more
-    than a bend in depth explains (0.06 SD), for bends (0.36 rad SD across the rays, more where foreshortened; S-bends count
-    half more), for strong foreshortening and for rings of unlike weight,
-    plus evidence of a dark shaft between the electrodes and behind the last but not before the tip.
-    A set is worth its scores and 6 for each chain, so that a third, weaker catheter is not dropped; crossing catheters may
-    share one candidate, at a price, but not stand in the same places.
+    A chain's score is the sum of its candidates' weights. Penalties are subtracted for:
+
+    - spacings whose foreshortening differs more than a bend in depth explains (0.06 SD),
+    - bends (0.36 rad SD across the rays, more where foreshortened; S-bends count half more),
+    - strong foreshortening,
+    - rings of unlike weight.
+
+    A dark shaft between the electrodes and behind the last one raises the score; a dark shaft before the tip lowers it.
+    The value of a set is the sum of its scores plus 6 for each chain, so that a third, weaker catheter is not dropped.
+    Crossing
+    catheters may share one candidate at a price, but two chains must not lie at the same place. A set has at most as many
+    chains
+    of a family as the catalogue has catheters.
 
     Parameters
     ----------
@@ -109,39 +128,42 @@ def link(
     weights : (n,)
         Their :func:`evidence`.
     variance_px2 : (n,)
-        Of each coordinate of theirs.
-    shafts : Shafts
-    kinds : sequence of Family
+        Variance of each coordinate of a candidate.
+    shaft_image : ShaftImage
+    families : sequence of CatheterFamily
     sure : int
-        The first so many candidates are sound; others may make up half of a chain at most, at a price. All by default.
+        Number of sure candidates; they come first. Other candidates may make up half of a chain at most, at a price. All
+        candidates are sure by default.
     slack : float
-        How far below its family's floor a chain may lie.
+        How far a chain's score may lie below its family's floor.
     completed : sequence of (n, electrodes) int
-        More chains of each family, as indices from the tip on; then the others are made of the sound candidates only.
+        More chains of each family, as indices from the tip on. Then the search itself uses only the sure candidates.
 
     Returns
     -------
-    tuple of Linked
+    tuple of CandidateChain
         Best first.
     """
     sure = len(points_uv) if sure is None else sure
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
-    found: list[Linked] = []
-    for index, family in enumerate(kinds):
+    found: list[CandidateChain] = []
+    for index, family in enumerate(families):
         if len(points) < family.catheter.electrodes:
             continue
-        spacing_px = _spacing_px(family.catheter, shafts.px_per_mm)
+        spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
         searched = sure if completed else len(points)
-        paths = chain_search.paths(points[:searched], weights[:searched], spacing_px)
+        paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px)
         if completed:
             paths = np.concatenate([paths, completed[index]])
-        scores = chain_scores.scores(
-            paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
-            shafts.reduction, shafts.clear, shafts.side_px, _SHAFT_WEIGHT, family.floor - slack,
+        scores = chain_scores.score_paths(
+            paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm, shaft_image.px_per_mm,
+            shaft_image.smooth, shaft_image.reduction, shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, family.floor - slack,
         )  # fmt: skip
         best = np.argsort(-scores)[:_BEST]
         found += [
-            Linked(tuple(paths[row].tolist()), index, float(scores[row])) for row in best if np.isfinite(scores[row])
+            CandidateChain(tuple(paths[row].tolist()), index, float(scores[row]))
+            for row in best
+            if np.isfinite(scores[row])
         ]
     if not found:
         return ()
@@ -151,37 +173,45 @@ def link(
         within[row, : len(chain.candidates)] = chain.candidates
     chosen = chain_search.best_set(
         np.array([chain.score + _WORTH for chain in found]),
-        chain_search.shared(within, points, _SAME_PLACE_MM * shafts.px_per_mm, _SAME_PLACES),
+        chain_search.count_shared(within, points, _SAME_PLACE_MM * shaft_image.px_per_mm, _SAME_PLACES),
         np.array([chain.family for chain in found]),
-        np.array([len(family.names) for family in kinds]),
+        np.array([len(family.names) for family in families]),
         _SHARED,
     )
     return tuple(found[int(index)] for index in chosen)
 
 
-def chain_score(points_uv: Array, weights: Array, variance_px2: Array, shafts: Shafts, family: Family) -> float:
-    """Score of the chain that the points make in this order, as in :func:`link`."""
+def chain_score(
+    points_uv: Array, weights: Array, variance_px2: Array, shaft_image: ShaftImage, family: CatheterFamily
+) -> float:
+    """Return the score of the points in this order, as in :func:`link_candidates`."""
     return float(
-        chain_scores.scores(
+        chain_scores.score_paths(
             np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,
-            _spacing_px(family.catheter, shafts.px_per_mm), family.catheter.tip_mm, shafts.px_per_mm, shafts.smooth,
-            shafts.reduction, shafts.clear, shafts.side_px, _SHAFT_WEIGHT, -np.inf,
+            _spacing_px(family.catheter, shaft_image.px_per_mm), family.catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,
+            shaft_image.reduction, shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, -np.inf,
         )[0]
     )  # fmt: skip
 
 
 def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> Array:
-    """Log-likelihood, up to a constant, of each chain's spacings (n, electrodes, 2) as those of this catheter, one
-    foreshortening free; (n,)."""
+    """Return the log-likelihood of each chain's spacings for this catheter, (n,).
+
+    points_uv : (n, electrodes, 2). One foreshortening is free. The likelihood lacks a constant.
+    """
     return chain_scores.spacing_fit(points_uv, _spacing_px(catheter, px_per_mm), variance_px2, px_per_mm)
 
 
-def shaft_evidence(points_uv: Array, catheter: Catheter, shafts: Shafts) -> Array:
-    """Of each chain (n, electrodes, 2), dark between the electrodes of the widest gap and behind the last electrode, not
-    before the tip: -3 to 3, (n,)."""
+def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage) -> Array:
+    """Return how clearly each chain (n, electrodes, 2) shows a shaft.
+
+    The result (n,) lies between -3 and 3. Dark pixels in the widest gap and behind the last electrode count for a shaft,
+    dark
+    pixels before the tip against it.
+    """
     return chain_scores.shaft_evidence(
-        points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shafts.px_per_mm, shafts.smooth, shafts.reduction,
-        shafts.clear, shafts.side_px,
+        points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,
+        shaft_image.reduction, shaft_image.clear, shaft_image.side_px,
     )  # fmt: skip
 
 
@@ -189,18 +219,24 @@ def _spacing_px(catheter: Catheter, px_per_mm: float) -> Array:
     return np.asarray(catheter.spacing_mm, dtype=np.float64) * px_per_mm
 
 
-def kind_probabilities(log_likelihoods: Array, kinds: Sequence[Family]) -> tuple[tuple[tuple[str, float], ...], ...]:
-    """Which catheter each chain of one frame is, given at most one chain a catheter.
+def kind_probabilities(
+    log_likelihoods: Array, families: Sequence[CatheterFamily]
+) -> tuple[tuple[tuple[str, float], ...], ...]:
+    """Return the probability of each catheter for each chain of one frame.
+
+    Each catheter has at most one chain.
 
     Parameters
     ----------
     log_likelihoods : (chains, families)
-        How well each chain fits each family; -inf where it cannot be one of it.
+        How well each chain fits each family; -inf where it cannot belong to it.
+    families : sequence of CatheterFamily
 
     Returns
     -------
-    One ``kinds`` a chain as in :class:`~fluoromap.contracts.Chain`: probabilities over all assignments that the catalogue
-    allows; look-alikes share theirs equally.
+    tuple
+        One ``kinds`` for each chain as in :class:`~fluoromap.contracts.Chain`: probabilities over all assignments that the
+        catalogue allows. Look-alikes share their probability equally.
     """
     chains, count = log_likelihoods.shape
     marginal = np.zeros((chains, count))
@@ -215,17 +251,17 @@ def kind_probabilities(log_likelihoods: Array, kinds: Sequence[Family]) -> tuple
             return
         for family in range(count):
             if left[family]:
-                # Each of the look-alikes still free is one way to be of this family.
+                # Each free look-alike is one more way to assign this family.
                 left[family] -= 1
                 assign(chain + 1, left, weight * relative[chain, family] * (left[family] + 1), (*taken, family))
                 left[family] += 1
 
-    assign(0, [len(family.names) for family in kinds], 1.0, ())
+    assign(0, [len(family.names) for family in families], 1.0, ())
     marginal /= np.maximum(marginal.sum(axis=1, keepdims=True), math.ulp(0.0))
     return tuple(
         tuple(
             (name, float(row[index]) / len(family.names))
-            for index, family in enumerate(kinds)
+            for index, family in enumerate(families)
             for name in family.names
             if row[index] > 1e-6
         )

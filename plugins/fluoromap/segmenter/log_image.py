@@ -1,4 +1,4 @@
-"""Stored pixels -> logarithm of the detected intensity, in which attenuations add."""
+"""Log images: the logarithm of the detected intensity, in which attenuations add."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ def _look_up(pixels, table, out):  # type: ignore[no-untyped-def]  # pragma: no 
 
 
 def central_range(x: Image, inside: BoolArray) -> tuple[float, float] | None:
-    """0.5th and 99.5th percentile (nearest rank) of every fourth row and column inside the mask; None where there is
-    nothing, or nothing but one value."""
+    """Return the 0.5th and 99.5th percentile inside the mask.
+
+    Every fourth row and column is used; the percentiles are of nearest rank. None for a constant image.
+    """
     values = x[::4, ::4][inside[::4, ::4]]
     if values.size < 2:
         return None
@@ -38,13 +40,19 @@ def central_range(x: Image, inside: BoolArray) -> tuple[float, float] | None:
 
 
 def pixel_noise(half: Image, inside: BoolArray) -> float:
-    """Standard deviation of a pixel of the log image at half its size, from noise: of differences between neighbours."""
+    """Return the noise of a pixel of the half-size log image.
+
+    The result is a standard deviation, from differences between neighbours.
+    """
     differences = (half[::4, 1::2] - half[::4, :-1:2])[inside[::4, 1::2]]
     return robust_sd(differences) / math.sqrt(2.0)
 
 
 def robust_sd(values: Image) -> float:
-    """Standard deviation of values about 0, from the median of their sizes; 1e-6 at least."""
+    """Return the standard deviation of values about 0.
+
+    It follows from their median size, and is at least 1e-6.
+    """
     if not values.size:
         return 1e-6
     middle = values.size // 2
@@ -53,10 +61,11 @@ def robust_sd(values: Image) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogTransform:
-    """The map from stored grey levels to log units that one run needs; dark stays low.
+    """The map from stored grey levels to log units for one run.
 
-    offset : grey levels added before the logarithm. highest : the grey level MONOCHROME1 is mirrored at, else None.
-    table : float32, the answer for each grey level.
+    Dark stays low. offset : grey levels that are added before the logarithm. highest : the grey level at which MONOCHROME1
+    is
+    mirrored, else None. table : float32, the log value of each grey level.
     """
 
     offset: float
@@ -66,9 +75,11 @@ class LogTransform:
 
     @classmethod
     def of_run(cls, facts: PixelFacts, mean_level: float) -> LogTransform:
-        """Choose offset and table from what the header says and from the run's mean grey level (stored pixels).
+        """Choose offset and table from the header and the mean grey level.
 
-        Up to 9 bits the offset is 2 % of the mean: one grey level would blow up the noise of dark regions.
+        The mean is in stored pixels. For up to 9 bits the offset is 2 % of the mean: an offset of one grey level would
+        amplify the
+        noise of dark regions.
         """
         highest = 2**facts.bits_stored - 1 if facts.monochrome1 else None
         level = mean_level if highest is None else highest - mean_level
@@ -78,7 +89,10 @@ class LogTransform:
         return cls(offset, highest, facts.logarithmic, table)
 
     def __call__(self, pixels: NDArray[np.generic]) -> Image:
-        """Log image of one frame, shape (rows, columns). Means of frames (floating point) are taken exactly."""
+        """Return the log image of one frame, shape (rows, columns).
+
+        Means of frames (floating point) are transformed without the table.
+        """
         if pixels.dtype.kind == "u":
             out = np.empty(pixels.shape, np.float32)
             _look_up(pixels, self.table, out)

@@ -1,4 +1,4 @@
-"""How much each frame moves, and which frames round diastole stand still enough to be averaged."""
+"""Motion of each frame, and the quiet frames round diastole that can be averaged."""
 
 from __future__ import annotations
 
@@ -23,10 +23,13 @@ _USUAL_CYCLE_MS = 800.0
 
 
 class MotionMeter:
-    """RMS difference of each log image to the one before, after a Gaussian of sigma 3 px, where the run moves at all.
+    """RMS difference of each log image to the previous one, where the run moves.
 
-    The paper's criterion for the diastolic frame; unsmoothed, and over the whole image, photon noise would decide. The
-    liveliest twentieth of the field is found beforehand from at most 15 evenly spaced log images. Keeps one reduced image.
+    This is the paper's criterion for the diastolic frame. A Gaussian of sigma 3 px is applied first; otherwise photon noise
+    would
+    decide. Only the twentieth of the field that varies most is compared; at most 15 evenly spaced log images determine it.
+    The
+    object stores one reduced image.
     """
 
     def __init__(self, samples: Iterable[Image], inside: BoolArray) -> None:
@@ -39,7 +42,7 @@ class MotionMeter:
         self._before: Image | None = None
 
     def __call__(self, x: Image) -> float:
-        """Motion of the next frame; 0 for the first."""
+        """Return the motion of the next frame; 0 for the first."""
         small = _reduced(x)
         before, self._before = self._before, small
         if before is None:
@@ -53,10 +56,11 @@ def _reduced(x: Image) -> Image:
 
 
 def is_quiet(motion: Array) -> BoolArray:
-    """Frames that differ from the frame before by little more than noise, (n,).
+    """Return which frames differ from the previous one by little more than noise, (n,).
 
-    Motion and noise add in squares. The noise is what the quietest fifth shows, unless that moves already; quiet is a
-    fifteenth of the liveliest motion, or what the noise could be alone.
+    Motion and noise add in squares. The quietest fifth determines the noise, unless it moves already. A frame is quiet up
+    to a
+    fifteenth of the largest motion, or up to the motion that noise alone can cause.
     """
     if len(motion) < 3:
         return np.ones(len(motion), dtype=np.bool_)
@@ -68,8 +72,10 @@ def is_quiet(motion: Array) -> BoolArray:
 
 
 def quiet_stretches(motion: Array) -> tuple[tuple[int, int], ...]:
-    """(first, last) frames between which nothing moves, in order. A stretch begins one frame before its first quiet
-    difference: both frames of a small difference show the same place."""
+    """Return (first, last) frames between which nothing moves, in order.
+
+    A stretch begins one frame before its first quiet difference: both frames of a small difference show the same place.
+    """
     quiet = is_quiet(motion)
     stretches = []
     start: int | None = None
@@ -83,11 +89,11 @@ def quiet_stretches(motion: Array) -> tuple[tuple[int, int], ...]:
 
 
 def diastolic_frames(motion: Array, frame_times_ms: Array, r_wave_frames: Sequence[int] = ()) -> tuple[int, ...]:
-    """Frames round diastole that may be averaged, ascending; at most 7.
+    """Return at most 7 frames round diastole that can be averaged, ascending.
 
-    Without R waves they are the middle of the longest quiet stretch: end-systole stands still too, but shorter. With R
-    waves (RWavePointer, DICOM 0028,6040) they are the middle of the longest quiet stretch within the last 45 % before one.
-    Where nothing stands still, the single quietest frame.
+    - Without R waves: the middle of the longest quiet stretch. The heart also rests at end-systole, but for a shorter time.
+    - With R waves (RWavePointer, DICOM 0028,6040): the middle of the longest quiet stretch within the last 45 % before one.
+    - Without a quiet stretch: the single quietest frame.
     """
     n = len(motion)
     if n < 3:

@@ -1,4 +1,4 @@
-"""Sub-pixel places of the electrodes of a chain: the middle of each band, along and across the catheter."""
+"""Sub-pixel positions of the electrodes: the middle of each band along and across."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _APART_PX = 6.0
 _GAIN, _TIP_GAIN = (4.6, 5.3), (6.15, 6.35)
 _FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.034, 0.048), (0.09, 0.056), (0.155, 0.056)
 _LONG_TIP_MM = 3.0
-_VAGUE, _USUAL_CLEARNESS = 0.7, 1.8
+_BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
 _SPACING_SD = 0.10
 _PROFILE_SAMPLES = 7.0
@@ -38,9 +38,13 @@ _LOCAL, _LEAST_SHORTENING = 0.75, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refined:
-    """points_uv : (n, electrodes, 2) px. covariance_px2 : (n, electrodes, 2, 2). misfits : (n, electrodes) share of each band's
-    profile that its template does not explain."""
+class ElectrodeFit:
+    """Positions of the electrodes of several chains.
+
+    points_uv : (n, electrodes, 2) px. covariance_px2 : (n, electrodes, 2, 2). misfits : (n, electrodes), the share of each
+    band's
+    profile that its template does not explain.
+    """
 
     points_uv: Array
     covariance_px2: Array
@@ -48,15 +52,19 @@ class Refined:
 
     @property
     def log_likelihood(self) -> Array:
-        """How well bands of these lengths fit the image, up to a constant common to all catheters, and both directions, tried
-        on the same candidates; (n,)."""
+        """Log-likelihood of bands of these lengths in the image, (n,).
+
+        It lacks a constant that is common to all catheters and to both directions of the same candidates.
+        """
         likelihood: Array = 0.5 * _PROFILE_SAMPLES * self.misfits.shape[1] * self.clearness
         return likelihood
 
     @property
     def clearness(self) -> Array:
-        """Mean of -ln(misfit) over the electrodes: 0 where nothing looks like one, above 1 where most of each profile does;
-        (n,)."""
+        """Mean of -ln(misfit) over the electrodes, (n,).
+
+        It is 0 where no pixel looks like an electrode, and above 1 where the template explains most of each profile.
+        """
         return _clearness(self.misfits)
 
 
@@ -67,13 +75,15 @@ def refine(
     px_per_mm: float,
     noise: float,
     hidden: BoolArray,
-    unseen: BoolArray,
-) -> Refined:
-    """Move each electrode of several chains to where a band of its length and width fits best.
+    without_blob: BoolArray,
+) -> ElectrodeFit:
+    """Move each electrode to where a band of its length and width fits best.
 
-    Along the axis the profile is compared with a box of the electrode's foreshortened length (the tip's far end rounded),
-    across it with the chord of a cylinder; zero-mean correlation, parabola through the best shift; two rounds. Points far
-    off the catalogue's spacing are then drawn towards it by their own uncertainty.
+    Along the axis the profile is compared with a box of the electrode's foreshortened length (the tip's far end is
+    rounded),
+    across the axis with the chord of a cylinder. The fit maximises the zero-mean correlation with a parabola through the
+    best
+    shift, in two rounds. Then points far off the catalogue's spacing are pulled towards it according to their uncertainty.
 
     Parameters
     ----------
@@ -81,13 +91,16 @@ def refine(
         Log image.
     points_uv : (n, electrodes, 2)
         First guess of each chain from the tip on, pixels.
+    catheter : Catheter
+    px_per_mm : float
+        At the isocentre.
     noise : float
-        Standard deviation of a pixel from noise, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+        Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
     hidden : (n, electrodes)
-        Electrodes whose image is another catheter's: they are put where the curve through the others has them, and fit as
-        well as the others do on average.
-    unseen : (n, electrodes)
-        Electrodes without a blob of their own: they are looked for close by only.
+        Electrodes behind another catheter. They are put on the curve through the others and get the mean misfit of the
+        others.
+    without_blob : (n, electrodes)
+        Electrodes without a blob of their own. They are searched only close by.
     """
     points = np.array(points_uv, dtype=np.float64, order="C")
     arc_mm = catheter.arc_lengths_mm
@@ -99,48 +112,59 @@ def refine(
     half[0] = 0.5 * catheter.tip_mm * px_per_mm
     shifts = np.full(misfits.shape, int(_REACH_PX / _STEP_PX))
     shifts[:, 0] = int(_TIP_REACH_PX / _STEP_PX)
-    shifts[hidden | unseen] = int(_LAST_REACH_PX / _STEP_PX)
+    shifts[hidden | without_blob] = int(_LAST_REACH_PX / _STEP_PX)
     for _ in range(2):
-        _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
+        _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
         longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
         scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
         _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, misfits)
         shifts[:] = int(_LAST_REACH_PX / _STEP_PX)
-    _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
-    sd = _stated_sd(unit_sd * noise, misfits, catheter.tip_mm)
+    _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
+    sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
     if len(arc_mm) >= 3:
-        _draw_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
-    refined = Refined(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
-    covariance = refined.covariance_px2
+        _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
+    fit = ElectrodeFit(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
+    covariance = fit.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):
-        covered = hidden[row]
-        if np.count_nonzero(~covered) >= 2:
-            points[row, covered] = on_curve(points[row], covered, arc_mm)
-            covariance[row, covered] = (_HIDDEN_MM * px_per_mm) ** 2 * np.eye(2)
-            misfits[row, covered] = np.exp(np.log(misfits[row, ~covered]).mean())
-    return refined
+        is_hidden = hidden[row]
+        if np.count_nonzero(~is_hidden) >= 2:
+            points[row, is_hidden] = predict_on_curve(points[row], is_hidden, arc_mm)
+            covariance[row, is_hidden] = (_HIDDEN_MM * px_per_mm) ** 2 * np.eye(2)
+            misfits[row, is_hidden] = np.exp(np.log(misfits[row, ~is_hidden]).mean())
+    return fit
 
 
-def on_curve(points: Array, covered: BoolArray, arc_mm: Array) -> Array:
-    """Places of the covered electrodes on a parabola in arc length through the others, its curvature kept low."""
+def predict_on_curve(points: Array, is_hidden: BoolArray, arc_mm: Array) -> Array:
+    """Return the positions of the hidden electrodes on a curve through the others.
+
+    The curve is a parabola in arc length with low curvature.
+    """
     middle = arc_mm.mean()
     design = np.stack([np.ones(len(arc_mm)), arc_mm - middle, (arc_mm - middle) ** 2], axis=1)
-    known = np.concatenate([design[~covered], [[0.0, 0.0, _STIFFNESS]]])
-    answer = np.linalg.lstsq(known, np.concatenate([points[~covered], np.zeros((1, points.shape[1]))]), rcond=None)[0]
-    predicted: Array = design[covered] @ answer
+    known = np.concatenate([design[~is_hidden], [[0.0, 0.0, _STIFFNESS]]])
+    answer = np.linalg.lstsq(known, np.concatenate([points[~is_hidden], np.zeros((1, points.shape[1]))]), rcond=None)[0]
+    predicted: Array = design[is_hidden] @ answer
     return predicted
 
 
 def _diameter_mm(catheter: Catheter) -> float:
-    """Catalogues give no diameter: 7F for the longer tips of ablation catheters, 6F else."""
+    """Return the diameter: 7F for the longer tips of ablation catheters, else 6F.
+
+    Catalogues give no diameter.
+    """
     return 2.33 if catheter.tip_mm >= _LONG_TIP_MM else 2.0
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes the arc length seen up to each electrode, pixels; the unit vector along the catheter there; half the length of
-    its band as foreshortened there, from the gaps beside it and the whole catheter's; and how many steps to each side its
-    profile is compared: the next electrode's band, which would push it away, stays out."""
+def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write arc lengths, axes, band lengths and profile lengths of all electrodes.
+
+    arc : visible arc length up to each electrode, pixels. axes : unit vector along the catheter. bands : half the
+    foreshortened
+    length of the band, from the gaps beside it and from the whole catheter. sides : number of steps to each side over which
+    the
+    profile is compared. The profile ends before the next electrode's band, which would push the fit away.
+    """
     last = arc_mm.size - 1
     for row in range(points.shape[0]):
         arc[row, 0] = 0.0
@@ -167,11 +191,14 @@ def _measure(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  # type:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, misfits):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Moves points to the best places near by for bands along these axes; writes the standard deviations of that along and
-    across if the noise were 1 a pixel, and the share of the profile's variance along that stays unexplained.
+    """Move the points to the best nearby positions of bands along these axes.
 
-    First along, then across the axis a template is moved over the profile; a tip's far end is a dome of its radius.
-    ``shifts`` and ``sides`` : how far the template is moved and reaches, in steps. ``scratch`` : three lines of work space.
+    Writes the standard deviations along and across for a pixel noise of 1, and the share of the variance along the axis
+    that stays
+    unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a dome of its
+    radius.
+    ``shifts`` and ``sides`` : largest shift and half length of the template, in steps. ``scratch`` : three lines of work
+    space.
     """
     highest_u, highest_v = x.shape[1] - 1.001, x.shape[0] - 1.001
     template, profile, scores = scratch[0], scratch[1], scratch[2]
@@ -187,7 +214,7 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
                     value = 1.0
                     rim = s / radius
                     if way == 0:
-                        # From 0 to 1 and back; a tip's far end, at -length, is round.
+                        # The template rises from 0 to 1 and falls again; a tip's far end, at -length, is round.
                         away = s if k == 0 else abs(s)
                         value = min(max(0.5 + (length - away) / _SOFT_PX, 0.0), 1.0)
                         rim = min(max(1.0 - rim - length / radius, 0.0), 1.0) if k == 0 else 0.0
@@ -234,7 +261,7 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
                 depth = max(best, 0.0) / max(strength, 1e-9)
                 if way == 0:
                     misfits[row, k] = max(1.0 - depth * best / max(squares - total * total / m, 1e-12), 0.0)
-                # Cramer-Rao bound of a shift in white noise of 1 a pixel, here averaged over the band's width.
+                # Cramer-Rao bound of a shift in white noise of 1 a pixel, averaged over the band's width.
                 unit_sd[row, k, way] = math.sqrt(_STEP_PX / (wide * max(edges, 1e-9))) / max(depth, 1e-6)
                 moved = float(chosen - shift)
                 if 0 < chosen < 2 * shift:
@@ -247,22 +274,23 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
                 side, shift, wide = int((radius + 4.0) / _STEP_PX), min(shift, 7), 2.0 * length
 
 
-def _stated_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:
-    """Standard deviations along and across, (n, electrodes, 2) pixels, of places of which noise alone makes up these.
+def _position_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:
+    """Return the standard deviations along and across, (n, electrodes, 2) pixels.
 
-    Noise blurred by the detector weighs more than white noise does; where bands fit badly, errors have long tails; and no
-    noise at all leaves what the templates simplify, a tip's rounded end most.
+    ``noise_sd`` is the contribution of white noise. The detector's blur increases it. Badly fitting bands have long-tailed
+    errors.
+    Without noise the simplifications of the templates remain, most of all at a tip's rounded end.
     """
     gain, floor = _gains_and_floors(misfits.shape[1], tip_mm >= _LONG_TIP_MM)
-    vague = 1.0 + _VAGUE * np.maximum(_USUAL_CLEARNESS - _clearness(misfits), 0.0)
-    sd = noise_sd * gain * vague[:, None, None]
+    blur_gain = 1.0 + _BLUR_GAIN * np.maximum(_USUAL_CLEARNESS - _clearness(misfits), 0.0)
+    sd = noise_sd * gain * blur_gain[:, None, None]
     stated: Array = np.minimum(np.sqrt(sd * sd + floor * floor), _APART_PX)
     return stated
 
 
 @functools.lru_cache(maxsize=64)
 def _gains_and_floors(electrodes: int, long_tip: bool) -> tuple[Array, Array]:
-    """Of each electrode along and across, (electrodes, 2)."""
+    """Return gain and floor of each electrode along and across, (electrodes, 2)."""
     gain, floor = np.full((electrodes, 2), _GAIN), np.full((electrodes, 2), _FLOOR_PX)
     gain[0] = _TIP_GAIN
     floor[0] = _LONG_TIP_FLOOR_PX if long_tip else _TIP_FLOOR_PX
@@ -274,10 +302,13 @@ def _clearness(misfits: Array) -> Array:
     return mean
 
 
-def _draw_to_spacing(
+def _pull_to_spacing(
     points: Array, sd: Array, weighed_sd: Array, arc: Array, axes: Array, arc_mm: Array, px_per_mm: float
 ) -> None:
-    """Combine, in place, measured arc lengths and the catalogue's spacing under one free foreshortening and offset."""
+    """Combine measured arc lengths with the catalogue's spacing, in place.
+
+    One foreshortening and one offset are free.
+    """
     variance = weighed_sd * weighed_sd
     model_sd = 0.5 * _SPACING_SD * px_per_mm * arc_mm[-1] / (len(arc_mm) - 1)
     weights = 1.0 / variance
@@ -292,8 +323,10 @@ def _draw_to_spacing(
 
 
 def _covariances(points: Array, sd: Array, axes: Array, arc_mm: Array, px_per_mm: float) -> Array:
-    """(n, electrodes, 2, 2) square pixels. A steeply foreshortened tip covers the ring behind it, and its own axis is hard to
-    tell."""
+    """Return the covariances (n, electrodes, 2, 2), square pixels.
+
+    A steeply foreshortened tip covers the ring behind it, and its axis is uncertain.
+    """
     variance = sd * sd
     first = points[:, 1] - points[:, 0]
     lacking = np.maximum(_STEEP - np.sqrt((first * first).sum(axis=1)) / (px_per_mm * (arc_mm[1] - arc_mm[0])), 0.0)

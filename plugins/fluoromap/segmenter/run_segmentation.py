@@ -1,4 +1,4 @@
-"""The way of every built-in segmenter through a run: field, frames, tracks, diastole."""
+"""Segmentation of a run: field, chains of every frame, tracks, diastole."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced, find_field
+from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
-from fluoromap.segmenter.tracking import Carry, chain_distance, follow
+from fluoromap.segmenter.tracking import ChainSearch, chain_distance, track_chains
 
 _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
@@ -22,17 +22,38 @@ _EDGE_PX = 12
 
 
 class Detector(Protocol):
-    """Finds chains in the images of one run."""
+    """Search for chains in the log images of one run."""
 
-    def chains(self, x: Image, frame: int) -> FrameChains:
-        """Chains of one log image; with ``manual_needed`` they are not sure: good for continuing a track only."""
+    def find_chains(self, x: Image, frame: int) -> FrameChains:
+        """Return the chains of one log image.
 
-    def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
-        """A chain seen before, moved by about ``shift`` and at most ``reach_px`` farther, beside those that are taken; None
-        where it does not show, or from a detector that only sees whole frames."""
+        With ``manual_needed`` the chains are uncertain: they may continue a track but do not begin one.
+        """
 
-    def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
-        """Whether one more catheter shows clearly beside these chains."""
+    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        """Return a chain of another frame at its place in this log image.
+
+        Parameters
+        ----------
+        x : (rows, columns) float32
+            Log image.
+        chain : Chain
+            The catheter in another frame.
+        shift : (2,)
+            Expected displacement, pixels.
+        reach_px : float
+            Largest distance from the expected place.
+        taken : sequence of Chain
+            Other catheters that were already found in this image.
+
+        Returns
+        -------
+        Chain or None
+            None where the image does not show the chain, and from a detector that searches whole frames only.
+        """
+
+    def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Return whether the log image clearly shows a catheter besides these chains."""
 
 
 def segment_run(
@@ -41,14 +62,30 @@ def segment_run(
     marks: Marks,
     context: Context,
     detector_of: Callable[[FieldMask], Detector],
-    carry: bool = False,
+    search_again: bool = False,
 ) -> Segmentation:
-    """Chains of all frames, followed along the run, and of the mean of the quiet frames round diastole.
+    """Segment a run: chains of all frames with their tracks, and chains at diastole.
 
-    Marks stand in for what was found in their frames, and the tracks start from the first of them. At diastole they count
-    like this: a mark in one of the averaged frames replaces the automatic chain of the same catheter or place; a mark
-    elsewhere, of a catheter that diastole lacks, makes the quietest marked frame stand for diastole, with what was found
-    automatically beside it in that frame.
+    Chains at diastole come from the mean of the quiet frames round diastole. Marks replace the automatic chains of their
+    frames, and the tracks start from the first marked frame. At diastole a mark counts as follows:
+
+    - A mark in one of the averaged frames replaces the automatic chain of the same catheter or place.
+    - A mark elsewhere, of a catheter that is missing at diastole, moves diastole to the quietest marked frame. The
+    automatic
+      chains of that frame are added.
+
+    Parameters
+    ----------
+    run : Run
+    catalogue : Catalogue
+    marks : Marks
+        Chains that were set by hand.
+    context : Context
+        For progress and cancellation.
+    detector_of : callable
+        The field mask of the run -> the detector to use.
+    search_again : bool
+        Whether to search for missing catheters with :meth:`Detector.find_again`.
     """
     context.check()
     field = find_field(run.frames, run.pixels)
@@ -59,7 +96,7 @@ def segment_run(
     def log_image(frame: int) -> Image:
         return field.fill(transform(run.frames[frame]))
 
-    meter = MotionMeter((log_image(index) for index in evenly_spaced(count)), field.inside)
+    meter = MotionMeter((log_image(index) for index in evenly_spaced_frames(count)), field.inside)
     motion = np.zeros(count)
     found: list[FrameChains] = []
     automatic: dict[int, tuple[Chain, ...]] = {}
@@ -67,7 +104,7 @@ def segment_run(
         context.check()
         x = log_image(index)
         motion[index] = meter(x)
-        entry = detector.chains(x, index)
+        entry = detector.find_chains(x, index)
         if index in marks:
             automatic[index] = entry.chains if entry.manual_needed is None else ()
             entry = FrameChains(index, tuple(replace(chain, manual=True) for chain in marks[index]))
@@ -82,20 +119,20 @@ def segment_run(
     for index in averaged:
         total += run.frames[index].astype(np.float64)
     mean_image = field.fill(transform(total / len(averaged)))
-    mean = detector.chains(mean_image, middle)
+    mean = detector.find_chains(mean_image, middle)
     mean = mean if mean.manual_needed is None else FrameChains(middle, ())
     catheters = len(catalogue.catheters)
-    carrying = _carry(detector, log_image, context) if carry else None
-    entries = follow(found, run.frame_times_ms, catheters, carrying, mean if len(averaged) > 1 else None)
-    entries = _told_out_of_field(entries, field)
+    search = _chain_search(detector, log_image, context) if search_again else None
+    entries = track_chains(found, run.frame_times_ms, catheters, search, mean if len(averaged) > 1 else None)
+    entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
-    if carry:
-        chains = _with_carried(mean_image, chains, detector, averaged, entries, catheters)
-    chains, averaged = _with_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
-    chains = _on_tracks(chains, averaged, entries)
+    if search_again:
+        chains = _add_missing_catheters(mean_image, chains, detector, averaged, entries, catheters)
+    chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
+    chains = _assign_tracks(chains, averaged, entries)
     reason = None if chains else Reason.MANUAL_NEEDED
-    if len(chains) >= catheters and detector.extra(mean_image, chains):
+    if len(chains) >= catheters and detector.shows_extra_catheter(mean_image, chains):
         reason = Reason.EXTRA_CATHETER
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
@@ -109,20 +146,20 @@ def segment_run(
     )
 
 
-def _carry(detector: Detector, log_image: Callable[[int], Image], context: Context) -> Carry:
+def _chain_search(detector: Detector, log_image: Callable[[int], Image], context: Context) -> ChainSearch:
     kept: tuple[int, Image] | None = None
 
-    def carry(frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def search(frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
         nonlocal kept
         if kept is None or kept[0] != frame:
             context.check()
             kept = frame, log_image(frame)
-        return detector.carried(kept[1], chain, shift, reach_px, taken)
+        return detector.find_again(kept[1], chain, shift, reach_px, taken)
 
-    return carry
+    return search
 
 
-def _with_carried(
+def _add_missing_catheters(
     x: Image,
     found: tuple[Chain, ...],
     detector: Detector,
@@ -130,21 +167,24 @@ def _with_carried(
     entries: Sequence[FrameChains],
     catheters: int,
 ) -> tuple[Chain, ...]:
-    """Chains of the mean image, and the catheters that its frames show but were not found in it."""
+    """Add catheters that only single frames show to the mean image's chains."""
     middle = averaged[len(averaged) // 2]
     chains = list(found)
-    on_tracks = {chain.track for chain in _on_tracks(chains, averaged, entries)}
+    on_tracks = {chain.track for chain in _assign_tracks(chains, averaged, entries)}
     for frame in sorted(averaged, key=lambda frame: abs(frame - middle)):
         for known in entries[frame].chains:
             if known.track not in on_tracks and len(chains) < catheters and not known.manual:
                 on_tracks.add(known.track)
-                carried = detector.carried(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
+                carried = detector.find_again(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
                 chains += [] if carried is None else [replace(carried, track=-1)]
     return tuple(chains)
 
 
-def _told_out_of_field(entries: Sequence[FrameChains], field: FieldMask) -> tuple[FrameChains, ...]:
-    """Say OUT_OF_FIELD where a track is interrupted because its catheter stood at the field's edge when it was seen last."""
+def _mark_out_of_field(entries: Sequence[FrameChains], field: FieldMask) -> tuple[FrameChains, ...]:
+    """Replace TRACK_INTERRUPTED by OUT_OF_FIELD where catheters left the field.
+
+    Every missing catheter must have been at the edge of the field when it was found last.
+    """
     seen: dict[int, list[tuple[int, Chain]]] = {}
     for entry in entries:
         for chain in entry.chains:
@@ -176,21 +216,21 @@ def _at_edge(chain: Chain, field: FieldMask) -> bool:
     return False
 
 
-def _same(one: Chain, other: Chain, px_per_mm: float) -> bool:
-    """Whether two chains of one moment are the same catheter: the same certain name, or the same place."""
+def _is_same_catheter(one: Chain, other: Chain, px_per_mm: float) -> bool:
+    """Return whether two chains of one moment share a certain name or the place."""
     if any(probability > 0.99 and other.probability(name) > 0.99 for name, probability in one.kinds):
         return True
     return sum(chain_distance(one, other)) <= _SAME_PLACE_MM * px_per_mm
 
 
-def _beside(marked: Sequence[Chain], automatic: Sequence[Chain], px_per_mm: float) -> tuple[Chain, ...]:
+def _merge_marks(marked: Sequence[Chain], automatic: Sequence[Chain], px_per_mm: float) -> tuple[Chain, ...]:
     return (
         *marked,
-        *(chain for chain in automatic if not any(_same(chain, mark, px_per_mm) for mark in marked)),
+        *(chain for chain in automatic if not any(_is_same_catheter(chain, mark, px_per_mm) for mark in marked)),
     )
 
 
-def _with_marks(
+def _apply_marks(
     chains: tuple[Chain, ...],
     averaged: tuple[int, ...],
     entries: Sequence[FrameChains],
@@ -204,17 +244,22 @@ def _with_marks(
     within = [frame for frame in automatic if frame in averaged]
     if within:
         nearest = min(within, key=lambda frame: abs(frame - middle))
-        return _beside(entries[nearest].chains, chains, px_per_mm), averaged
-    tracks = {chain.track for chain in _on_tracks(chains, averaged, entries)}
+        return _merge_marks(entries[nearest].chains, chains, px_per_mm), averaged
+    tracks = {chain.track for chain in _assign_tracks(chains, averaged, entries)}
     lacking = [frame for frame in automatic if any(chain.track not in tracks for chain in entries[frame].chains)]
     if not lacking:
         return chains, averaged
     quietest = min(lacking, key=lambda frame: float(motion[frame]))
-    return _beside(entries[quietest].chains, automatic[quietest], px_per_mm), (quietest,)
+    return _merge_marks(entries[quietest].chains, automatic[quietest], px_per_mm), (quietest,)
 
 
-def _on_tracks(chains: Sequence[Chain], averaged: Sequence[int], entries: Sequence[FrameChains]) -> tuple[Chain, ...]:
-    """Give the diastolic chains the track numbers of the chains that lie in their place in the averaged frames."""
+def _assign_tracks(
+    chains: Sequence[Chain], averaged: Sequence[int], entries: Sequence[FrameChains]
+) -> tuple[Chain, ...]:
+    """Give each diastolic chain the track number of the averaged frames.
+
+    The number is that of the chains at the same place.
+    """
     taken: set[int] = {chain.track for chain in chains if chain.track >= 0}
     fresh = 1 + max((chain.track for entry in entries for chain in entry.chains), default=-1)
     numbered: list[Chain] = []

@@ -1,4 +1,4 @@
-"""Catheters followed along a run: chains of successive frames that are the same catheter get the same track number."""
+"""Tracks of catheters: chains of one catheter in successive frames get the same number."""
 
 from __future__ import annotations
 
@@ -25,31 +25,39 @@ _CONFIRMED_PX = 18.0
 _CONFIRMERS = 60
 _SAME_PLACE_PX = 4.0
 _SEEN_AT_LEAST = 0.2
-_CARRIED_AT_LEAST = 0.5
+_RECOVERED_AT_LEAST = 0.5
 _LONG_RUN = 5
 _REVERSED_PX = 4.0
 
-Carry = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
-"""(frame, chain last seen, shift expected, reach in pixels, chains that stand in the frame) -> the chain in that frame."""
+ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
+"""(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
 
 
 @dataclass(slots=True)
 class _Track:
-    """Where a catheter was met last; ``velocity`` in pixels a millisecond, forwards in time. detected : in how many frames,
-    of which in ``reversed`` with the tip at the other end. seeded : stands in the seed."""
+    """A catheter along the run.
+
+    chain, time_ms : the chain that was assigned last, and its time. velocity : (2,) pixels a millisecond, forwards in time.
+    detections : number of frames in which the segmenter found it. reversals : number of those with the tip at the other
+    end.
+    from_seed : whether the seed contains it.
+    """
 
     chain: Chain
     time_ms: float
     velocity: Array
-    detected: int = 1
-    reversed: int = 0
-    seeded: bool = False
+    detections: int = 1
+    reversals: int = 0
+    from_seed: bool = False
     manual: bool = False
     chains: dict[int, Chain] = field(default_factory=dict)
 
 
 def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
-    """(mean shift, largest rest after that shift) in pixels over the electrodes both chains have; infinite without any."""
+    """Return mean shift and largest remaining distance between two chains, pixels.
+
+    Only electrodes that both chains have are compared. Both numbers are infinite where there are none.
+    """
     if one.electrodes == other.electrodes:
         mine, theirs = one.pixels_uv, other.pixels_uv
     else:
@@ -65,43 +73,53 @@ def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tupl
 
 
 def kind_overlap(one: Chain, other: Chain) -> float:
-    """0 where the two cannot be the same catheter, 1 where their probabilities agree as far as they can."""
+    """Return how well the kinds of two chains agree.
+
+    0 : they cannot be the same catheter. 1 : their probabilities agree as far as they can.
+    """
     agreement = sum(probability * other.probability(name) for name, probability in one.kinds)
     squares = [sum(probability**2 for _, probability in chain.kinds) for chain in (one, other)]
     return agreement / max(*squares, 1e-9)
 
 
-def follow(
+def track_chains(
     found: Sequence[FrameChains],
     frame_times_ms: Array,
     catheters: int,
-    carry: Carry | None = None,
+    search: ChainSearch | None = None,
     seed: FrameChains | None = None,
 ) -> tuple[FrameChains, ...]:
     """Give the chains of a run track numbers.
 
-    Starts from the first frame marked by hand, else from the seed, else from the frame that most others confirm, and goes
-    both ways. Each catheter is predicted by 0.6 of its last velocity and the chains of the frame are assigned to the
-    predictions: least total cost (mean shift, twice the largest change of shape, a price for unlike kinds), gated. A
-    catheter that no chain was assigned to, or one that bends too fast, is carried, where there is a way to; else its track
-    waits: it comes back with the next beat.
+    The tracks start at one frame and extend in both directions. The start is the first frame with a mark, else the seed,
+    else
+    the frame that most other frames confirm. In each frame:
+
+    1. Each track predicts its chain from 0.6 of its last velocity.
+    2. The chains of the frame are assigned to the predictions at the least total cost: mean shift, twice the largest change
+    of
+       shape, and a price for unlike kinds. Chains that are too far off are not assigned.
+    3. ``search`` looks for a catheter that got no chain or a chain that bends too fast. Without success the track waits:
+    the
+       catheter may return with the next beat.
 
     Parameters
     ----------
     found : sequence of FrameChains
-        Chains of each frame. Those of a frame with ``manual_needed`` are not sure: they may continue a track, not begin one.
+        Chains of each frame. Chains of a frame with ``manual_needed`` may continue a track but do not begin one.
     frame_times_ms : (n,)
     catheters : int
-        Of the catalogue: at most so many chains stand in a frame.
-    carry : Carry, optional
+        Number of catheters in the catalogue: the largest number of chains of one frame.
+    search : ChainSearch, optional
     seed : FrameChains, optional
-        What the mean of the frames round ``seed.frame`` shows, which is surer than any of them.
+        Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
 
     Returns
     -------
     tuple of FrameChains
-        ``manual_needed`` is MANUAL_NEEDED in a frame without chains, TRACK_INTERRUPTED where a catheter is missing that
-        stands in most of the frames.
+        ``manual_needed`` is MANUAL_NEEDED in a frame without chains. It is TRACK_INTERRUPTED in a frame that lacks a
+        catheter
+        which most frames have.
     """
     if not found:
         return ()
@@ -110,7 +128,7 @@ def follow(
     if seed is not None and seed.chains and not marked:
         start = seed.frame
         at = float(frame_times_ms[start])
-        tracks = [_Track(chain, at, np.zeros(2), detected=0, seeded=True) for chain in seed.chains]
+        tracks = [_Track(chain, at, np.zeros(2), detections=0, from_seed=True) for chain in seed.chains]
     else:
         start = marked[0] if marked else _start(found, catheters)
     for frames in (range(start, len(found)), range(start - 1, -1, -1)):
@@ -122,27 +140,27 @@ def follow(
                 track.chain, track.time_ms = track.chains[first], float(frame_times_ms[first])
                 track.velocity = _first_velocity(track.chains, frame_times_ms)
         for frame in frames:
-            _step(tracks, found[frame], float(frame_times_ms[frame]), catheters, carry)
+            _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
-    lasting = [
+    tracks_kept = [
         track
         for track in tracks
         if track.manual
-        or track.detected >= least
-        or (track.seeded and len(track.chains) >= max(least, _CARRIED_AT_LEAST * len(found)))
+        or track.detections >= least
+        or (track.from_seed and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found)))
     ]
-    lasting.sort(key=lambda track: -track.detected)
-    for track in lasting:
-        if 2 * track.reversed > track.detected and not track.manual:
-            track.chains = {frame: _turned(chain) for frame, chain in track.chains.items()}
-    usual = [track for track in lasting if len(track.chains) > len(found) / 2]
+    tracks_kept.sort(key=lambda track: -track.detections)
+    for track in tracks_kept:
+        if 2 * track.reversals > track.detections and not track.manual:
+            track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
+    usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
         chains: list[Chain] = []
-        for number, track in enumerate(lasting):
+        for number, track in enumerate(tracks_kept):
             chain = track.chains.get(frame)
             room = len(chains) < catheters or (chain is not None and chain.manual)
-            if chain is not None and room and (chain.manual or not _covered(chain, chains)):
+            if chain is not None and room and (chain.manual or not _overlaps(chain, chains)):
                 chains.append(replace(chain, track=number))
         missing = any(frame not in track.chains for track in usual)
         reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
@@ -185,12 +203,12 @@ def _first_velocity(chains: dict[int, Chain], frame_times_ms: Array) -> Array:
         return np.zeros(2)
     return (
         _KEPT_VELOCITY
-        * _moved(chains[first], after)
+        * _mean_shift(chains[first], after)
         / max(float(frame_times_ms[first + 1] - frame_times_ms[first]), 1e-6)
     )
 
 
-def _moved(one: Chain, other: Chain) -> Array:
+def _mean_shift(one: Chain, other: Chain) -> Array:
     common = [number for number in one.electrodes if number in other.electrodes]
     if not common:
         return np.zeros(2)
@@ -199,8 +217,8 @@ def _moved(one: Chain, other: Chain) -> Array:
     return moved
 
 
-def _covered(chain: Chain, others: Sequence[Chain]) -> bool:
-    """Whether two or more of its electrodes lie on those of another chain."""
+def _overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
+    """Return whether two or more electrodes lie on electrodes of another chain."""
     for other in others:
         apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
         if np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < _SAME_PLACE_PX**2) >= 2:
@@ -208,80 +226,85 @@ def _covered(chain: Chain, others: Sequence[Chain]) -> bool:
     return False
 
 
-def _step(tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, carry: Carry | None) -> None:
+def _advance(
+    tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None
+) -> None:
     numbers, turned = _assign(tracks, entry.chains, time_ms)
     by_hand = any(chain.manual for chain in entry.chains)
-    standing: list[Chain] = []
+    present: list[Chain] = []
     bent: list[tuple[int, Chain]] = []
     for chain, number, other_way in zip(entry.chains, numbers, turned, strict=True):
         if number < 0:
             continue
-        tracks[number].detected += 1
+        tracks[number].detections += 1
         if other_way:
-            tracks[number].reversed += 1
-            chain = _turned(chain)
-        if carry is not None and not by_hand and (other_way or _is_bent(tracks[number], chain, time_ms)):
+            tracks[number].reversals += 1
+            chain = _reverse(chain)
+        if search is not None and not by_hand and (other_way or _is_bent(tracks[number], chain, time_ms)):
             bent.append((number, chain))
         else:
-            _meet(tracks[number], chain, entry.frame, time_ms)
-            standing.append(chain)
+            _extend(tracks[number], chain, entry.frame, time_ms)
+            present.append(chain)
     for number, chain in bent:
-        # One of its electrodes may be another catheter's.
+        # One electrode of the chain may belong to another catheter.
         track = tracks[number]
         shift, reach = _expected(track, time_ms)
-        carried = carry(entry.frame, track.chain, shift, reach, standing) if carry is not None else None
-        if carried is not None and not _is_bent(track, carried, time_ms) and not _covered(carried, standing):
-            chain = replace(carried, kinds=chain.kinds)
-        _meet(track, chain, entry.frame, time_ms)
-        standing.append(chain)
+        recovered = search(entry.frame, track.chain, shift, reach, present) if search is not None else None
+        if recovered is not None and not _is_bent(track, recovered, time_ms) and not _overlaps(recovered, present):
+            chain = replace(recovered, kinds=chain.kinds)
+        _extend(track, chain, entry.frame, time_ms)
+        present.append(chain)
     loose = [chain for chain, number in zip(entry.chains, numbers, strict=True) if number < 0]
-    if carry is not None and not by_hand:
+    if search is not None and not by_hand:
         for number, track in enumerate(tracks):
-            if number in numbers or len(standing) >= catheters:
+            if number in numbers or len(present) >= catheters:
                 continue
             shift, reach = _expected(track, time_ms)
-            carried = carry(entry.frame, track.chain, shift, reach, standing)
-            if carried is not None and not _covered(carried, standing):
-                _meet(track, carried, entry.frame, time_ms)
-                standing.append(carried)
+            recovered = search(entry.frame, track.chain, shift, reach, present)
+            if recovered is not None and not _overlaps(recovered, present):
+                _extend(track, recovered, entry.frame, time_ms)
+                present.append(recovered)
     for chain in loose:
-        if chain.manual or (entry.manual_needed is None and not _covered(chain, standing)):
-            standing.append(chain)
+        if chain.manual or (entry.manual_needed is None and not _overlaps(chain, present)):
+            present.append(chain)
             tracks.append(_Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain}))
 
 
 def _is_bent(track: _Track, chain: Chain, time_ms: float) -> bool:
-    """Whether its shape changed by more than a heart bends a catheter in that time."""
+    """Return whether the shape changed faster than a heart bends a catheter."""
     allowed = _STIFF_PX + _BENDING_PX_PER_MS * abs(time_ms - track.time_ms)
     return chain_distance(track.chain, chain)[1] > min(allowed, _BEND_PX)
 
 
-def _meet(track: _Track, chain: Chain, frame: int, time_ms: float) -> None:
+def _extend(track: _Track, chain: Chain, frame: int, time_ms: float) -> None:
     elapsed = time_ms - track.time_ms
     if elapsed != 0:
-        track.velocity = _KEPT_VELOCITY * _moved(track.chain, chain) / elapsed
+        track.velocity = _KEPT_VELOCITY * _mean_shift(track.chain, chain) / elapsed
     track.chain, track.time_ms = chain, time_ms
     track.manual |= chain.manual
     track.chains[frame] = chain
 
 
 def _expected(track: _Track, time_ms: float) -> tuple[Array, float]:
-    """Shift of a track since it was met last, and how far from there it may be."""
+    """Return the expected shift of a track and its largest error, pixels."""
     elapsed = time_ms - track.time_ms
     # An old velocity says nothing about where the heart is now.
     shift = track.velocity * elapsed if abs(elapsed) < _STALE_MS else np.zeros(2)
     return shift, min(max(_NEAREST_PX, _SPEED_PX_PER_MS * abs(elapsed)), _FARTHEST_PX)
 
 
-def _turned(chain: Chain) -> Chain:
-    """The same chain with its tip at the other end."""
+def _reverse(chain: Chain) -> Chain:
+    """Return the same chain with its tip at the other end."""
     return replace(
         chain, pixels_uv=chain.pixels_uv[::-1], covariance_px2=chain.covariance_px2[::-1], scores=chain.scores[::-1]
     )
 
 
 def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -> tuple[list[int], list[bool]]:
-    """Track number of each chain, -1 where none fits, and whether it fits with its tip at the other end."""
+    """Return the track number of each chain and whether the chain is reversed.
+
+    The number is -1 where no track fits.
+    """
     if not chains or not tracks:
         return [-1] * len(chains), [False] * len(chains)
     cost = np.full((len(chains), len(tracks)), _IMPOSSIBLE)
@@ -299,7 +322,7 @@ def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -
                 cost[row, column] = away + 2.0 * bent + unlike
             elif not chain.manual:
                 if row not in others:
-                    others[row] = _turned(chain)
+                    others[row] = _reverse(chain)
                 away, bent = chain_distance(track.chain, others[row], shift)
                 if away <= gate and bent <= _BEND_PX:
                     cost[row, column] = away + 2.0 * bent + unlike + _REVERSED_PX

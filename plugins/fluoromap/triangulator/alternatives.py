@@ -1,4 +1,4 @@
-"""Points whose catheter could be paired otherwise across the views: the other place belongs to what is told."""
+"""Uncertainty of electrodes whose catheters could be paired another way across the views."""
 
 from __future__ import annotations
 
@@ -11,37 +11,40 @@ from fluoromap.contracts import Array, ElectrodePoint
 from fluoromap.reasons import Reason
 
 
-def with_alternative(
+def add_alternative(
     points: tuple[ElectrodePoint, ...],
     other: Mapping[tuple[str, int], ElectrodePoint],
     reference_shift_mm: Array | None,
     probability: float,
 ) -> tuple[ElectrodePoint, ...]:
-    """The points with the places they would have under another pairing of the site's catheters.
+    """Widen the covariances of points by another pairing of the site's catheters.
 
-    With probability p the truth lies at the other place, d away and known there with its own covariance C': the second
-    moment about the told place is ``(1 - p) C + p (C' + d d')``. That is the mixture's covariance, with p (1 - p) d d',
-    and p^2 d d' for its mean, which is not told. Where the reference catheter is paired otherwise, every relative
-    position hangs on it.
+    With probability p the true position is the alternative one. It lies at distance d from the reported position and has
+    its own covariance C'. The second moment about the reported position is ``(1 - p) C + p (C' + d d')``. This is the
+    covariance of the mixture, which contains p (1 - p) d d', plus p^2 d d' because the mixture's mean is not reported.
+    If the reference catheter is paired differently, every relative position changes with it.
 
     Parameters
     ----------
+    points : tuple of ElectrodePoint
+        Electrodes under the most probable pairing.
     other : mapping
         (catheter, electrode) -> the same electrode under the alternative pairing.
     reference_shift_mm : ndarray (3,) or None
-        Where the reference's mean would be, less where it is; None where it is not located in both pairings.
+        Displacement of the reference's mean from this pairing to the alternative one, world; None where the reference is
+        not located in both pairings.
     probability : float
-        Of the alternative.
+        Probability of the alternative.
     """
     return tuple(
-        _mixed(point, other.get((point.catheter, point.electrode)), reference_shift_mm, probability) for point in points
+        _mix(point, other.get((point.catheter, point.electrode)), reference_shift_mm, probability) for point in points
     )
 
 
 _SAME_MM = 0.01
 
 
-def _mixed(
+def _mix(
     point: ElectrodePoint, other: ElectrodePoint | None, reference_shift_mm: Array | None, p: float
 ) -> ElectrodePoint:
     if other is None:
@@ -62,11 +65,11 @@ def _mixed(
         point.relative_covariance_mm2 is None or other.relative_covariance_mm2 is None or reference_shift_mm is None
     ):  # fmt: skip
         return point
-    moved = apart - reference_shift_mm
-    if np.linalg.norm(moved) <= _SAME_MM:
+    relative_apart = apart - reference_shift_mm
+    if np.linalg.norm(relative_apart) <= _SAME_MM:
         return point
-    mixed = _second_moment(point.relative_covariance_mm2, other.relative_covariance_mm2, moved, p)
-    return replace(point, relative_covariance_mm2=mixed)
+    moment = _second_moment(point.relative_covariance_mm2, other.relative_covariance_mm2, relative_apart, p)
+    return replace(point, relative_covariance_mm2=moment)
 
 
 def _second_moment(own: Array, other: Array, apart_mm: Array, p: float) -> Array:

@@ -1,4 +1,4 @@
-"""Points from the pixels of two views, and how each pixel's error reaches them."""
+"""Points from the pixels of two views, and how pixel errors propagate to them."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ from fluoromap.triangulator.uncertainty import jacobians
 
 _STEPS = 8
 _SETTLED_MM = 1e-6
-"""What is left after a step is a small part of it."""
+"""Iteration ends below this step: the next step would be much smaller still."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Points (..., N, 3) in the world, mm, and ``gain`` (..., 3 N, 4 N): their change with each pixel coordinate, to first
-    order; leading axes where several moments were asked about together."""
+    """Points and their first-order dependence on the pixels.
+
+    points_mm : (..., N, 3) world. gain : (..., 3 N, 4 N) change of each coordinate with each pixel coordinate, mm a pixel.
+    Leading axes are moments.
+    """
 
     points_mm: Array
     gain: Array
 
     def covariance_mm2(self, pixels_px2: Array) -> Array:
-        """Covariance (..., N, 3, N, 3) between all coordinates of all points, from the pixels' (..., 4 N, 4 N)."""
+        """Return the joint covariance (..., N, 3, N, 3) of all points, from the pixels' (..., 4 N, 4 N)."""
         covariance = self.gain @ pixels_px2 @ _transposed(self.gain)
         shape = self.points_mm.shape
         symmetric: Array = ((covariance + _transposed(covariance)) / 2).reshape(*shape, *shape[-2:])
@@ -35,38 +38,39 @@ class Estimate:
 
 
 class Method(Protocol):
-    """How a triangulator finds points."""
+    """A triangulator's way to find points."""
 
     @property
-    def takes_out_breathing(self) -> bool:
-        """Whether a displacement of the whole heart between the runs is estimated."""
+    def estimates_breathing(self) -> bool:
+        """True where the method estimates a displacement of the whole heart between the runs."""
 
     def start(self, cameras: Cameras, pixels: TwoViewPixels) -> Array:
-        """Points (N, 3), each electrode on its own."""
+        """Return points (N, 3) in the world, mm, each electrode located separately."""
 
     def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
-        """Points given the covariance (..., 4 N, 4 N) that weights the pixels."""
+        """Estimate points with the covariance (..., 4 N, 4 N) that weights the pixels."""
 
 
-class EachAlone:
-    """The paper's: algebraic least squares of equations (8), electrode by electrode."""
+class SeparateLeastSquares:
+    """The paper's method: algebraic least squares of equations (8), electrode by electrode."""
 
-    takes_out_breathing = False
+    estimates_breathing = False
 
     def start(self, cameras: Cameras, pixels: TwoViewPixels) -> Array:
         return triangulate_linear(*cameras, *pixels.pixels)
 
     def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
-        return Estimate(start_mm, alone_gain(cameras, start_mm))
+        return Estimate(start_mm, separate_gain(cameras, start_mm))
 
 
-class AllTogether:
-    """All electrodes of the moment at once, by generalised least squares.
+class JointLeastSquares:
+    """Generalised least squares of all electrodes of a moment together.
 
-    Breathing displaces all electrodes alike between the runs: that is told from their common misfit and taken out.
+    Breathing displaces all electrodes alike between the runs. The method estimates that from their common misfit and
+    removes it.
     """
 
-    takes_out_breathing = True
+    estimates_breathing = True
 
     def start(self, cameras: Cameras, pixels: TwoViewPixels) -> Array:
         return triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
@@ -85,8 +89,8 @@ class AllTogether:
         return Estimate(points, gain)
 
 
-def alone_gain(cameras: Cameras, points_mm: Array) -> Array:
-    """Gain (..., 3 N, 4 N) of unweighted least squares, each electrode on its own."""
+def separate_gain(cameras: Cameras, points_mm: Array) -> Array:
+    """Return the gain (..., 3 N, 4 N) of unweighted least squares, each electrode separately."""
     *moments, n, _ = points_mm.shape
     inverse = np.linalg.pinv(jacobians(cameras, points_mm).reshape(*moments, n, 4, 3))
     gain = np.zeros((*moments, n, 3, n, 4))
@@ -96,7 +100,7 @@ def alone_gain(cameras: Cameras, points_mm: Array) -> Array:
 
 
 def _design(cameras: Cameras, points_mm: Array) -> Array:
-    """d pixels/d points, (..., 4 N, 3 N)."""
+    """Return d pixels/d points, (..., 4 N, 3 N)."""
     *moments, n, _ = points_mm.shape
     own = jacobians(cameras, points_mm).reshape(*moments, n, 4, 3)
     design = np.zeros((*moments, n, 4, n, 3))
@@ -118,14 +122,16 @@ def triangulate_maximum_likelihood(
     covariances_a_px2: Array,
     covariances_b_px2: Array,
 ) -> Array:
-    """Points of least reprojection error by Gauss-Newton, all at once, from the linear solution on.
+    """Return the points of least reprojection error.
+
+    Gauss-Newton steps start at the linear solution; all points move in the same step.
 
     Parameters
     ----------
     pixels_a, pixels_b : ndarray, shape (N, 2)
         The same N electrodes (u, v) in the two views.
     covariances_a_px2, covariances_b_px2 : ndarray, shape (N, 2, 2)
-        Of those pixels.
+        Covariances of those pixels.
 
     Returns
     -------

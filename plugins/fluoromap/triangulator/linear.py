@@ -8,13 +8,13 @@ from pydantic import BaseModel
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, MatchedSite, Triangulation
-from fluoromap.triangulator.estimate import EachAlone
+from fluoromap.triangulator.estimate import SeparateLeastSquares
 from fluoromap.triangulator.study_triangulation import locate_study
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 
 class Linear:
-    """Triangulator ``linear``: every electrode on its own, algebraic least squares of equations (8) in both views."""
+    """Triangulator ``linear``: algebraic least squares of equations (8), each electrode separately."""
 
     name: ClassVar[str] = "linear"
     version: ClassVar[str] = "5"
@@ -24,4 +24,4 @@ class Linear:
         self._params = params
 
     def triangulate(self, sites: tuple[MatchedSite, ...], catalogue: Catalogue, context: Context) -> Triangulation:
-        return locate_study(sites, catalogue, context, self._params, EachAlone())
+        return locate_study(sites, catalogue, context, self._params, SeparateLeastSquares())

@@ -10,21 +10,27 @@ from numpy.typing import ArrayLike
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, PhasePair, SiteCycle
 from fluoromap.triangulator.estimate import Method
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, seen_in_both
-from fluoromap.triangulator.uncertainty import Motion, UncertaintyParams, error_sources, pixel_noise_px2, seen_breathing
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
+from fluoromap.triangulator.uncertainty import (
+    Motion,
+    UncertaintyParams,
+    error_sources,
+    pixel_noise_px2,
+    visible_breathing,
+)
 
 IN_MOST_PAIRS = 0.8
-"""An electrode belongs to the site's cycle when both views show it at this share of the moments."""
+"""Share of the moments at which both views must show an electrode for it to belong to the site's cycle."""
 FEWEST_MOMENTS = 4
 _HARMONICS = 5
 _SMOOTHNESS = 1e-3
 
 
 class CycleMoments:
-    """The moments of the cycle at which both views show the same electrodes, and how those move.
+    """The moments of the cycle at which both views show the same electrodes, and their motion.
 
-    phases : (p,), rising. pixels : what is seen of m electrodes at all of them. positions_mm : (p, m, 3), each electrode
-    located on its own.
+    phases : (p,), rising. pixels : m electrodes at each of the p moments. positions_mm : (p, m, 3) world, each electrode
+    located separately.
     """
 
     def __init__(self, phases: Array, pixels: TwoViewPixels, positions_mm: Array) -> None:
@@ -35,7 +41,10 @@ class CycleMoments:
         self._coefficients = _fit(phases, positions_mm)
 
     def motion(self, phases: Array, diastolic_phase: float, labels: Sequence[tuple[str, int]]) -> Motion:
-        """How these electrodes move at phases (...); one that the cycle does not know moves as the others on average."""
+        """Return the motion of these electrodes at phases (...).
+
+        An electrode that is not part of the cycle gets the mean motion of the others.
+        """
         displaced = np.einsum("...k,kmc->...mc", _waves(phases) - _waves(diastolic_phase), self._coefficients)
         velocity = np.einsum("...k,kmc->...mc", _waves(phases, derivative=True), self._coefficients)
         known = [self.labels.index(label) if label in self.labels else -1 for label in labels]
@@ -48,8 +57,8 @@ class CycleMoments:
 
 
 def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) -> CycleMoments | None:
-    """The moments of a site's cycle; None where too few show its electrodes."""
-    moments = [(pair.phase, seen_in_both(pair)) for pair in pairs if pair.phase is not None]
+    """Return the moments of a site's cycle; None where too few show its electrodes."""
+    moments = [(pair.phase, pixels_in_both_views(pair)) for pair in pairs if pair.phase is not None]
     counts: dict[tuple[str, int], int] = {}
     for _, pixels in moments:
         for label in pixels.labels:
@@ -57,26 +66,25 @@ def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) 
     labels = tuple(label for label, count in counts.items() if count >= IN_MOST_PAIRS * len(moments))
     whole: dict[float, TwoViewPixels] = {}
     for phase, pixels in moments:
-        # Beats told by R waves repeat phase 0; one moment of each phase is enough.
+        # Beats timed by R waves repeat phase 0; one moment of each phase is enough.
         if phase not in whole and set(labels) <= set(pixels.labels):
             whole[phase] = pixels.only(labels)
     if not labels or len(whole) < FEWEST_MOMENTS:
         return None
     phases = np.array(sorted(whole))
-    seen = [whole[phase] for phase in phases]
-    pixels = _stacked(seen)
-    # As if all electrodes of all moments were seen at one: each is located on its own.
-    positions = method.start(cameras, _flat(pixels)).reshape(len(seen), len(labels), 3)
+    pixels = _stack([whole[phase] for phase in phases])
+    # Each electrode is located separately, so that all moments can go through one call.
+    positions = method.start(cameras, _flatten(pixels)).reshape(len(phases), len(labels), 3)
     return CycleMoments(phases, pixels, positions)
 
 
-def _stacked(moments: Sequence[TwoViewPixels]) -> TwoViewPixels:
+def _stack(moments: Sequence[TwoViewPixels]) -> TwoViewPixels:
     a, b = (np.stack([moment.pixels[view] for moment in moments]) for view in (0, 1))
     sa, sb = (np.stack([moment.covariances[view] for moment in moments]) for view in (0, 1))
     return TwoViewPixels(moments[0].labels, (a, b), (sa, sb))
 
 
-def _flat(pixels: TwoViewPixels) -> TwoViewPixels:
+def _flatten(pixels: TwoViewPixels) -> TwoViewPixels:
     (a, b), (sa, sb) = pixels.pixels, pixels.covariances
     flat = (a.reshape(-1, 2), b.reshape(-1, 2)), (sa.reshape(-1, 2, 2), sb.reshape(-1, 2, 2))
     return TwoViewPixels(pixels.labels * len(a), *flat)
@@ -91,23 +99,26 @@ def locate_cycle(
     method: Method,
     gantry_covariance: Array,
 ) -> SiteCycle:
-    """The electrodes at every moment, with a covariance that grows where the heart moves fast."""
+    """Locate the electrodes at every moment, with a covariance that grows where the heart moves fast."""
     start, pixels = moments.positions_mm, moments.pixels
     motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
     sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
     noise = pixel_noise_px2(pixels.covariances)
     errors = noise + sum(source.pixels_px2() for source in sources)
-    seen = seen_breathing(cameras, start, params)
+    seen = visible_breathing(cameras, start, params)
     found = method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
     covariances = np.einsum("piaib->piab", found.covariance_mm2(errors))
     return SiteCycle(moments.phases, moments.labels, found.points_mm, covariances)
 
 
 def _fit(phases: Array, positions_mm: Array) -> Array:
-    """Coefficients (k, m, 3) of a smooth cycle through positions (p, m, 3): for its velocity, not for the answer."""
+    """Fit coefficients (k, m, 3) of a smooth cycle to positions (p, m, 3).
+
+    The fit serves displacement and velocity only; the reported positions are not smoothed.
+    """
     waves = _waves(phases)
     order = np.concatenate([[0], np.repeat(np.arange(1, _HARMONICS + 1), 2)])
-    # Gaps in the cycle leave the high harmonics free: motion that is not needed is not there.
+    # Gaps in the cycle leave the high harmonics free; the ridge keeps them small there.
     ridge = _SMOOTHNESS * len(phases) * np.diag(order.astype(np.float64) ** 2)
     flat = positions_mm.reshape(len(phases), -1)
     coefficients = np.linalg.solve(waves.T @ waves + ridge, waves.T @ flat)
@@ -115,7 +126,7 @@ def _fit(phases: Array, positions_mm: Array) -> Array:
 
 
 def _waves(phases: ArrayLike, derivative: bool = False) -> Array:
-    """1, cos and sin of the harmonics at phases (...), or their derivatives by phase, shape (..., k)."""
+    """Return 1, cos and sin of the harmonics at phases (...), or their derivatives by phase, shape (..., k)."""
     angle = 2 * np.pi * np.asarray(phases, dtype=np.float64)[..., None] * np.arange(1, _HARMONICS + 1)
     rate = 2 * np.pi * np.arange(1, _HARMONICS + 1)
     pairs = (-rate * np.sin(angle), rate * np.cos(angle)) if derivative else (np.cos(angle), np.sin(angle))

@@ -1,4 +1,4 @@
-"""Electrode spacings as located against the catalogue's."""
+"""Located electrode spacings compared with the catalogue's."""
 
 from __future__ import annotations
 
@@ -13,22 +13,28 @@ from fluoromap.contracts import Array
 from fluoromap.triangulator.two_view_pixels import TwoViewPixels
 
 STUDY_LIMIT_MM = 0.75
-"""A spacing whose median over the study is farther than this from the catalogue's is the catalogue's fault."""
+"""Difference between a spacing's median over the study and the catalogue's above which the catalogue is wrong."""
 _CHANCE_SD = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class WrongGap:
-    """Two electrodes of a catheter that stand ``found_mm`` apart, ``told_mm`` by the catalogue."""
+    """Two electrodes of a catheter whose distance in the study differs from the catalogue's."""
 
     first: int
     second: int
-    found_mm: float
-    told_mm: float
+    located_mm: float
+    catalogue_mm: float
 
 
 def neighbours(labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> list[tuple[int, int, float]]:
-    """Places of electrodes that follow each other on their catheter, and the catalogue's distance between them in mm."""
+    """Return pairs of successive electrodes of a catheter.
+
+    Returns
+    -------
+    list of (int, int, float)
+        Indices of the two electrodes in ``labels``, and the catalogue's distance between them in mm.
+    """
     found = []
     for name in catalogue.names:
         along = catalogue[name].arc_lengths_mm
@@ -44,7 +50,10 @@ def neighbours(labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> list[
 def spacing_mismatches(
     points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue, limit_mm: float
 ) -> set[int]:
-    """Indices of electrodes whose distance from the next one located on the catheter is not the catalogue's."""
+    """Return the indices of electrodes whose distance from a neighbour is not the catalogue's.
+
+    Neighbours are successive located electrodes of one catheter.
+    """
     found: set[int] = set()
     for i, j, gap in neighbours(labels, catalogue):
         if abs(float(np.linalg.norm(points_mm[i] - points_mm[j])) - gap) > limit_mm:
@@ -55,12 +64,12 @@ def spacing_mismatches(
 def wrong_spacings(
     sites: Sequence[tuple[TwoViewPixels, Array, Array]], catalogue: Catalogue
 ) -> dict[str, list[WrongGap]]:
-    """Catheters the catalogue describes wrongly, and each of their gaps that is off.
+    """Return the catheters that the catalogue describes wrongly, with their wrong gaps.
 
     Parameters
     ----------
     sites : sequence of (pixels, points (N, 3) in mm, their covariance (N, 3, N, 3) from pixel noise)
-        All sites of the study: one site's spacing may be off by chance, the study's median is not.
+        All sites of the study. One site's spacing may be wrong by chance; the median over the study is not.
     """
     found: dict[tuple[str, int, int], list[tuple[float, float, float]]] = {}
     for pixels, points, joint in sites:

@@ -1,4 +1,4 @@
-"""The electrodes that both views of a site show at one moment."""
+"""Electrodes that both views of a site show at one moment."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ Cameras = tuple[Camera, Camera]
 
 @dataclass(frozen=True, eq=False)
 class TwoViewPixels:
-    """The N electrodes that both views show at one moment, or at each of several moments: then with a leading axis.
+    """The N electrodes that both views show, at one moment or at several moments (leading axis).
 
-    labels : (catheter, electrode). pixels : (..., N, 2) in view a, view b. covariances : (..., N, 2, 2) in view a, view b.
+    labels : (catheter, electrode). pixels : (..., N, 2) in view a, view b. covariances : (..., N, 2, 2) in view a, view b,
+    px^2.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -29,20 +30,23 @@ class TwoViewPixels:
         return tuple(catheter for catheter, _ in self.labels)
 
     def only(self, labels: Sequence[tuple[str, int]]) -> TwoViewPixels:
-        """The same moment with these electrodes, in this order."""
+        """Return the same moment with these electrodes only, in this order."""
         rows = [self.labels.index(label) for label in labels]
         (pa, pb), (ca, cb) = self.pixels, self.covariances
         return TwoViewPixels(tuple(labels), (pa[rows], pb[rows]), (ca[rows], cb[rows]))
 
     def residuals_px(self, cameras: Cameras, points_world_mm: Array) -> Array:
-        """Pixels less the projected points (..., N, 3), shape (..., 4 N): electrode by electrode u, v in view a, then in b."""
-        apart = [seen - camera.project(points_world_mm) for camera, seen in zip(cameras, self.pixels, strict=True)]
+        """Return pixels minus projected points (..., N, 3), shape (..., 4 N).
+
+        The order is electrode by electrode, each u, v in view a, then u, v in view b.
+        """
+        apart = [uv - camera.project(points_world_mm) for camera, uv in zip(cameras, self.pixels, strict=True)]
         residuals: Array = np.stack(apart, axis=-2).reshape(*apart[0].shape[:-2], -1)
         return residuals
 
 
-def seen_in_both(pair: PhasePair) -> TwoViewPixels:
-    """The electrodes that both views of a pair show, paired by catheter and number."""
+def pixels_in_both_views(pair: PhasePair) -> TwoViewPixels:
+    """Return the electrodes that both views of a pair show, paired by catheter and number."""
     first, second = _by_label(pair.a.chains), _by_label(pair.b.chains)
     labels = tuple(label for label in first if label in second)
 

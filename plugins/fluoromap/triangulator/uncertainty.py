@@ -1,7 +1,7 @@
-"""What can be wrong about electrodes seen in two views: every source of error, and what it does to the pixels.
+"""Sources of error of electrodes in two views, and their effect on the pixels.
 
-Moments with the same electrodes are asked about together: where points are (N, 3), they may be (..., N, 3) for many moments,
-and every answer then has the same leading axes.
+Points (N, 3) may also be (..., N, 3): many moments with the same electrodes. Every returned array then has the same leading
+axes.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from fluoromap.geometry import Camera
 from fluoromap.triangulator.two_view_pixels import Cameras
 
 Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
-"""Where an error source counts in the :class:`~fluoromap.contracts.ErrorBudget`."""
+"""Entry of the :class:`~fluoromap.contracts.ErrorBudget` to which an error source belongs."""
 
 
 class UncertaintyParams(BaseModel, extra="forbid"):
-    """What both triangulators assume about everything but the pixels; standard deviations."""
+    """Assumptions of both triangulators about all errors except pixel noise; standard deviations."""
 
     gantry_angle_sd_deg: float = Field(
         0.5, ge=0, le=10, description="Error of each gantry angle in the header, degrees."
@@ -48,7 +48,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         0.025,
         ge=0,
         le=10,
-        description="How far an electrode strays from what its catheter's tip tells of it, mm an axis.",
+        description="Displacement of an electrode beyond the share that follows its catheter's tip, mm an axis.",
     )
     beat_amplitude_sd: float = Field(
         0.04, ge=0, le=1, description="Variation of the motion's amplitude from beat to beat, as a share of it."
@@ -60,25 +60,25 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         0.015, ge=0, le=0.5, description="Error of bringing the two runs to the same cardiac phase, in cycles."
     )
     spacing_limit_mm: float = Field(
-        1.5, gt=0, le=20, description="Electrode spacings farther than this from the catalogue's are told, mm."
+        1.5, gt=0, le=20, description="Electrode spacings farther than this from the catalogue's are reported, mm."
     )
 
     def respiration_covariance_mm2(self) -> Array:
-        """Covariance (3, 3) of where breathing holds the heart in one run."""
+        """Return the covariance (3, 3) of the heart's breathing position in one run."""
         other, head = self.respiration_other_sd_mm**2, self.respiration_head_feet_sd_mm**2
         return np.diag([other, other, head])
 
     def gantry_covariance(self) -> Array:
-        """Covariance (12, 12) of the gantry's errors, see :func:`gantry_effect_px`; the views' are independent."""
+        """Return the covariance (12, 12) of the gantry's errors, independent in each view; see :func:`gantry_effect_px`."""
         angle, offset = np.radians(self.gantry_angle_sd_deg) ** 2, self.isocentre_sd_mm**2
         return np.diag(np.tile(np.repeat([angle, offset], 3), 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the electrodes move at one moment of the cycle.
+    """Motion of the electrodes at one moment of the cycle.
 
-    displaced_mm : (..., N, 3) from where they are at diastole. velocity_mm : (..., N, 3), mm a cycle.
+    displaced_mm : (..., N, 3) displacement from diastole. velocity_mm : (..., N, 3), mm a cycle.
     """
 
     displaced_mm: Array
@@ -89,8 +89,8 @@ class Motion:
 class ErrorSource:
     """One cause of error with k unknown parameters.
 
-    effect_px : (..., 4 N, k) what one unit of each parameter does to the pixels, electrode by electrode: u, v in view a, then
-    in view b. covariance : (k, k) of the parameters. shares : (k,) where each counts in the error budget.
+    effect_px : (..., 4 N, k) change of the pixels with one unit of each parameter, electrode by electrode: u, v in view a,
+    then in view b. covariance : (k, k) of the parameters. shares : (k,) the error budget's entry of each parameter.
     """
 
     effect_px: Array
@@ -98,25 +98,25 @@ class ErrorSource:
     shares: tuple[Share, ...]
 
     def pixels_px2(self) -> Array:
-        """Covariance (..., 4 N, 4 N) of the pixels from this source."""
+        """Return the covariance (..., 4 N, 4 N) of the pixels from this source."""
         covariance: Array = self.effect_px @ self.covariance @ np.swapaxes(self.effect_px, -1, -2)
         return covariance
 
 
 def jacobians(cameras: Cameras, points_world_mm: Array) -> Array:
-    """d(u, v)/d(X, Y, Z) in view a and b at points (..., N, 3), shape (..., N, 2, 2, 3)."""
+    """Return d(u, v)/d(X, Y, Z) in view a and b at points (..., N, 3), shape (..., N, 2, 2, 3)."""
     return np.stack([camera.jacobian(points_world_mm) for camera in cameras], axis=-3)
 
 
 def effect_px(jacobian: Array, displacement_a: Array, displacement_b: Array) -> Array:
-    """What parameters do to the pixels, (..., 4 N, k), that displace the electrodes as seen by each view.
+    """Return the effect (..., 4 N, k) on the pixels of parameters that displace the electrodes.
 
     Parameters
     ----------
     jacobian : ndarray, shape (..., N, 2, 2, 3)
         See :func:`jacobians`.
     displacement_a, displacement_b : ndarray, shape (..., N, 3, k) or (3, k)
-        mm in the world for one unit of each parameter.
+        Displacement as each view sees it, world, mm, for one unit of each parameter.
     """
     *moments, n = jacobian.shape[:-3]
     parts = [jacobian[..., view, :, :] @ d for view, d in enumerate((displacement_a, displacement_b))]
@@ -125,29 +125,32 @@ def effect_px(jacobian: Array, displacement_a: Array, displacement_b: Array) -> 
 
 
 def gantry_effect_px(jacobian: Array, points_world_mm: Array) -> Array:
-    """Effect (4 N, 12) of the gantry's errors: rotation vector about the isocentre (radians) and offset (mm) of view a,
-    then of view b. They displace the electrodes as that view sees them: ``X' = R X + t``."""
+    """Return the effect (4 N, 12) of the gantry's errors on the pixels.
+
+    The parameters are the rotation vector about the isocentre (radians) and the offset (mm) of view a, then of view b.
+    They displace the electrodes as that view sees them: ``X' = R X + t``.
+    """
     x, y, z = np.moveaxis(points_world_mm, -1, 0)
     zero = np.zeros_like(x)
-    turned = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), (0, 1), (-2, -1))
-    own = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=-1)
+    cross_product = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), (0, 1), (-2, -1))
+    own = np.concatenate([cross_product, np.broadcast_to(np.eye(3), cross_product.shape)], axis=-1)
     none = np.zeros_like(own)
     return effect_px(jacobian, np.concatenate([own, none], axis=-1), np.concatenate([none, own], axis=-1))
 
 
 def breathing_effect_px(jacobian: Array) -> Array:
-    """Effect (4 N, 3) of half the difference (mm) of where breathing held the heart in the two runs.
+    """Return the effect (4 N, 3) of half the breathing displacement (mm) between the two runs.
 
-    A position is told for the middle of the two runs' breaths: nothing says where breathing is at rest.
+    Positions are those at the middle of the two runs' breathing positions: no data show the rest position.
     """
     return effect_px(jacobian, np.eye(3), -np.eye(3))
 
 
-def seen_breathing(cameras: Cameras, points_world_mm: Array, params: UncertaintyParams) -> ErrorSource:
-    """The part of breathing's displacement that the two views show: across the plane of their rays, one parameter.
+def visible_breathing(cameras: Cameras, points_world_mm: Array, params: UncertaintyParams) -> ErrorSource:
+    """Return the part of the breathing displacement that two views can show, one parameter.
 
-    In that plane each view shows its own displacement as if the heart stood elsewhere; perspective tells the difference,
-    but so faintly that the gantry's errors drown it.
+    That part is perpendicular to the plane of the two central rays. Within the plane, breathing between the runs looks like
+    another position of the heart. Perspective distinguishes them, but by less than the gantry's errors.
     """
     across = np.cross(cameras[0].axis_world, cameras[1].axis_world)
     across /= np.linalg.norm(across)
@@ -165,22 +168,22 @@ def error_sources(
     gantry_covariance: Array,
     motion: Motion | None,
 ) -> tuple[ErrorSource, ...]:
-    """Everything but the pixels' own noise that is wrong at one moment of a site.
+    """Return all error sources at one moment of a site, except pixel noise.
 
-    Breathing displaces all catheters alike in each run, and errors of the gantry turn and shift them alike: both are
-    carried along with their correlation, so that they cancel, as far as they do, in positions relative to the reference
-    catheter. Beat-to-beat variation displaces each catheter as a whole in each run, strengthens or weakens the motion of
-    all of them and moves it in time; the last two matter where the heart moves.
+    Breathing displaces all catheters alike in each run, and errors of the gantry turn and shift them alike. The sources
+    keep these correlations, so that such errors partly cancel in positions relative to the reference catheter.
+    Beat-to-beat variation displaces each catheter as a whole in each run. It also strengthens or weakens the motion of all
+    catheters and shifts it in time; these two matter where the heart moves.
 
     Parameters
     ----------
     points_world_mm : ndarray, shape (..., N, 3)
     labels : sequence of (catheter, electrode)
-        Of each point.
+        Labels of the N points.
     gantry_covariance : ndarray, shape (12, 12)
-        As :meth:`UncertaintyParams.gantry_covariance` or what self-calibration left of it.
+        From :meth:`UncertaintyParams.gantry_covariance` or from self-calibration.
     motion : Motion or None
-        None: the moment is one of rest.
+        None where the heart rests.
     """
     n = len(labels)
     jacobian = jacobians(cameras, points_world_mm)
@@ -202,7 +205,7 @@ def error_sources(
     if motion is not None:
         displaced, velocity = motion.displaced_mm[..., None], motion.velocity_mm[..., None]
         sources.append(_both_views(jacobian, displaced, displaced, params.beat_amplitude_sd, "phase_mismatch"))
-        # The phase is view a's; view b's frame is only the nearest to it.
+        # The phase is that of view a; view b contributes its frame nearest to that phase.
         timing = np.diag(np.square([params.beat_timing_sd, np.hypot(params.beat_timing_sd, params.phase_pairing_sd)]))
         none = np.zeros_like(velocity)
         late = effect_px(
@@ -213,7 +216,7 @@ def error_sources(
 
 
 def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Share) -> ErrorSource:
-    """The same parameters drawn anew in each view."""
+    """Return a source whose parameters vary independently in each view."""
     k = in_a.shape[-1]
     *moments, n = jacobian.shape[:-3]
     effect = np.zeros((*moments, n, 2, 2, 2, k))
@@ -224,14 +227,14 @@ def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Sha
 
 
 def _across(camera: Camera, points_world_mm: Array) -> Array:
-    """Points less their part along the central ray, (..., N, 3, 1): what a wrong magnification stretches."""
+    """Return the part of points across the central ray, (..., N, 3, 1): a wrong magnification stretches it."""
     along = camera.axis_world
     across: Array = (points_world_mm - (points_world_mm @ along)[..., None] * along)[..., None]
     return across
 
 
 def pixel_noise_px2(covariances_px2: tuple[Array, Array]) -> Array:
-    """The pixels' own covariances, (..., N, 2, 2) in view a and b, as one matrix (..., 4 N, 4 N)."""
+    """Return the pixels' covariances, (..., N, 2, 2) in view a and b, as one matrix (..., 4 N, 4 N)."""
     *moments, n = covariances_px2[0].shape[:-2]
     noise = np.zeros((*moments, n, 2, 2, n, 2, 2))
     for row in range(n):
@@ -241,10 +244,20 @@ def pixel_noise_px2(covariances_px2: tuple[Array, Array]) -> Array:
 
 
 def relative_covariance_mm2(joint_mm2: Array, index: int, reference: list[int]) -> Array:
-    """Covariance (3, 3) of point ``index`` minus the mean of the points ``reference``, from the joint one (N, 3, N, 3)."""
+    """Return the covariance (3, 3) of a point relative to the reference catheter's mean.
+
+    Parameters
+    ----------
+    joint_mm2 : ndarray, shape (N, 3, N, 3)
+        Joint covariance of all points.
+    index : int
+        The point.
+    reference : list of int
+        The reference catheter's points.
+    """
     weights = np.zeros(len(joint_mm2))
     weights[index] += 1.0
     weights[reference] -= 1.0 / len(reference)
     covariance: Array = np.einsum("i,iajb,j->ab", weights, joint_mm2, weights)
-    # The reference's own electrodes can come out with nearly nothing; a covariance stays positive definite.
+    # The variance of the reference's own electrodes can be nearly 0; this keeps the covariance positive definite.
     return covariance + 1e-9 * np.eye(3)

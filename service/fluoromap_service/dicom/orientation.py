@@ -7,13 +7,12 @@ An image is upright when a frontal view shows the patient's left on its right an
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
+from fluoromap.geometry.gantry import UPRIGHT, ImageAxes, view_axes
 
 Array = NDArray[np.float64]
 
@@ -25,17 +24,6 @@ _AGREEMENT = 0.6
 
 _TURN: Array = np.array([[0, -1], [1, 0]], dtype=np.float64)
 _FLIP: Array = np.array([[-1, 0], [0, 1]], dtype=np.float64)
-
-
-def upright_axes_world(primary_deg: float, secondary_deg: float) -> Array:
-    """Directions of +u and +v of the upright image in the world (LPS), shape (2, 3)."""
-    a, b = math.radians(primary_deg), math.radians(secondary_deg)
-    return np.array(
-        [
-            [math.cos(a), math.sin(a), 0.0],
-            [math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b)],
-        ]
-    )
 
 
 def image_axes_from_field_of_view(rotation_deg: float, flipped: bool) -> ImageAxes | None:
@@ -77,7 +65,7 @@ def image_axes_from_orientation(
     if len(named) != 2 or named[0] is None or named[1] is None:
         return None
     told = np.stack([named[0], named[1]])
-    upright = upright_axes_world(primary_deg, secondary_deg)
+    upright = view_axes(primary_deg, secondary_deg)[:2]
     candidates = [
         np.linalg.matrix_power(_TURN, turns) if not flip else _FLIP @ np.linalg.matrix_power(_TURN, turns)
         for flip in (False, True)
@@ -90,7 +78,7 @@ def image_axes_from_orientation(
 
 def patient_orientation(primary_deg: float, secondary_deg: float, image_axes: ImageAxes = UPRIGHT) -> tuple[str, str]:
     """PatientOrientation (0020,0020) of a stored image."""
-    rows, columns = np.array(image_axes, dtype=np.float64) @ upright_axes_world(primary_deg, secondary_deg)
+    rows, columns = np.array(image_axes, dtype=np.float64) @ view_axes(primary_deg, secondary_deg)[:2]
     return _letters(rows), _letters(columns)
 
 

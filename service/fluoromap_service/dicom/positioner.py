@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
+from fluoromap.geometry.gantry import LEAST_SOURCE_MM, UPRIGHT, ImageAxes
 from fluoromap_service.dicom.facts import HeaderWarning, Pair
 from fluoromap_service.dicom.header import Header
 from fluoromap_service.dicom.orientation import image_axes_from_field_of_view, image_axes_from_orientation
@@ -32,7 +32,7 @@ def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderW
     """
     primary = _within(header.number("PositionerPrimaryAngle"), -180, 180, warnings)
     secondary = _within(header.number("PositionerSecondaryAngle"), -90, 90, warnings)
-    detector = _within(header.number("DistanceSourceToDetector") or None, 200, 3000, warnings)
+    detector = _within(header.number("DistanceSourceToDetector") or None, LEAST_SOURCE_MM, 3000, warnings)
     isocentre = _source_isocentre_mm(header, detector, warnings)
     spacing = _pixel_spacing_mm(header, rows, columns, warnings)
     told = {
@@ -61,12 +61,12 @@ def _warn(warnings: list[HeaderWarning], warning: HeaderWarning) -> None:
 def _source_isocentre_mm(header: Header, detector_mm: float | None, warnings: list[HeaderWarning]) -> float | None:
     farthest = detector_mm - 1e-3 if detector_mm else 3000
     told = header.number("DistanceSourceToIsocenter") or header.number("DistanceSourceToPatient") or None
-    isocentre = _within(told, 100, farthest, warnings)
+    isocentre = _within(told, LEAST_SOURCE_MM, farthest, warnings)
     if isocentre is not None or detector_mm is None:
         return isocentre
     # ERMF = SID / SOD, PS3.3 C.8.7.5.
     magnification = header.number("EstimatedRadiographicMagnificationFactor")
-    if magnification is None or magnification <= 1 or detector_mm / magnification < 100:
+    if magnification is None or magnification <= 1 or detector_mm / magnification < LEAST_SOURCE_MM:
         return None
     _warn(warnings, HeaderWarning.SOURCE_ISOCENTRE_FROM_MAGNIFICATION)
     return detector_mm / magnification

@@ -1,20 +1,20 @@
-"""The life of jobs and stages. SQL is the truth; a message is only a hint that a row may be claimed.
+"""The life of jobs and stages. SQL is the truth; a message only says that a row may be claimed.
 
-Every function works inside the caller's transaction and locks the job's row first, so that two stages that finish together
-see each other and nobody deadlocks.
+Every function works inside the caller's transaction and locks the job's row first. So two stages that finish together see
+each other, and no two transactions wait for each other.
 """
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from sqlalchemy import Row, or_, select, update
 from sqlalchemy.orm import Session, defer
 
-from fluoromap import matching
+from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
 from fluoromap_service.settings import settings
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.models import (
@@ -30,13 +30,11 @@ from fluoromap_service.store.models import (
 )
 from fluoromap_service.study.snapshot import Snapshot
 
-FATAL = frozenset({"match", "triangulate", "fuse"})
-"""Stages whose failure fails the job; the others fail their subject only."""
-
 LONGEST_REPUBLISH_SECONDS = 60.0
-_TOLD = (
+_REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
+"""Columns of a stage that its events report."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +48,16 @@ class Claim:
     subject: str
 
 
+@dataclass(frozen=True, slots=True)
+class StoredResult:
+    """A stage's result in the store: the hash of its file, and the rows that belong to it."""
+
+    sha256: str
+    rows: tuple[Base, ...] = ()
+
+
 def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
-    """Add a job with all its stages; the first ones are ready, which is their announcement."""
+    """Add a job with all its stages; the first ones are ready, which announces them."""
     job = Job(
         id=uuid.uuid4().hex,
         study_id=study_id,
@@ -60,35 +66,29 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
     )
     session.add(job)
     session.flush()
-
-    def add(name: str, subject: str, plugin: str, version: str, depends_on: Sequence[int]) -> int:
-        state = StageState.PENDING if depends_on else StageState.READY
-        row = StageRow(
-            job_id=job.id, name=name, subject=subject, plugin=plugin, plugin_version=version,
-            depends_on=list(depends_on), state=state,
-        )  # fmt: skip
-        session.add(row)
+    ids: dict[StageName, list[int]] = {}
+    for stage in PIPELINE:
+        depends_on = [number for name in stage.depends_on for number in ids[name]]
+        plugin = plugin_of(stage, snapshot)
+        rows = [
+            StageRow(
+                job_id=job.id, name=stage.name, subject=subject, plugin=plugin.name, plugin_version=plugin.version,
+                depends_on=depends_on, state=StageState.PENDING if depends_on else StageState.READY,
+            )
+            for subject in subjects_of(stage, snapshot)
+        ]  # fmt: skip
+        session.add_all(rows)
         session.flush()
-        return row.id
-
-    segmenter, triangulator = snapshot.segmenter, snapshot.triangulator
-    # Runs with corrections first: after a correction they are what is computed again, and everything waits for them.
-    used = sorted(
-        {uid for site in snapshot.sites for uid in (site.view_a, site.view_b)},
-        key=lambda uid: (not snapshot.runs[uid].corrections, uid),
-    )
-    segments = [add("segment", uid, segmenter.name, segmenter.version, []) for uid in used]
-    match = add("match", study_id, "fluoromap", matching.VERSION, segments)
-    triangulate = add("triangulate", study_id, triangulator.name, triangulator.version, [match])
-    add("fuse", study_id, snapshot.fuser.name, snapshot.fuser.version, [triangulate])
-    for site in snapshot.sites:
-        add("monoplane", site.site, snapshot.monoplane.name, snapshot.monoplane.version, [triangulate])
-    _tell_job(session, job)
+        ids[stage.name] = [row.id for row in rows]
+    _report_job(session, job)
     return job
 
 
 def take_due(session: Session, limit: int = 200) -> list[int]:
-    """Ready stages that were never announced, or so long ago that the announcement may be lost; corrections them announced."""
+    """Return the ready stages that need an announcement, and note that they are announced.
+
+    These are stages that were never announced, and stages whose announcement is so old that it may be lost.
+    """
     wait = settings().republish_seconds
     # Each repetition waits longer, so that a long queue is not announced over and over.
     due = or_(
@@ -108,29 +108,32 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
 
 
 def ready(session: Session, job_id: str) -> list[Claim]:
-    """The job's stages that may be claimed, in the order they were made, as the claims they would give."""
+    """Return the claims that a job's ready stages would give, in the order in which they were made."""
     columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
     query = select(*columns).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
     return [Claim(*row) for row in session.execute(query.order_by(StageRow.id))]
 
 
-def finish_ready(session: Session, job_id: str, results: Mapping[int, str]) -> None:
-    """End stages whose results are known already, stage id -> result, as far as nobody has claimed them."""
+def finish_ready(session: Session, job_id: str, results: Sequence[tuple[Claim, StoredResult]]) -> None:
+    """End stages whose results are stored already, unless another worker has claimed them."""
     job = _lock(session, job_id)
-    for stage_id, result in results.items():
+    for claimable, result in results:
         ended = session.execute(
             update(StageRow)
-            .where(StageRow.id == stage_id, StageRow.state == StageState.READY)
-            .values(state=StageState.DONE, attempt=StageRow.attempt + 1, result=result, reused=True, progress=1.0)
-            .returning(*_TOLD)
+            .where(StageRow.id == claimable.stage_id, StageRow.state == StageState.READY)
+            .values(
+                state=StageState.DONE, attempt=StageRow.attempt + 1, result=result.sha256, reused=True, progress=1.0
+            )
+            .returning(*_REPORTED)
         ).first()
         if ended is not None:
-            _tell_stage(session, job_id, ended)
+            session.add_all(result.rows)
+            _report_stage(session, job_id, ended)
     _settle(session, job)
 
 
 def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
-    """Take a ready stage; None when the announcement was stale or doubled."""
+    """Claim a ready stage. Return None when the announcement was old or doubled."""
     job_id = session.scalar(select(StageRow.job_id).where(StageRow.id == stage_id, StageRow.state == StageState.READY))
     if job_id is None:
         return None
@@ -145,45 +148,45 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
             worker=worker,
             progress=0.0,
         )
-        .returning(*_TOLD)
+        .returning(*_REPORTED)
     ).first()
     if row is None:
         return None
     if job.state == JobState.QUEUED:
         job.state = JobState.RUNNING
         job.started = session.scalar(select(db_now()))
-        _tell_job(session, job)
-    _tell_stage(session, job_id, row)
+        _report_job(session, job)
+    _report_stage(session, job_id, row)
     return Claim(stage_id, job_id, row.attempt, row.name, row.subject)
 
 
 def beat(session: Session, held: Claim, progress: float) -> Literal["alive", "cancelled", "lost"]:
-    """Extend the lease and tell the progress; answers whether the work is still wanted."""
+    """Extend the lease, store the progress, and return whether the work is still wanted."""
     alive = session.execute(
         update(StageRow)
         .where(*_held(held))
         .values(lease_until=db_now() + settings().lease_seconds, progress=progress)
-        .returning(*_TOLD)
+        .returning(*_REPORTED)
     ).first()
     if alive is None:
         return "lost"
-    _tell_stage(session, held.job_id, alive)
+    _report_stage(session, held.job_id, alive)
     cancelled = session.scalar(select(Job.cancel_requested).where(Job.id == held.job_id))
     return "cancelled" if cancelled else "alive"
 
 
-def finish(session: Session, held: Claim, result: str, *, reused: bool, rows: Iterable[Base] = ()) -> bool:
-    """Store a stage's end. False when the claim was lost: the output is then thrown away."""
+def finish(session: Session, held: Claim, result: StoredResult, *, reused: bool) -> bool:
+    """Store a stage's end. Return False when the claim was lost: then the result is dropped."""
     job = _lock(session, held.job_id)
-    if not _end(session, held, StageState.DONE, result=result, reused=reused, progress=1.0):
+    if not _end(session, held, StageState.DONE, result=result.sha256, reused=reused, progress=1.0):
         return False
-    session.add_all(rows)
+    session.add_all(result.rows)
     _settle(session, job)
     return True
 
 
 def fail(session: Session, held: Claim, error: dict[str, Any]) -> bool:
-    """Store that a stage raised. False when the claim was lost."""
+    """Store that a stage failed. Return False when the claim was lost."""
     job = _lock(session, held.job_id)
     if not _end(session, held, StageState.FAILED, error=error):
         return False
@@ -199,25 +202,28 @@ def stopped(session: Session, held: Claim) -> None:
 
 
 def cancel(session: Session, job_id: str) -> bool:
-    """Ask a job to stop: what has not begun never will, what runs stops at its next check. False when it had ended."""
+    """Ask a job to stop. Return False when it had ended.
+
+    Stages that wait are cancelled at once. A running stage stops at its next check.
+    """
     job = _lock(session, job_id)
     if job.state in ENDED_JOB:
         return False
     job.cancel_requested = True
-    _cancel_waiting(session, job_id, (StageState.PENDING, StageState.READY))
+    _cancel_waiting(session, job_id, (StageState.PENDING, StageState.READY), STAGES)
     _settle(session, job)
     return True
 
 
 def reap(session: Session) -> int:
-    """Free the stages whose workers fell silent; after the last attempt they fail. Returns how many."""
+    """Free the stages whose workers fell silent and return how many. After its last attempt a stage fails."""
     expired = session.execute(
         select(StageRow.id, StageRow.job_id)
         .where(StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now())
         .order_by(StageRow.job_id, StageRow.id)
     ).all()
     for stage_id, job_id in expired:
-        # Whoever holds the job now either renews the lease or is another reaper.
+        # A transaction that holds the job now either renews the lease or is another reaper.
         free = session.scalar(select(Job.id).where(Job.id == job_id).with_for_update(skip_locked=True))
         if free is None:
             continue
@@ -236,19 +242,19 @@ def reap(session: Session) -> int:
             stage.state = StageState.FAILED
             stage.error = {
                 "code": "worker_lost",
-                "detail": f"This stage was begun {stage.attempt} times and never came to an end: the worker died, ran out of "
-                "time or could not store the result; see its log, memory and disk.",
+                "detail": f"This stage began {stage.attempt} times and never ended: the worker died, ran out of time or could not "
+                "store the result. Look at the worker's log, memory and disk, then start a new job.",
             }
         else:
             stage.state = StageState.READY
         stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
-        _tell_stage(session, job_id, stage)
+        _report_stage(session, job_id, stage)
         _settle(session, job)
     return len(expired)
 
 
 def worker_seen(session: Session, name: str) -> None:
-    """Note a worker's sign of life."""
+    """Store a worker's sign of life."""
     row = session.get(WorkerSeen, name)
     now = session.scalar(select(db_now())) or 0.0
     if row is None:
@@ -267,54 +273,53 @@ def _held(held: Claim) -> tuple[Any, ...]:
 
 def _lock(session: Session, job_id: str) -> Job:
     locking = update(Job).where(Job.id == job_id).values(version=Job.version + 1).returning(Job)
-    # Without its snapshot, which is long and does not change.
+    # The snapshot is long and never changes: it stays in the database.
     answer = session.scalars(locking.options(defer(Job.snapshot)), execution_options={"populate_existing": True})
     return answer.one()
 
 
 def _end(session: Session, held: Claim, state: StageState, **values: Any) -> bool:
     ended = session.execute(
-        update(StageRow).where(*_held(held)).values(state=state, lease_until=None, **values).returning(*_TOLD)
+        update(StageRow).where(*_held(held)).values(state=state, lease_until=None, **values).returning(*_REPORTED)
     ).first()
     if ended is None:
         return False
-    _tell_stage(session, held.job_id, ended)
+    _report_stage(session, held.job_id, ended)
     return True
 
 
-def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState]) -> None:
+def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState], names: Iterable[str]) -> None:
     waiting = session.execute(
         update(StageRow)
-        .where(StageRow.job_id == job_id, StageRow.state.in_(list(states)))
+        .where(StageRow.job_id == job_id, StageRow.state.in_(list(states)), StageRow.name.in_(list(names)))
         .values(state=StageState.CANCELLED)
-        .returning(*_TOLD)
+        .returning(*_REPORTED)
     ).all()
     for stage in waiting:
-        _tell_stage(session, job_id, stage)
+        _report_stage(session, job_id, stage)
 
 
 def _settle(session: Session, job: Job) -> None:
-    """Promote what became ready and end the job when nothing is left; the job's row is locked."""
+    """Make stages ready whose inputs have ended, and end the job after its last stage. The job's row is locked."""
     rows = _stages(session, job.id)
-    broken = [row for row in rows if row.state == StageState.FAILED and row.name in FATAL]
+    broken = [row for row in rows if row.state == StageState.FAILED and STAGES[row.name].fails == "job"]
     if broken:
         job.error = job.error or {"subject": broken[0].name, **(broken[0].error or {})}
-        dead = {"match": {"triangulate", "fuse", "monoplane"}, "triangulate": {"fuse", "monoplane"}, "fuse": set()}
-        if any(row.name in dead[broken[0].name] and row.state == StageState.PENDING for row in rows):
-            _cancel_waiting(session, job.id, (StageState.PENDING,))
-            rows = _stages(session, job.id)
+        lost = {name for row in broken for name in after(STAGES[row.name].name)}
+        _cancel_waiting(session, job.id, (StageState.PENDING,), lost)
+        rows = _stages(session, job.id)
     ended = {row.id for row in rows if row.state in ENDED_STAGE}
     for row in rows:
         if row.state == StageState.PENDING and set(row.depends_on) <= ended:
             row.state = StageState.READY
-            _tell_stage(session, job.id, row)
+            _report_stage(session, job.id, row)
     if len(ended) == len(rows):
         if job.cancel_requested:
             job.state = JobState.CANCELLED
         else:
             job.state = JobState.FAILED if broken else JobState.SUCCEEDED
         job.finished = session.scalar(select(db_now()))
-        _tell_job(session, job)
+        _report_job(session, job)
 
 
 def _stages(session: Session, job_id: str) -> Sequence[StageRow]:
@@ -322,11 +327,11 @@ def _stages(session: Session, job_id: str) -> Sequence[StageRow]:
     return session.scalars(query.execution_options(populate_existing=True)).all()
 
 
-def _tell_job(session: Session, job: Job) -> None:
+def _report_job(session: Session, job: Job) -> None:
     session.add(Event(job_id=job.id, kind="job", data={"state": job.state, "error": job.error}))
 
 
-def _tell_stage(session: Session, job_id: str, stage: StageRow | Row[*tuple[Any, ...]]) -> None:
-    """Add the event of a stage's new state; ``stage`` is its row, or a result with the columns of ``_TOLD``."""
-    data = {column.key: getattr(stage, column.key) for column in _TOLD}
+def _report_stage(session: Session, job_id: str, stage: StageRow | Row[*tuple[Any, ...]]) -> None:
+    """Add the event of a stage's new state. ``stage`` is its row, or a result with the columns of ``_REPORTED``."""
+    data = {column.key: getattr(stage, column.key) for column in _REPORTED}
     session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(float(stage.progress), 3)}))

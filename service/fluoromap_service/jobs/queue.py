@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -16,7 +17,7 @@ RUN_STAGE = "fluoromap.run_stage"
 """Name of the registered task that runs a stage by its id."""
 
 STAYS_SECONDS = 10
-"""How long a worker takes one stage of a job after the other before others have their turn."""
+"""How long a worker takes stages of one job before it takes those of others."""
 
 log = structlog.get_logger(__name__)
 
@@ -37,7 +38,9 @@ def _transport_options(url: str) -> dict[str, Any]:
     return {"socket_timeout": 5, "socket_connect_timeout": 2}
 
 
-def _make_app() -> Celery:
+@functools.cache
+def celery_app() -> Celery:
+    """Return the process's Celery application, configured from the settings at the first call."""
     configured = settings()
     url = "memory://" if configured.eager else configured.broker_url or "filesystem://localhost/"
     app = Celery("fluoromap", broker=url)
@@ -49,10 +52,10 @@ def _make_app() -> Celery:
         task_acks_late=False,
         task_serializer="json",
         accept_content=["json"],
-        # Of the last stage, which is begun before the worker's stay with the job is over.
+        # A worker may begin its last stage of a job at the end of this time.
         task_time_limit=configured.stage_seconds + STAYS_SECONDS,
         worker_prefetch_multiplier=1,
-        # A child that replaces a dead one compiles its kernels first; by default it would be killed after 4 s, again and again.
+        # A child that replaces a dead one compiles its kernels first. Celery's default would kill it after 4 s, again and again.
         worker_proc_alive_timeout=180,
         worker_concurrency=configured.workers,
         worker_max_memory_per_child=configured.worker_memory_mib * 1024 // 2,
@@ -66,25 +69,23 @@ def _make_app() -> Celery:
     return app
 
 
-app = _make_app()
-
-
 def publish(stage_ids: list[int]) -> None:
-    """Announce ready stages. A failure is only logged: the committed rows are announced again until claimed."""
+    """Announce ready stages. A failure is only logged: the committed rows are announced again until a worker claims them."""
+    app = celery_app()
     if app.conf.task_always_eager:
         app.loader.import_default_modules()
     for stage_id in stage_ids:
         try:
-            # A fresh signature each time: one made before the task was registered would bypass eager mode.
+            # A signature that was made before the task was registered would bypass eager mode.
             app.signature(RUN_STAGE, args=(stage_id,)).apply_async(retry=False)
         except Exception as error:
-            # Whatever the broker's fault is, the rows are committed: the request that made them must not fail.
+            # The rows are committed, so the request that made them must not fail.
             log.warning("broker_unreachable", error=type(error).__name__)
             return
 
 
 def publish_due() -> int:
-    """Announce everything that is due; call it after any commit that made stages ready. Returns how many."""
+    """Announce all stages that are due and return how many. Call it after each commit that made stages ready."""
     with writing() as session:
         ids = job_life.take_due(session)
     publish(ids)
@@ -92,7 +93,7 @@ def publish_due() -> int:
 
 
 def sweep() -> None:
-    """Free the stages of dead workers and announce what is due; anyone may call it at any time."""
+    """Free the stages of dead workers and announce the stages that are due. Any process may call it at any time."""
     publish_due()
     with writing() as session:
         freed = job_life.reap(session)

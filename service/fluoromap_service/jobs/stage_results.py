@@ -1,4 +1,4 @@
-"""What the stages of a job store, and reading it."""
+"""The results that stages store, and reading them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from sqlalchemy.orm import Session
 
 from fluoromap.contracts import ChamberMap, Track, View
 from fluoromap.reasons import Reason
+from fluoromap_service.problem import Problem
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import decode
+from fluoromap_service.store.codec import StoredOtherwise, decode
 from fluoromap_service.store.models import StageRow
 
 T = TypeVar("T")
@@ -22,18 +23,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class MapResult:
-    """A map, or the reason why there is none with a sentence that says what to do."""
+    """The result of ``fuse``: a map, or the reason why there is none with a sentence that says what to do."""
 
     chamber: ChamberMap | None
     refused: Reason | None
     message: str
     reference_mm: tuple[float, float, float] | None
-    """Mean of the sites' reference positions: added to the map's coordinates it gives them from the isocentre."""
+    """Mean of the sites' reference positions. Added to the map's coordinates it gives them from the isocentre."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewTrack:
-    """One view of a site followed in 3D, or the reason why not."""
+    """The track of one view of a site, or the reason why there is none."""
 
     view: View
     track: Track | None
@@ -43,52 +44,70 @@ class ViewTrack:
 
 @dataclass(frozen=True, slots=True)
 class SiteTracks:
+    """The result of ``monoplane``: the tracks of a site's views."""
+
     site: str
     views: tuple[ViewTrack, ...]
 
 
-_AT_HAND_BYTES = 32 << 20
-"""Most of what is at hand, as stored: a study's results are read again by each stage after them, and after a correction."""
-_known: OrderedDict[str, tuple[Any, int]] = OrderedDict()
+_REMEMBERED_BYTES = 32 << 20
+"""Size limit of the decoded results that a process remembers, counted as stored.
+
+Each stage reads the results of the stages before it, and a correction reads most of them again.
+"""
+_remembered: OrderedDict[str, tuple[Any, int]] = OrderedDict()
 _lock = threading.Lock()
 
 
 def stages_of(session: Session, job_id: str, name: str | None = None) -> Sequence[StageRow]:
-    """All stages of a job, or those of one name, in the order they were made."""
+    """Return all stages of a job, or those of one name, in the order in which they were made."""
     query = select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)
     return session.scalars(query if name is None else query.where(StageRow.name == name)).all()
 
 
 def stage_of(session: Session, job_id: str, name: str, subject: str | None = None) -> StageRow | None:
-    """One stage of a job; ``subject`` may be left out for the stages a job has one of (match, triangulate, fuse)."""
+    """Return one stage of a job; a stage about the whole study needs no ``subject``."""
     query = select(StageRow).where(StageRow.job_id == job_id, StageRow.name == name)
     return session.scalar(query if subject is None else query.where(StageRow.subject == subject))
 
 
 def load(kind: type[T], stage: StageRow) -> T:
-    """The decoded result of a stage that is done.
+    """Return the decoded result of a stage that is done.
 
     Raises
     ------
     ValueError
         When the stage has no result.
+    Problem
+        409 ``result_outdated`` when another version of fluoromap stored it.
     """
     if stage.result is None:
         raise ValueError(f"stage {stage.id} has no result")
+    return load_file(kind, stage.result)
+
+
+def load_file(kind: type[T], sha256: str) -> T:
+    """Return the decoded result in a stored file, as :func:`load`."""
     with _lock:
-        known, size = _known.get(stage.result, (None, 0))
+        known, size = _remembered.get(sha256, (None, 0))
     # Two kinds of results may have the same bytes.
     if not isinstance(known, kind):
-        content = files.path_of(stage.result).read_bytes()
-        known, size = decode(kind, content), len(content)
-    remember(stage.result, known, size)
+        content = files.path_of(sha256).read_bytes()
+        try:
+            known, size = decode(kind, content), len(content)
+        except StoredOtherwise:
+            sentence = (
+                "Another version of fluoromap stored this result, or its file is damaged. Start a new job to get it."
+            )
+            raise Problem(409, "result_outdated", sentence) from None
+    remember(sha256, known, size)
     return known
 
 
 def remember(sha256: str, result: Any, size: int) -> None:
-    """Keep a result at hand under hash and size of its stored form: content-addressed and frozen, it stays true."""
+    """Remember a decoded result under the hash of its stored form, which never changes."""
     with _lock:
-        _known[sha256] = result, size
-        _known.move_to_end(sha256)
-        while sum(kept for _, kept in _known.values()) > _AT_HAND_BYTES:
-            _known.popitem(last=False)
+        _remembered[sha256] = result, size
+        _remembered.move_to_end(sha256)
+        while sum(stored for _, stored in _remembered.values()) > _REMEMBERED_BYTES:
+            _remembered.popitem(last=False)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
+from fluoromap.geometry import view_axes
+
 PAIRING_ANGLE_DEG = 30.0
 """Smallest angle between the views of two runs that acquisition time pairs."""
 PARALLEL_ANGLE_DEG = 20.0
@@ -278,8 +280,8 @@ def _moment(run: Run) -> tuple[float, int]:
 
 def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
     """Return the direction from the isocentre to the detector of a gantry position."""
-    a, b = math.radians(primary_deg), math.radians(secondary_deg)
-    return math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)
+    x, y, z = view_axes(primary_deg, secondary_deg)[2].tolist()
+    return x, y, z
 
 
 def ray_angle_deg(first: Run, second: Run) -> float | None:

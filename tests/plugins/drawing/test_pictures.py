@@ -1,4 +1,4 @@
-"""Overlays, views, isochrones and colours: what is drawn stands where geometry puts it."""
+"""Overlays, views, isochrones and colours: every symbol is drawn at its projected place."""
 
 import io
 from dataclasses import replace
@@ -19,7 +19,7 @@ from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.drawing.png import encode_png
 from fluoromap.drawing.raster import rasterise
-from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, bands_shown
+from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, pixel_bands
 from fluoromap.fuser.surface import face_normals
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 
@@ -57,7 +57,7 @@ class TestIsochrones:
         for line in isochrones(ball, np.arange(-20.0, 25.0, 5.0)):
             corners = ball.vertices_mm[ball.faces[line.faces]]
             for ends in (line.points_mm[:-1], line.points_mm[1:]):
-                # On one of its edges: the shortest way over two corners is as long as the edge.
+                # On one of the face's edges: the way over two corners is as long as the edge.
                 to_corner = np.linalg.norm(corners - ends[:, None], axis=2)
                 edge = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
                 assert ((to_corner + np.roll(to_corner, -1, axis=1) - edge).min(axis=1) < 1e-9).all()
@@ -72,7 +72,7 @@ class TestIsochrones:
             later = joined.lat_ms >= level
             assert segments == (np.ptp(later[fin].astype(int), axis=1) > 0).sum()
 
-    def test_nothing_runs_through_what_is_not_covered(self, sparse_ball):
+    def test_no_line_runs_through_uncovered_faces(self, sparse_ball):
         for line in isochrones(sparse_ball, np.arange(-20.0, 25.0, 5.0)):
             assert sparse_ball.covered[sparse_ball.faces[line.faces]].all()
 
@@ -90,7 +90,7 @@ class TestColours:
         colours = colour_map(np.linspace(0, 1, 30)).astype(float)
         linear = np.where(colours / 255 <= 0.04045, colours / 255 / 12.92, ((colours / 255 + 0.055) / 1.055) ** 2.4)
         assert (np.diff(linear @ [0.2126, 0.7152, 0.0722]) < 0).all()
-        # Machado, Oliveira & Fernandes (2009), complete deuteranopia: what such a reader sees is in the same order.
+        # Machado, Oliveira & Fernandes (2009), complete deuteranopia: such a reader sees the same order.
         deuteranope = linear @ np.array([[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
                                          [-0.011820, 0.042940, 0.968881]]).T  # fmt: skip
         assert (np.diff(deuteranope @ [0.2126, 0.7152, 0.0722]) < 0).all()
@@ -101,7 +101,7 @@ class TestColours:
         assert middle[1] > middle[0]
         assert last[2] > last[0] > last[1]
 
-    def test_a_step_that_is_asked_for_is_kept(self, ball):
+    def test_a_given_step_is_kept(self, ball):
         assert [scale_of(ball, step).step_ms for step in (5.0, 10.0)] == [5.0, 10.0]
 
     def test_no_data_is_grey_and_no_band_is(self, sparse_ball):
@@ -180,24 +180,24 @@ def test_each_pixel_shows_the_band_of_its_own_time(ball, sparse_ball, until, sca
         uv = (250 + 4 * chamber.vertices_mm[:, :2]) * scale
         facing = np.ones(len(chamber.faces), bool)
         raster = rasterise(uv, chamber.vertices_mm[:, 2], chamber.faces, facing, (500 * scale, 500 * scale))
-        shown = bands_shown(raster, chamber, scale_of(chamber), 1.0, until)
+        shown = pixel_bands(raster, chamber, scale_of(chamber), 1.0, until)
         _same_where_known(shown, _bands_pixel_by_pixel(raster, chamber, scale_of(chamber), until))
 
 
 @pytest.mark.parametrize("until", [None, 100.0, 200.0])
 @pytest.mark.parametrize(
-    # The last one's second band holds everything beyond it, on both sides of where the cycle closes.
+    # The second band of the last scale contains all later times, on both sides of the closing of the cycle.
     "times", [Scale(0.0, 20.0, 18), Scale(0.0, 360.0, 1), Scale(0.0, 0.01, 36000), Scale(0.0, 2.0, 2)]
 )  # fmt: skip
 def test_each_pixel_of_a_reentry_shows_the_band_of_its_own_time(until, times):
     reentry, uv = circling(360.0)
     raster = rasterise(uv, reentry.vertices_mm[:, 2], reentry.faces, np.ones(len(reentry.faces), bool), (500, 500))
-    shown = bands_shown(raster, reentry, times, 1.0, until)
+    shown = pixel_bands(raster, reentry, times, 1.0, until)
     _same_where_known(shown, _bands_pixel_by_pixel(raster, reentry, times, until))
-    # Whole cycles more say the same.
+    # Times later by whole cycles give the same bands.
     later = replace(reentry, lat_ms=reentry.lat_ms + 360.0 * (np.arange(len(uv)) % 3 == 0) * (uv[:, 0] > 250))
     # Where the cycle closes a rounding error decides.
-    assert (bands_shown(raster, later, times, 1.0, until) != shown).mean() < 5e-4
+    assert (pixel_bands(raster, later, times, 1.0, until) != shown).mean() < 5e-4
 
 
 def test_the_rim_takes_the_times_of_its_neighbours(sparse_ball):
@@ -206,12 +206,12 @@ def test_the_rim_takes_the_times_of_its_neighbours(sparse_ball):
         np.ones(len(sparse_ball.faces), bool), (500, 500),
     )  # fmt: skip
     late = replace(sparse_ball, lat_ms=np.where(sparse_ball.covered, 100.0, 0.0))
-    shown = bands_shown(raster, late, Scale(0.0, 5.0, 30), 1.0)
+    shown = pixel_bands(raster, late, Scale(0.0, 5.0, 30), 1.0)
     assert set(np.unique(shown)) == {NOTHING, HATCH, NO_DATA, 20}
 
 
 def circling(cycle):
-    """A re-entry whose times go round once, and its vertices seen along the axis of the circuit: each its own angle."""
+    """Return a re-entry whose times go round once, and its vertices along the axis of the circuit: each its own angle."""
     chamber = fused(sphere(20, slope_ms_per_mm=1.0), edge_mm=4)
     middle = chamber.vertices_mm.mean(axis=0)
     turn = np.degrees(np.arctan2(*(chamber.vertices_mm - middle)[:, [1, 0]].T)) % 360 * cycle / 360
@@ -245,7 +245,7 @@ class TestOverlay:
 
     @pytest.mark.parametrize("scale", [1, 2])
     @pytest.mark.parametrize(("primary", "secondary"), [(90, 0), (-30, 20)])
-    def test_star_stands_at_the_projected_tip(self, ball, primary, secondary, scale):
+    def test_star_is_at_the_projected_tip(self, ball, primary, secondary, scale):
         view = camera(primary, secondary)
         site = next(site for site in ball.sites if site.site == "S05")
         tip = (view.project(site.position_mm + SHIFT) + 0.5) * scale - 0.5
@@ -273,7 +273,7 @@ class TestOverlay:
         assert np.ptp(u) / 2 == pytest.approx(reach, abs=2)
         assert (v.max() + v.min()) / 2 == pytest.approx(centre[1], abs=3)
 
-    def test_wall_is_coloured_up_to_the_time_asked_for(self, ball):
+    def test_wall_is_coloured_up_to_the_given_time(self, ball):
         view = camera(0.0)
         early, late = (
             draw_overlay(grey(view), view, ball, SHIFT, "none", None, Look(until_ms=until)).astype(int)
@@ -297,7 +297,7 @@ class TestOverlay:
             shares.append((np.ptp(picture, axis=2) > 12)[:, :440].sum())
         assert shares == sorted(set(shares))
 
-    def test_star_takes_the_tip_that_was_seen(self, ball):
+    def test_star_takes_the_given_tip(self, ball):
         view = camera()
         tip = np.array([60.0, 380.0])
         with_star = draw_overlay(grey(view), view, ball, SHIFT, "S05", tip)
@@ -308,7 +308,7 @@ class TestOverlay:
         assert np.linalg.norm(star.mean(axis=0) - tip) <= 1
 
     @pytest.mark.parametrize("primary", [0, 90, 45])
-    def test_each_dot_stands_where_its_site_projects(self, primary):
+    def test_each_dot_is_where_its_site_projects(self, primary):
         tips = np.array([[0.0, 0, 0], [30, 5, 0], [0, 30, 8], [4, 3, 30], [-20, -15, 10]])
         view = camera(primary)
         times = np.array([0.0, 20, 40, 60, 80])
@@ -379,7 +379,7 @@ class TestOverlay:
         middles = [row.mean() for row in rows]
         assert (np.diff(middles) > 5).all()
 
-    def test_electrodes_stay_legible_and_the_rest_stays_as_it_was(self, ball):
+    def test_electrodes_stay_legible_and_the_rest_is_unchanged(self, ball):
         view = camera()
         bright = draw_overlay(np.full((512, 512), 160, np.uint8), view, ball, SHIFT, "none", None).astype(int)
         dark = draw_overlay(np.full((512, 512), 60, np.uint8), view, ball, SHIFT, "none", None).astype(int)
@@ -388,7 +388,7 @@ class TestOverlay:
         assert np.median(contrast[v - 40 : v + 41, u - 40 : u + 41]) > 0.6 * 100
         assert (bright[:40, :300] == 160).all()
 
-    def test_what_is_not_covered_gets_no_colour_but_a_hatch(self, sparse_ball):
+    def test_an_uncovered_wall_gets_no_colour_but_a_hatch(self, sparse_ball):
         view = camera()
         wall = draw_overlay(grey(view), view, replace(sparse_ball, covered=np.zeros_like(sparse_ball.covered)), SHIFT,
                             "none", None, Look(times=scale_of(sparse_ball))).astype(int)  # fmt: skip
@@ -397,7 +397,7 @@ class TestOverlay:
         patch = patch[np.ptp(patch, axis=2) == 0][:, 0]
         hatched = patch == round(120 + 0.4 * (205 - 120))
         assert 0.08 < hatched.mean() < 0.3
-        # Between the lines of the hatch the image is as it was.
+        # Between the lines of the hatch the image is unchanged.
         assert (patch[~hatched] == 120).mean() > 0.9
 
     def test_unknown_site_far_map_and_wrong_frame(self, ball):

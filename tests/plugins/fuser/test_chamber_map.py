@@ -1,4 +1,4 @@
-"""What every fuser makes of bad input, of outliers and of a re-entry's cycle."""
+"""Bad input, outliers and the cycle of a re-entry, for every fuser."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_sites_without_volume_are_refused(fuse, tips, reason):
 
 
 @FUSERS
-def test_equal_times_are_told(fuse):
+def test_equal_times_are_reported(fuse):
     tips = np.array([site.tip_mm for site in sphere(20)])
     chamber = fuse(sites_at(tips, np.full(20, 12.0)), edge_mm=6)
     assert chamber.warnings == (Reason.TIMES_EQUAL,)
@@ -74,7 +74,7 @@ def test_no_site_is_lost_to_noise(fuse):
         assert site.distance_mm == pytest.approx(np.linalg.norm(site.surface_mm - site.position_mm), abs=1e-9)
 
 
-def test_conduction_velocity_is_told_where_sites_lie_close():
+def test_conduction_velocity_is_reported_where_sites_lie_close():
     sites, _ = wave(150, 1)
     assert smooth(sites, edge_mm=6).conduction_velocity is not None
     assert smooth(sites_at(*_sparse()), edge_mm=6).conduction_velocity is None
@@ -86,7 +86,7 @@ def _sparse():
 
 
 class TestCycle:
-    """A wave that runs round the Z axis of a sphere for ever: 200 ms a turn."""
+    """Return a wave that circles the Z axis of a sphere in 200 ms, without end."""
 
     LENGTH = 200.0
 
@@ -123,7 +123,7 @@ class TestCycle:
             ends.append(belt.any())
         assert sum(ends) >= 3
 
-    def test_times_outside_the_window_are_brought_in_and_told(self):
+    def test_times_outside_the_window_are_moved_in_and_reported(self):
         inside = self.around()
         moved = tuple(
             MappedSite(s.site, s.tip_mm, s.covariance_mm2, s.axis, 4.0, s.lat_ms + (400 if k == 5 else 0), s.lat_sd_ms)

@@ -14,14 +14,14 @@ def grid(step_mm=5.0, count=6):
     return np.column_stack([x.ravel(), y.ravel(), np.zeros(count * count)])
 
 
-def told(places, times, sd_ms, difference=np.subtract):
+def velocity(places, times, sd_ms, difference=np.subtract):
     return conduction_velocity(places, np.tile(UP, (len(places), 1)), times, np.full(len(places), sd_ms), difference)
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.8, 2.0])
 def test_a_plane_wave_has_its_speed(speed):
     places = grid()
-    found = told(places, places @ [0.6, 0.8, 0.0] / speed, 0.01)
+    found = velocity(places, places @ [0.6, 0.8, 0.0] / speed, 0.01)
     assert found.median_m_per_s == pytest.approx(speed, rel=1e-3)
     assert found.low_m_per_s <= speed * 1.001
     assert found.high_m_per_s >= speed * 0.999
@@ -31,7 +31,7 @@ def test_the_interval_holds_the_truth_and_the_median_is_not_drawn_by_noise():
     places, inside, medians = grid(), 0, []
     for seed in range(30):
         noise = np.random.default_rng(seed).normal(size=len(places))
-        found = told(places, places @ [0.6, 0.8, 0.0] / 0.8 + noise, 1.0)
+        found = velocity(places, places @ [0.6, 0.8, 0.0] / 0.8 + noise, 1.0)
         inside += found.low_m_per_s <= 0.8 <= found.high_m_per_s
         medians.append(found.median_m_per_s)
     assert inside >= 26
@@ -49,10 +49,10 @@ def test_a_curved_wall_is_unfolded():
 
 def test_few_far_or_simultaneous_sites_tell_nothing():
     places = grid()
-    assert told(places[:3], places[:3, 0], 0.1) is None
-    assert told(4 * places, places[:, 0], 0.1) is None
-    assert told(places, np.zeros(len(places)), 1.0) is None
-    assert told(np.outer(np.arange(8.0), [2, 0, 0]), np.arange(8.0), 0.1) is None
+    assert velocity(places[:3], places[:3, 0], 0.1) is None
+    assert velocity(4 * places, places[:, 0], 0.1) is None
+    assert velocity(places, np.zeros(len(places)), 1.0) is None
+    assert velocity(np.outer(np.arange(8.0), [2, 0, 0]), np.arange(8.0), 0.1) is None
 
 
 def test_a_site_on_the_opposite_wall_is_not_near():
@@ -66,5 +66,5 @@ def test_across_the_end_of_the_cycle():
     places = grid()
     cycle = Cycle(200.0, -100.0)
     times = places[:, 0] / 0.8 + 85
-    found = told(places, cycle.bring_in(times), 0.01, cycle.difference)
+    found = velocity(places, cycle.into_window(times), 0.01, cycle.difference)
     assert found.median_m_per_s == pytest.approx(0.8, rel=1e-3)

@@ -1,4 +1,4 @@
-"""The paper's chamber against fields, shapes and waves that are known."""
+"""The paper's chamber against known fields, shapes and waves."""
 
 import math
 
@@ -17,7 +17,7 @@ TETRAHEDRON = np.array([[0.0, 0, 0], [30, 0, 0], [0, 30, 0], [0, 0, 30]])
 
 
 def times_at_sites(chamber):
-    """Map times where each site lies, by the nearest vertex; sites on the hull are vertices."""
+    """Return map times at each site, from the nearest vertex; sites on the hull are vertices."""
     surface = np.array([site.surface_mm for site in chamber.sites])
     nearest = np.linalg.norm(chamber.vertices_mm[None] - surface[:, None], axis=2).argmin(axis=1)
     return chamber.lat_ms[nearest]
@@ -135,7 +135,7 @@ def test_colour_does_not_reach_through_a_thin_chamber():
 
 
 @pytest.mark.parametrize("error_ms", [70.0, -70.0, 150.0])
-def test_outlier_is_told_and_colours_nothing(error_ms):
+def test_outlier_is_reported_and_colours_nothing(error_ms):
     sites, _ = wave(20, 1)
     clean = fused(sites, edge_mm=5)
     tips, times = np.array([site.tip_mm for site in sites]), np.array([site.lat_ms for site in sites])

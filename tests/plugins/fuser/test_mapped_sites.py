@@ -1,4 +1,4 @@
-"""From located sites to what a fuser gets."""
+"""Located sites joined with their activation times."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def located(name: str, reference: np.ndarray | None) -> LocatedSite:
     return LocatedSite(name, LATERAL, FRONTAL, 0, 0, (tip,), reference, None)
 
 
-def test_a_borrowed_reference_is_told_and_makes_the_place_less_sure() -> None:
+def test_a_borrowed_reference_is_reported_and_widens_the_covariance() -> None:
     references = [np.array([1.0, 2.0, 3.0]), np.array([3.0, 2.0, 5.0]), None]
     sites = tuple(located(f"S{k}", at) for k, at in enumerate(references))
     times = {site.site: (10.0, 2.0) for site in sites}

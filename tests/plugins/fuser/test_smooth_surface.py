@@ -1,4 +1,4 @@
-"""The smooth wall against bodies whose shape and volume are known."""
+"""The smooth wall against bodies of known shape and volume."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Hull, refinement and distances against solids whose numbers are known."""
+"""Hull, refinement and distances against solids of known area and volume."""
 
 import numpy as np
 import pytest

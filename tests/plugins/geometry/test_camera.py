@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from fluoromap.geometry import Camera, Gantry, camera_from_gantry, ray_angle_deg
+from fluoromap.geometry import LEAST_SOURCE_MM, Camera, Gantry, camera_from_gantry, ray_angle_deg, view_axes
 
 angles = st.floats(-179, 179)
 tilts = st.floats(-89, 89)
@@ -40,6 +40,20 @@ def pixel_by_hand(g: Gantry, point: np.ndarray) -> tuple[float, float]:
 def test_equation_1_agrees_with_turning_the_patient_instead(a: float, b: float, point: np.ndarray) -> None:
     g = gantry(a, b, pixel_spacing_mm=(0.3, 0.4), rows=400, columns=600)
     assert camera_from_gantry(g).project(point) == pytest.approx(pixel_by_hand(g, point), abs=1e-8)
+
+
+@given(angles, tilts)
+def test_view_axes_are_left_handed_unit_vectors(a: float, b: float) -> None:
+    axes = view_axes(a, b)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(-1.0)
+    np.testing.assert_allclose(camera_from_gantry(gantry(a, b)).axis_world, axes[2], atol=1e-12)
+
+
+def test_a_source_nearer_than_any_c_arm_s_is_refused() -> None:
+    assert gantry(source_isocentre_mm=LEAST_SOURCE_MM).source_isocentre_mm == 200.0
+    with pytest.raises(ValueError, match="source distances are 199 mm"):
+        gantry(source_isocentre_mm=199.0)
 
 
 def test_frontal_view_shows_the_left_on_the_right_and_the_head_at_the_top() -> None:

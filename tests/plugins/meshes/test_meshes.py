@@ -1,4 +1,4 @@
-"""Mesh files, read again by libraries that did not write them."""
+"""Mesh files, read by independent libraries."""
 
 import base64
 import csv

@@ -1,4 +1,4 @@
-"""The paper's simulation: a helix of 30 points moved 0.5 degrees about each axis and 1 mm along each, frame after frame."""
+"""The paper's simulation: a helix of 30 points that moves 0.5 degrees about each axis and 1 mm along each, frame after frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ FOCAL_PX = 1000 / (178 / 512)
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Points (n, 30, 3) in the world, their pixels (n, 30, 2) and the camera that saw them."""
+    """World points (n, 30, 3), their pixels (n, 30, 2) and the camera."""
 
     camera: Camera
     points_mm: Array
@@ -30,7 +30,7 @@ def _rotation(axis: int, degrees: float) -> Array:
 
 
 def helix(radius: float, length: float, axis: int, centre: tuple[float, float, float]) -> Array:
-    """30 points over 2 turns, right-handed, from phase 0, both ends included."""
+    """Return 30 points over 2 right-handed turns from phase 0, both ends included."""
     t = np.linspace(0, 1, 30)
     points = np.empty((30, 3))
     points[:, (axis + 1) % 3] = radius * np.cos(4 * np.pi * t)
@@ -45,7 +45,10 @@ ROTATIONS = {"AP": np.eye(3), "LAT": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 
 
 @pytest.fixture(scope="session")
 def simulate() -> Callable[[str, str, int], Simulation]:
-    """(helix, view, frames) -> the simulation; right-handed cameras, 500 mm from the isocentre, c = (256, 256)."""
+    """Return a function (helix, view, frames) -> simulation.
+
+    The cameras are right-handed, 500 mm from the isocentre, with c = (256, 256).
+    """
 
     def build(name: str, view: str, frames: int) -> Simulation:
         intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""The paper's monoplane method: its equations and what it cannot tell. Its Table 1 is tested with the tables."""
+"""The paper's monoplane method: its equations and its lack of depth. tables/ tests Table 1."""
 
 import numpy as np
 import pytest
@@ -9,18 +9,18 @@ from fluoromap.monoplane.a_priori_lm import (
     APrioriLM,
     column_residual,
     distance_residual,
-    follow_points,
-    moved_share,
+    motion_variance_share,
     row_residual,
     start_displacement,
+    track_points,
 )
 from fluoromap.reasons import Reason
 
 
-def follow(simulation, depth_step_mm: float, start: int = 0):  # type: ignore[no-untyped-def]
-    seen = np.ones(simulation.pixels_uv.shape[:2], dtype=bool)
-    return follow_points(
-        simulation.camera, simulation.points_mm[start], simulation.pixels_uv, seen, start, depth_step_mm
+def track(simulation, depth_step_mm: float, start: int = 0):  # type: ignore[no-untyped-def]
+    visible = np.ones(simulation.pixels_uv.shape[:2], dtype=bool)
+    return track_points(
+        simulation.camera, simulation.points_mm[start], simulation.pixels_uv, visible, start, depth_step_mm
     )
 
 
@@ -29,16 +29,16 @@ def test_depth_of_the_answer_is_the_depth_of_the_start(simulate, view: str) -> N
     simulation = simulate("H18", view, 4)
     camera = simulation.camera
     for dz in (0.0, 2.0):
-        found = follow(simulation, dz)
+        found = track(simulation, dz)
         # Across the ray the image decides.
         assert camera.project(found) == pytest.approx(simulation.pixels_uv, abs=1e-5)
-        # Along it, what was put in comes out, up to the ray's slant.
+        # Along it the start value comes out, up to the slant of the ray.
         assert np.diff(camera.depth_mm(found), axis=0) == pytest.approx(dz, abs=0.25)
 
 
 def test_the_sequence_runs_to_both_ends(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 7)
-    found = follow(simulation, 1.0, start=3)
+    found = track(simulation, 1.0, start=3)
     assert found[3] == pytest.approx(simulation.points_mm[3], abs=1e-9)
     # With the true displacement as start value both directions stay near the truth.
     assert np.linalg.norm(found - simulation.points_mm, axis=2).max() < 3.5
@@ -80,22 +80,22 @@ def test_the_start_is_the_parallel_back_projection_at_the_mean_depth(simulate) -
 
 def test_a_point_that_is_hidden_goes_on_from_where_it_was(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
-    seen = np.ones((5, 30), dtype=bool)
-    seen[2:4, 4] = False
-    pixels = np.where(seen[..., None], simulation.pixels_uv, 0.0)
-    whole = follow(simulation, 1.0)
-    found = follow_points(simulation.camera, simulation.points_mm[0], pixels, seen, 0, 1.0)
+    visible = np.ones((5, 30), dtype=bool)
+    visible[2:4, 4] = False
+    pixels = np.where(visible[..., None], simulation.pixels_uv, 0.0)
+    whole = track(simulation, 1.0)
+    found = track_points(simulation.camera, simulation.points_mm[0], pixels, visible, 0, 1.0)
     assert found[2:4, 4] == pytest.approx(np.broadcast_to(found[1, 4], (2, 3)))
     assert found[4, 4] == pytest.approx(whole[4, 4], abs=0.05)
     assert found[:, 5] == pytest.approx(whole[:, 5])
 
 
 def test_the_share_of_motion_since_the_start_is_periodic() -> None:
-    share = moved_share(np.array([0.8, 0.9, 0.3, 0.8, np.nan]), 0)
+    share = motion_variance_share(np.array([0.8, 0.9, 0.3, 0.8, np.nan]), 0)
     assert share[0] == share[3] == pytest.approx(0, abs=1e-12)
     assert 0 < share[1] < 1 < share[2]
     assert share[4] == 1
-    assert moved_share(np.arange(20) / 20, 0).mean() == pytest.approx(1)
+    assert motion_variance_share(np.arange(20) / 20, 0).mean() == pytest.approx(1)
 
 
 def view(simulation, frames: int = 5, a_priori: bool = True, hidden: int | None = None) -> MonoplaneView:  # type: ignore[no-untyped-def]
@@ -121,7 +121,7 @@ def view(simulation, frames: int = 5, a_priori: bool = True, hidden: int | None 
     )  # fmt: skip
 
 
-def test_a_track_says_that_its_depth_is_assumed_and_how_unsure_it_is(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_a_track_says_that_its_depth_is_assumed_and_how_uncertain_it_is(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
     track = APrioriLM(APrioriLM.Params(isocentre_sd_mm=0)).track(view(simulation, hidden=2), Silent())
     assert track.labels[0] == ("mapping", 1)
@@ -132,7 +132,7 @@ def test_a_track_says_that_its_depth_is_assumed_and_how_unsure_it_is(simulate) -
     assert track.reasons[4] == (Reason.DEPTH_ASSUMED,)
     axis = simulation.camera.axis_world
     along = np.sqrt(np.einsum("i,nmij,j->nm", axis, track.covariance_mm2, axis))
-    # Along the ray the doubt grows with the heart's motion, more so for the mapping catheter.
+    # Along the ray the uncertainty grows with the heart's motion, more so for the mapping catheter.
     assert (np.diff(along[[0, 1, 3, 4], 0]) > 0).all()
     assert along[4, 0] > along[4, 4]
     lateral = np.sqrt(track.covariance_mm2[4, 0, 0, 0])
@@ -143,7 +143,7 @@ def test_a_track_says_that_its_depth_is_assumed_and_how_unsure_it_is(simulate) -
     assert depth == pytest.approx(simulation.camera.depth_mm(simulation.points_mm[0, :8]))
 
 
-def test_an_isocentre_that_stands_elsewhere_counts_across_the_view(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_an_isocentre_error_counts_across_the_view(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
     known, unknown = (
         APrioriLM(APrioriLM.Params(isocentre_sd_mm=sd)).track(view(simulation), Silent()).covariance_mm2
@@ -152,7 +152,7 @@ def test_an_isocentre_that_stands_elsewhere_counts_across_the_view(simulate) -> 
     assert unknown[4, 0] - known[4, 0] == pytest.approx(np.diag([0.49, 0.49, 0.0]), abs=1e-9)
 
 
-def test_a_start_value_in_depth_widens_the_answer_s_doubt(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_a_start_value_in_depth_widens_the_answer_s_uncertainty(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
     plain = APrioriLM(APrioriLM.Params()).track(view(simulation), Silent())
     stepped = APrioriLM(APrioriLM.Params(depth_step_mm=2)).track(view(simulation), Silent())

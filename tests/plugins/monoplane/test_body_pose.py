@@ -8,13 +8,13 @@ from scipy.linalg import expm
 
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.monoplane.body_pose import (
-    follow_body,
+    determines_pose,
     point_jacobian,
     pose_covariance_mm2,
     pose_jacobian,
     rotation_of,
     solve_poses,
-    spans,
+    track_body,
     vector_of,
 )
 
@@ -38,7 +38,7 @@ def cloud(seed: int, points: int = 12, radius_mm: float = 30.0):  # type: ignore
 
 
 def c_arm(primary_deg: float = 37.0, secondary_deg: float = -20.0) -> Camera:
-    """A view as a C-arm gives it: left-handed, oblique, pixels that are not square."""
+    """Return a view of a C-arm: left-handed, oblique, pixels that are not square."""
     return camera_from_gantry(Gantry(primary_deg, secondary_deg, 1040.0, 530.0, (0.35, 0.31), 512, 640))
 
 
@@ -64,10 +64,10 @@ def body_positions(simulation, rotations, centres):  # type: ignore[no-untyped-d
 @pytest.mark.parametrize("frames", [3, 30])
 def test_without_noise_every_start_in_depth_gives_the_truth(simulate, helix: str, view: str, frames: int) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate(helix, view, frames)
-    seen = np.ones(simulation.pixels_uv.shape[:2], dtype=bool)
+    visible = np.ones(simulation.pixels_uv.shape[:2], dtype=bool)
     for depth_step_mm in range(6):
-        poses = follow_body(
-            simulation.camera, simulation.points_mm[0], simulation.pixels_uv, seen, 0, float(depth_step_mm), 6
+        poses = track_body(
+            simulation.camera, simulation.points_mm[0], simulation.pixels_uv, visible, 0, float(depth_step_mm), 6
         )
         assert np.abs(body_positions(simulation, *poses) - simulation.points_mm).max() <= 1e-8
 
@@ -154,7 +154,7 @@ def test_the_error_stays_at_the_bound_through_thirty_frames(simulate, helix: str
     simulation = simulate(helix, "LAT", 30)
     rng = np.random.default_rng(12)
     body = simulation.points_mm[0] - simulation.points_mm[0].mean(axis=0)
-    noise, seen = np.broadcast_to(0.25 * np.eye(2), (30, 2, 2)), np.ones(30, dtype=bool)
+    noise, visible = np.broadcast_to(0.25 * np.eye(2), (30, 2, 2)), np.ones(30, dtype=bool)
     rotations = np.broadcast_to(np.eye(3), (1000, 3, 3))
     centres = np.broadcast_to(simulation.points_mm[0].mean(axis=0), (1000, 3))
     squared = []
@@ -162,13 +162,13 @@ def test_the_error_stays_at_the_bound_through_thirty_frames(simulate, helix: str
         pixels = exact + rng.normal(0, 0.5, (1000, 30, 2))
         rotations, centres = solve_poses(simulation.camera, body, pixels, rotations, centres, 6)
         squared.append(((body @ np.swapaxes(rotations, 1, 2) + centres[:, None] - at) ** 2).sum(axis=2).mean())
-        covariance = pose_covariance_mm2(simulation.camera, at, at.mean(axis=0), noise, seen)
+        covariance = pose_covariance_mm2(simulation.camera, at, at.mean(axis=0), noise, visible)
         # Of 1000 poses, whose error is one number, the depth: it scatters by 2 %.
         assert np.sqrt(squared[-1] / np.trace(covariance, axis1=1, axis2=2).mean()) == pytest.approx(1, abs=0.09)
     assert np.sqrt(np.mean(squared)) <= most_mm
 
 
-def test_the_bound_of_what_no_image_tells_is_wide_and_finite() -> None:
+def test_the_bound_without_an_image_is_wide_and_finite() -> None:
     camera, body = c_arm(), cloud(7)
     noise = np.broadcast_to(0.25 * np.eye(2), (12, 2, 2))
     one = np.arange(12) == 3
@@ -184,4 +184,4 @@ def test_the_bound_of_what_no_image_tells_is_wide_and_finite() -> None:
     [(cloud(1, 3), False), (cloud(1, 4), True), (np.arange(9)[:, None] * np.array([3.0, 1, 2]), False)],
 )
 def test_four_points_off_one_line_are_enough(points, enough: bool) -> None:  # type: ignore[no-untyped-def]
-    assert spans(points) is enough
+    assert determines_pose(points) is enough

@@ -1,4 +1,4 @@
-"""The bundle adjustment against dense least squares, its own statement of error, and the errors it is made for."""
+"""The bundle adjustment against dense least squares, its stated errors, and uncertain points."""
 
 import numpy as np
 import pytest
@@ -6,22 +6,22 @@ from scipy.optimize import least_squares
 
 from fluoromap.contracts import Array
 from fluoromap.geometry import Gantry, camera_from_gantry
-from fluoromap.monoplane.body_pose import follow_body, rotation_of, vector_of
+from fluoromap.monoplane.body_pose import rotation_of, track_body, vector_of
 from fluoromap.monoplane.bundle import AdjustedBody, BodyView, adjust
 
 FRAMES, POINTS, START = 5, 6, 1
 
 
 def small_view(acceleration_sd: tuple[float, float] | None, seed: int = 5) -> tuple[BodyView, Array]:
-    """Five of the frames of a C-arm view of six points, one of them hidden once, with unequal noise; and the truth."""
+    """Return five frames of a C-arm view of six points, one hidden once, with unequal noise; and the truth."""
     rng = np.random.default_rng(seed)
     camera = camera_from_gantry(Gantry(30.0, 15.0, 1000.0, 500.0, (0.35, 0.35), 512, 512))
     body = rng.uniform(-25, 25, (POINTS, 3))
     turns = rotation_of(rng.normal(0, 0.02, (FRAMES, 3)) * (np.arange(FRAMES) != START)[:, None])
     shifts = rng.normal(0, 1, (FRAMES, 3))
     truth = body @ np.swapaxes(turns, 1, 2) + shifts[:, None]
-    seen = np.ones((FRAMES, POINTS), dtype=bool)
-    seen[3, 2] = False
+    visible = np.ones((FRAMES, POINTS), dtype=bool)
+    visible[3, 2] = False
     root = rng.normal(0, 0.3, (FRAMES, POINTS, 2, 2)) + 0.5 * np.eye(2)
     noise = root @ np.swapaxes(root, -1, -2)
     shape_root = rng.normal(0, 0.2, (POINTS, 3, 3)) + 0.6 * np.eye(3)
@@ -29,22 +29,22 @@ def small_view(acceleration_sd: tuple[float, float] | None, seed: int = 5) -> tu
     prior = body + (shape_root @ rng.normal(0, 1, (POINTS, 3, 1)))[..., 0]
     pixels = camera.project(truth) + (root @ rng.normal(0, 1, (FRAMES, POINTS, 2, 1)))[..., 0]
     frames = np.array([0, 1, 2, 3, 6])
-    view = BodyView(camera, prior, shape, np.eye(3), frames, START, pixels, noise, seen, acceleration_sd)
+    view = BodyView(camera, prior, shape, np.eye(3), frames, START, pixels, noise, visible, acceleration_sd)
     return view, truth
 
 
 def adjusted(view: BodyView) -> AdjustedBody:
-    return adjust(view, *follow_body(view.camera, view.prior_mm, view.pixels_uv, view.seen, view.start, 0.0, 20))
+    return adjust(view, *track_body(view.camera, view.prior_mm, view.pixels_uv, view.visible, view.start, 0.0, 20))
 
 
 def dense_residuals(view: BodyView, unknowns: Array) -> Array:
-    """Everything that is minimised, as one vector: the a-priori frame only shifts, the others turn and shift."""
+    """Return all minimised residuals as one vector: the a-priori frame only shifts, the others turn and shift."""
     points, shifts = unknowns[: 3 * POINTS].reshape(-1, 3), unknowns[3 * POINTS : 3 * (POINTS + FRAMES)].reshape(-1, 3)
     turns = np.insert(unknowns[3 * (POINTS + FRAMES) :].reshape(-1, 3), START, 0.0, axis=0)
     rotations = rotation_of(turns)
     positions = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
     white = np.linalg.inv(np.linalg.cholesky(view.covariance_px2))
-    off = (white @ (view.camera.project(positions) - view.pixels_uv)[..., None])[view.seen]
+    off = (white @ (view.camera.project(positions) - view.pixels_uv)[..., None])[view.visible]
     from_prior = np.linalg.solve(
         np.linalg.cholesky(view.shape_mm2), (points + view.origin_mm - view.prior_mm)[..., None]
     )
@@ -129,7 +129,7 @@ def test_a_priori_errors_of_two_millimetres_shrink(simulate, helix: str, frames:
     assert np.sqrt(np.mean(squared)) <= 1.1 * most_mm
 
 
-def test_a_smooth_path_is_followed_better_when_it_is_known_to_be_smooth(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_a_smooth_path_is_tracked_better_when_it_is_known_to_be_smooth(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "LAT", 12)
     rng = np.random.default_rng(22)
     pixels = simulation.pixels_uv + rng.normal(0, 0.5, simulation.pixels_uv.shape)

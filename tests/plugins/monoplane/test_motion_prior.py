@@ -1,4 +1,4 @@
-"""Following the electrodes over the cycle in one view, on the phantom's motion with given pixels."""
+"""Tracking the electrodes over the cycle in one view, on the phantom's motion with given pixels."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from fluoromap.contracts import (
     SiteCycle,
     Track,
 )
-from fluoromap.monoplane.expected_motion import expect
+from fluoromap.monoplane.expected_motion import expected_motion
 from fluoromap.monoplane.motion_covariance import FIXED, MotionCovariance, MotionParams
 from fluoromap.monoplane.motion_prior import MotionPrior
-from fluoromap.monoplane.observed_view import observe
+from fluoromap.monoplane.view_electrodes import gather_electrodes
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.known_pixels import matched_sites
 from fluoromap.reasons import Reason
@@ -40,21 +40,21 @@ SITES = 12
 def _study(
     seed: int, rate_hz: float = 30.0
 ) -> tuple[tuple[MonoplaneView, ...], tuple[Array, ...], tuple[SiteCycle, ...]]:
-    """View a and b of the first site with its cycle, their true points (n, m, 3), and the other sites' cycles; breath held."""
+    """Return view a and b of the first site with its cycle, true points (n, m, 3), other cycles; breath held."""
     frames = int(1.6 * rate_hz)
     study = simulate_study(
         StudySpec(seed, sites=SITES, frames=frames, frame_rate_hz=rate_hz, heart="dog", breathing_mm=0.0)
     )
     matched = matched_sites(study)
     located = Linear(UncertaintyParams.model_validate(EXACT)).triangulate(matched, DEFAULT_CATALOGUE, Silent()).sites
-    site, seen = located[0], matched[0]
+    site, visible = located[0], matched[0]
     views = (
         MonoplaneView(
-            "S01", "a", site.camera_a, DEFAULT_CATALOGUE, seen.frame_times_a_ms, seen.track_a, site.points, site.frame_a,
+            "S01", "a", site.camera_a, DEFAULT_CATALOGUE, visible.frame_times_a_ms, visible.track_a, site.points, site.frame_a,
             site.cycle, (),
         ),
         MonoplaneView(
-            "S01", "b", site.camera_b, DEFAULT_CATALOGUE, seen.frame_times_b_ms, seen.track_b, site.points, site.frame_b,
+            "S01", "b", site.camera_b, DEFAULT_CATALOGUE, visible.frame_times_b_ms, visible.track_b, site.points, site.frame_b,
             site.cycle, (),
         ),
     )  # fmt: skip
@@ -65,7 +65,7 @@ def _study(
     return views, truth, tuple(other.cycle for other in located[1:] if other.cycle is not None)
 
 
-def _follow(view: MonoplaneView, **parameters: float) -> Track:
+def _track(view: MonoplaneView, **parameters: float) -> Track:
     return MotionPrior(MotionPrior.Params.model_validate({**EXACT, **parameters})).track(view, Silent())
 
 
@@ -75,11 +75,11 @@ def _rms(track: Track, truth: Array, positions: Array | None = None) -> float:
 
 
 def _whole(track: Track) -> None:
-    """Every covariance of a located sample is one: finite (by contract), symmetric, positive definite."""
+    """Assert that each covariance of a located sample is symmetric and positive definite."""
     assert track.relative_covariance_mm2 is not None
     for covariances in (track.covariance_mm2, track.relative_covariance_mm2):
-        seen = covariances[track.located]
-        np.testing.assert_allclose(seen, np.swapaxes(seen, -1, -2), atol=1e-12)
+        visible = covariances[track.located]
+        np.testing.assert_allclose(visible, np.swapaxes(visible, -1, -2), atol=1e-12)
     assert np.linalg.eigvalsh(track.covariance_mm2[track.located]).min() > 0
 
 
@@ -88,13 +88,13 @@ def _without(observation: Observation, *catheters: str) -> Observation:
 
 
 def _at_other_pixels(view: MonoplaneView, catheter: str, shift: Array) -> MonoplaneView:
-    """One catheter displaced in the image, frame by frame, by (n, 2) pixels."""
+    """Return the view with one catheter displaced in the image, frame by frame, by (n, 2) pixels."""
     changed = tuple(
-        replace(seen, chains=tuple(
+        replace(visible, chains=tuple(
             replace(chain, pixels_uv=chain.pixels_uv + shift[row]) if chain.catheter == catheter else chain
-            for chain in seen.chains
+            for chain in visible.chains
         ))
-        for row, seen in enumerate(view.observations)
+        for row, visible in enumerate(view.observations)
     )  # fmt: skip
     return replace(view, observations=changed)
 
@@ -103,7 +103,7 @@ def _at_other_pixels(view: MonoplaneView, catheter: str, shift: Array) -> Monopl
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_sites_own_cycle_gives_depth_in_every_frame(seed: int, number: int) -> None:
     views, truth, _ = _study(seed)
-    track = _follow(views[number])
+    track = _track(views[number])
     assert track.located.all()
     assert _rms(track, truth[number]) <= 0.9
     assert np.sqrt(((track.positions_mm - truth[number]) ** 2).sum(axis=-1).mean(axis=1)).max() < 2.0
@@ -117,9 +117,9 @@ def test_the_other_sites_motion_stands_in_for_an_unknown_cycle() -> None:
     for seed in (1, 2, 3):
         views, truths, others = _study(seed)
         for view, truth in zip(views, truths, strict=True):
-            track = _follow(replace(view, cycle=None, others=others))
+            track = _track(replace(view, cycle=None, others=others))
             assert set(track.reasons) == {(Reason.MOTION_FROM_OTHERS,)}
-            still = _follow(replace(view, cycle=None))
+            still = _track(replace(view, cycle=None))
             assert set(still.reasons) == {(Reason.DEPTH_ASSUMED,)}
             errors.append((_rms(track, truth), _rms(track, truth, track.baseline_mm), _rms(still, truth)))
     field, baseline, constant = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -130,7 +130,7 @@ def test_the_other_sites_motion_stands_in_for_an_unknown_cycle() -> None:
 
 def test_the_baseline_lies_on_the_rays_and_positions_within_the_pixels() -> None:
     (view, _), _, _ = _study(1)
-    track = _follow(view)
+    track = _track(view)
     np.testing.assert_allclose(view.camera.project(track.baseline_mm), track.pixels_uv, atol=1e-9)
     assert np.abs(view.camera.project(track.positions_mm) - track.pixels_uv).max() < 4 * 0.5
 
@@ -138,9 +138,12 @@ def test_the_baseline_lies_on_the_rays_and_positions_within_the_pixels() -> None
 def test_without_phases_the_last_known_depth_is_kept_and_said() -> None:
     (view, _), truth, others = _study(1)
     blind = replace(
-        view, observations=tuple(replace(seen, phase=None) for seen in view.observations), cycle=None, others=others
+        view,
+        observations=tuple(replace(visible, phase=None) for visible in view.observations),
+        cycle=None,
+        others=others,
     )
-    track = _follow(blind)
+    track = _track(blind)
     assert all(set(reasons) == {Reason.DEPTH_ASSUMED, Reason.PHASE_UNKNOWN} for reasons in track.reasons)
     assert _rms(track, truth[0]) < 3.5
     _whole(track)
@@ -150,7 +153,7 @@ def test_a_catheter_is_located_only_where_it_is_seen() -> None:
     (view, _), truth, _ = _study(1)
     gaps = {3, 4, 20}
     gone = tuple(_without(s, "mapping") if row in gaps else s for row, s in enumerate(view.observations))
-    track = _follow(replace(view, observations=gone))
+    track = _track(replace(view, observations=gone))
     mapping = np.array([name == "mapping" for name, _ in track.labels])
     expected = np.ones_like(track.located)
     expected[np.ix_(np.array(sorted(gaps)), np.flatnonzero(mapping))] = False
@@ -163,17 +166,17 @@ def test_a_catheter_is_located_only_where_it_is_seen() -> None:
 def test_one_electrode_in_view_stays_at_the_cycles_depth() -> None:
     (view, _), truth, _ = _study(1)
     alone = tuple(
-        replace(seen, chains=tuple(
+        replace(visible, chains=tuple(
             NamedChain("mapping", (1,), chain.pixels_uv[:1], chain.covariance_px2[:1])
-            for chain in seen.chains if chain.catheter == "mapping"
+            for chain in visible.chains if chain.catheter == "mapping"
         ))
-        for seen in view.observations
+        for visible in view.observations
     )  # fmt: skip
-    track = _follow(replace(view, observations=alone))
+    track = _track(replace(view, observations=alone))
     assert track.located.sum() == len(view.observations)
     assert _rms(track, truth[0]) <= 1.2
     _whole(track)
-    # Nothing to subtract: what is told of the difference is what is told of the position.
+    # There is no reference to subtract, so that both covariances are equal.
     assert track.relative_covariance_mm2 is not None
     np.testing.assert_array_equal(track.relative_covariance_mm2, track.covariance_mm2)
 
@@ -182,14 +185,14 @@ def test_a_mirrored_view_is_refused() -> None:
     (view, _), _, _ = _study(1)
     middle = 2 * view.camera.principal_point_uv[0]
     mirrored = tuple(
-        replace(seen, chains=tuple(
+        replace(visible, chains=tuple(
             replace(chain, pixels_uv=np.stack([middle - chain.pixels_uv[:, 0], chain.pixels_uv[:, 1]], axis=1))
-            for chain in seen.chains
+            for chain in visible.chains
         ))
-        for seen in view.observations
+        for visible in view.observations
     )  # fmt: skip
     with pytest.raises(Refusal) as refused:
-        _follow(replace(view, observations=mirrored))
+        _track(replace(view, observations=mirrored))
     assert refused.value.reason == Reason.VIEW_MIRRORED
 
 
@@ -197,11 +200,11 @@ def test_a_catheter_that_jumps_away_does_not_move_the_others() -> None:
     (view, _), truth, _ = _study(1)
     shift = np.zeros((len(view.observations), 2))
     shift[10:13] = (60.0, -35.0)
-    track = _follow(_at_other_pixels(view, "pacing", shift))
+    track = _track(_at_other_pixels(view, "pacing", shift))
     pacing = np.array([name == "pacing" for name, _ in track.labels])
     assert [Reason.PRIOR_GATE in reasons for reasons in track.reasons] == pacing.tolist()
     np.testing.assert_array_equal(track.positions_mm[10:13, pacing], track.baseline_mm[10:13, pacing])
-    # Pixels say one thing, the cycle another: the uncertainty contains both.
+    # Pixels and cycle contradict each other: the uncertainty contains both.
     off = (track.positions_mm - truth[0])[10:13, pacing]
     distance = np.einsum(
         "nmi,nmi->nm", off, np.linalg.solve(track.covariance_mm2[10:13, pacing], off[..., None])[..., 0]
@@ -216,14 +219,14 @@ def test_a_catheter_longer_than_its_maker_says_is_not_pulled_in_depth() -> None:
     mapping = DEFAULT_CATALOGUE["mapping"]
     wrong = replace(mapping, spacing_mm=(6.65, 6.3, 3.3))
     catheters = tuple(wrong if one is mapping else one for one in DEFAULT_CATALOGUE.catheters)
-    track = _follow(replace(view, catalogue=replace(DEFAULT_CATALOGUE, catheters=catheters)))
+    track = _track(replace(view, catalogue=replace(DEFAULT_CATALOGUE, catheters=catheters)))
     assert _rms(track, truth[0]) <= 1.0
 
 
 def test_less_than_one_beat_is_enough() -> None:
     (view, _), truth, _ = _study(1)
     short = slice(view.a_priori_frame, view.a_priori_frame + 5)
-    track = _follow(
+    track = _track(
         replace(
             view, observations=view.observations[short], frame_times_ms=view.frame_times_ms[short], a_priori_frame=0
         )
@@ -233,16 +236,16 @@ def test_less_than_one_beat_is_enough() -> None:
     still = replace(
         view, observations=view.observations[one], frame_times_ms=view.frame_times_ms[one], a_priori_frame=0
     )
-    _whole(_follow(still))
+    _whole(_track(still))
 
 
-def test_an_irregular_rhythm_is_told_and_widens_the_depth() -> None:
+def test_an_irregular_rhythm_is_reported_and_widens_the_depth() -> None:
     (view, _), _, _ = _study(1)
     n = len(view.observations)
     uneven = np.concatenate([np.arange(0, 2, 2 / 12), np.arange(0, 1, 1 / 22), np.arange(0, 1, 1 / 22)])[:n]
     phases = np.concatenate([uneven, np.linspace(0, 0.5, n)])[:n] % 1.0
-    changed = tuple(replace(seen, phase=float(p)) for seen, p in zip(view.observations, phases, strict=True))
-    track = _follow(replace(view, observations=changed))
+    changed = tuple(replace(visible, phase=float(p)) for visible, p in zip(view.observations, phases, strict=True))
+    track = _track(replace(view, observations=changed))
     assert all(Reason.IRREGULAR_RHYTHM in reasons for reasons in track.reasons)
     _whole(track)
 
@@ -250,7 +253,7 @@ def test_an_irregular_rhythm_is_told_and_widens_the_depth() -> None:
 def test_nothing_known_from_two_views_is_refused() -> None:
     (view, _), _, _ = _study(1)
     with pytest.raises(Refusal) as refused:
-        _follow(replace(view, a_priori=()))
+        _track(replace(view, a_priori=()))
     assert refused.value.reason == Reason.NO_A_PRIORI
 
 
@@ -263,14 +266,14 @@ def test_an_electrode_that_the_cycle_lacks_moves_with_its_catheter() -> None:
         view.cycle.phases, tuple(view.cycle.labels[i] for i in keep), view.cycle.positions_mm[:, keep],
         view.cycle.covariance_mm2[:, keep],
     )  # fmt: skip
-    track = _follow(replace(view, cycle=fewer))
+    track = _track(replace(view, cycle=fewer))
     at = track.labels.index(("mapping", 2))
     assert np.sqrt(((track.positions_mm - truth[0])[:, at] ** 2).sum(axis=-1).mean()) <= 1.5
 
 
 def test_breathing_makes_the_depth_uncertain_but_not_what_is_relative_to_the_reference() -> None:
     (view, _), _, _ = _study(1)
-    held, breathing = _follow(view), _follow(view, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
+    held, breathing = _track(view), _track(view, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
     ray = view.camera.axis_world
 
     def depth_sd(covariance: Array | None) -> float:
@@ -282,7 +285,7 @@ def test_breathing_makes_the_depth_uncertain_but_not_what_is_relative_to_the_ref
     assert relative[1] == pytest.approx(relative[0], rel=0.1)
 
 
-def test_depth_told_by_another_run_is_off_by_both_runs_breaths() -> None:
+def test_depth_from_another_run_is_off_by_both_runs_breaths() -> None:
     (view, _), _, _ = _study(1)
     assert view.cycle is not None
     breath = np.diag([1.0, 1.0, 16.0])
@@ -291,19 +294,20 @@ def test_depth_told_by_another_run_is_off_by_both_runs_breaths() -> None:
 
     def depth_variance(covariance: Array, **breathing: float) -> Array:
         assert view.cycle is not None
-        told = replace(view, cycle=replace(view.cycle, covariance_mm2=covariance))
+        changed = replace(view, cycle=replace(view.cycle, covariance_mm2=covariance))
         p = MotionParams.model_validate({**EXACT, "respiration_drift_sd_mm": 0.0, **breathing})
-        seen = observe(told)
-        expected = expect(told, seen, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg)
-        prior = MotionCovariance(told, seen.labels, expected, seen.phases, p).window(slice(0, 10))
+        electrodes = gather_electrodes(changed)
+        sds = p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg
+        expected = expected_motion(changed, electrodes, *sds)
+        prior = MotionCovariance(changed, electrodes.labels, expected, electrodes.phases, p).window(slice(0, 10))
         return prior.variance_mm2(np.ones(4), (FIXED,), np.broadcast_to(view.camera.axis_world, prior.mean_mm.shape))
 
-    # The cycle stands for the middle of two breaths: half of one breath's variance.
+    # The cycle is valid for the middle of two breathing positions: half of one position's variance.
     middle = depth_variance(still + breath / 2, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
     np.testing.assert_allclose(
         middle - depth_variance(still), 2 * view.camera.axis_world @ breath @ view.camera.axis_world, rtol=1e-6
     )
-    # A cycle recorded with the breath held tells the depth of that breath; only this run's own is left.
+    # A cycle recorded with the breath held has the depth of that breath; only this run's breath remains.
     held = depth_variance(still, respiration_other_sd_mm=1.0, respiration_head_feet_sd_mm=4.0)
     np.testing.assert_allclose(
         held - depth_variance(still), view.camera.axis_world @ breath @ view.camera.axis_world, rtol=1e-6
@@ -311,12 +315,12 @@ def test_depth_told_by_another_run_is_off_by_both_runs_breaths() -> None:
 
 
 def test_ellipsoids_hold_the_truth_about_as_often_as_they_say() -> None:
-    """A coarse floor over few hearts; the figure itself comes from the benchmark."""
+    """Check a coarse limit over few hearts; the benchmark measures the figure."""
     inside = []
     for seed in (1, 2, 3):
         views, truths, _ = _study(seed)
         for view, truth in zip(views, truths, strict=True):
-            track = _follow(view)
+            track = _track(view)
             error = track.positions_mm - truth
             distance = np.einsum("nmi,nmi->nm", error, np.linalg.solve(track.covariance_mm2, error[..., None])[..., 0])
             inside.append((distance <= 7.815).mean())
@@ -325,12 +329,12 @@ def test_ellipsoids_hold_the_truth_about_as_often_as_they_say() -> None:
 
 def test_cost_is_linear_in_frames_because_beats_are_solved_one_by_one() -> None:
     (view, _), _, _ = _study(1)
-    phases = np.array([seen.phase or 0.0 for seen in view.observations])
+    phases = np.array([visible.phase or 0.0 for visible in view.observations])
     cut = int(np.flatnonzero(np.diff(phases) < -0.5)[-1]) + 1
     # The same moment of an earlier beat, so that it stays in the part.
     at_rest = int(np.abs(phases[:cut] - phases[view.a_priori_frame]).argmin())
     view = replace(view, a_priori_frame=at_rest)
-    whole = _follow(view)
-    part = _follow(replace(view, observations=view.observations[:cut], frame_times_ms=view.frame_times_ms[:cut]))
+    whole = _track(view)
+    part = _track(replace(view, observations=view.observations[:cut], frame_times_ms=view.frame_times_ms[:cut]))
     # The pixels of later beats do not enter; only the number of beats that were averaged differs.
     assert np.abs(part.positions_mm - whole.positions_mm[:cut]).max() < 0.3

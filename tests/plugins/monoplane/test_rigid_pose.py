@@ -1,4 +1,4 @@
-"""The plugin rigid-pose: what it states holds; what one view cannot tell, or no rigid body does, it refuses with the cause."""
+"""The plugin rigid-pose: stated errors hold; unobservable depth and bodies that are not rigid are refused with the cause."""
 
 import contextlib
 
@@ -39,15 +39,18 @@ def view_of(  # type: ignore[no-untyped-def]
     *,
     sd_mm: float = 1e-3,
     shared_sd_mm: float | None = None,
-    seen: BoolArray | None = None,
+    visible: BoolArray | None = None,
     labels=LABELS,
     catalogue: Catalogue = BODY,
     **more,
 ) -> MonoplaneView:
-    """Pixels (n, m, 2) with half a pixel of noise, points known in frame 0 to ``sd_mm``, and together to ``shared_sd_mm``."""
+    """Return a view with half a pixel of noise in its pixels (n, m, 2).
+
+    The points are known in frame 0 to ``sd_mm``, and together to ``shared_sd_mm``.
+    """
     n, m = pixels.shape[:2]
     labels = labels[:m]
-    seen = np.ones((n, m), dtype=bool) if seen is None else seen
+    visible = np.ones((n, m), dtype=bool) if visible is None else visible
     shape = sd_mm**2 * np.eye(3)
     relative = None if shared_sd_mm is None else shape
     absolute = shape + (shared_sd_mm or 0.0) ** 2 * np.eye(3)
@@ -59,7 +62,7 @@ def view_of(  # type: ignore[no-untyped-def]
     for frame in range(n):
         chains = []
         for name in sorted({name for name, _ in labels}):
-            columns = [k for k in range(m) if labels[k][0] == name and seen[frame, k]]
+            columns = [k for k in range(m) if labels[k][0] == name and visible[frame, k]]
             if columns:
                 noise = np.broadcast_to(0.25 * np.eye(2), (len(columns), 2, 2))
                 chains.append(NamedChain(name, tuple(labels[k][1] for k in columns), pixels[frame, columns], noise))
@@ -70,14 +73,14 @@ def view_of(  # type: ignore[no-untyped-def]
     return MonoplaneView("S01", "a", camera, catalogue, times, tuple(observations), known, start, cycle, others)
 
 
-def follow(view: MonoplaneView, **params: object) -> Track:
+def solve(view: MonoplaneView, **params: object) -> Track:
     known = {"gantry_angle_sd_deg": 0, "isocentre_sd_mm": 0, "known_rigid": True}
     return RigidPose(RigidPose.Params.model_validate(known | params)).track(view, Silent())
 
 
 def refusal_of(view: MonoplaneView, **params: object) -> Refusal:
     with pytest.raises(Refusal) as refusal:
-        follow(view, **params)
+        solve(view, **params)
     return refusal.value
 
 
@@ -91,7 +94,7 @@ def inside(error: Array, covariance: Array) -> float:
 def test_without_noise_the_track_is_the_truth(simulate, depth_step_mm: float, start: int) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 8)
     view = view_of(simulation.camera, simulation.points_mm[start], simulation.pixels_uv, start=start)
-    track = follow(view, depth_step_mm=depth_step_mm)
+    track = solve(view, depth_step_mm=depth_step_mm)
     assert np.abs(track.positions_mm - simulation.points_mm).max() <= 1e-8
     assert track.located.all()
     assert track.reasons == ((),) * 30
@@ -105,7 +108,7 @@ def test_covariances_hold_the_truth_from_the_isocentre_and_from_the_reference(si
     for _ in range(25):
         pixels = simulation.pixels_uv + rng.normal(0, 0.5, simulation.pixels_uv.shape)
         a_priori = simulation.points_mm[0] + rng.normal(0, sd_mm, (30, 3))
-        track = follow(view_of(simulation.camera, a_priori, pixels, sd_mm=sd_mm))
+        track = solve(view_of(simulation.camera, a_priori, pixels, sd_mm=sd_mm))
         error = track.positions_mm - simulation.points_mm
         absolute.append(inside(error, track.covariance_mm2))
         assert track.relative_covariance_mm2 is not None
@@ -116,10 +119,10 @@ def test_covariances_hold_the_truth_from_the_isocentre_and_from_the_reference(si
     assert 0.92 <= np.mean(relative) <= 0.98
 
 
-def test_an_isocentre_that_stands_elsewhere_counts_across_the_view_and_not_between_electrodes(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_an_isocentre_error_counts_across_the_view_and_not_between_electrodes(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 5)
-    seen = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv)
-    known, unknown = (follow(seen, isocentre_sd_mm=sd) for sd in (0.0, 0.7))
+    visible = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv)
+    known, unknown = (solve(visible, isocentre_sd_mm=sd) for sd in (0.0, 0.7))
     assert unknown.covariance_mm2[4, 0] - known.covariance_mm2[4, 0] == pytest.approx(
         np.diag([0.49, 0.49, 0.0]), abs=1e-9
     )
@@ -127,9 +130,9 @@ def test_an_isocentre_that_stands_elsewhere_counts_across_the_view_and_not_betwe
     assert unknown.relative_covariance_mm2 == pytest.approx(known.relative_covariance_mm2)
 
 
-def test_without_the_reference_in_the_body_nothing_is_told_relative_to_it(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_without_the_reference_in_the_body_nothing_is_relative_to_it(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 3)
-    track = follow(view_of(simulation.camera, simulation.points_mm[0, :20], simulation.pixels_uv[:, :20]))
+    track = solve(view_of(simulation.camera, simulation.points_mm[0, :20], simulation.pixels_uv[:, :20]))
     assert track.relative_covariance_mm2 is None
 
 
@@ -139,18 +142,18 @@ def test_a_shift_of_the_whole_body_since_the_a_priori_does_not_spoil_its_shape(s
     view = view_of(
         simulation.camera, simulation.points_mm[0] + breath, simulation.pixels_uv, sd_mm=0.05, shared_sd_mm=4.0
     )
-    track = follow(view)
+    track = solve(view)
     assert np.abs(track.positions_mm - simulation.points_mm).max() < 0.2
 
 
 def test_hidden_electrodes_are_not_located_and_hidden_frames_do_not_end_the_track(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 6)
-    seen = np.ones((6, 30), dtype=bool)
-    seen[2, 5] = False
-    seen[3, 2:] = False
-    seen[4, 20:] = False
-    track = follow(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, seen=seen))
-    expected = seen.copy()
+    visible = np.ones((6, 30), dtype=bool)
+    visible[2, 5] = False
+    visible[3, 2:] = False
+    visible[4, 20:] = False
+    track = solve(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, visible=visible))
+    expected = visible.copy()
     expected[3] = False
     assert (track.located == expected).all()
     assert np.abs((track.positions_mm - simulation.points_mm)[expected]).max() < 1e-6
@@ -161,22 +164,22 @@ def test_hidden_electrodes_are_not_located_and_hidden_frames_do_not_end_the_trac
     assert eigenvalues.min() > -1e-9
 
 
-def test_a_frame_whose_few_electrodes_cannot_tell_depth_holds_no_position(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_a_frame_whose_few_electrodes_do_not_show_depth_holds_no_position(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 6)
-    seen = np.ones((6, 30), dtype=bool)
-    seen[3, 4:] = False
-    track = follow(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, seen=seen))
+    visible = np.ones((6, 30), dtype=bool)
+    visible[3, 4:] = False
+    track = solve(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, visible=visible))
     assert not track.located[3].any()
     assert track.located[[0, 1, 2, 4, 5]].all()
     assert track.reasons[0] == (Reason.DEPTH_UNOBSERVABLE, Reason.TRACK_INTERRUPTED)
     assert track.reasons[9] == (Reason.TRACK_INTERRUPTED,)
 
 
-def test_a_c_arm_view_is_followed_without_a_mirror_world(simulate) -> None:  # type: ignore[no-untyped-def]
+def test_a_c_arm_view_is_tracked_without_a_mirror_world(simulate) -> None:  # type: ignore[no-untyped-def]
     points = simulate("H18", "AP", 6).points_mm
     camera = camera_from_gantry(FRONTAL)
     assert np.linalg.det(camera.matrix[:, :3]) < 0
-    track = follow(view_of(camera, points[0], camera.project(points)))
+    track = solve(view_of(camera, points[0], camera.project(points)))
     assert np.abs(track.positions_mm - points).max() <= 1e-8
 
 
@@ -200,20 +203,20 @@ def test_a_body_that_bends_is_refused(simulate) -> None:  # type: ignore[no-unty
     assert "rigid body" in str(refusal)
 
 
-@pytest.mark.parametrize("told_by", ["cycle", "others"])
-def test_a_contraction_that_looks_like_depth_is_refused_where_two_views_have_shown_it(simulate, told_by: str) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize("source", ["cycle", "others"])
+def test_a_contraction_that_looks_like_depth_is_refused_where_two_views_have_shown_it(simulate, source: str) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 8)
     centre = simulation.points_mm[0].mean(axis=0)
     shares = 1 - 0.02 * np.sin(np.linspace(0, np.pi, 8))
     beating = centre + shares[:, None, None] * (simulation.points_mm[0] - centre)
     pixels = simulation.camera.project(beating)
     blind = view_of(simulation.camera, beating[0], pixels)
-    assert np.abs(follow(blind).positions_mm - beating).max() > 5
+    assert np.abs(solve(blind).positions_mm - beating).max() > 5
     unknown = refusal_of(blind, known_rigid=False)
     assert unknown.reason is Reason.DEPTH_UNOBSERVABLE
-    assert "contracts by one percent looks like one that moves 5 mm away" in str(unknown)
+    assert "contracts by one percent looks like a heart that moves 5 mm away" in str(unknown)
     cycle = SiteCycle(np.linspace(0, 0.9, 8), LABELS, beating, np.broadcast_to(0.01 * np.eye(3), (8, 30, 3, 3)))
-    known = {"cycle": cycle} if told_by == "cycle" else {"others": (cycle, cycle, cycle)}
+    known = {"cycle": cycle} if source == "cycle" else {"others": (cycle, cycle, cycle)}
     refusal = refusal_of(view_of(simulation.camera, beating[0], pixels, **known))
     assert refusal.reason is Reason.DEPTH_UNOBSERVABLE
     assert 5 < float(str(refusal).split("would be ")[1].split(" mm")[0]) < 15
@@ -221,31 +224,31 @@ def test_a_contraction_that_looks_like_depth_is_refused_where_two_views_have_sho
         np.linspace(0, 0.9, 8), LABELS, simulation.points_mm, np.broadcast_to(0.01 * np.eye(3), (8, 30, 3, 3))
     )
     shown = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, cycle=rigid)
-    follow(shown, known_rigid=False)
+    solve(shown, known_rigid=False)
 
 
-@pytest.mark.parametrize("told_by", ["cycle", "others"])
-@pytest.mark.parametrize("told", ["of one catheter at rest", "of all in diastole", "of three electrodes"])
+@pytest.mark.parametrize("source", ["cycle", "others"])
+@pytest.mark.parametrize("shown_part", ["of one catheter at rest", "of all in diastole", "of three electrodes"])
 def test_a_cycle_that_shows_too_little_does_not_pass_for_proof_of_a_rigid_body(
-    simulate, told: str, told_by: str
+    simulate, shown_part: str, source: str
 ) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 8)
     centre = simulation.points_mm[0].mean(axis=0)
     shares = 1 - 0.02 * np.sin(np.linspace(0, np.pi, 8))
     beating = centre + shares[:, None, None] * (simulation.points_mm[0] - centre)
     phases, rows = np.linspace(0, 0.9, 8), slice(None)
-    if told == "of all in diastole":
+    if shown_part == "of all in diastole":
         phases = np.linspace(0, 0.06, 4)
     else:
-        rows = slice(20, 30) if told == "of one catheter at rest" else slice(0, 3)
+        rows = slice(20, 30) if shown_part == "of one catheter at rest" else slice(0, 3)
     n, labels = len(phases), LABELS[rows]
     still = np.repeat(beating[:1, rows], n, axis=0)
     cycle = SiteCycle(phases, labels, still, np.broadcast_to(0.01 * np.eye(3), (n, len(labels), 3, 3)))
-    known = {"cycle": cycle} if told_by == "cycle" else {"others": (cycle, cycle, cycle)}
+    known = {"cycle": cycle} if source == "cycle" else {"others": (cycle, cycle, cycle)}
     view = view_of(simulation.camera, beating[0], simulation.camera.project(beating), **known)
     refusal = refusal_of(view, known_rigid=False)
     assert refusal.reason is Reason.DEPTH_UNOBSERVABLE
-    assert "no whole cycle of all these electrodes" in str(refusal)
+    assert "no whole cycle of all of them" in str(refusal)
 
 
 @pytest.mark.parametrize("seed", [3, 4])
@@ -278,9 +281,9 @@ def test_one_catheter_alone_is_refused_with_the_bound(simulate) -> None:  # type
     assert 5 < bound < 200
 
 
-@pytest.mark.parametrize(("count", "told"), [(1, "at all"), (3, "mm"), (8, "mm")])
-def test_too_few_electrodes_or_electrodes_on_a_line_are_refused_with_what_they_tell(
-    simulate, count: int, told: str
+@pytest.mark.parametrize(("count", "accuracy"), [(1, "at all"), (3, "mm"), (8, "mm")])
+def test_too_few_electrodes_or_electrodes_on_a_line_are_refused_with_their_bound(
+    simulate, count: int, accuracy: str
 ) -> None:  # type: ignore[no-untyped-def]
     camera = simulate("H18", "AP", 1).camera
     points = np.arange(count)[:, None] * np.array([3.0, 1.0, 2.0])
@@ -290,32 +293,33 @@ def test_too_few_electrodes_or_electrodes_on_a_line_are_refused_with_what_they_t
     refusal = refusal_of(view_of(camera, points, pixels))
     assert refusal.reason is Reason.DEPTH_UNOBSERVABLE
     assert "four electrodes" in str(refusal)
-    assert told in str(refusal).split("cannot be known")[1]
+    assert accuracy in str(refusal).split("cannot be known")[1]
 
 
 def test_a_run_that_shows_nothing_is_refused(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 3)
-    view = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, seen=np.zeros((3, 30), dtype=bool))
+    view = view_of(
+        simulation.camera, simulation.points_mm[0], simulation.pixels_uv, visible=np.zeros((3, 30), dtype=bool)
+    )
     assert refusal_of(view).reason is Reason.DEPTH_UNOBSERVABLE
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_whatever_the_pixels_are_the_answer_is_finite_or_a_refusal(simulate, seed: int) -> None:  # type: ignore[no-untyped-def]
+def test_any_pixels_give_an_answer_that_is_finite_or_a_refusal(simulate, seed: int) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "LAT", 5)
     rng = np.random.default_rng(seed)
     pixels = simulation.pixels_uv + rng.normal(0, 0.5, simulation.pixels_uv.shape)
     pixels[rng.integers(5)] = rng.uniform(0, 511, (30, 2))
-    seen = rng.uniform(size=(5, 30)) < rng.uniform(0.05, 1)
+    visible = rng.uniform(size=(5, 30)) < rng.uniform(0.05, 1)
     with contextlib.suppress(Refusal):
-        track = follow(view_of(simulation.camera, simulation.points_mm[0], pixels, seen=seen, sd_mm=0.2))
+        track = solve(view_of(simulation.camera, simulation.points_mm[0], pixels, visible=visible, sd_mm=0.2))
         assert np.abs((track.positions_mm - simulation.points_mm)[track.located]).max() < 20
 
 
 def test_an_uncertain_shape_counts_against_the_bound(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 4)
     exact, vague = (
-        follow(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, sd_mm=sd))
-        for sd in (1e-3, 1.0)
+        solve(view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv, sd_mm=sd)) for sd in (1e-3, 1.0)
     )
     assert vague.covariance_mm2[3, 0, 2, 2] > 4 * exact.covariance_mm2[3, 0, 2, 2]
 
@@ -323,7 +327,7 @@ def test_an_uncertain_shape_counts_against_the_bound(simulate) -> None:  # type:
 def test_a_smooth_path_gives_smaller_covariances(simulate) -> None:  # type: ignore[no-untyped-def]
     simulation = simulate("H18", "AP", 8)
     view = view_of(simulation.camera, simulation.points_mm[0], simulation.pixels_uv)
-    free, smooth = follow(view), follow(view, acceleration_sd_mm=0.05)
+    free, smooth = solve(view), solve(view, acceleration_sd_mm=0.05)
     assert np.abs(smooth.positions_mm - simulation.points_mm).max() < 0.01
     assert np.trace(smooth.covariance_mm2[4, 0]) < 0.5 * np.trace(free.covariance_mm2[4, 0])
 

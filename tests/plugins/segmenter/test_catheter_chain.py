@@ -33,7 +33,7 @@ def segmented(frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, m
 
 @pytest.fixture(scope="module", params=["LAT", "PA"])
 def beating(request):
-    """A run of either contrast at 60 frames a second, its truth and what was found in it."""
+    """A run of either contrast at 60 frames a second, its truth and its segmentation."""
     study = simulate_study(StudySpec(313, sites=1, frames=30, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA")))
     simulated = study.sites[0].runs[request.param == "PA"]
     frames = [simulated.frames[index] for index in range(30)]

@@ -65,10 +65,11 @@ def test_shutter_attributes_are_believed(patient):
 
 
 def test_shutter_shapes():
-    polygon = inside_shutter(Shutter(polygon=((10, 10), (50, 10), (50, 40), (10, 40))), (64, 64))
-    rectangle = inside_shutter(Shutter(rectangle=(10, 50, 10, 40)), (64, 64))
+    v, u = np.mgrid[0:64, 0:64].astype(float)
+    polygon = inside_shutter(Shutter(polygon=((10, 10), (50, 10), (50, 40), (10, 40))), u, v)
+    rectangle = inside_shutter(Shutter(rectangle=(10, 50, 10, 40)), u, v)
     assert np.count_nonzero(polygon ^ rectangle) <= 140
-    circle = inside_shutter(Shutter(circle=(32, 32, 20)), (64, 64))
+    circle = inside_shutter(Shutter(circle=(32, 32, 20)), u, v)
     assert circle.sum() == pytest.approx(np.pi * 400, rel=0.02)
 
 

@@ -181,6 +181,16 @@ def test_otsu_agrees_with_scikit_image():
     assert otsu_threshold(x, np.ones(x.shape, bool)) == pytest.approx(threshold_otsu(x, nbins=1024), abs=0.02)
 
 
+def test_otsu_of_few_grey_levels_needs_no_class_means():
+    inside = np.ones((20, 20), bool)
+    assert otsu_threshold(np.zeros((20, 20), np.float32), inside) == 0.0
+    assert otsu_threshold(np.ones((20, 20), np.float32), inside) == pytest.approx(1 / 1023)
+    # The brightest pixel lies outside the mask, so that the upper bins are empty.
+    two = np.where(np.arange(20) < 10, 100.0, 200.0).astype(np.float32)[None].repeat(20, axis=0)
+    two[0, 0], inside[0, 0] = 1000.0, False
+    assert 100 < otsu_threshold(two, inside) < 200
+
+
 def test_components_agree_with_scikit_image():
     from skimage.measure import label, regionprops
 
@@ -188,8 +198,9 @@ def test_components_agree_with_scikit_image():
     for share in (0.02, 0.4, 0.6, 0.95):
         x = rng.random((70, 93)).astype(np.float32)
         inside = np.hypot(*np.ogrid[-35:35, -46:47]) < 45
-        areas, centroids = components(x, inside, 1.0 - share)
-        expected = regionprops(label((x >= np.float32(1.0 - share)) & inside, connectivity=2))
+        bright = (x >= np.float32(1.0 - share)) & inside
+        areas, centroids = components(bright)
+        expected = regionprops(label(bright, connectivity=2))
         np.testing.assert_array_equal(areas, [region.area for region in expected])
         np.testing.assert_allclose(centroids[:, ::-1], [region.centroid for region in expected], atol=1e-9)
 

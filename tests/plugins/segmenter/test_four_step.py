@@ -12,7 +12,7 @@ PX_PER_MM = 512 / 178 * 2
 
 @pytest.fixture(scope="module")
 def simulated(study):
-    """A lateral run of the phantom, its truth and what was found in it."""
+    """A lateral run of the phantom, its truth and its segmentation."""
     simulated = study.sites[0].runs[0]
     run = Run(simulated.frames, simulated.frame_times_ms, PX_PER_MM, PixelFacts(False, 12, False))
     return run, simulated.truth, FourStep().segment(run, DEFAULT_CATALOGUE, {}, Silent())

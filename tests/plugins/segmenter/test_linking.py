@@ -3,7 +3,7 @@ import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap.segmenter.four_step.contrast import Contrast
-from fluoromap.segmenter.linking import Shafts, evidence, families, kind_probabilities, link
+from fluoromap.segmenter.linking import ShaftImage, catheter_families, evidence, kind_probabilities, link_candidates
 
 PX = 5.75
 
@@ -31,7 +31,9 @@ def straight(catheter, tip, angle, foreshortening=0.9):
 
 def linked(points, image, catalogue=DEFAULT_CATALOGUE):
     weights = evidence(Contrast.of_frame(image, np.ones(image.shape, bool), PX).of(points))
-    return link(points, weights, np.zeros(len(points)), Shafts(image, 1, 0.05, PX), families(catalogue))
+    return link_candidates(
+        points, weights, np.zeros(len(points)), ShaftImage(image, 1, 0.05, PX), catheter_families(catalogue)
+    )
 
 
 @pytest.mark.parametrize("electrodes", [2, 3, 4, 6, 8, 10])
@@ -64,17 +66,17 @@ def test_candidates_on_a_plain_background_make_no_chain():
 
 
 def test_look_alikes_are_one_family_and_share_their_probability():
-    kinds = families(DEFAULT_CATALOGUE)
-    assert [family.names for family in kinds] == [("reference", "pacing"), ("mapping",)]
-    given = kind_probabilities(np.log(np.array([[0.6, 0.4]])), kinds)
+    families = catheter_families(DEFAULT_CATALOGUE)
+    assert [family.names for family in families] == [("reference", "pacing"), ("mapping",)]
+    given = kind_probabilities(np.log(np.array([[0.6, 0.4]])), families)
     assert dict(given[0])["reference"] == pytest.approx(dict(given[0])["pacing"])
     assert sum(dict(given[0]).values()) == pytest.approx(1.0)
 
 
 def test_kinds_respect_how_many_of_each_the_catalogue_has():
     """Three chains, all looking like the diagnostic kind: one of them must be the mapping catheter."""
-    kinds = families(DEFAULT_CATALOGUE)
-    given = kind_probabilities(np.array([[0.0, -1.0], [0.0, -1.0], [0.0, -0.2]]), kinds)
+    families = catheter_families(DEFAULT_CATALOGUE)
+    given = kind_probabilities(np.array([[0.0, -1.0], [0.0, -1.0], [0.0, -0.2]]), families)
     mapping = [dict(row).get("mapping", 0.0) for row in given]
     assert sum(mapping) == pytest.approx(1.0)
     assert mapping[2] > mapping[0]

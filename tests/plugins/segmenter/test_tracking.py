@@ -2,7 +2,7 @@ import numpy as np
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.tracking import follow
+from fluoromap.segmenter.tracking import track_chains
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 
@@ -35,7 +35,7 @@ def test_two_beating_catheters_keep_their_numbers_through_a_gap():
         if frame in range(12, 16):
             chains = chains[1:]
         found.append(chains[::-1] if frame % 2 else chains)
-    entries = follow(run(found), times(40), 3)
+    entries = track_chains(run(found), times(40), 3)
     seen = {(float(np.ptp(one.pixels_uv[:, 0])) > 50, one.track) for entry in entries for one in entry.chains}
     assert len(seen) == 2
     assert [entry.manual_needed for entry in entries[11:17]] == [None, *[Reason.TRACK_INTERRUPTED] * 4, None]
@@ -44,7 +44,7 @@ def test_two_beating_catheters_keep_their_numbers_through_a_gap():
 def test_a_missing_catheter_is_carried_from_where_it_was():
     asked = []
 
-    def carry(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken):
         asked.append(frame)
         assert len(taken) == 1
         expected = two_beating(frame)[0]
@@ -52,42 +52,42 @@ def test_a_missing_catheter_is_carried_from_where_it_was():
         return expected if frame != 13 else None
 
     found = [two_beating(frame)[1 if frame in range(12, 16) else 0 :] for frame in range(40)]
-    entries = follow(run(found), times(40), 3, carry)
+    entries = track_chains(run(found), times(40), 3, search)
     assert sorted(asked) == [12, 13, 14, 15]
     assert [len(entry.chains) for entry in entries[11:17]] == [2, 2, 1, 2, 2, 2]
 
 
 def test_another_kind_is_another_track():
-    entries = follow(run([[chain(POINTS)], [chain(POINTS + 1, "mapping")]]), times(2), 3)
+    entries = track_chains(run([[chain(POINTS)], [chain(POINTS + 1, "mapping")]]), times(2), 3)
     assert entries[0].chains[0].track != entries[1].chains[0].track
 
 
 def test_what_is_not_sure_continues_a_track_but_begins_none():
     found = [two_beating(frame) for frame in range(10)]
-    entries = follow(run(found, unsure=range(4, 10)), times(10), 3)
+    entries = track_chains(run(found, unsure=range(4, 10)), times(10), 3)
     assert all(len(entry.chains) == 2 for entry in entries)
-    nothing = follow(run(found, unsure=range(10)), times(10), 3)
+    nothing = track_chains(run(found, unsure=range(10)), times(10), 3)
     assert all(entry.chains == () and entry.manual_needed == Reason.MANUAL_NEEDED for entry in nothing)
 
 
 def test_what_stands_in_single_frames_only_is_dropped():
     found = [two_beating(frame) for frame in range(30)]
     found[7].append(chain(POINTS + np.array([250, 30])))
-    assert all(len(entry.chains) == 2 for entry in follow(run(found), times(30), 3))
+    assert all(len(entry.chains) == 2 for entry in track_chains(run(found), times(30), 3))
 
 
 def test_tracks_start_from_a_mark():
     found = [two_beating(frame)[:1] for frame in range(12)]
     found[5] = [chain(POINTS[:, ::-1] + 180, "mapping", manual=True)]
-    entries = follow(run(found), times(12), 3)
+    entries = track_chains(run(found), times(12), 3)
     assert entries[5].chains[0].manual
     assert entries[5].chains[0].track != entries[6].chains[0].track
 
 
 def test_never_more_chains_than_catheters():
     found = [[*two_beating(frame), chain(POINTS + np.array([250, 30]))] for frame in range(10)]
-    assert all(len(entry.chains) == 2 for entry in follow(run(found), times(10), 2))
+    assert all(len(entry.chains) == 2 for entry in track_chains(run(found), times(10), 2))
 
 
 def test_an_empty_run():
-    assert follow([], np.zeros(0), 3) == ()
+    assert track_chains([], np.zeros(0), 3) == ()

@@ -1,4 +1,4 @@
-"""Whole sites: positions, honest covariances, what is relative to the reference catheter, reasons."""
+"""Whole sites: positions, honest covariances, positions relative to the reference catheter, reasons."""
 
 import numpy as np
 import pytest
@@ -44,11 +44,11 @@ def heart(rng: np.random.Generator) -> dict[str, Array]:
 
 
 def observation(
-    seen_by: Camera, points: dict[str, Array], rng: np.random.Generator | None = None, phase: float | None = 0.8
+    by: Camera, points: dict[str, Array], rng: np.random.Generator | None = None, phase: float | None = 0.8
 ) -> Observation:
     chains = []
     for name, at in points.items():
-        pixels = seen_by.project(at)
+        pixels = by.project(at)
         if rng is not None:
             pixels = pixels + rng.normal(0, NOISE_PX, pixels.shape)
         covariance = np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(at), 2, 2))
@@ -92,7 +92,7 @@ def test_a_still_heart_without_noise_is_located_exactly(plugin: type) -> None:
 @BOTH
 @pytest.mark.parametrize("cameras", [LATERAL_AND_FRONTAL, (camera(60, 15), camera(-10, -10)), (camera(45), camera(0))])
 def test_ellipsoids_hold_the_truth_in_as_many_hearts_as_they_say(plugin: type, cameras: tuple[Camera, Camera]) -> None:
-    """Pixel noise, beats, breathing and a wrong gantry, drawn as the parameters say; hearts, not electrodes, are counted."""
+    """Draw pixel noise, beats, breathing and gantry errors as the parameters say; count hearts, not electrodes."""
     rng = np.random.default_rng(7)
     inside, inside_relative, errors, relative_errors = [], [], [], []
     params = UncertaintyParams()
@@ -124,7 +124,7 @@ def test_ellipsoids_hold_the_truth_in_as_many_hearts_as_they_say(plugin: type, c
 
 
 def bend(name: str) -> Array:
-    """How far each electrode follows its tip, shape (m, 1)."""
+    """Return the share of its tip's displacement that each electrode follows, shape (m, 1)."""
     along = DEFAULT_CATALOGUE[name].arc_lengths_mm
     return (0.5 + 0.5 * np.exp(-along / BENDS_OVER_MM))[:, None]
 
@@ -186,7 +186,7 @@ def test_a_missing_mapping_catheter_rejects_the_site(plugin: type) -> None:
     assert answer.rejected[0].reasons == (Reason.CATHETER_NOT_FOUND,)
 
 
-def test_a_wrong_spacing_and_matching_s_doubts_are_told_at_the_electrodes() -> None:
+def test_a_wrong_spacing_and_matching_s_doubts_are_reported_at_the_electrodes() -> None:
     points = heart(np.random.default_rng(1))
     points["mapping"] = points["mapping"].copy()
     points["mapping"][3] += 2.0 * (points["mapping"][3] - points["mapping"][2]) / 3.3
@@ -221,7 +221,7 @@ def test_the_cycle_follows_the_beating_heart(plugin: type) -> None:
 
 
 def beating_site(rng: np.random.Generator) -> MatchedSite:
-    """A cycle with a pulse of 5 mm in systole and rest in diastole."""
+    """Return a site with a pulse of 5 mm in systole and rest in diastole."""
     points = heart(rng)
     pairs = []
     for phase in np.arange(0, 1, 0.05):
@@ -275,7 +275,7 @@ def test_one_electrode_in_views_twenty_two_degrees_apart_is_located_with_an_hone
 
 
 @BOTH
-def test_views_that_contradict_each_other_are_told_or_rejected_but_never_without_numbers(plugin: type) -> None:
+def test_views_that_contradict_each_other_are_doubted_or_rejected_but_never_without_numbers(plugin: type) -> None:
     rng = np.random.default_rng(3)
     points = heart(rng)
     a = observation(camera(90), points)
@@ -316,6 +316,6 @@ def test_another_pairing_that_cannot_be_ruled_out_widens_the_ellipsoid_and_lower
     assert tip.alternative_mm is None
     assert tip.reasons == ()
     assert tip.covariance_mm2 == pytest.approx(before.point("mapping", 1).covariance_mm2)
-    # The reference may be the other catheter: then every relative position hangs on it.
+    # The reference may be the other catheter: then every relative position changes with it.
     assert grade_of(before.point("mapping", 1).relative_covariance_mm2) is Grade.A
     assert grade_of(tip.relative_covariance_mm2) is Grade.C

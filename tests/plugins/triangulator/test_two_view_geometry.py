@@ -46,7 +46,7 @@ def test_fundamental_matrix_sends_the_other_source_to_nothing() -> None:
 
 
 def bound_mm(cameras: tuple[Camera, Camera], points: Array, noise_px: float) -> float:
-    """RMS of the Cramer-Rao bound, written from the Fisher information of four independent pixel coordinates."""
+    """Return the RMS Cramer-Rao bound from the Fisher information of four independent pixel coordinates."""
     jacobian = np.concatenate([one.jacobian(points) for one in cameras], axis=1)
     information = np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2
     return float(np.sqrt(np.trace(np.linalg.inv(information), axis1=1, axis2=2).mean()))
@@ -57,11 +57,11 @@ def test_both_methods_reach_the_bound_at_ninety_degrees(noise_px: float) -> None
     rng = np.random.default_rng(3)
     a, b = camera(90), camera(0)
     points = rng.uniform(-35, 35, (20_000, 3))
-    seen = [one.project(points) + rng.normal(0, noise_px, (len(points), 2)) for one in (a, b)]
+    pixels = [one.project(points) + rng.normal(0, noise_px, (len(points), 2)) for one in (a, b)]
     bound = bound_mm((a, b), points, noise_px)
     for found in (
-        triangulate_linear(a, b, *seen),
-        triangulate_maximum_likelihood(a, b, *seen, unit(len(points)), unit(len(points))),
+        triangulate_linear(a, b, *pixels),
+        triangulate_maximum_likelihood(a, b, *pixels, unit(len(points)), unit(len(points))),
     ):
         rms = np.sqrt(((found - points) ** 2).sum(axis=1).mean())
         assert 0.98 <= rms / bound <= 1.02
@@ -86,11 +86,11 @@ def test_the_answer_has_the_least_reprojection_error_nearby() -> None:
     rng = np.random.default_rng(5)
     a, b = camera(60, 20), camera(0, -10)
     points = rng.uniform(-35, 35, (50, 3))
-    seen = [one.project(points) + rng.normal(0, 1, (50, 2)) for one in (a, b)]
+    pixels = [one.project(points) + rng.normal(0, 1, (50, 2)) for one in (a, b)]
 
     def cost(at: Array) -> Array:
-        return sum(((one.project(at) - uv) ** 2).sum(axis=1) for one, uv in zip((a, b), seen, strict=True))
+        return sum(((one.project(at) - uv) ** 2).sum(axis=1) for one, uv in zip((a, b), pixels, strict=True))
 
-    found = triangulate_maximum_likelihood(a, b, *seen, unit(50), unit(50))
+    found = triangulate_maximum_likelihood(a, b, *pixels, unit(50), unit(50))
     for _ in range(20):
         assert (cost(found) <= cost(found + rng.normal(0, 0.01, (50, 3)))).all()

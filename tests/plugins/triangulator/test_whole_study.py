@@ -1,4 +1,4 @@
-"""What only the whole study shows: a wrong gantry, a wrong catalogue, a moved table."""
+"""Faults that only the whole study shows: a wrong gantry, a wrong catalogue, a moved table."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Points = dict[str, Array]
 
 
 def turn(angle_deg: float, offset_mm: float, seed: int) -> Array:
-    """A displacement (4, 4) of the world as a wrong header makes it, by so much in a random direction."""
+    """Return the displacement (4, 4) of the world by a wrong header, of given size and random direction."""
     rng = np.random.default_rng(seed)
     axis, along = rng.normal(size=3), rng.normal(size=3)
     displaced = np.eye(4)
@@ -42,18 +42,21 @@ def turn(angle_deg: float, offset_mm: float, seed: int) -> Array:
 
 
 def electrodes(seed: int, sites: int = 12) -> list[Points]:
-    """The electrodes of a simulated heart at diastole, site by site."""
+    """Return the electrodes of a simulated heart at diastole, site by site."""
     study = simulate_study(StudySpec(seed, sites=sites, frames=1, breathing_mm=0.0))
     return [dict(site.truth.diastole_mm) for site in study.sites]
 
 
-def seen(
+def matched_sites(
     by_site: list[Points],
     rng: np.random.Generator,
     displaced: Array | None = None,
     shifts: dict[int, Array] | None = None,
 ) -> tuple[MatchedSite, ...]:
-    """All sites seen at once by both views; view b displaced against its header, and at some sites the heart in it."""
+    """Return all sites as both views show them.
+
+    ``displaced`` (4, 4) displaces view b against its header; ``shifts`` moves the heart in view b at some sites.
+    """
     true_b = CAMERAS[1] if displaced is None else Camera(CAMERAS[1].matrix @ displaced, 512, 512)
     sites = []
     for index, points in enumerate(by_site):
@@ -78,7 +81,7 @@ def located(sites: tuple[MatchedSite, ...], catalogue: Catalogue = DEFAULT_CATAL
 
 
 def errors(answer: Triangulation, by_site: list[Points]) -> tuple[Array, Array]:
-    """Points found and true, both (n, 3)."""
+    """Return located and true points, both (n, 3), mm."""
     found = [point.position_mm for site in answer.sites for point in site.points]
     true = [points[name][k] for points in by_site for name in points for k in range(len(points[name]))]
     return np.array(found), np.array(true)
@@ -95,9 +98,9 @@ def aligned(found: Array, true: Array) -> Array:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
-def test_a_right_header_stands(seed: int) -> None:
+def test_a_right_header_is_kept(seed: int) -> None:
     by_site = electrodes(seed)
-    sites = seen(by_site, np.random.default_rng(seed))
+    sites = matched_sites(by_site, np.random.default_rng(seed))
     answer = located(sites)
     assert answer.calibration is not None
     assert not answer.calibration.applied
@@ -109,12 +112,12 @@ def test_a_right_header_stands(seed: int) -> None:
     assert answer.notes == ()
 
 
-def test_a_gantry_wrong_by_one_degree_and_two_millimetres_is_found_and_told() -> None:
+def test_a_gantry_wrong_by_one_degree_and_two_millimetres_is_found_and_reported() -> None:
     left = []
     for seed in (1, 2, 3):
         by_site = electrodes(seed, sites=20)
         displaced = turn(1.0, 2.0, seed)
-        answer = located(seen(by_site, np.random.default_rng(seed), displaced))
+        answer = located(matched_sites(by_site, np.random.default_rng(seed), displaced))
         found = answer.calibration
         assert found is not None
         assert found.applied
@@ -128,9 +131,9 @@ def test_a_gantry_wrong_by_one_degree_and_two_millimetres_is_found_and_told() ->
         true_b = Camera(CAMERAS[1].matrix @ displaced, 512, 512)
         apart = answer.sites[0].camera_b.project(true) - true_b.project(true)
         assert np.abs(apart).mean() < np.abs(CAMERAS[1].project(true) - true_b.project(true)).mean() / 2
-        (told,) = answer.notes
-        assert "degrees" in told
-        assert "mm" in told
+        (note,) = answer.notes
+        assert "degrees" in note
+        assert "mm" in note
     assert np.mean(left) <= 0.16
 
 
@@ -138,16 +141,16 @@ def test_breathing_between_the_runs_is_not_taken_for_a_wrong_gantry() -> None:
     rng = np.random.default_rng(5)
     by_site = electrodes(5)
     shifts = {index: rng.normal(0, [1.4, 1.4, 5.0]) for index in range(len(by_site))}
-    answer = located(seen(by_site, rng, shifts=shifts))
+    answer = located(matched_sites(by_site, rng, shifts=shifts))
     assert answer.calibration is not None
     assert not answer.calibration.applied
     assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
 
 
-def test_what_no_gantry_can_do_is_not_corrected_but_doubted() -> None:
+def test_a_difference_that_no_gantry_explains_is_not_corrected_but_doubted() -> None:
     by_site = electrodes(6)
     upside_down = np.diag([1.0, 1.0, -1.0, 1.0])
-    answer = located(seen(by_site, np.random.default_rng(6), upside_down))
+    answer = located(matched_sites(by_site, np.random.default_rng(6), upside_down))
     assert answer.calibration is None or not answer.calibration.applied
     assert all(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in (*answer.sites, *answer.rejected))
 
@@ -156,7 +159,7 @@ def test_what_no_gantry_can_do_is_not_corrected_but_doubted() -> None:
 def test_beats_that_displace_catheters_are_no_doubt_where_pixels_are_known_unequally_well(seed: int) -> None:
     rng = np.random.default_rng(seed)
     by_site, sites = electrodes(seed), []
-    for points, site in zip(by_site, seen(by_site, rng), strict=True):
+    for points, site in zip(by_site, matched_sites(by_site, rng), strict=True):
         views = []
         for camera, view in zip(CAMERAS, (site.diastole.a, site.diastole.b), strict=True):
             chains = []
@@ -178,16 +181,18 @@ def test_a_study_whose_catheters_are_all_described_wrongly_is_refused_with_the_c
         replace(catheter, spacing_mm=tuple(gap + 2.0 for gap in catheter.spacing_mm))
         for catheter in DEFAULT_CATALOGUE.catheters
     )
-    answer = located(seen(by_site, np.random.default_rng(7), np.eye(4)), replace(DEFAULT_CATALOGUE, catheters=wider))
+    answer = located(
+        matched_sites(by_site, np.random.default_rng(7), np.eye(4)), replace(DEFAULT_CATALOGUE, catheters=wider)
+    )
     assert answer.sites == ()
     assert {site.reasons for site in answer.rejected} == {(Reason.SPACING_MISMATCH, Reason.GEOMETRY_DOUBTFUL)}
-    assert any("spaced otherwise than described" in note for note in answer.notes)
+    assert any("differ from its description" in note for note in answer.notes)
 
 
 @pytest.mark.parametrize("error", [0.0, 1.0])
-def test_a_catalogue_two_millimetres_off_is_told_and_not_believed(error: float) -> None:
+def test_a_catalogue_two_millimetres_off_is_reported_and_not_believed(error: float) -> None:
     by_site = electrodes(7, sites=20)
-    sites = seen(by_site, np.random.default_rng(7), turn(error, 2 * error, 7))
+    sites = matched_sites(by_site, np.random.default_rng(7), turn(error, 2 * error, 7))
     mapping = DEFAULT_CATALOGUE["mapping"]
     first, second, third = mapping.spacing_mm
     wrong = replace(mapping, spacing_mm=(first, second + 2.0, third))
@@ -216,7 +221,7 @@ def test_a_table_that_moved_between_the_views_is_found(
     shift: tuple[float, float, float], at: list[int], words: str
 ) -> None:
     by_site = electrodes(8, sites=10)
-    sites = seen(by_site, np.random.default_rng(8), shifts=dict.fromkeys(at, np.array(shift)))
+    sites = matched_sites(by_site, np.random.default_rng(8), shifts=dict.fromkeys(at, np.array(shift)))
     answer = located(sites)
     assert [index for index, site in enumerate(answer.sites) if Reason.TABLE_MOVED in site.reasons] == at
     assert answer.notes[0].startswith(words)
@@ -231,8 +236,8 @@ def test_a_table_that_moved_between_the_views_is_found(
             assert grade_of(tip.covariance_mm2) is Grade.C
 
 
-def test_a_heart_that_stands_elsewhere_in_both_views_is_no_moved_table() -> None:
+def test_a_heart_displaced_in_both_views_is_no_moved_table() -> None:
     by_site = electrodes(9, sites=8)
     by_site[3] = {name: at + np.array([12.0, -12.0, 5.0]) for name, at in by_site[3].items()}
-    answer = located(seen(by_site, np.random.default_rng(9)))
+    answer = located(matched_sites(by_site, np.random.default_rng(9)))
     assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)

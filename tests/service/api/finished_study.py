@@ -35,7 +35,7 @@ from fluoromap_service.dicom import InstanceFacts, deterministic_uid, read_insta
 from fluoromap_service.jobs import job_life
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import encode
+from fluoromap_service.store.codec import MEDIA_TYPE, encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
 from fluoromap_service.study.catheters import StudyCatheter
@@ -94,8 +94,9 @@ class FinishedStudy:
 
     def end(self, name: str, subject: str | None, result: Any, rows: list[Base] | None = None) -> None:
         with self.claimed(name, subject) as (session, held):
-            sha256 = files.keep_bytes(session, encode(result), "application/json")
-            assert job_life.finish(session, held, sha256, reused=False, rows=rows or ())
+            sha256 = files.keep_bytes(session, encode(result), MEDIA_TYPE)
+            stored = job_life.StoredResult(sha256, tuple(rows or ()))
+            assert job_life.finish(session, held, stored, reused=False)
 
     def fail(self, name: str, subject: str | None = None) -> None:
         error = {"code": "plugin_failed", "detail": f"The stage {name!r} failed: it broke."}

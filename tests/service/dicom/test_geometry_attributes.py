@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 from pydicom.dataset import Dataset
 from pydicom.uid import EnhancedXAImageStorage
 
-from fluoromap.geometry import Gantry, camera_from_gantry
+from fluoromap.geometry import Gantry, camera_from_gantry, view_axes
 from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom import HeaderWarning, InstanceFacts, image_axes_from_orientation, read_instance
 from fluoromap_service.dicom.orientation import (
     field_of_view_of,
     image_axes_from_field_of_view,
     patient_orientation,
-    upright_axes_world,
 )
 
 MakeXa = Callable[..., Path]
@@ -94,7 +93,7 @@ def test_calibrated_spacing_is_never_taken(make_xa: MakeXa) -> None:
 
 def test_upright_axes_are_the_cameras(gantry: Gantry) -> None:
     camera = camera_from_gantry(gantry)
-    axes = upright_axes_world(gantry.primary_deg, gantry.secondary_deg)
+    axes = view_axes(gantry.primary_deg, gantry.secondary_deg)[:2]
     moved = camera.project(axes) - camera.project(np.zeros(3))
     np.testing.assert_allclose(moved / np.linalg.norm(moved, axis=1, keepdims=True), np.eye(2), atol=1e-12)
 

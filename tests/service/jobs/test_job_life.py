@@ -84,8 +84,8 @@ def _claim(stage_id: int, worker: str = "w") -> job_life.Claim | None:
 
 def _finish(held: job_life.Claim) -> bool:
     with writing() as session:
-        sha256 = files.keep_bytes(session, b"{}", "application/json")
-        return job_life.finish(session, held, sha256, reused=False)
+        sha256 = files.keep_bytes(session, b"{}", "application/octet-stream")
+        return job_life.finish(session, held, job_life.StoredResult(sha256), reused=False)
 
 
 def _work(job_id: str, end: Callable[[job_life.Claim], object] = _finish, only: str | None = None) -> None:

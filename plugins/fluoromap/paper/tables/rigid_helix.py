@@ -9,7 +9,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, MonoplaneView, Silent
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.rigid_pose import pose_covariance_mm2
+from fluoromap.monoplane.body_pose import pose_covariance_mm2
 from fluoromap.paper.tables.helix import HELICES, Helix, HelixName, HelixView, helix_camera, motion_mm
 from fluoromap.paper.tables.helix_run import helix_run
 from fluoromap.paper.tables.published import DEPTH_STEPS_MM

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from fluoromap.contracts import Array, Refusal, Silent
-from fluoromap.monoplane.rigid_pose import pose_covariance_mm2
+from fluoromap.monoplane.body_pose import pose_covariance_mm2
 from fluoromap.paper.tables.depth_figures import DepthFigures, depth_figures
 from fluoromap.paper.tables.phantom_runs import CYCLE_IMAGES, NOISE_PX, PhantomRun, PhantomView
 from fluoromap.paper.tables.published import DEPTH_STEPS_MM, IMAGES, table_2_rms_over_mean

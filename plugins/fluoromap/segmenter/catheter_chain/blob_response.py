@@ -1,4 +1,4 @@
-"""Dark blobs of electrode size: the Laplacian of Gaussians of a log image at three scales, and its maxima."""
+"""Dark blobs of electrode size: Laplacians of Gaussians at three scales, and their maxima."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class BlobResponse:
     """Response of one log image to dark blobs.
 
     stack : (3, rows, columns) float32, scale-normalised half Laplacian in log units, positive where dark; image size over
-    ``reduction``. best : (rows, columns) the same over noise, the largest of the scales. noise : (3,) robust standard
+    ``reduction``. best : (rows, columns), the largest of the three scales, each over its noise. noise : (3,) robust
+    standard
     deviation of ``stack`` inside the field. smooth : (rows, columns) the reduced log image at the smallest scale.
     pixel_noise : standard deviation of a pixel of the reduced log image.
     """
@@ -40,7 +41,10 @@ class BlobResponse:
 
     @classmethod
     def of_image(cls, x: Image, inside: BoolArray, ring_mm: float, px_per_mm: float) -> BlobResponse:
-        """Response of a log image, worked out at half its size unless a ring would be narrower than 5 px of the frame."""
+        """Compute the response of a log image.
+
+        The image is halved unless a ring would be narrower than 5 px of the frame.
+        """
         reduction = 2 if ring_mm * px_per_mm >= _LEAST_RING_PX and min(x.shape) >= 64 else 1
         small = reduce_by(x, 2) if reduction == 2 else x
         scale = px_per_mm / reduction
@@ -65,14 +69,18 @@ class BlobResponse:
         )
 
     def candidates(self, allowed: BoolArray, expected: int) -> tuple[Array, Array]:
-        """Maxima over u, v and scale above 4 robust standard deviations.
+        """Return the maxima over u, v and scale above 4 robust standard deviations.
 
-        Scales compete by response: by response over noise, a long tip would split in two. What is weaker than a fifth of
-        the ``expected``-th best is dropped.
+        Scales compete by response. With response over noise, a long tip would split in two. Candidates weaker than a fifth
+        of the
+        ``expected``-th best are dropped.
 
         Returns
         -------
-        points_uv : (n, 2) pixels of the frame, sub-pixel. snr : (n,) response over noise, strongest response first.
+        points_uv : (n, 2)
+            Pixels of the frame, sub-pixel.
+        snr : (n,)
+            Response over noise, strongest response first.
         """
         scale, v, u = self._maxima(allowed[:: self.reduction, :: self.reduction])
         strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
@@ -88,7 +96,10 @@ class BlobResponse:
         return places * self.reduction + shift, snr
 
     def _maxima(self, allowed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
-        """(scale, v, u) of what no neighbour in any scale exceeds, ``allowed`` being nowhere at the border."""
+        """Return (scale, v, u) of the maxima over place and scale.
+
+        ``allowed`` is False at the border. skimage.feature.peak_local_max takes 10 to 50 times as long.
+        """
         first, second, third = self.stack
         top = np.maximum(np.maximum(first, second), third).reshape(-1)
         columns = self.stack.shape[2]
@@ -101,7 +112,7 @@ class BlobResponse:
         return scale[clear], v[clear], u[clear]
 
     def _sub_pixel(self, scale: IntArray, v: IntArray, u: IntArray) -> Array:
-        """Tops of the paraboloids through these maxima and their neighbours, (n, 2) pixels of ``stack``."""
+        """Return the tops of the paraboloids through the maxima, (n, 2) pixels of ``stack``."""
         steps = np.arange(-1, 2)
         near = self.stack[scale[:, None, None], v[:, None, None] + steps[:, None], u[:, None, None] + steps]
         near = near.astype(np.float64)
@@ -118,7 +129,10 @@ class BlobResponse:
         return tops
 
     def at(self, points_uv: Array) -> Array:
-        """Response over noise at points of the frame, the best scale of each, (n,)."""
+        """Return the response over noise at points of the frame, (n,).
+
+        Each point has the response of its best scale.
+        """
         rows, columns = self.smooth.shape
         places = (points_uv - 0.5 * (self.reduction - 1)) / self.reduction
         u = np.minimum(np.maximum(np.rint(places[:, 0]), 0), columns - 1).astype(np.int64)
@@ -128,7 +142,7 @@ class BlobResponse:
 
 
 def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
-    """Write half the Laplacian of ``x`` times sigma squared; nought at the border."""
+    """Write half the Laplacian of ``x`` times sigma squared, and 0 at the border."""
     columns = x.shape[1]
     flat = x.reshape(-1)
     middle = slice(columns, flat.size - columns)
@@ -147,7 +161,7 @@ def _sum_round(up, left, centre, right, down, weight, out):  # type: ignore[no-u
 
 
 def _apart(places: Array, distance: float) -> BoolArray:
-    """Which of these, in order, lie farther than ``distance`` from all kept before, (n,)."""
+    """Return which places lie farther than ``distance`` from all accepted earlier ones, (n,)."""
     keep = np.ones(len(places), np.bool_)
     if len(places) > 1:
         pairs = cKDTree(places).query_pairs(distance, output_type="ndarray")

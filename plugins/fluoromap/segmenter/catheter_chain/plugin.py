@@ -1,4 +1,4 @@
-"""Segmenter ``catheter-chain``, the default: blobs of electrode size, linked to the chains that the catalogue allows."""
+"""Segmenter ``catheter-chain``, the default: blobs linked to chains that fit the catalogue."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from fluoromap.contracts import Chain, Context, FrameChains, Marks, NoParams, Ru
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.blob_chains import BlobDetector
 from fluoromap.segmenter.run_segmentation import segment_run
-from fluoromap.segmenter.warm_run import compile_on_drawn_run
+from fluoromap.segmenter.warm_up import compile_kernels
 
 DIM_BELOW = 0.2
-"""An electrode that is fainter than this share of its chain's clearest was predicted, not seen: it is not told."""
-LEAST_SEEN = 3
-"""A catheter of which fewer electrodes are seen cannot be told from background, nor which end is its tip."""
+"""An electrode fainter than this share of its chain's clearest one was only predicted; it is left out."""
+LEAST_VISIBLE = 3
+"""A chain with fewer visible electrodes may be background, and its tip may be at either end."""
 
 
 class CatheterChain:
-    """Electrodes as blobs at three scales, catheters as chains of them that fit the catalogue, the best set of chains.
+    """Segmenter that links blobs at three scales to the best set of chains.
 
-    Every frame is searched on its own; what one frame does not show clearly is carried along the catheter's track. Frames in
-    which no chain stands out are handed to the user, not filled.
+    Every frame is searched on its own. A catheter that one frame does not show clearly is searched again along its track.
+    Frames
+    without a clear chain are left to the user.
     """
 
     name: ClassVar[str] = "catheter-chain"
@@ -37,39 +38,47 @@ class CatheterChain:
 
     @classmethod
     def warm_up(cls) -> None:
-        """Compile the kernels, or load what is kept of them."""
-        compile_on_drawn_run(cls())
+        """Compile the kernels, or load them from the cache."""
+        compile_kernels(cls())
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
-        """Chains of all frames and of the diastolic mean; see :class:`~fluoromap.contracts.Segmenter`."""
+        """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
         found = segment_run(
-            run, catalogue, marks, context, lambda field: BlobDetector(catalogue, field, run.px_per_mm), carry=True
+            run,
+            catalogue,
+            marks,
+            context,
+            lambda field: BlobDetector(catalogue, field, run.px_per_mm),
+            search_again=True,
         )
-        diastole = None if found.diastole is None else _as_seen(found.diastole)
-        return replace(found, frames=tuple(map(_as_seen, found.frames)), diastole=diastole)
+        diastole = None if found.diastole is None else _visible_chains(found.diastole)
+        return replace(found, frames=tuple(map(_visible_chains, found.frames)), diastole=diastole)
 
 
-def _as_seen(entry: FrameChains) -> FrameChains:
-    """The chains without electrodes that the image does not show; where none is left, that is said."""
-    chains = tuple(seen for chain in entry.chains if (seen := _seen_part(chain)) is not None)
+def _visible_chains(entry: FrameChains) -> FrameChains:
+    """Return the entry without electrodes that the image does not show.
+
+    Where no chain is left, ``manual_needed`` is set.
+    """
+    chains = tuple(visible for chain in entry.chains if (visible := _visible_part(chain)) is not None)
     reason = entry.manual_needed
     if entry.chains and not chains:
         reason = reason or Reason.MANUAL_NEEDED
     return replace(entry, chains=chains, manual_needed=reason)
 
 
-def _seen_part(chain: Chain) -> Chain | None:
+def _visible_part(chain: Chain) -> Chain | None:
     if chain.manual:
         return chain
-    seen = np.flatnonzero(chain.scores >= DIM_BELOW * chain.scores.max())
-    if len(seen) == len(chain.electrodes):
+    visible = np.flatnonzero(chain.scores >= DIM_BELOW * chain.scores.max())
+    if len(visible) == len(chain.electrodes):
         return chain
-    if len(seen) < LEAST_SEEN:
+    if len(visible) < LEAST_VISIBLE:
         return None
     return replace(
         chain,
-        electrodes=tuple(chain.electrodes[index] for index in seen),
-        pixels_uv=chain.pixels_uv[seen],
-        covariance_px2=chain.covariance_px2[seen],
-        scores=chain.scores[seen],
+        electrodes=tuple(chain.electrodes[index] for index in visible),
+        pixels_uv=chain.pixels_uv[visible],
+        covariance_px2=chain.covariance_px2[visible],
+        scores=chain.scores[visible],
     )

@@ -1,1 +1,1 @@
-"""Segmenter ``four-step``: the filters of the paper, equations (4) to (7)."""
+"""Segmenter ``four-step``: the paper's filters, equations (4) to (7)."""

@@ -1,4 +1,4 @@
-"""From the four-step filter's answer to candidate electrodes: Otsu's threshold, connected components, centroids."""
+"""Candidate electrodes: Otsu's threshold, connected components, centroids."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from skimage.filters import threshold_otsu
+from skimage.measure import label
 
 from fluoromap.contracts import Array, BoolArray, frozen
 from fluoromap.segmenter.log_image import Image
+
+MOST_FOREGROUND = 0.02
+"""Above this share of the field the threshold has separated noise or contrast medium from the rest, not electrodes."""
 
 _BINS = 1024
 
@@ -17,8 +22,7 @@ _BINS = 1024
 class Blobs:
     """Connected components of one frame.
 
-    centroids_uv : (n, 2) pixels. areas_px : (n,).
-    foreground : share of the field mask above the threshold.
+    centroids_uv : (n, 2) pixels. areas_px : (n,). foreground : share of the field mask above the threshold.
     """
 
     centroids_uv: Array
@@ -34,60 +38,66 @@ class Blobs:
 
 
 def otsu_threshold(x: Image, inside: BoolArray) -> float:
-    """Otsu's threshold of the pixels inside the mask, on 1024 grey levels from 0 to the largest value.
+    """Return Otsu's threshold of the pixels inside the mask.
 
-    Otsu, IEEE Trans. Syst. Man Cybern. 9 (1979) 62: the threshold that separates the two class means most.
+    The histogram has 1024 grey levels from 0 to the largest value of the image.
     """
     highest = float(x.max())
     if not highest > 0:
         return highest
     counts = np.zeros(_BINS, np.int64)
     _count(x, inside, np.float32((_BINS - 1) / highest), counts)
-    below = np.cumsum(counts)[:-1].astype(np.float64)
-    above = counts.sum() - below
-    sums = np.cumsum(counts * np.arange(_BINS))
-    mean_below = sums[:-1] / np.maximum(below, 1)
-    mean_above = (sums[-1] - sums[:-1]) / np.maximum(above, 1)
-    level = int(np.argmax(below * above * (mean_below - mean_above) ** 2))
-    return (level + 1) * highest / (_BINS - 1)
+    upper_edges = np.arange(1, _BINS + 1) * highest / (_BINS - 1)
+    levels = np.flatnonzero(counts)
+    if len(levels) < 2:
+        return float(upper_edges[0])
+    # Empty bins at either end would make the class means of scikit-image undefined.
+    occupied = slice(levels[0], levels[-1] + 1)
+    return float(threshold_otsu(hist=(counts[occupied], upper_edges[occupied])))  # type: ignore[no-untyped-call]
 
 
 def find_blobs(x: Image, inside: BoolArray, candidates: BoolArray, smallest_px: float, largest_px: float) -> Blobs:
-    """Threshold, label (8-connected) and measure.
+    """Return the connected components above Otsu's threshold.
+
+    The function measures no component where the foreground exceeds :data:`MOST_FOREGROUND`.
 
     Parameters
     ----------
     x : (rows, columns) float32
-        Answer of :func:`~fluoromap.segmenter.four_step.morphology.disk_morphology`: electrodes are bright.
+        Result of :func:`~fluoromap.segmenter.four_step.morphology.disk_morphology`: electrodes are bright.
     inside, candidates : (rows, columns) bool
-        The field mask, in which the threshold is found, and where an electrode's centroid may lie.
+        The field mask, in which the threshold is computed, and the pixels where an electrode's centroid may lie.
     smallest_px, largest_px : float
-        Limits of a component's area.
+        Limits of a component's area, square pixels.
     """
     threshold = max(otsu_threshold(x, inside), float(np.finfo(np.float32).tiny))
-    areas, centroids = components(x, inside, threshold)
-    foreground = float(areas.sum()) / max(int(np.count_nonzero(inside)), 1)
+    bright = (x >= np.float32(threshold)) & inside
+    foreground = int(np.count_nonzero(bright)) / max(int(np.count_nonzero(inside)), 1)
+    if foreground > MOST_FOREGROUND:
+        return Blobs(np.zeros((0, 2)), np.zeros(0), foreground)
+    areas, centroids = components(bright)
     columns, rows = np.rint(centroids).astype(np.int64).T
     keep = (areas >= smallest_px) & (areas <= largest_px) & candidates[rows, columns]
     return Blobs(centroids[keep], areas[keep], foreground)
 
 
-def components(x: Image, inside: BoolArray, threshold: float) -> tuple[Array, Array]:
-    """8-connected components of what reaches ``threshold`` inside the mask, in the order of their first pixels.
+def components(bright: BoolArray) -> tuple[Array, Array]:
+    """Return areas and centroids of the 8-connected components.
+
+    Components have the order of their first pixels.
 
     Returns
     -------
-    areas_px : (n,). centroids_uv : (n, 2) pixels.
+    areas_px : (n,)
+    centroids_uv : (n, 2) pixels
     """
-    rows, columns = x.shape
-    most = rows * ((columns + 1) // 2)
-    spans = np.empty((most, 2), np.int32)
-    parents = np.empty(most, np.int32)
-    sums = np.empty((most, 3))
-    count = _label(x, inside, np.float32(threshold), spans, parents, sums)
-    of_component = sums[:count][parents[:count] == np.arange(count)]
-    areas: Array = of_component[:, 0].copy()
-    centroids: Array = of_component[:, 1:] / areas[:, None]
+    labels = label(bright, connectivity=2).reshape(-1)  # type: ignore[no-untyped-call]
+    pixels = np.flatnonzero(labels)
+    component = labels[pixels] - 1
+    v, u = np.divmod(pixels, bright.shape[1])
+    # scikit-image's regionprops gives the same numbers, but takes four times as long for 345 components.
+    areas = np.bincount(component).astype(np.float64)
+    centroids: Array = np.stack([np.bincount(component, u), np.bincount(component, v)], axis=1) / areas[:, None]
     return areas, centroids
 
 
@@ -97,51 +107,3 @@ def _count(x, inside, scale, counts):  # type: ignore[no-untyped-def]  # pragma:
         for u in range(x.shape[1]):
             if inside[v, u]:
                 counts[int(x[v, u] * scale)] += 1
-
-
-@njit(inline="always")
-def _root(parents, node):  # type: ignore[no-untyped-def]  # pragma: no cover
-    while parents[node] != node:
-        parents[node] = parents[parents[node]]
-        node = parents[node]
-    return node
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _label(x, inside, threshold, spans, parents, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Union of the horizontal spans that touch, over their order. A component is the root of its spans, its first one;
-    there ``sums`` holds its area and the sums of u and v. Returns the number of spans."""
-    rows, columns = x.shape
-    count = above = above_end = 0
-    for v in range(rows):
-        line, allowed = x[v], inside[v]
-        first = count
-        candidate = above
-        u = 0
-        while u < columns:
-            if line[u] < threshold or not allowed[u]:
-                u += 1
-                continue
-            start = u
-            while u < columns and line[u] >= threshold and allowed[u]:
-                u += 1
-            spans[count, 0], spans[count, 1], parents[count] = start, u, count
-            length = u - start
-            sums[count, 0] = length
-            sums[count, 1] = 0.5 * length * (start + u - 1)
-            sums[count, 2] = length * v
-            while candidate < above_end and spans[candidate, 1] < start:
-                candidate += 1
-            touching = candidate
-            while touching < above_end and spans[touching, 0] <= u:
-                one, other = _root(parents, touching), _root(parents, count)
-                parents[max(one, other)] = min(one, other)
-                touching += 1
-            count += 1
-        above, above_end = first, count
-    for span in range(count):
-        root = _root(parents, span)
-        if root != span:
-            for k in range(3):
-                sums[root, k] += sums[span, k]
-    return count

@@ -12,9 +12,11 @@ from fluoromap.segmenter.log_image import Image, central_range
 
 
 def to_grey_range(x: Image, inside: BoolArray) -> Image:
-    """Linear map that brings the 0.5th to 99.5th percentile inside the mask to 0..255, the scale of :func:`complex_shock`.
+    """Map the 0.5th to 99.5th percentile inside the mask linearly to 0..255.
 
-    The gain ``feedback`` of equation (7) is not free of scale. Values beyond the percentiles are kept, not clipped.
+    This is the scale of :func:`complex_shock`: the gain ``feedback`` of equation (7) depends on the scale. Values beyond
+    the
+    percentiles are not clipped.
     """
     ends = central_range(x, inside)
     low, high = ends if ends is not None else (0.0, 255.0)
@@ -31,24 +33,27 @@ def complex_shock(
     theta: float = math.pi / 1000,
     feedback: float = 0.5,
 ) -> Image:
-    """Complex shock filter, eq. (7) of the paper, on a 0..255 grey scale; returns the real part.
+    """Apply the complex shock filter, eq. (7) of the paper; return the real part.
 
     With lambda = r exp(i theta), R the real part and J = imaginary part / theta::
 
         R_t = -(2/pi) atan(a J) |grad R| + r cos(theta) R_nn - r theta sin(theta) J_nn + lt R_ee
         J_t = r cos(theta) J_nn + (r sin(theta) / theta) R_nn + lt J_ee
 
-    n runs along the gradient, e across it. The minus sign makes the dark side of an edge darker; plus would blur. |grad R|
-    uses minmod differences, everything else central ones. The border repeats itself.
+    n is the direction along the gradient, e across it. The minus sign makes the dark side of an edge darker; a plus would
+    blur.
+    |grad R| uses minmod differences, all other terms central differences. The border values are repeated.
 
-    The paper's lambda tilde equals r, and theta is small. So r cos(theta) is taken as r, which makes the diffusion of R and
-    of J r times their Laplacians, and the feedback of J_nn on R is left out: both are less than 1e-4 of what stays for
-    theta up to 0.01, and below 1e-4 of the range in the answer.
+    The paper's lambda tilde equals r, and theta is small. Two simplifications follow. r cos(theta) is taken as r, so that
+    the
+    diffusion of R and of J is r times their Laplacians. The feedback of J_nn on R is left out. For theta up to 0.01 both
+    are less
+    than 1e-4 of the remaining terms, and change the result by less than 1e-4 of its range.
 
     Parameters
     ----------
     x : (rows, columns) float32
-        Grey levels, see :func:`to_grey_range`.
+        Grey levels 0..255, see :func:`to_grey_range`.
     sweeps : int
     step : float
         At most 1 / (4 r).
@@ -77,16 +82,20 @@ def complex_shock(
 
 @njit(inline="always")
 def _minmod(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """The middle one of a, b and 0."""
+    """Return the middle one of a, b and 0."""
     return max(min(a, b), min(max(a, b), np.float32(0)))
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sharpen_row(r, r_north, r_south, j, j_north, j_south, real, imaginary, step, flow, drive):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """One sweep over one row, from R and a J in it and in its neighbours, all with a spare pixel at both ends.
+    """Do one sweep over one row.
 
-    (2/pi) atan(x) is x P(|x|) / Q(|x|) to 1e-4, with quadratic P and cubic Q that tend to its limit; it shares one division
-    with the second derivative along the gradient. Gradients are twice as large here, which cancels.
+    The arguments are R and a J in it and in its neighbours.
+    All rows have one extra pixel at both ends. (2/pi) atan(x) is computed as x P(|x|) / Q(|x|) to 1e-4, with quadratic P
+    and cubic
+    Q of the same limit. It shares one division with the second derivative along the gradient. Gradients are twice as large
+    here,
+    which cancels.
     """
     n = r.size - 2
     r_west, r_here, r_east = r[:n], r[1:-1], r[2:]
@@ -118,8 +127,12 @@ def _sharpen_row(r, r_north, r_south, j, j_north, j_south, real, imaginary, step
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sharpen(real, imaginary, sweeps, step, flow, drive):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """All sweeps as one wavefront. A sweep leaves each row two rows higher in the buffer, where nothing is needed any more,
-    so that neighbours still hold the values from before the sweep and no row is copied."""
+    """Do all sweeps as one wavefront.
+
+    A sweep moves each row two rows up in the buffer, where no values are needed any more. So neighbours still hold the
+    values from
+    before the sweep, and no row is copied.
+    """
     rows = real.shape[0] - 2 * sweeps
     n = real.shape[1] - 2
     for front in range(rows + sweeps - 1):

@@ -1,4 +1,4 @@
-"""One image -> its chains: the four steps, linking and refinement in a row, with their guards."""
+"""Chains of one image by the four steps: filters, linking, fit."""
 
 from __future__ import annotations
 
@@ -11,28 +11,27 @@ from pydantic import BaseModel, Field
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.chain_fitting import fit_chains
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.four_step.blobs import Blobs, find_blobs
+from fluoromap.segmenter.four_step.blobs import MOST_FOREGROUND, Blobs, find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.four_step.homomorphic import homomorphic
 from fluoromap.segmenter.four_step.morphology import disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.gaussian_blur import reduce_by
-from fluoromap.segmenter.linking import Shafts, evidence, families, link
+from fluoromap.segmenter.linking import ShaftImage, catheter_families, evidence, link_candidates
 from fluoromap.segmenter.log_image import Image, pixel_noise
-from fluoromap.segmenter.placing import place_chains
 
-MOST_FOREGROUND = 0.02
 MOST_BLOBS = 40
-"""Beyond these the threshold has split noise or contrast medium from the rest, not electrodes."""
+"""With more blobs than this the threshold has separated noise from the rest, not electrodes."""
 
 _LEAST_LINE = 0.05
 _OWN_MM = 0.6
 
 
 class FourStepParams(BaseModel, extra="forbid"):
-    """Parameters of the four-step segmenter; the defaults are the ones to keep."""
+    """Parameters of the four-step segmenter; keep the defaults."""
 
     gamma_low: float = Field(
         0.5, ge=0.0, le=1.0, description="Homomorphic gain of slow shading, gamma_L of equation (4)."
@@ -62,7 +61,7 @@ class FourStepParams(BaseModel, extra="forbid"):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FourStepDetector:
-    """Finds chains in the images of one run, whose field and scale are fixed."""
+    """Detector of chains by the four steps, for one run."""
 
     catalogue: Catalogue
     field: FieldMask
@@ -70,10 +69,16 @@ class FourStepDetector:
     settings: FourStepParams
 
     def blobs(self, x: Image) -> tuple[Blobs, Image, float] | None:
-        """Blobs of a log image, the diffused image and K; None for a flat one. Equations (4) to (7), then disks."""
+        """Apply equations (4) to (7) and the disks to a log image.
+
+        Returns
+        -------
+        tuple or None
+            The blobs, the diffused image and K; None for a flat image.
+        """
         inside, of = self.field.inside, self.settings
-        # Each image takes the name of the one before, which frees that: memory that grows is given back to the system
-        # after every frame, and costs as much time as a filter to get again.
+        # Each image takes the name of the previous one, so that its memory is freed: a growing heap goes back to the system
+        # after every frame, and getting it again takes as long as a filter.
         image = homomorphic(x, of.gamma_low, of.gamma_high, of.slope, of.cutoff)
         k = edge_scale(image, inside, of.edge_factor)
         if k is None:
@@ -89,8 +94,8 @@ class FourStepDetector:
         smallest, largest = 0.6 * self.px_per_mm**2, 24.0 * self.px_per_mm**2
         return find_blobs(image, inside, self.field.candidates, smallest, largest), diffused, k
 
-    def chains(self, x: Image, frame: int) -> FrameChains:
-        """Chains of one log image, or why there are none."""
+    def find_chains(self, x: Image, frame: int) -> FrameChains:
+        """Return the chains of one log image, or the reason why there are none."""
         if min(x.shape) < 16:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         found = self.blobs(self.field.fill(x))
@@ -100,28 +105,34 @@ class FourStepDetector:
         if blobs.foreground > MOST_FOREGROUND or len(blobs) > MOST_BLOBS:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         contrast = Contrast.of_frame(x, self.field.inside, self.px_per_mm)
-        shafts = Shafts(diffused, 1, max(_LEAST_LINE, 0.5 * k), self.px_per_mm)
-        kinds = families(self.catalogue)
-        points = _with_lost(blobs.centroids_uv, contrast.peaks(self.field.candidates), self.px_per_mm)
-        linked = link(points, evidence(contrast.of(points)), np.zeros(len(points)), shafts, kinds, sure=len(blobs))
+        shaft_image = ShaftImage(diffused, 1, max(_LEAST_LINE, 0.5 * k), self.px_per_mm)
+        families = catheter_families(self.catalogue)
+        points = _add_peaks(blobs.centroids_uv, contrast.peaks(self.field.candidates), self.px_per_mm)
+        linked = link_candidates(
+            points, evidence(contrast.of(points)), np.zeros(len(points)), shaft_image, families, sure=len(blobs)
+        )
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         noise = pixel_noise(reduce_by(x, 2), self.field.inside[::2, ::2])
-        chains = [placed.chain for placed in place_chains(x, points, linked, shafts, kinds, noise)]
+        chains = [fitted.chain for fitted in fit_chains(x, points, linked, shaft_image, families, noise)]
         return FrameChains(frame, tuple(replace(chain, scores=contrast.of(chain.pixels_uv)) for chain in chains))
 
-    def carried(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
-        """Always None: the paper looks at whole frames."""
+    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        """Return None: the paper searches whole frames."""
         return None
 
-    def extra(self, x: Image, chains: Sequence[Chain]) -> bool:
-        """Always False: what the threshold leaves beside the chains may be anything."""
+    def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Return False: blobs beside the chains may be anything."""
         return False
 
 
-def _with_lost(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:
-    """Blobs, then the peaks that are not one of them: steeply foreshortened rings are narrower than the opening disk, and
-    electrodes of crossing catheters merge into one component."""
+def _add_peaks(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:
+    """Return the blobs, then the peaks that are not one of them.
+
+    The blobs lack two kinds of electrodes: steeply foreshortened rings are narrower than the opening disk, and electrodes
+    of
+    crossing catheters merge into one component.
+    """
     if not len(peaks_uv):
         return blobs_uv
     if len(blobs_uv):

@@ -1,4 +1,9 @@
-"""Step 4 of the four-step filter: grey-level morphology with disks."""
+"""Step 4 of the four-step filter: grey-level morphology with disks.
+
+scikit-image's closing with a disk of 14 px takes 260 times as long (40 times with a decomposed disk), its opening with 2 px
+16
+times.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +22,15 @@ _LEVELS = 65536
 
 
 def disk_morphology(x: Image, background_px: int = 14, opening_px: int = 2) -> Image:
-    """Dark things that a disk of ``background_px`` does not fit into and one of ``opening_px`` does, as bright ones.
+    """Return dark things between the two disk sizes as bright ones.
 
-    Closing by the large disk minus the image (black top-hat), then opening by the small one. Radii are in pixels at the
-    heart: the large one must exceed half an electrode's length, the small one stay within half a ring's.
+    The closing by the large disk minus the image (black top-hat) keeps dark things that the large disk does not fit into.
+    The
+    opening by the small disk removes those that it does not fit into. Radii are in pixels at the heart: the large one must
+    exceed
+    half an electrode's length, the small one must be at most half a ring's length.
 
-    Worked out on 65536 grey levels between the extremes of ``x``: rank filters are several times faster on short integers.
+    The image is mapped to 65536 grey levels between its extremes: rank filters are several times faster on short integers.
     """
     low, high = float(x.min()), float(x.max())
     scale = (_LEVELS - 1) / (high - low) if high > low else 1.0
@@ -31,23 +39,21 @@ def disk_morphology(x: Image, background_px: int = 14, opening_px: int = 2) -> I
     return opening(hat, opening_px).astype(np.float32) * np.float32(1.0 / scale)
 
 
-def disk(radius: int) -> NDArray[np.bool_]:
-    """Pixels whose centres lie within ``radius`` of the middle one, shape (2 radius + 1, 2 radius + 1)."""
-    v, u = np.ogrid[-radius : radius + 1, -radius : radius + 1]
-    inside: NDArray[np.bool_] = u * u + v * v <= radius * radius
-    return inside
-
-
 def closing(x: Levels, radius: int) -> Levels:
+    """Dilate, then erode."""
     return erode(dilate(x, radius), radius)
 
 
 def opening(x: Levels, radius: int) -> Levels:
+    """Erode, then dilate."""
     return dilate(erode(x, radius), radius)
 
 
 def dilate(x: Levels, radius: int) -> Levels:
-    """Largest value under an exact disk; what lies outside the image does not count."""
+    """Return the largest value under an exact disk.
+
+    Pixels outside the image do not count.
+    """
     if radius < 1:
         return x.copy()
     out = np.empty(x.shape, np.uint16)
@@ -56,12 +62,15 @@ def dilate(x: Levels, radius: int) -> Levels:
 
 
 def erode(x: Levels, radius: int) -> Levels:
-    """Smallest value under an exact disk; what lies outside the image does not count."""
+    """Return the smallest value under an exact disk.
+
+    Pixels outside the image do not count.
+    """
     return ~dilate(~x, radius)
 
 
 def _half_widths(radius: int) -> IntArray:
-    """Half width of the disk's row at distance 0, 1, ... radius from its middle."""
+    """Return the half widths of the disk's rows, from its middle outwards."""
     return np.array([math.isqrt(radius**2 - k**2) for k in range(radius + 1)], dtype=np.int64)
 
 
@@ -73,8 +82,12 @@ def _larger(first, second, out):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _raise(out, rows, first, second, outer_rows, outer_first, outer_second):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Raise a row to two windows each of four other rows: those that begin at ``first`` and ``second`` in the row above and
-    the row below, and likewise in a pair of rows farther off. Four at once, for each call costs as much as a row does."""
+    """Raise a row to two windows each of four other rows.
+
+    These are the windows that begin at ``first`` and ``second`` in the row above and the row below, and likewise in an
+    outer pair
+    of rows. Four rows at once: each call costs as much as a row.
+    """
     above, below = rows
     outer_above, outer_below = outer_rows
     a, b, c, d = above[first:], above[second:], below[first:], below[second:]
@@ -89,8 +102,13 @@ def _raise(out, rows, first, second, outer_rows, outer_first, outer_second):  # 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _dilate(x, half_widths, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Each row is widened once by windows of 1, 2, 4, ... pixels and kept while it is in reach. A row of the answer is the
-    largest of the rows round it, each widened to its row of the disk: by two windows of one size that overlap."""
+    """Dilate by a disk, row by row.
+
+    Each row is widened once by windows of 1, 2, 4, ... pixels and stored while it is in reach.
+    A row of the result is the largest of the rows round it, each widened to its row of the disk by two overlapping windows
+    of one
+    size.
+    """
     rows, columns = x.shape
     radius = half_widths.size - 1
     depth, width = 2 * radius + 1, columns + 2 * radius

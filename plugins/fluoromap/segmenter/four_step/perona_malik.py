@@ -11,17 +11,18 @@ from fluoromap.contracts import BoolArray
 from fluoromap.segmenter.log_image import Image, central_range
 
 STABLE_STEP = 0.25
-"""Explicit four-neighbour diffusion must stay below this time step: at it a checkerboard survives for ever."""
+"""Limit of the time step of explicit four-neighbour diffusion: at this step a checkerboard never fades."""
 
 _FLOOR = 1e-3
 _GAUSSIAN_SD = 1.4826
 
 
 def edge_scale(x: Image, inside: BoolArray, factor: float = 2.0) -> float | None:
-    """K of equation (6) from the noise: ``factor`` x 1.4826 x the median |horizontal difference| inside the mask.
+    """Return K of equation (6) from the noise, or None for a flat frame.
 
-    On coarsely quantised frames the median is 0; then, and where it is smaller, a thousandth of the spread of x takes its
-    place. None for a flat frame, which has nothing to diffuse.
+    K is ``factor`` x 1.4826 x the median |horizontal difference| inside the mask. On coarsely quantised frames the median
+    is 0. K
+    is therefore at least a thousandth of the spread of x.
     """
     ends = central_range(x, inside)
     if ends is None:
@@ -34,10 +35,11 @@ def edge_scale(x: Image, inside: BoolArray, factor: float = 2.0) -> float | None
 
 
 def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Image:
-    """Perona-Malik diffusion, eq. (5) of the paper, with the conduction of :func:`_flux`.
+    """Apply Perona-Malik diffusion, eq. (5) of the paper, with the conduction of :func:`_flux`.
 
     Four neighbours, explicit steps, no flux through the image border. All sweeps run as one wavefront over the rows, in
-    place: a row is visited by sweep n + 1 as soon as its lower neighbour has left sweep n, while both are in the cache.
+    place:
+    sweep n + 1 visits a row as soon as sweep n has left the row below, while both are in the cache.
 
     Parameters
     ----------
@@ -50,7 +52,8 @@ def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Ima
 
     Returns
     -------
-    (rows, columns) float32, within 0.005 of the range of a double precision sweep-by-sweep evaluation.
+    (rows, columns) float32
+        Within 0.005 of the range of a double precision sweep-by-sweep evaluation.
     """
     if not 0 < step < STABLE_STEP:
         raise ValueError("the step of the diffusion must lie between 0 and 0.25")
@@ -64,10 +67,12 @@ def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Ima
 
 @njit(inline="always")
 def _flux(d):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """A difference d times the conduction exp(-(d/K)^2), eq. (6) of the paper, in the unit in which it is d exp(-8 d^2).
+    """Return d times the conduction exp(-(d/K)^2), eq. (6) of the paper.
 
-    To 1e-4 of its largest value: the eighth power of a cubic in d^2, best over 0 <= 8 d^2 <= 10; beyond, the flux is
-    nought. Library calls would break vectorisation."""
+    d is in the unit in which the product is d exp(-8 d^2). The error is 1e-4 of the largest value. The exponential is the
+    eighth
+    power of a cubic in d^2, best over 0 <= 8 d^2 <= 10; beyond, the flux is 0. Library calls would break vectorisation.
+    """
     y = min(d * d, np.float32(1.3))
     series = np.float32(0.49140077) - np.float32(0.13123593) * y
     series = np.float32(1) - y * (np.float32(0.99949358) - y * series)
@@ -78,8 +83,12 @@ def _flux(d):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _diffuse_row(row, below, north, flow, step):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """One sweep over one row. ``north`` holds the flux from above and leaves with the flux below; ``flow`` the fluxes through
-    the vertical pixel faces, whose ends stay 0."""
+    """Do one sweep over one row.
+
+    ``north`` holds the flux from above and, afterwards, the flux below. ``flow`` holds the fluxes through the vertical
+    pixel faces;
+    its ends stay 0.
+    """
     n = row.size
     right, west, east = row[1:], flow[:n], flow[1:]
     for u in range(n - 1):

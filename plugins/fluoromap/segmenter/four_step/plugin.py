@@ -1,4 +1,4 @@
-"""Segmenter ``four-step``: the paper's filter in every frame, linked to chains, and once more in the diastolic mean."""
+"""Segmenter ``four-step``: the paper's filters in every frame and in the diastolic mean."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from fluoromap.segmenter.run_segmentation import segment_run
 
 
 class FourStep:
-    """The paper's segmentation: equations (4) to (7), disk morphology, Otsu, components; then linking by the catalogue.
+    """The paper's segmenter: equations (4) to (7), disks, Otsu, components; then linking.
 
-    Every frame is filtered and linked on its own, and so is the mean of the quiet frames round diastole, in which the
-    steeply angulated, noisy views succeed too that fail frame by frame.
+    Every frame is filtered and linked on its own. So is the mean of the quiet frames round diastole: steeply angulated,
+    noisy views
+    succeed there that fail frame by frame.
     """
 
     name: ClassVar[str] = "four-step"
@@ -27,7 +28,7 @@ class FourStep:
         self.params = params or FourStepParams()
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
-        """Chains of all frames and of the diastolic mean; see :class:`~fluoromap.contracts.Segmenter`."""
+        """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
         return segment_run(
             run,
             catalogue,

@@ -54,7 +54,7 @@ def _database() -> str:
 
 def _broker() -> str:
     if not settings().eager:
-        with queue.app.connection_for_write() as connection:
+        with queue.celery_app().connection_for_write() as connection:
             connection.ensure_connection(max_retries=1, interval_start=0, timeout=3)
     return ""
 

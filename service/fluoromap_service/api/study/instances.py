@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap.geometry import Gantry
+from fluoromap.geometry import LEAST_SOURCE_MM, Gantry
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
@@ -80,8 +80,8 @@ class GantryPatch(BaseModel):
     model_config = ConfigDict(extra="forbid")
     primary_deg: float | None = Field(None, ge=-180, le=180, allow_inf_nan=False)
     secondary_deg: float | None = Field(None, ge=-90, le=90, allow_inf_nan=False)
-    source_detector_mm: float | None = Field(None, ge=100, le=3000, allow_inf_nan=False)
-    source_isocentre_mm: float | None = Field(None, ge=100, le=3000, allow_inf_nan=False)
+    source_detector_mm: float | None = Field(None, ge=LEAST_SOURCE_MM, le=3000, allow_inf_nan=False)
+    source_isocentre_mm: float | None = Field(None, ge=LEAST_SOURCE_MM, le=3000, allow_inf_nan=False)
     pixel_spacing_mm: tuple[Spacing, Spacing] | None = None
 
 

@@ -1,4 +1,4 @@
-"""Electrodes that one view took for something else: told by the others of the same moment, and trusted as little."""
+"""Stray electrodes: one view took something else for the electrode, and the other electrodes show it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from fluoromap.triangulator.uncertainty import ErrorSource, jacobians, pixel_noi
 
 STRAY_BEYOND_SD = 4.0
 _MOST_STRAYS = 0.34
-"""Where more electrodes than this share disagree with the rest, it is not they that are wrong."""
+"""Largest share of electrodes that can be strays; more of them mean that something else is wrong."""
 
 
 def epipolar_rows(cameras: Cameras, points_mm: Array) -> Array:
-    """For each electrode the direction of its four pixel coordinates that no displacement of it reaches, (N, 4 N).
+    """Return the epipolar direction of each electrode's four pixel coordinates, (N, 4 N).
 
-    The pixel residual along it is Sampson's epipolar distance, px.
+    No displacement of the electrode changes its pixels along that direction. The pixel residual along it is Sampson's
+    epipolar distance, px.
     """
     n = len(points_mm)
     across = np.linalg.svd(jacobians(cameras, points_mm).reshape(n, 4, 3))[0][:, :, 3]
@@ -27,13 +28,13 @@ def epipolar_rows(cameras: Cameras, points_mm: Array) -> Array:
     return rows.reshape(n, 4 * n)
 
 
-def strays_doubted(
+def widen_strays(
     cameras: Cameras, pixels: TwoViewPixels, points_mm: Array, sources: Sequence[ErrorSource]
 ) -> TwoViewPixels:
-    """The same pixels; those of an electrode whose epipolar distance the others cannot foretell get a covariance as large
-    as that misfit.
+    """Widen the pixel covariances of stray electrodes by their misfit.
 
-    Breathing, beats and the gantry displace neighbours alike, which ``sources`` know: what is left is the electrode's own.
+    A stray is an electrode whose epipolar distance the other electrodes do not predict. Breathing, beats and the gantry
+    displace neighbours alike; ``sources`` describe these errors, so that the remaining misfit belongs to the electrode.
     """
     n = len(points_mm)
     rows = epipolar_rows(cameras, points_mm)

@@ -9,7 +9,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
-from fluoromap.segmenter.warm_run import DrawnFrames
+from fluoromap.segmenter.warm_up import SyntheticFrames
 
 IN_A_NEW_PROCESS = """
 import sys
@@ -41,7 +41,7 @@ def test_after_warm_up_a_run_compiles_nothing():
 
 
 def test_the_drawn_run_shows_its_catheters_and_hides_one_once():
-    frames = DrawnFrames(DEFAULT_CATALOGUE)
+    frames = SyntheticFrames(DEFAULT_CATALOGUE)
     run = Run(frames, 66.7 * np.arange(len(frames)), 5.75, PixelFacts(False, 12, False))
     found = CatheterChain().segment(run, DEFAULT_CATALOGUE, {}, Silent())
     assert [len(entry.chains) for entry in found.frames] == [3, 3, 2, 3, 3]

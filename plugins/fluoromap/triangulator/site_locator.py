@@ -1,4 +1,4 @@
-"""What the triangulators share: from a matched site to a located one, given how to find points from two views."""
+"""Location of one site: from a matched site to a located one, shared by all triangulators."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from scipy.stats import chi2
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair
 from fluoromap.reasons import Reason
-from fluoromap.triangulator.alternatives import with_alternative
+from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.estimate import Estimate, Method
 from fluoromap.triangulator.self_calibration import GantryBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
-from fluoromap.triangulator.strays import epipolar_rows, strays_doubted
+from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
 from fluoromap.triangulator.table_motion import Jump
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, seen_in_both
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
     UncertaintyParams,
@@ -26,20 +26,20 @@ from fluoromap.triangulator.uncertainty import (
     jacobians,
     pixel_noise_px2,
     relative_covariance_mm2,
-    seen_breathing,
+    visible_breathing,
 )
 
 FAR_MM = 500.0
-"""No electrode is this far from the isocentre: two views that say so do not belong together."""
+"""Largest plausible distance from the isocentre: two views that exceed it do not belong together."""
 DOUBTFUL_BELOW = 1e-5
-"""Chance of a misfit as large as a site's below which its geometry is doubted."""
+"""Probability of a site's misfit by chance below which its geometry is doubted."""
 
 
 @dataclass(frozen=True, eq=False)
-class Locator:
-    """Locates the sites of one study.
+class SiteLocator:
+    """The method and assumptions that locate the sites of one study.
 
-    wrong_spacings : catheters whose catalogue entry does not fit the study.
+    wrong_spacings : catheters whose catalogue entry contradicts the study.
     """
 
     method: Method
@@ -49,12 +49,13 @@ class Locator:
     wrong_spacings: frozenset[str] = frozenset()
 
     def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
-        """A site in 3D; None where its two views contradict each other altogether.
+        """Locate a site in 3D.
 
         Returns
         -------
-        tuple
-            The site, its diastole for the error budget, and sentences for the report.
+        tuple or None
+            The site, its diastole for the error budget, and sentences for the report. None where no plausible position
+            agrees with both views.
         """
         cameras = self.gantry.cameras((site.camera_a, site.camera_b))
         rest = site.diastole.a.phase if site.diastole.a.phase is not None else site.diastole.b.phase
@@ -69,7 +70,7 @@ class Locator:
                 others, other_mm = self._points(site, other, cameras)
                 shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
                 by_label = {(point.catheter, point.electrode): point for point in others}
-                points = with_alternative(points, by_label, shift, site.alternative.probability)
+                points = add_alternative(points, by_label, shift, site.alternative.probability)
         cycle = None
         if moments is not None and rest is not None:
             cycle = locate_cycle(
@@ -97,7 +98,7 @@ class Locator:
     def _moment(
         self, pair: PhasePair, cameras: Cameras, cycle: CycleMoments | None, jump: Jump | None
     ) -> Moment | None:
-        pixels = seen_in_both(pair)
+        pixels = pixels_in_both_views(pair)
         start = self.method.start(cameras, pixels)
         if not _plausible(start):
             return None
@@ -109,25 +110,25 @@ class Locator:
             cameras, start, pixels.labels, self.catalogue, self.params, self.gantry.covariance, motion
         )  # fmt: skip
         if jump is not None:
-            sources = (*sources, _jumped(cameras, start, jump))
-        if self.method.takes_out_breathing:
-            pixels = strays_doubted(cameras, pixels, start, sources)
+            sources = (*sources, _jump_source(cameras, start, jump))
+        if self.method.estimates_breathing:
+            pixels = widen_strays(cameras, pixels, start, sources)
         noise = pixel_noise_px2(pixels.covariances)
         errors = noise + sum(source.pixels_px2() for source in sources)
-        seen = seen_breathing(cameras, start, self.params)
-        found = self.method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
+        breathing = visible_breathing(cameras, start, self.params)
+        found = self.method.estimate(cameras, pixels, start, noise + breathing.pixels_px2())
         if not _plausible(found.points_mm):
             return None
         residuals = pixels.residuals_px(cameras, found.points_mm)
         breathing_mm, inflation = 0.0, 1.0
-        if self.method.takes_out_breathing:
-            # Only what no displacement of the electrodes reaches is misfit; the rest hangs on how the pixels are weighted.
+        if self.method.estimates_breathing:
+            # Epipolar residuals do not depend on the pixels' weights: no displacement of an electrode changes them.
             rows = epipolar_rows(cameras, found.points_mm)
             apart, free = rows @ residuals, len(start)
             misfit = float(apart @ np.linalg.solve(rows @ errors @ rows.T, apart))
-            gain = seen.covariance @ seen.effect_px.T @ np.linalg.inv(noise + seen.pixels_px2())
+            gain = breathing.covariance @ breathing.effect_px.T @ np.linalg.inv(noise + breathing.pixels_px2())
             breathing_mm = float((gain @ residuals)[0])
-            residuals = residuals - seen.effect_px[:, 0] * breathing_mm
+            residuals = residuals - breathing.effect_px[:, 0] * breathing_mm
             if chi2.sf(misfit, free) < DOUBTFUL_BELOW:
                 inflation = misfit / free
         return Moment(pixels, found, sources, noise, errors, residuals.reshape(-1, 2, 2), breathing_mm, inflation)
@@ -135,7 +136,7 @@ class Locator:
     def _points(
         self, site: MatchedSite, moment: Moment, cameras: Cameras
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
-        """The electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
+        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
         pixels, points = moment.pixels, moment.found.points_mm
         joint = moment.inflation * moment.found.covariance_mm2(moment.errors_px2)
         reference = [i for i, (catheter, _) in enumerate(pixels.labels) if catheter == self.catalogue.reference]
@@ -169,11 +170,12 @@ class Locator:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A site at diastole: N electrodes in 3D and what is unsure about them.
+    """A site at diastole: N electrodes in 3D with their sources of error.
 
-    noise_px2 : (4 N, 4 N) of the pixels alone. errors_px2 : of all there is. residuals_px : (N, 2 views, 2), less a
-    displacement of the heart between the runs. breathing_mm : half of that displacement, as far as the views show it.
-    inflation : how much larger the misfit is than chance allows; 1 where chance allows it.
+    noise_px2 : (4 N, 4 N) covariance from pixel noise. errors_px2 : (4 N, 4 N) covariance from all sources.
+    residuals_px : (N, 2 views, 2), without the displacement of the heart between the runs. breathing_mm : half of that
+    displacement, as far as the views show it. inflation : misfit over its expected value where chance does not explain
+    it, else 1.
     """
 
     pixels: TwoViewPixels
@@ -190,8 +192,8 @@ def _plausible(points_mm: Array) -> bool:
     return bool(np.isfinite(points_mm).all() and np.abs(points_mm).max() < FAR_MM)
 
 
-def _jumped(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
-    """One view displaced by as much as it was seen to be, in either direction: the truth may lie with the other one."""
+def _jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
+    """Return the error source of a jump, in either direction: either view may show the true place."""
     own, none = jump.displacement_mm[:, None], np.zeros((3, 1))
     effect = effect_px(jacobians(cameras, points_mm), *((own, none) if jump.view == "a" else (none, own)))
     return ErrorSource(effect, np.eye(1), ("breathing",))
@@ -202,14 +204,14 @@ def _breathing_note(site: str, moment: Moment) -> list[str]:
     if apart_mm <= 2.0 or moment.inflation > 1:
         return []
     return [
-        f"{site}: between its two runs the whole heart stands {apart_mm:.0f} mm apart (breathing, a moved "
-        "table or the gantry's angles); positions relative to the reference catheter hardly suffer from it."
+        f"{site}: the whole heart is {apart_mm:.0f} mm apart between the two runs (breathing, a moved table or the "
+        "gantry's angles). Positions relative to the reference catheter are hardly affected."
     ]
 
 
 def _ray_angles_deg(cameras: Cameras, pixels: TwoViewPixels) -> Array:
-    """Angle between each electrode's two rays, folded to 0..90 degrees, shape (N,)."""
-    ray_a, ray_b = (camera.rays(seen) for camera, seen in zip(cameras, pixels.pixels, strict=True))
+    """Return the angle between each electrode's two rays, folded to 0..90 degrees, shape (N,)."""
+    ray_a, ray_b = (camera.rays(uv) for camera, uv in zip(cameras, pixels.pixels, strict=True))
     cosine = np.abs((ray_a * ray_b).sum(axis=1))
     angles: Array = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
     return angles

@@ -1,4 +1,4 @@
-"""A small drawn run, on which a worker process compiles the kernels before it takes work."""
+"""A small synthetic run that makes a worker compile the kernels before it takes work."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ _HIDDEN_IN = 2
 _LEVEL, _SHAFT, _ELECTRODE = 1000.0, 0.9, 0.45
 
 
-class DrawnFrames:
-    """Straight catheters side by side, a little lower in each frame; the last of them is absent from one frame, so that it
-    has to be carried along its track. Stored pixels are 12 bits in 16, noise as of 1000 photons."""
+class SyntheticFrames:
+    """Frames with straight catheters side by side, one pixel lower in each frame.
+
+    The last catheter is absent from one frame, so that the segmenter has to search for it. Stored pixels are 12 bits in 16,
+    with
+    the noise of 1000 photons.
+    """
 
     def __init__(self, catalogue: Catalogue) -> None:
         self._catalogue = catalogue
@@ -48,10 +52,10 @@ class DrawnFrames:
         return (self[index] for index in range(_FRAMES))
 
 
-def compile_on_drawn_run(segmenter: Segmenter) -> None:
-    """Segment the drawn run, for the kernels that it compiles, or loads, on the way."""
+def compile_kernels(segmenter: Segmenter) -> None:
+    """Segment the synthetic run, which compiles the kernels or loads them from the cache."""
     run = Run(
-        DrawnFrames(DEFAULT_CATALOGUE),
+        SyntheticFrames(DEFAULT_CATALOGUE),
         np.arange(_FRAMES, dtype=np.float64) * _FRAME_MS,
         _PX_PER_MM,
         PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False),

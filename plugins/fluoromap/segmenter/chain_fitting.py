@@ -1,0 +1,151 @@
+"""Fit of linked chains to the image: positions, order and kind of their electrodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.linking import (
+    CandidateChain,
+    CatheterFamily,
+    ShaftImage,
+    kind_probabilities,
+    shaft_evidence,
+    spacing_fit,
+)
+from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.refinement import ElectrodeFit, predict_on_curve, refine
+
+_SHAFT_WEIGHT = 1.0
+_NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class FittedChain:
+    """A chain with the score of linking, and its clearness.
+
+    clearness : how clearly its electrodes look like electrodes, see
+    :attr:`~fluoromap.segmenter.refinement.ElectrodeFit.clearness`.
+    """
+
+    chain: Chain
+    clearness: float
+
+
+def fit_chains(
+    x: Image,
+    candidates_uv: Array,
+    linked: Sequence[CandidateChain],
+    shaft_image: ShaftImage,
+    families: tuple[CatheterFamily, ...],
+    noise: float,
+    sure: int | None = None,
+) -> tuple[FittedChain, ...]:
+    """Fit each chain with every catheter of as many electrodes, in both orders.
+
+    The catheter and the order with the highest likelihood win.
+
+    Parameters
+    ----------
+    x : (rows, columns) float32
+        Log image.
+    candidates_uv : (n, 2)
+        The candidates of the chains, pixels.
+    linked : sequence of CandidateChain
+    shaft_image : ShaftImage
+    families : tuple of CatheterFamily
+    noise : float
+        Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+    sure : int
+        Number of candidates with a blob of their own; they come first. All by default.
+
+    Returns
+    -------
+    tuple of FittedChain
+        In the order of ``linked``.
+    """
+    likelihood = np.full((len(linked), len(families)), -np.inf)
+    foreign = _candidates_of_others(candidates_uv, linked, families)
+    electrode_fits: dict[tuple[int, int], tuple[ElectrodeFit, int]] = {}
+    for column, family in enumerate(families):
+        rows = [row for row, chain in enumerate(linked) if len(chain.candidates) == family.catheter.electrodes]
+        if not rows:
+            continue
+        order = np.array([linked[row].candidates for row in rows])
+        hidden = np.array([[candidate in foreign[row] for candidate in linked[row].candidates] for row in rows])
+        order, hidden = (np.concatenate([forth, forth[:, ::-1]]) for forth in (order, hidden))
+        without_blob = np.zeros_like(hidden) if sure is None else order >= sure
+        electrode_fit = refine(
+            x, candidates_uv[order], family.catheter, shaft_image.px_per_mm, noise, hidden, without_blob
+        )
+        no_variance = np.zeros(order.shape)
+        fit = electrode_fit.log_likelihood + spacing_fit(
+            electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm
+        )
+        fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
+        for index, row in enumerate(rows):
+            best = index if fit[index] >= fit[index + len(rows)] else index + len(rows)
+            likelihood[row, column] = fit[best]
+            electrode_fits[row, column] = electrode_fit, best
+    probabilities = kind_probabilities(likelihood, families)
+    chains = []
+    for row, chain in enumerate(linked):
+        of_family = [
+            sum(probability for name, probability in probabilities[row] if name in family.names) for family in families
+        ]
+        electrode_fit, best = electrode_fits.get((row, int(np.argmax(of_family)))) or electrode_fits[row, chain.family]
+        chains.append(
+            FittedChain(
+                Chain(
+                    electrodes=tuple(range(1, len(chain.candidates) + 1)),
+                    pixels_uv=electrode_fit.points_uv[best],
+                    covariance_px2=electrode_fit.covariance_px2[best],
+                    scores=np.full(len(chain.candidates), chain.score),
+                    kinds=probabilities[row],
+                ),
+                float(electrode_fit.clearness[best]),
+            )
+        )
+    return tuple(chains)
+
+
+def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) -> Array:
+    """Return the chain's covariances, widened near electrodes of other chains.
+
+    Bands that lie close together disturb each other's fit.
+    """
+    if not others:
+        return chain.covariance_px2
+    beside = np.concatenate([other.pixels_uv for other in others])
+    near = np.linalg.norm(chain.pixels_uv[:, None] - beside[None], axis=2).min(axis=1) < _NEAR_MM * px_per_mm
+    return np.where(near[:, None, None], _NEAR_FACTOR, 1.0) * chain.covariance_px2
+
+
+def _candidates_of_others(
+    candidates_uv: Array, linked: Sequence[CandidateChain], families: Sequence[CatheterFamily]
+) -> tuple[frozenset[int], ...]:
+    """Return, for each chain, the shared candidates that fit another chain's curve better.
+
+    Where two catheters cross, one blob may represent two electrodes and lie at the place of one of them.
+    """
+    foreign: list[set[int]] = [set() for _ in linked]
+    for row, chain in enumerate(linked):
+        for other in range(row):
+            for candidate in set(chain.candidates) & set(linked[other].candidates):
+                away = [_distance_from_curve(candidates_uv, linked[one], families, candidate) for one in (row, other)]
+                foreign[row if away[0] > away[1] else other].add(candidate)
+    return tuple(frozenset(candidates) for candidates in foreign)
+
+
+def _distance_from_curve(
+    candidates_uv: Array, chain: CandidateChain, families: Sequence[CatheterFamily], candidate: int
+) -> float:
+    points = candidates_uv[list(chain.candidates)]
+    covered = np.array([one == candidate for one in chain.candidates])
+    if np.count_nonzero(~covered) < 2:
+        return 0.0
+    predicted = predict_on_curve(points, covered, families[chain.family].catheter.arc_lengths_mm)
+    return float(np.linalg.norm(predicted - points[covered]))
