@@ -468,6 +468,14 @@ class LocatedSite:
                 return point
         return None
 
+    def camera(self, view: View) -> Camera:
+        """Return the camera of a view."""
+        return self.camera_a if view == "a" else self.camera_b
+
+    def diastolic_frame(self, view: View) -> int:
+        """Return the diastolic frame of a view, counted from 0."""
+        return self.frame_a if view == "a" else self.frame_b
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:

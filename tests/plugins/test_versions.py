@@ -205,9 +205,11 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     fields = [] if old["sha256"] == new["sha256"] else ["sha256"]
     for name in {*old["sums"], *new["sums"]}:
         before, after = old["sums"].get(name), new["sums"].get(name)
-        if before is None or after is None:
-            fields.append(name)
-        elif max(abs(a - b) for a, b in zip(before, after, strict=True)) > TOLERANCE * max(before[1], 1e-9):
+        if (
+            before is None
+            or after is None
+            or max(abs(a - b) for a, b in zip(before, after, strict=True)) > TOLERANCE * max(before[1], 1e-9)
+        ):
             fields.append(name)
     return sorted(fields)
 

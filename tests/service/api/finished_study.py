@@ -38,8 +38,8 @@ from fluoromap_service.store import files
 from fluoromap_service.store.codec import MEDIA_TYPE, encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
+from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
-    CatheterSnapshot,
     GantrySnapshot,
     PluginSnapshot,
     RejectedSiteSnapshot,
@@ -172,7 +172,7 @@ def make_study() -> FinishedStudy:
         snapshot = Snapshot(
             study=study.id,
             catheters=tuple(
-                CatheterSnapshot(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
+                StudyCatheter(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
                 for name in ("reference", "mapping")
             ),
             reference="reference",
