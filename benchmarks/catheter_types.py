@@ -1,10 +1,10 @@
 """Catheters of many types in synthetic scenes: ``python benchmarks/catheter_types.py [first seed] [scenes] [--weights FILE]``.
 
-Each scene has the catheters of one catalogue, crossing at random, among cables, wires, probes and vessels; 512 x 512, 8 bit, half of
-them JPEG, 3.0 to 4.4 px/mm. Prints for each catalogue the electrodes found within 5 px,
-false ones, and those with the right name and the right number; then the same for a catalogue that lacks one of the catheters, and
-how many electrodes of the unlisted catheter got a name. Scenes come from the generator that the network is trained with, other
-seeds: these are figures of the chain search, not of the network on real frames.
+Each scene has the catheters of one catalogue, crossing at random, among cables, wires, probes and vessels: 512 x 512, 8 bit, half
+of them JPEG, 3.0 to 4.4 px/mm. A run is the same picture three times. Prints for each catalogue the electrodes found within 5 px,
+false ones, and those with the right name and the right number; then the same for a catalogue that lacks one of the catheters, where
+an electrode of the unlisted catheter counts as false. Scenes come from the generator that the network is trained with, other seeds:
+these are figures of the chain search in hard scenes, not of the network on real frames.
 """
 
 from __future__ import annotations

@@ -296,6 +296,7 @@ class NamedChain:
     electrodes: tuple[int, ...]
     pixels_uv: Array
     covariance_px2: Array
+    track: int = -1
 
     def __post_init__(self) -> None:
         m = len(self.electrodes)
@@ -466,6 +467,14 @@ class LocatedSite:
             if point.catheter == catheter and point.electrode == electrode:
                 return point
         return None
+
+    def camera(self, view: View) -> Camera:
+        """Return the camera of a view."""
+        return self.camera_a if view == "a" else self.camera_b
+
+    def diastolic_frame(self, view: View) -> int:
+        """Return the diastolic frame of a view, counted from 0."""
+        return self.frame_a if view == "a" else self.frame_b
 
 
 @dataclass(frozen=True, eq=False)
@@ -677,7 +686,9 @@ class ChamberMap:
         n = len(self.vertices_mm)
         object.__setattr__(self, "faces", frozen(self.faces, (None, 3), "faces", dtype=np.int64))
         if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < n):
-            raise ValueError(f"faces name vertices {self.faces.min()} to {self.faces.max()}, but there are {n} vertices")
+            raise ValueError(
+                f"faces name vertices {self.faces.min()} to {self.faces.max()}, but there are {n} vertices"
+            )
         object.__setattr__(self, "lat_ms", frozen(self.lat_ms, (n,), "lat_ms"))
         object.__setattr__(self, "lat_sd_ms", frozen(self.lat_sd_ms, (n,), "lat_sd_ms"))
         object.__setattr__(self, "covered", frozen(self.covered, (n,), "covered", dtype=np.bool_))

@@ -72,7 +72,11 @@ def _located(
 
 
 def _rejected(
-    job_id: str, planned: SiteSnapshot | RejectedSiteSnapshot, catheter: str, electrode: int, reasons: tuple[Reason, ...]
+    job_id: str,
+    planned: SiteSnapshot | RejectedSiteSnapshot,
+    catheter: str,
+    electrode: int,
+    reasons: tuple[Reason, ...],
 ) -> Point:
     return Point(
         job_id=job_id,

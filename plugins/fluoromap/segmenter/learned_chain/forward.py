@@ -43,7 +43,8 @@ class Layer:
 
     def _tap_by_tap(self, x: Image) -> Image:
         """Sum over taps of (pixels shifted by the tap) times (inputs x outputs): rows of the padded picture follow each other in
-        memory, so that a shifted picture is the same memory from another start on."""
+        memory, so that a shifted picture is the same memory from another start on.
+        """
         stride, dilation = self.shape.stride, self.shape.dilation
         rows, columns = x.shape[0] // stride, x.shape[1] // stride
         border = 1 if stride == 2 else dilation

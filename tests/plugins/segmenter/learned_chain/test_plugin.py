@@ -58,9 +58,10 @@ def test_it_is_a_segmenter():
 
 
 def test_weights_that_are_not_there_are_named(simulated):
-    with pytest.raises(ValueError, match="missing.npz"):
-        run = Run(simulated.frames, simulated.frame_times_ms, PX_PER_MM, PixelFacts(False, 12, False))
-        LearnedChain(LearnedChainParams(weights="/missing.npz")).segment(run, DEFAULT_CATALOGUE, {}, Silent())
+    run = Run(simulated.frames, simulated.frame_times_ms, PX_PER_MM, PixelFacts(False, 12, False))
+    segmenter = LearnedChain(LearnedChainParams(weights="/missing.npz"))
+    with pytest.raises(ValueError, match=r"missing\.npz"):
+        segmenter.segment(run, DEFAULT_CATALOGUE, {}, Silent())
 
 
 def test_all_catheters_of_the_phantom_are_found_and_nothing_else(simulated):
