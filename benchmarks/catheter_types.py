@@ -13,7 +13,7 @@ import argparse
 import time
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from real_frames import LabelledRun, score
 
 from fluoromap.catheters import Catalogue, Catheter, catheter_type
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def _scene(random: np.random.Generator, catheters: tuple[Catheter, ...], missing: int | None) -> LabelledRun:
-    """A run of one scene with all catheters, and a catalogue without the ``missing`` one, whose electrodes have no labels."""
+    """Make a run of one scene with all catheters, and a catalogue without the ``missing`` one, whose electrodes have no labels."""
     px_per_mm = float(random.uniform(3.0, 4.4))
     canvas = Canvas.empty(SIZE_PX)
     draw_distractors(random, canvas, px_per_mm)
@@ -84,7 +84,7 @@ def _scene(random: np.random.Generator, catheters: tuple[Catheter, ...], missing
         }
         for one in listed
     }
-    run = Run(KeptFrames(pictures), np.arange(FRAMES) * 66.7, px_per_mm, PixelFacts(True, 8, False))
+    run = Run(MemoryFrames(pictures), np.arange(FRAMES) * 66.7, px_per_mm, PixelFacts(True, 8, False))
     return LabelledRun("", run, Catalogue(listed, listed[0].name, listed[-1].name), [labels] * FRAMES)
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.optimize import linear_sum_assignment
@@ -95,7 +95,7 @@ def _labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
         px_per_mm = given.px_per_mm or facts.get("px_per_mm", 3.4)
         times = np.arange(len(frames), dtype=np.float64) * float(facts.get("frame_ms", 66.7))
         pixels = PixelFacts(bool(facts.get("logarithmic", False)), 8, False)
-        runs.append(LabelledRun(path.stem, Run(KeptFrames(frames), times, px_per_mm, pixels), catalogue, labels))
+        runs.append(LabelledRun(path.stem, Run(MemoryFrames(frames), times, px_per_mm, pixels), catalogue, labels))
     return runs
 
 
@@ -112,7 +112,7 @@ def _empty_runs(given: argparse.Namespace) -> list[LabelledRun]:
         px_per_mm = given.px_per_mm or 3.4
         if facts.source_detector_mm and facts.source_isocentre_mm and facts.pixel_spacing_mm:
             px_per_mm = facts.source_detector_mm / facts.source_isocentre_mm / facts.pixel_spacing_mm[0]
-        run = Run(KeptFrames(frames), np.arange(len(frames), dtype=np.float64) * 66.7, px_per_mm, facts.pixels)
+        run = Run(MemoryFrames(frames), np.arange(len(frames), dtype=np.float64) * 66.7, px_per_mm, facts.pixels)
         runs.append(LabelledRun(path.stem, run, _catalogue(given.catheter, {}), [{} for _ in frames]))
     return runs
 
@@ -151,7 +151,7 @@ def _segment(segmenter: Segmenter, one: LabelledRun, single: bool) -> list[Frame
         return list(segmenter.segment(one.run, one.catalogue, {}, Silent()).frames)
     entries = []
     for index in range(len(one.run.frames)):
-        still = Run(KeptFrames([one.run.frames[index]]), np.zeros(1), one.run.px_per_mm, one.run.pixels)
+        still = Run(MemoryFrames([one.run.frames[index]]), np.zeros(1), one.run.px_per_mm, one.run.pixels)
         entries.append(segmenter.segment(still, one.catalogue, {}, Silent()).frames[0])
     return entries
 
