@@ -83,7 +83,7 @@ class ImageEvidence(Protocol):
         """Variance of each coordinate of electrodes that are proposed at these points, (n,) pixels squared."""
 
     def scores_at(self, points_uv: Array) -> Array:
-        """The proposer's own measure of how clearly the electrodes of one chain show, (n,): ``Chain.scores``."""
+        """Return the proposer's own measure of how clearly the electrodes of one chain show, (n,): ``Chain.scores``."""
 
 
 Proposer = Callable[[Image], ImageEvidence]

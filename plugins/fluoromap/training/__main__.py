@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _catheter(entry: dict[str, object]) -> Catheter:
-    """A catheter by its type, or by its electrodes, spacing_mm, tip_mm and ring_mm."""
+    """Build a catheter by its type, or by its electrodes, spacing_mm, tip_mm and ring_mm."""
     if "type" in entry:
         return catheter_type(str(entry["type"]), str(entry.get("name", entry["type"])))
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}

@@ -49,7 +49,7 @@ def _square(heading: Array) -> Array:
 
 
 def _cable(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """ECG cables and other lines of any width, sometimes a bundle of them."""
+    """Draw ECG cables and other lines of any width, sometimes a bundle of them."""
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.0, 1.2))
     hollow = between(random, 0.3, 0.8) if chance(random, 0.3) else 0.0
     radius = scaled(random, 0.15, 2.3) * px_per_mm
@@ -63,7 +63,7 @@ def _cable(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _ecg_electrode(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A cable that ends in a snap: a ring, a plug, a rod."""
+    """Draw a cable that ends in a snap: a ring, a plug, a rod."""
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.0, 1.0))
     canvas.stroke(line, scaled(random, 0.3, 1.3) * px_per_mm, scaled(random, 0.1, 0.7))
     at, wide = line[0], between(random, 1.5, 6.0) * px_per_mm
@@ -92,7 +92,7 @@ def _ecg_electrode(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _guide_wire(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A thin wire, often curled, sometimes with a denser end."""
+    """Draw a thin wire, often curled, sometimes with a denser end."""
     line, _ = _long_line(random, canvas, px_per_mm, between(random, 0.5, 3.5))
     canvas.stroke(line, scaled(random, 0.1, 0.45) * px_per_mm, scaled(random, 0.1, 1.0))
     if chance(random, 0.5):
@@ -101,7 +101,7 @@ def _guide_wire(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _sheath(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A hollow tube without electrodes, perhaps with one marker band."""
+    """Draw a hollow tube without electrodes, perhaps with one marker band."""
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.0, 1.5))
     wide = between(random, 0.8, 2.2) * px_per_mm
     canvas.stroke(line, wide, scaled(random, 0.05, 0.5), between(random, 0.5, 0.88))
@@ -120,7 +120,7 @@ def _sheath(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _plain_catheter(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """An angiography catheter or a swan-ganz: a shaft that ends without electrodes, hooked or curled."""
+    """Draw an angiography catheter or a swan-ganz: a shaft that ends without electrodes, hooked or curled."""
     curve = random_curve(random, between(random, 40.0, 120.0), 0.5, between(random, 0.8, 4.0), tilt_change=0.3)
     line = _placed(random, canvas, curve, px_per_mm)
     canvas.stroke(
@@ -135,7 +135,7 @@ def _plain_catheter(random: Generator, canvas: Canvas, px_per_mm: float) -> None
 
 
 def _coil(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A shock coil of a defibrillator's lead, a spring, a braid: a dense zigzag along a line."""
+    """Draw a shock coil of a defibrillator's lead, a spring, a braid: a dense zigzag along a line."""
     curve = random_curve(random, between(random, 15.0, 60.0), 0.25, between(random, 0.0, 1.5), tilt=0.0)
     line = _placed(random, canvas, curve, px_per_mm)
     swing = between(random, 0.4, 1.6) * px_per_mm
@@ -147,7 +147,7 @@ def _coil(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _vessels(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Vessels filled with contrast medium; in places beaded, interrupted, or mixed with blood."""
+    """Draw vessels filled with contrast medium; in places beaded, interrupted, or mixed with blood."""
     _branch(
         random, canvas, px_per_mm, random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3), between(random, 0.5, 2.4),
         scaled(random, 0.08, 1.4), int(random.integers(1, 4)),
@@ -194,7 +194,7 @@ def _beads(random: Generator, count: int) -> Array:
 
 
 def _drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A vessel or tube that the contrast medium has left but for a few plugs and rims, which lie in a row like electrodes."""
+    """Draw a vessel or tube that the contrast medium has left but for a few plugs and rims, which lie in a row like electrodes."""
     curve = random_curve(random, between(random, 15.0, 70.0), 0.5, between(random, 0.2, 2.0), tilt=0.0)
     line = _placed(random, canvas, curve, px_per_mm)
     radius, dark = between(random, 0.7, 2.2) * px_per_mm, scaled(random, 0.1, 1.5)
@@ -217,7 +217,7 @@ def _drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _residue(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Contrast medium left in crumbs along a line or an edge."""
+    """Draw contrast medium left in crumbs along a line or an edge."""
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.2, 2.0))
     dark = scaled(random, 0.1, 1.5)
     wide = scaled(random, 0.3, 3.0) * px_per_mm
@@ -236,7 +236,7 @@ def _residue(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _echo_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A transoesophageal echo probe: a box with parts inside, and a thick shaft of many segments."""
+    """Draw a transoesophageal echo probe: a box with parts inside, and a thick shaft of many segments."""
     at = random.uniform(-0.1, 1.1, 2) * canvas.size
     angle = between(random, 0.0, 6.3)
     half = between(random, 4.0, 7.0) * px_per_mm
@@ -253,7 +253,7 @@ def _echo_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _segmented_shaft(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """The shaft of an echo probe or an endoscope without its head."""
+    """Draw the shaft of an echo probe or an endoscope without its head."""
     _segments(random, canvas, px_per_mm, random.uniform(-0.1, 1.1, 2) * canvas.size, between(random, 0.0, 6.3),
               between(random, 2.0, 5.5) * px_per_mm)  # fmt: skip
 
@@ -282,7 +282,7 @@ def _segments(random: Generator, canvas: Canvas, px_per_mm: float, start: Array,
 
 
 def _temperature_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """An oesophageal temperature probe: a soft shaft with one to five olives wider than itself, or a metal cap at its end."""
+    """Draw an oesophageal temperature probe: a soft shaft with one to five olives wider than itself, or a metal cap at its end."""
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.2, 1.2), 0.5)
     radius = between(random, 1.0, 2.5) * px_per_mm
     canvas.stroke(line, radius, scaled(random, 0.04, 0.4), between(random, 0.0, 0.8))
@@ -294,7 +294,7 @@ def _temperature_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> N
 
 
 def _clip(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Surgical clips and staples: short dense strokes, alone, as a V or in a row."""
+    """Draw surgical clips and staples: short dense strokes, alone, as a V or in a row."""
     at, angle = random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3)
     length, radius, dark = (
         between(random, 1.5, 7.0) * px_per_mm,
@@ -312,14 +312,14 @@ def _clip(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _blob(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """One dense thing of electrode size without a catheter: calcium, a bead, a screw's head, a marker."""
+    """Draw one dense thing of electrode size without a catheter: calcium, a bead, a screw's head, a marker."""
     at = random.uniform(0.0, canvas.size, 2)
     canvas.disc(at, scaled(random, 0.4, 2.5) * px_per_mm, scaled(random, 0.4, 2.0) * px_per_mm, between(random, 0.0, 6.3),
                 scaled(random, 0.1, 1.3), between(random, 0.6, 2.0), between(random, 2.0, 5.0))  # fmt: skip
 
 
 def _sternal_wire(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Loops of steel wire with a twisted knot."""
+    """Draw loops of steel wire with a twisted knot."""
     at = random.uniform(0.0, canvas.size, 2)
     radius, dark = between(random, 0.25, 0.55) * px_per_mm, scaled(random, 0.3, 1.5)
     for number in range(int(random.integers(1, 4))):
@@ -336,7 +336,7 @@ def _sternal_wire(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _valve_ring(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A valve's ring or a stent: an ellipse of wire, perhaps with struts or a row of cells."""
+    """Draw a valve's ring or a stent: an ellipse of wire, perhaps with struts or a row of cells."""
     at, turn = random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3)
     wide, high = between(random, 7.0, 16.0) * px_per_mm, between(random, 0.5, 12.0) * px_per_mm
     angle = np.linspace(0.0, 2.0 * math.pi, 72)
@@ -355,7 +355,7 @@ def _valve_ring(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _device(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """A pacemaker's can with its parts, at the edge of the scene."""
+    """Draw a pacemaker's can with its parts, at the edge of the scene."""
     at = random.uniform(0.0, 1.0, 2) * canvas.size
     at[int(random.integers(2))] = float(random.choice([0.0, 1.0])) * canvas.size
     size = between(random, 10.0, 25.0) * px_per_mm

@@ -177,7 +177,7 @@ def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, me
 
 
 def _draw_sheath(random: Generator, canvas: Canvas, line: Array, radius: float, px_per_mm: float) -> None:
-    """A long sheath over the shaft, perhaps with a marker band, which is no electrode."""
+    """Draw a long sheath over the shaft, perhaps with a marker band, which is no electrode."""
     if len(line) < 4:
         return
     wide = radius * between(random, 1.2, 1.6)

@@ -96,7 +96,7 @@ def _curve(heading: Array, shortening: Array, step_mm: float) -> Curve:
 
 
 def _rotation(random: Generator) -> Array:
-    """A random rotation of space; a plane of a circle seen nearly edge-on is rare."""
+    """Draw a random rotation of space; a plane of a circle seen nearly edge-on is rare."""
     axes, _ = np.linalg.qr(random.normal(size=(3, 3)) + 0.8 * np.eye(3))
     return np.asarray(axes)
 

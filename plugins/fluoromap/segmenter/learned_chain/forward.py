@@ -42,8 +42,9 @@ class Layer:
         return self._tap_by_tap(x)
 
     def _tap_by_tap(self, x: Image) -> Image:
-        """Sum over taps of (pixels shifted by the tap) times (inputs x outputs): rows of the padded picture follow each other in
-        memory, so that a shifted picture is the same memory from another start on.
+        """Sum over the taps: pixels shifted by the tap, times (inputs x outputs).
+
+        Rows of the padded picture follow each other in memory: a shifted picture is the same memory from another start on.
         """
         stride, dilation = self.shape.stride, self.shape.dilation
         rows, columns = x.shape[0] // stride, x.shape[1] // stride
@@ -90,7 +91,7 @@ class Layer:
 
 
 def _phases(x: Image, stride: int, border: int, wide: int) -> list[Image]:
-    """The picture with borders of zeros as (pixels, channels); for a stride of 2 its four interleaved parts, even rows first."""
+    """Return the picture with borders of zeros as (pixels, channels); for a stride of 2 its four interleaved parts, even rows first."""
     rows, columns = x.shape[0] // stride, x.shape[1] // stride
     parts = []
     for down in range(stride):
@@ -162,7 +163,7 @@ def _finished(flat: Image, bias: Image, rows: int, columns: int, wide: int, rect
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _add_bias(flat, bias, wide, rectified, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Writes the first columns of each row of ``wide`` pixels, the bias added, negative values cut off where rectified."""
+    """Write the first columns of each row of ``wide`` pixels, the bias added, negative values cut off where rectified."""
     least = np.float32(0.0) if rectified else np.float32(-1e30)
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):

@@ -98,13 +98,13 @@ class NetworkResponse:
         return Proposals(self.found.points_uv[kept], self.found.probability[kept], self.found.covariance_px2[kept])
 
     def probability_at(self, points_uv: Array) -> Array:
-        """The highest probability of the cell of each point and its eight neighbours, (n,)."""
+        """Return the highest probability of the cell of each point and its eight neighbours, (n,)."""
         v, u = self._best_cells(points_uv)
         near: Array = self.probability[v, u].astype(np.float64)
         return near
 
     def unseen_probability_at(self, points_uv: Array) -> Array:
-        """The same; 0 within two cells of an electrode that was found."""
+        """Return the same, but 0 within two cells of an electrode that was found."""
         probability = self.probability_at(points_uv)
         if len(self.found) and len(points_uv):
             away, _ = cKDTree(self.found.points_uv).query(points_uv)
@@ -166,7 +166,7 @@ def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, 
 
 
 def _variance_px2(log_variance: Array, gain: float, cell_px: float) -> Array:
-    """What the network states, and a floor: real electrodes are not drawn by the rules it learned from."""
+    """Add a floor to what the network states: real electrodes are not drawn by the rules it learned from."""
     variance: Array = (gain * np.exp(np.clip(log_variance, -8.0, 4.0)) + _FLOOR_CELLS**2) * cell_px**2
     return variance
 
@@ -185,7 +185,7 @@ def answer(trained: Trained, picture: Image) -> Image:
 
 
 def _highest_near(values: Image) -> Image:
-    """The highest of each value and its eight neighbours."""
+    """Return the highest of each value and its eight neighbours."""
     wide = np.pad(values, 1, constant_values=-np.inf)
     across = np.maximum(np.maximum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:])
     highest: Image = np.maximum(np.maximum(across[:-2], across[1:-1]), across[2:])
