@@ -29,7 +29,7 @@ from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
-from fluoromap.segmenter.unlisted import SURE, continues, not_on, unexplained_between
+from fluoromap.segmenter.unlisted import SURE, continues, not_on, shows_row, unexplained_between
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
@@ -232,6 +232,11 @@ class ChainDetector:
         """Return whether the image clearly shows a catheter besides these chains."""
         seen = self.image_evidence(x)
         proposed = seen.proposals(self.field.candidates, 2)
+        if self.acceptance.strict:
+            sure = proposed.points_uv[proposed.probability >= SURE]
+            return shows_row(not_on(sure, chains, self.px_per_mm), self.px_per_mm)
+        if len(chains) < len(self.catalogue.catheters):
+            return False
         taken = np.concatenate([chain.pixels_uv for chain in chains])
         away = np.linalg.norm(proposed.points_uv[:, None] - taken[None], axis=2).min(axis=1)
         free = away > _BESIDE_MM * self.px_per_mm

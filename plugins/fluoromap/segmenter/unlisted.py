@@ -17,6 +17,7 @@ _BESIDE_MM = 1.0
 _ROW_CONTINUES = 2
 _LEAST_COSINE = 0.88
 _LONGEST_STEP = 1.25
+_ROW, _ROW_STEP_MM = 4, 10.0
 
 
 def unexplained_between(chain: Chain, points_uv: Array, px_per_mm: float) -> int:
@@ -43,7 +44,7 @@ def unexplained_between(chain: Chain, points_uv: Array, px_per_mm: float) -> int
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    """Whether two or more points go on in the chain's line beyond one of its ends, no farther apart than its electrodes are.
+    """Return whether two or more points go on in the chain's line beyond one of its ends, no farther apart than its electrodes are.
 
     Parameters
     ----------
@@ -57,22 +58,42 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
     seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1)
     step = _LONGEST_STEP * float(np.max(catheter.spacing_mm)) * float(seen.sum()) / float(np.sum(catheter.spacing_mm))
     for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
-        at, before, left = row[-1], row[-3] if len(row) > 2 else row[-2], free
-        count = 0
-        while len(left):
-            way = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)
-            moves = left - at
-            lengths = np.maximum(np.linalg.norm(moves, axis=1), 1e-9)
-            fits = (lengths <= step) & (moves @ way >= _LEAST_COSINE * lengths)
-            if not fits.any():
-                break
-            nearest = int(np.argmin(np.where(fits, lengths, np.inf)))
-            before, at = at, left[nearest]
-            left = np.delete(left, nearest, axis=0)
-            count += 1
+        before = row[-3] if len(row) > 2 else row[-2]
+        count = _count_onwards(row[-1], before, free, step)
         if count >= _ROW_CONTINUES:
             return True
     return False
+
+
+def shows_row(points_uv: Array, px_per_mm: float) -> bool:
+    """Return whether four or more of these sure proposals lie in a row like the electrodes of a catheter, (n, 2)."""
+    reach = _ROW_STEP_MM * px_per_mm
+    for first in range(len(points_uv)):
+        for second in range(len(points_uv)):
+            way = points_uv[second] - points_uv[first]
+            if first == second or np.linalg.norm(way) > reach:
+                continue
+            left = np.delete(points_uv, [first, second], axis=0)
+            if 2 + _count_onwards(points_uv[second], points_uv[first], left, reach) >= _ROW:
+                return True
+    return False
+
+
+def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
+    """Count the points met when going on in the line from ``before`` to ``at``, none farther than ``reach`` from the last."""
+    count = 0
+    while len(left):
+        way = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)
+        moves = left - at
+        lengths = np.maximum(np.linalg.norm(moves, axis=1), 1e-9)
+        fits = (lengths <= reach) & (moves @ way >= _LEAST_COSINE * lengths)
+        if not fits.any():
+            break
+        nearest = int(np.argmin(np.where(fits, lengths, np.inf)))
+        before, at = at, left[nearest]
+        left = np.delete(left, nearest, axis=0)
+        count += 1
+    return count
 
 
 def not_on(points_uv: Array, chains: Sequence[Chain], px_per_mm: float) -> Array:

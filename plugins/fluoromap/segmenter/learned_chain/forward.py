@@ -91,7 +91,10 @@ class Layer:
 
 
 def _phases(x: Image, stride: int, border: int, wide: int) -> list[Image]:
-    """Return the picture with borders of zeros as (pixels, channels); for a stride of 2 its four interleaved parts, even rows first."""
+    """Return the picture with borders of zeros as (pixels, channels).
+
+    For a stride of 2 these are its four interleaved parts, even rows first.
+    """
     rows, columns = x.shape[0] // stride, x.shape[1] // stride
     parts = []
     for down in range(stride):
