@@ -36,6 +36,8 @@ _IN_A_RUN = Acceptance(
 _ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.35, seen_score=0.15)
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
+_DIM_BELOW = 0.03
+"""Probabilities fall fast: an electrode of a thirtieth of its chain's best probability was only predicted."""
 _COARSE_BITS = 8
 _COARSE_NOISE = 0.004
 
@@ -81,4 +83,4 @@ class LearnedChain:
 
             return ChainDetector(catalogue, field, run.px_per_mm, ask, acceptance)
 
-        return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True))
+        return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True), _DIM_BELOW)
