@@ -152,7 +152,8 @@ def rigid_view() -> MonoplaneView:
         observations.append(Observation(frame, None, tuple(chains)))
     return MonoplaneView(
         site="S01", view="a", camera=place.camera_a, catalogue=DEFAULT_CATALOGUE,
-        frame_times_ms=66.7 * np.arange(6, dtype=np.float64), observations=tuple(observations), a_priori=place.points, a_priori_frame=0, cycle=None, others=(),
+        frame_times_ms=66.7 * np.arange(6, dtype=np.float64), observations=tuple(observations),
+        a_priori=place.points, a_priori_frame=0, cycle=None, others=(),
     )  # fmt: skip
 
 
@@ -204,7 +205,7 @@ RESULTS: dict[Kind, Callable[[str], object]] = {
 
 
 def current(stage: str) -> dict[str, Any]:
-    """Return version and fingerprint of a stage as it is now."""
+    """Return the present version and fingerprint of a stage."""
     if stage == MATCHING:
         return {"version": matching.VERSION, **fingerprint(matched())}
     row = BUILT_IN[stage]
