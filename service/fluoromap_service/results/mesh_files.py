@@ -39,5 +39,4 @@ def mesh_of(job_id: str, finished: FinishedMap, mesh_format: MeshFormat, origin:
 
         return mesh_bytes(finished.chamber, mesh_format.value, finished.shift_mm(origin))
 
-    depends_on = mesh_dependencies(finished.sha256, mesh_format, origin)
-    return rendered(job_id, depends_on, MESH_MEDIA_TYPES[mesh_format], make)
+    return rendered(job_id, mesh_dependencies(finished.sha256, mesh_format, origin), make)

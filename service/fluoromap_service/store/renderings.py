@@ -25,7 +25,7 @@ class Rendered:
     path: Path
 
 
-def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Callable[[], bytes]) -> Rendered:
+def rendered(job_id: str, depends_on: dict[str, Any], make: Callable[[], bytes]) -> Rendered:
     """Return the kept rendering of a job; make it when there is none.
 
     Parameters
@@ -33,7 +33,6 @@ def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Cal
     job_id : str
     depends_on : dict
         JSON values: everything that changes the rendering.
-    media_type : str
     make : callable
         Makes the content. It is called outside any transaction.
     """
@@ -44,7 +43,7 @@ def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Cal
     content = make()
     try:
         with writing() as session:
-            sha256 = files.keep_bytes(session, content, media_type)
+            sha256 = files.keep_bytes(session, content)
             row = session.scalar(select(Rendering).where(Rendering.key == key))
             if row is None:
                 session.add(Rendering(job_id=job_id, key=key, sha256=sha256))

@@ -84,7 +84,7 @@ def _claim(stage_id: int, worker: str = "w") -> job_life.Claim | None:
 
 def _finish(held: job_life.Claim) -> bool:
     with writing() as session:
-        sha256 = files.keep_bytes(session, b"{}", "application/octet-stream")
+        sha256 = files.keep_bytes(session, b"{}")
         return job_life.finish(session, held, job_life.StoredResult(sha256), reused=False)
 
 

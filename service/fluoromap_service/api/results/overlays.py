@@ -69,8 +69,7 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
             raise Problem(409, "run_deleted", detail)
         return run_in_pool(Task.DRAW_PICTURE, draw_fusion, path, fusion, look, moving)
 
-    depends_on = overlay_dependencies(fusion, look, moving=moving)
-    return rendered(job_id, depends_on, "image/gif" if moving else "image/png", make)
+    return rendered(job_id, overlay_dependencies(fusion, look, moving=moving), make)
 
 
 @router.get(

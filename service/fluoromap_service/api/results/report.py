@@ -42,5 +42,5 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
             raise Problem(409, "not_ready", detail)
         study = session.get(Study, job.study_id)
         depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None)
-    page = rendered(job_id, depends_on, "text/html", lambda: report_page(job_id).encode())
+    page = rendered(job_id, depends_on, lambda: report_page(job_id).encode())
     return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)
