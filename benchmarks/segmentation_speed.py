@@ -36,8 +36,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.phantom import Contrast, SimulatedRun, StudySpec, simulate_study
-from fluoromap.segmenter.catheter_chain.blob_chains import BlobDetector
-from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain, blob_chains
 from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.four_step.blobs import find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
@@ -103,7 +102,7 @@ def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
     mask = find_field(run.frames, run.pixels)
     x: Image = mask.fill(LogTransform.of_run(run.pixels, mask.mean_level)(frame))
     steps = FourStepDetector(DEFAULT_CATALOGUE, mask, px_per_mm, FourStepParams())
-    blobs = BlobDetector(DEFAULT_CATALOGUE, mask, px_per_mm)
+    blobs = blob_chains(DEFAULT_CATALOGUE, mask, px_per_mm)
     filtered = homomorphic(x)
     k = edge_scale(filtered, mask.inside)
     assert k is not None

@@ -14,9 +14,10 @@ def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warni
     """Meaning of the pixels; ``bits_stored`` as measured, which BitsStored (0028,0101) need not be.
 
     PixelIntensityRelationship (0028,1040): LIN, LOG or DISP, PS3.3 C.8.7.1.1.2.
+    GE also writes DRM: prepared for display, its dynamic range compressed.
     """
     relationship = header.text("PixelIntensityRelationship")
-    if relationship not in ("LIN", "LOG", "DISP"):
+    if relationship not in ("LIN", "LOG", "DISP", "DRM"):
         warnings.append(HeaderWarning.PIXEL_INTENSITY_UNKNOWN)
     return PixelFacts(
         logarithmic=relationship != "LIN",
