@@ -1,21 +1,30 @@
-"""How well electrodes are found: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
+"""Accuracy of segmentation: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
 
-Prints, for both segmenters on runs of the phantom at 60 frames a second, recall, precision, the share of frames with all
-electrodes of the reference and the mapping catheter, RMS, how many catheter-frames are on the right track and how many 95 %
-ellipses hold the truth, each with a bootstrap interval over the runs; then what is accepted in runs without catheters.
-A detection is right within 5 px of the truth. Speed: ``benchmarks/segmentation_speed.py``.
+All segmenters process runs of the phantom at 60 frames a second. The benchmark prints, with a bootstrap interval over runs:
+
+- recall and precision; a detection is correct within 5 px of the truth,
+- the share of frames with all electrodes of the reference and the mapping catheter,
+- RMS,
+- the share of catheter-frames on the correct track,
+- the share of 95 % ellipses that hold the truth.
+
+The last lines count frames without catheters in which a segmenter accepts one. ``benchmarks/segmentation_speed.py`` measures
+speed.
 """
 
 from __future__ import annotations
 
+import io
 import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
 from scipy.optimize import linear_sum_assignment
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
@@ -26,6 +35,7 @@ from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.four_step.plugin import FourStep
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 Array = NDArray[np.float64]
 
@@ -33,14 +43,20 @@ NEAR_PX = 5.0
 TRACK_PX = 6.0
 MOVING_PX = 3.0
 FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
+DISPLAYED = PixelFacts(logarithmic=True, bits_stored=8, monochrome1=False)
 CHI2_95_2D = 5.991464547107979
-SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"four-step": FourStep, "catheter-chain": CatheterChain}
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {
+    "four-step": FourStep,
+    "catheter-chain": CatheterChain,
+    "learned-chain": LearnedChain,
+}
+CHAINS = "catheter-chain", "learned-chain"
 VIEWS: tuple[Contrast, Contrast] = ("LAT", "PA")
 
 
 @dataclass
 class Counts:
-    """What was right in one run, or a part of it."""
+    """Counts of correct detections in one run, or a part of it."""
 
     right: int = 0
     there: int = 0
@@ -102,7 +118,7 @@ def _ratio(sums: Array, name: str) -> float:
 
 
 def main(first: int, seeds: int, frames: int) -> None:
-    """All tables, on seeds ``first`` to ``first + seeds - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + seeds - 1``."""
     table = Table()
     spent = {name: [0.0, 0] for name in SEGMENTERS}
     for seed in range(first, first + seeds):
@@ -111,7 +127,12 @@ def main(first: int, seeds: int, frames: int) -> None:
             _score_run(table, spent, view, simulated, tuple(SEGMENTERS))
         for what, spec in _hard(seed, frames).items():
             for view, simulated in zip(VIEWS, simulate_study(spec).sites[0].runs, strict=True):
-                _score_run(table, None, f"{view} {what}", simulated, ("catheter-chain",))
+                _score_run(table, None, f"{view} {what}", simulated, CHAINS)
+        for width_mm, spec in _displayed(seed, frames).items():
+            for view, simulated in zip(VIEWS, simulate_study(spec).sites[0].runs, strict=True):
+                _score_run(
+                    table, None, f"{view} {1024 / width_mm:.2f} px/mm, 8 bit JPEG", simulated, CHAINS, displayed=True
+                )
     print(f"seeds {first} to {first + seeds - 1}, {frames} frames a run; mean and 95 % bootstrap interval over runs")
     table.show()
     for name, (seconds, count) in spent.items():
@@ -120,7 +141,7 @@ def main(first: int, seeds: int, frames: int) -> None:
 
 
 def _without_catheters(first: int, seeds: int) -> None:
-    """Single frames of the phantom's torso alone: none should be accepted."""
+    """Segment single frames of the phantom's torso without catheters: none should be accepted."""
     for name, segmenter in SEGMENTERS.items():
         accepted = count = 0
         for seed in range(first, first + seeds):
@@ -129,9 +150,9 @@ def _without_catheters(first: int, seeds: int) -> None:
                 behind = torso(gantry, appearance, np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.0)
                 photons = expected_photons(behind, np.ones((gantry.rows, gantry.columns), np.float32), appearance, 1.0)
                 for key in range(3):
-                    kept = KeptFrames([detect(photons, appearance.photons, 10 * seed + key)])
+                    frames = MemoryFrames([detect(photons, appearance.photons, 10 * seed + key)])
                     found = segmenter().segment(
-                        Run(kept, np.zeros(1), 1024 / 178, FACTS), DEFAULT_CATALOGUE, {}, Silent()
+                        Run(frames, np.zeros(1), 1024 / 178, FACTS), DEFAULT_CATALOGUE, {}, Silent()
                     )
                     accepted += bool(found.frames[0].chains)
                     count += 1
@@ -139,22 +160,60 @@ def _without_catheters(first: int, seeds: int) -> None:
 
 
 def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
-    wide = tuple(Gantry(angle, 0.0, 1000.0, 500.0, (250 / 512, 250 / 512), 512, 512) for angle in (90.0, 0.0))
     return {
         "dose 0.4": StudySpec(seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, dose=0.4),
         "4.1 px/mm": StudySpec(
-            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=(wide[0], wide[1])
+            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=_gantries(250.0)
         ),
     }
 
 
+def _displayed(seed: int, frames: int) -> dict[float, StudySpec]:
+    """Return the studies whose runs are shown as 8 bit JPEG, by the width of the field on the detector, mm."""
+    return {
+        width_mm: StudySpec(
+            seed,
+            sites=1,
+            frames=frames,
+            frame_rate_hz=60.0,
+            heart="dog",
+            contrast=VIEWS,
+            gantries=_gantries(width_mm),
+        )
+        for width_mm in (178.0, 250.0, 330.0)
+    }
+
+
+def _gantries(width_mm: float) -> tuple[Gantry, Gantry]:
+    spacing = width_mm / 512
+    lateral, frontal = (Gantry(angle, 0.0, 1000.0, 500.0, (spacing, spacing), 512, 512) for angle in (90.0, 0.0))
+    return lateral, frontal
+
+
+def _as_jpeg(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Return a frame as a lab displays and stores it: logarithm, sharpened, 8 bit, JPEG of quality 85."""
+    level = np.log(frame.astype(np.float64) + 1.0)
+    level += 0.8 * (level - gaussian_filter(level, 3.0))
+    low, high = np.percentile(level, [0.5, 99.5])
+    stored = io.BytesIO()
+    Image.fromarray((np.clip((level - low) / (high - low), 0.0, 1.0) * 255).astype(np.uint8)).save(
+        stored, "JPEG", quality=85
+    )
+    return np.asarray(Image.open(stored))
+
+
 def _score_run(
-    table: Table, spent: dict[str, list[float]] | None, view: str, simulated: SimulatedRun, names: tuple[str, ...]
+    table: Table,
+    spent: dict[str, list[float]] | None,
+    view: str,
+    simulated: SimulatedRun,
+    names: tuple[str, ...],
+    displayed: bool = False,
 ) -> None:
-    kept = KeptFrames(simulated.frames)
+    in_memory = MemoryFrames([_as_jpeg(frame) for frame in simulated.frames] if displayed else simulated.frames)
     gantry = simulated.gantry
     px_per_mm = gantry.source_detector_mm / gantry.source_isocentre_mm / gantry.pixel_spacing_mm[0]
-    run = Run(kept, simulated.frame_times_ms, px_per_mm, FACTS)
+    run = Run(in_memory, simulated.frame_times_ms, px_per_mm, DISPLAYED if displayed else FACTS)
     truth = simulated.truth.pixels_uv
     moved = np.linalg.norm(np.diff(np.concatenate(list(truth.values()), axis=1), axis=0), axis=2).max(axis=1)
     moving = np.concatenate([moved[:1], moved]) > MOVING_PX
@@ -163,8 +222,8 @@ def _score_run(
         found = SEGMENTERS[name]().segment(run, DEFAULT_CATALOGUE, {}, Silent())
         if spent is not None:
             spent[name][0] += time.process_time() - start
-            spent[name][1] += len(kept)
-        parts = {"": np.ones(len(kept), bool)} if spent is None else {" quiet": ~moving, " moving": moving}
+            spent[name][1] += len(in_memory)
+        parts = {"": np.ones(len(in_memory), bool)} if spent is None else {" quiet": ~moving, " moving": moving}
         for part, chosen in parts.items():
             frames = np.flatnonzero(chosen)
             counts = Counts()
@@ -200,7 +259,7 @@ def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -
 
 
 def _matched(points: Array, truth: Array) -> Array:
-    """Distances of the detections that are right, each true electrode taken once."""
+    """Return the distances of the correct detections; each true electrode counts once."""
     if not len(points):
         return np.zeros(0)
     distance = np.linalg.norm(points[:, None] - truth[None], axis=2)
@@ -210,7 +269,11 @@ def _matched(points: Array, truth: Array) -> Array:
 
 
 def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array], frames: NDArray[np.int64]) -> None:
-    """A catheter-frame is right when the track that is this catheter's in most of the run lies on all its electrodes."""
+    """Count correct catheter-frames.
+
+    A catheter's track is the track that lies on it in most frames. A catheter-frame is correct where this track lies on all
+    electrodes of the catheter.
+    """
     of_track: dict[int, dict[str, list[int]]] = {}
     for entry in found.frames:
         for chain in entry.chains:

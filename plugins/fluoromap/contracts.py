@@ -296,6 +296,7 @@ class NamedChain:
     electrodes: tuple[int, ...]
     pixels_uv: Array
     covariance_px2: Array
+    track: int = -1
 
     def __post_init__(self) -> None:
         m = len(self.electrodes)

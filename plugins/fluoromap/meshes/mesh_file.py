@@ -1,4 +1,7 @@
-"""The map as a mesh file: millimetres, DICOM patient axes (LPS), faces outward; the same map gives the same bytes."""
+"""The map as a mesh file: millimetres, DICOM patient axes (LPS), faces outward.
+
+The same map gives the same bytes.
+"""
 
 from __future__ import annotations
 

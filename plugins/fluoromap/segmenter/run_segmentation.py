@@ -132,7 +132,7 @@ def segment_run(
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
     reason = None if chains else Reason.MANUAL_NEEDED
-    if len(chains) >= catheters and detector.shows_extra_catheter(mean_image, chains):
+    if chains and detector.shows_extra_catheter(mean_image, chains):
         reason = Reason.EXTRA_CATHETER
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)

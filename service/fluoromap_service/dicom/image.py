@@ -14,10 +14,10 @@ def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warni
     """Return the meaning of the pixels.
 
     ``bits_stored`` is measured, because BitsStored (0028,0101) may be wrong. PixelIntensityRelationship (0028,1040) is LIN,
-    LOG or DISP, PS3.3 C.8.7.1.1.2.
+    LOG or DISP, PS3.3 C.8.7.1.1.2. GE also writes DRM: prepared for display, with a compressed dynamic range.
     """
     relationship = header.text("PixelIntensityRelationship")
-    if relationship not in ("LIN", "LOG", "DISP"):
+    if relationship not in ("LIN", "LOG", "DISP", "DRM"):
         warnings.append(HeaderWarning.PIXEL_INTENSITY_UNKNOWN)
     return PixelFacts(
         logarithmic=relationship != "LIN",

@@ -52,9 +52,12 @@ def detected_electrodes(session: Session, study_id: str, uid: str, frame: int) -
 
 
 def _names(session: Session, job_id: str, uid: str, frame: int, chains: tuple[Chain, ...]) -> list[str | None]:
-    """Return a catheter for each chain: the one that the job's matching chose, else the most probable one, none twice."""
-    named = {chain.pixels_uv.tobytes(): chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
-    names = [named.get(chain.pixels_uv.tobytes()) for chain in chains]
+    """Return a catheter for each chain, none twice.
+
+    It is the catheter that the job's matching chose, else the most probable kind.
+    """
+    of_track = {chain.track: chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
+    names = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
     likely = sorted(
         ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
         key=lambda item: (-item[0], item[1]),

@@ -282,7 +282,8 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
 
 def followed_site(relative: bool = False) -> SiteTracks:
     """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
-    is not seen in frame 2."""
+    is not seen in frame 2.
+    """
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
     half = np.array([0.0, 0.0, 2.0])
     positions = np.zeros((FRAMES, 3, 3))

@@ -85,7 +85,7 @@ def test_figures_go_to_output_and_progress_to_the_other_stream(
     option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "fluoromap_service.cli.tables.one_view_tables", lambda context: (context.progress(1.0), TABLES)[1]
+        "fluoromap_service.cli.commands.tables.one_view_tables", lambda context: (context.progress(1.0), TABLES)[1]
     )
     assert _call(monkeypatch, *([option] if option else [])) in (None, 0)
     written = capsys.readouterr()
@@ -105,7 +105,7 @@ def test_all_tables_come_about(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(made, "whole_cycle_rows", lambda scenario, runs: iter(()))
     monkeypatch.setattr(made, "rigid_pose_rows", lambda: iter(()))
     reported: list[float] = []
-    tables = made.one_view_tables(BarContext(reported.append), hearts=(7,), sites=2, followed_sites=1)
+    tables = made.one_view_tables(BarContext(reported.append), hearts=(7,), sites=2, tracked_sites=1)
     assert len(tables.table1) == 96
     assert len(tables.table2) == 48
     assert {row.runs for row in tables.rigid_pose_phantom} == {1}
