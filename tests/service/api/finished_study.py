@@ -281,8 +281,9 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
 
 
 def followed_site(relative: bool = False) -> SiteTracks:
-    """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
-    is not seen in frame 2.
+    """Return the tracks of reference electrodes 1 and 2 and of the tip.
+
+    The reference moves by 1 mm in frame 1. Frame 3 does not show the reference, frame 2 does not show the tip.
     """
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
     half = np.array([0.0, 0.0, 2.0])
