@@ -163,8 +163,9 @@ class ChainDetector:
         kept = []
         for chain in chains:
             family = self._family(chain)
-            between = unexplained_between(chain, free, self.px_per_mm)
-            if family is not None and between == 0 and not continues(chain, sure, family.catheter, self.px_per_mm):
+            if family is None or unexplained_between(chain, free, family.catheter, self.px_per_mm):
+                continue
+            if not continues(chain, sure, family.catheter, self.px_per_mm):
                 kept.append(chain)
         return tuple(kept)
 

@@ -14,22 +14,24 @@ SURE = 0.5
 
 _OWN_MM = 1.2
 _BESIDE_MM = 1.0
-_ROW_CONTINUES = 2
+_ROW_CONTINUES = 3
 _LEAST_COSINE = 0.88
 _LONGEST_STEP = 1.25
 _ROW, _ROW_STEP_MM = 4, 10.0
 
 
-def unexplained_between(chain: Chain, points_uv: Array, px_per_mm: float) -> int:
+def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> int:
     """Count points on the way from the chain's first electrode to its last that are none of its electrodes.
 
     Parameters
     ----------
     chain : Chain
     points_uv : (n, 2)
-        Sure proposals that no other chain has, pixels.
+        Sure proposals that no other chain has, pixels. Those on the tip electrode are parts of it.
+    catheter : Catheter
     """
     free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
+    free = free[_apart(free, chain.pixels_uv[:1], (0.5 * catheter.tip_mm + _BESIDE_MM) * px_per_mm)]
     count = 0
     for point in free:
         for start, end in zip(chain.pixels_uv[:-1], chain.pixels_uv[1:], strict=True):
@@ -44,7 +46,7 @@ def unexplained_between(chain: Chain, points_uv: Array, px_per_mm: float) -> int
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    """Return whether two or more points go on in the chain's line beyond one of its ends, no farther apart than its electrodes are.
+    """Return whether three or more points go on in the chain's line beyond one of its ends, no farther apart than its electrodes are.
 
     Parameters
     ----------

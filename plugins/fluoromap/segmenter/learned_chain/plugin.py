@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -21,13 +22,18 @@ from fluoromap.segmenter.warm_up import compile_kernels
 
 _TRUST = Trust(share=0.25, chain=0.6)
 _IN_A_RUN = Acceptance(
-    least_clearness=0.1, again_clearness=0.1, sure_clearness=0.1, extra_clearness=0.3, least_score=0.2, seen_score=0.02,
-    least_seen=0.75, unseen_evidence=-1.5, strict=True, trust=_TRUST,
-)  # fmt: skip
-_ALONE = Acceptance(
-    least_clearness=0.3, again_clearness=0.3, sure_clearness=0.5, extra_clearness=0.5, least_score=0.6, seen_score=0.1,
-    least_seen=0.75, unseen_evidence=-1.5, strict=True, trust=_TRUST,
-)  # fmt: skip
+    least_clearness=0.1,
+    again_clearness=0.1,
+    sure_clearness=0.1,
+    extra_clearness=0.3,
+    least_score=0.3,
+    seen_score=0.1,
+    least_seen=0.85,
+    unseen_evidence=-1.5,
+    strict=True,
+    trust=_TRUST,
+)
+_ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.35, seen_score=0.15)
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
 _COARSE_BITS = 8
