@@ -23,7 +23,7 @@ def functions(folder: Path) -> Iterator[tuple[Path, Function]]:
 
 
 def named_in_docstring(function: Function) -> set[int]:
-    """ "eq. (n) of the paper": what other authors' equations are cited by looks otherwise."""
+    """Only "eq. (n) of the paper" counts: equations of other authors are cited in another form."""
     text = ast.get_docstring(function) or ""
     return {int(number) for number in re.findall(r"[Ee]q\. \((\d+)\) of the paper", text)}
 

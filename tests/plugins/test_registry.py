@@ -35,7 +35,7 @@ class ParamsNotAModel(Working):
 
 @pytest.fixture
 def entry(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
-    """Entry points that load the classes of this file, or what cannot be loaded."""
+    """Entry points that load the classes of this file, or fail to load."""
     known = {cls.__name__: cls for cls in (Working, Again, WithoutMethod, ParamsNotAModel)}
 
     class Point(EntryPoint):

@@ -46,8 +46,17 @@ from fluoromap.registry import Kind, build_fuser, build_monoplane, build_segment
 from fluoromap.segmenter.warm_up import SyntheticFrames
 
 KNOWN = Path(__file__).with_name("result_fingerprints.json")
-TOLERANCE = 1e-5
-"""Largest change of a weighted sum that processors may cause, as a share of the norm."""
+TOLERANCE = 1e-6
+"""Largest change of a weighted sum between processors, as a share of the norm."""
+TOLERANCES = {
+    "Chain.covariance_px2": 1e-5,
+    "Chain.scores": 3e-3,  # read at the nearest pixel, which may be another one
+    "ChamberMap.lat_ms": 5e-4,  # an optimiser sets the prior of the field
+    "ChamberMap.lat_sd_ms": 5e-4,
+    "ChamberMap.leave_one_out_rms_ms": 5e-4,
+    "SurfaceSite.leave_one_out_error_ms": 5e-4,
+}
+"""Exceptions, measured by compiling for a generic processor (NUMBA_CPU_NAME=generic, OPENBLAS_CORETYPE=Nehalem)."""
 
 MATCHING = "matching"
 BUILT_IN = {
@@ -105,7 +114,7 @@ def located() -> Triangulation:
 
 def segmented(name: str) -> object:
     frames = SyntheticFrames(DEFAULT_CATALOGUE)
-    run = Run(frames, 66.7 * np.arange(len(frames)), 5.75, PixelFacts(False, 12, False))
+    run = Run(frames, 66.7 * np.arange(len(frames), dtype=np.float64), 5.75, PixelFacts(False, 12, False))
     return build_segmenter(name, {}).segment(run, DEFAULT_CATALOGUE, {}, Silent())
 
 
@@ -142,8 +151,9 @@ def rigid_view() -> MonoplaneView:
             chains.append(NamedChain(catheter, electrodes, pixels[own], np.tile(0.09 * np.eye(2), (len(own), 1, 1))))
         observations.append(Observation(frame, None, tuple(chains)))
     return MonoplaneView(
-        site="S01", view="a", camera=place.camera_a, catalogue=DEFAULT_CATALOGUE, frame_times_ms=66.7 * np.arange(6),
-        observations=tuple(observations), a_priori=place.points, a_priori_frame=0, cycle=None, others=(),
+        site="S01", view="a", camera=place.camera_a, catalogue=DEFAULT_CATALOGUE,
+        frame_times_ms=66.7 * np.arange(6, dtype=np.float64), observations=tuple(observations),
+        a_priori=place.points, a_priori_frame=0, cycle=None, others=(),
     )  # fmt: skip
 
 
@@ -156,8 +166,10 @@ def matched() -> object:
     runs = [
         SiteRuns(
             site.name,
-            *(camera_from_gantry(run.gantry) for run in site.runs),
-            *(chains_of(run, 10 * number + view) for view, run in enumerate(site.runs)),
+            camera_from_gantry(site.runs[0].gantry),
+            camera_from_gantry(site.runs[1].gantry),
+            chains_of(site.runs[0], 10 * number),
+            chains_of(site.runs[1], 10 * number + 1),
         )
         for number, site in enumerate(study().sites)
     ]
@@ -193,7 +205,7 @@ RESULTS: dict[Kind, Callable[[str], object]] = {
 
 
 def current(stage: str) -> dict[str, Any]:
-    """Return version and fingerprint of a stage as it is now."""
+    """Return the present version and fingerprint of a stage."""
     if stage == MATCHING:
         return {"version": matching.VERSION, **fingerprint(matched())}
     row = BUILT_IN[stage]
@@ -204,12 +216,9 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Return the fields in which two fingerprints differ."""
     fields = [] if old["sha256"] == new["sha256"] else ["sha256"]
     for name in {*old["sums"], *new["sums"]}:
-        before, after = old["sums"].get(name), new["sums"].get(name)
-        if (
-            before is None
-            or after is None
-            or max(abs(a - b) for a, b in zip(before, after, strict=True)) > TOLERANCE * max(before[1], 1e-9)
-        ):
+        before, after = (one["sums"].get(name, [math.nan, math.nan]) for one in (old, new))
+        allowed = TOLERANCES.get(name, TOLERANCE) * max(before[1], 1e-9)
+        if not all(abs(a - b) <= allowed for a, b in zip(before, after, strict=True)):
             fields.append(name)
     return sorted(fields)
 

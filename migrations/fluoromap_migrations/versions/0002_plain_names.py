@@ -24,6 +24,17 @@ def upgrade() -> None:
         table.drop_column("electrogram")
     with op.batch_alter_table("study_instance") as table:
         table.drop_column("added")
+    with op.batch_alter_table("file") as table:
+        table.drop_column("size")
+        table.drop_column("media_type")
+        table.drop_column("created")
+    with op.batch_alter_table("instance") as table:
+        table.drop_column("series_number")
+        table.drop_column("acquired")
+        table.drop_column("created")
+    for name in ("stage_result", "event"):
+        with op.batch_alter_table(name) as table:
+            table.drop_column("created")
     _rename_corrections()
     # Results were JSON and are MessagePack now: a new job computes them again.
     op.execute("DELETE FROM stage_result")

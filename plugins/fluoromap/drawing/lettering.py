@@ -79,7 +79,10 @@ def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:
 
 
 def draw_colour_bar(image: Image.Image, scale: Scale, size: int, *, dark: bool, mark_ms: float | None = None) -> None:
-    """Draw the bands with their times in ms, earliest on top, and the hatch "no data"; optionally a mark at a time."""
+    """Draw the bands with their times in ms, earliest on top, and the hatch "no data".
+
+    ``mark_ms`` adds a mark at a time.
+    """
     ink, ground = (WHITE, (0, 0, 0, 150)) if dark else ((40, 40, 40), (255, 255, 255, 255))
     left, top, right, bottom = bar_box(scale, image.size, size)
     panel = Image.new("RGBA", (round(right - left), round(bottom - top)), (0, 0, 0, 0))

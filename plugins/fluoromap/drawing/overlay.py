@@ -162,7 +162,10 @@ class _Canvas:
         return outline
 
     def facing(self, chamber: ChamberMap) -> BoolArray:
-        """Return True for faces that face the detector: the ray from the source leaves the chamber through them."""
+        """Return True for faces that face the detector.
+
+        The ray from the source leaves the chamber through such a face.
+        """
         normals = face_normals(chamber.vertices_mm, chamber.faces)
         rays = chamber.vertices_mm[chamber.faces].mean(axis=1) - self._camera.source_world_mm
         outward: BoolArray = (normals * rays).sum(axis=1) > 0

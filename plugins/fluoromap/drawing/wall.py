@@ -1,4 +1,4 @@
-"""The chamber's wall in a picture: the band of each pixel, the outline, and the visible parts of a line."""
+"""The chamber's wall in a picture: bands of pixels, outline, visible parts of lines."""
 
 from __future__ import annotations
 
@@ -98,6 +98,6 @@ def outline_edges(faces: IntArray, facing: BoolArray) -> IntArray:
 
 
 def line_parts(flags: BoolArray) -> list[slice]:
-    """Return slices of a line's points, one for each connected part of segments whose flag is set."""
+    """Return slices of a line's points, one for each connected part of flagged segments."""
     changes = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in changes.reshape(-1, 2)]

@@ -109,7 +109,10 @@ def refine(vertices_mm: Array, faces: IntArray, edge_mm: float) -> tuple[Array, 
 
 
 def _split_faces(vertices_mm: Array, faces: IntArray, middles: IntArray) -> IntArray:
-    """Replace faces by 1 to 4, given the new vertex on each edge (01, 12, 20), -1 where the edge is whole."""
+    """Replace each face by 1 to 4 faces.
+
+    ``middles`` (f, 3) are the new vertices on the edges 01, 12, 20 of each face; -1 where an edge stays whole.
+    """
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
 
@@ -203,7 +206,10 @@ def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfaceP
 
 
 def _edges_and_shortcuts(vertices_mm: Array, faces: IntArray) -> tuple[IntArray, Array]:
-    """Return each edge with its length, and each straight line across an edge that stays within its two faces."""
+    """Return the edges and shortcuts of a surface with their lengths.
+
+    A shortcut is a straight line across an edge that stays within the edge's two faces.
+    """
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     opposite = faces[:, [2, 0, 1]].ravel()
     order = np.lexsort((np.sort(half, axis=1)[:, 1], np.sort(half, axis=1)[:, 0]))

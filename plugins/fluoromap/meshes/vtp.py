@@ -16,7 +16,10 @@ _TYPES = {"<f8": "Float64", "<f4": "Float32", "<i8": "Int64", "|u1": "UInt8"}
 
 
 def vtp_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, statement: str) -> bytes:
-    """Return the file: one piece with point data ``lat_ms``, ``lat_sd_ms``, ``covered``; sites and unit as field data."""
+    """Return the file: one piece with point data ``lat_ms``, ``lat_sd_ms``, ``covered``.
+
+    Sites and unit are field data.
+    """
     root = ElementTree.Element(
         "VTKFile", type="PolyData", version="1.0", byte_order="LittleEndian", header_type="UInt32"
     )

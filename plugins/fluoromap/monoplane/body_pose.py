@@ -18,7 +18,10 @@ deviations of half a turn and ten metres. It keeps the bound finite where the im
 
 
 def determines_pose(points_mm: Array) -> bool:
-    """Return True where points (m, 3) determine a pose: at least four that do not lie on one line."""
+    """Return True where points (m, 3) determine a pose.
+
+    At least four points that do not lie on one line are needed.
+    """
     if len(points_mm) < FEWEST_ELECTRODES:
         return False
     return bool(np.linalg.svd(points_mm - points_mm.mean(axis=0), compute_uv=False)[1] > LEAST_BREADTH_MM)

@@ -85,7 +85,10 @@ def _evidence(waves: Array, flat: Array, width: float) -> tuple[float, float, fl
 
 
 def _strengths(width: float) -> Array:
-    """Return the expected size of the constant, the cosines and the sines; it falls faster for a larger ``width``."""
+    """Return the expected size of the constant, the cosines and the sines.
+
+    It falls faster for a larger ``width``.
+    """
     falling = np.exp(-0.5 * (width * _HARMONICS) ** 2)
     return np.concatenate([[1.0], falling, falling])
 

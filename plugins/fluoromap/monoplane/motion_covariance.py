@@ -120,7 +120,10 @@ class MotionCovariance:
             yield from self._free(frames)
 
     def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, Array]]:
-        """Yield the differences between this beat and the mean beat, and between the mean beats of the two views."""
+        """Yield the deviations of this beat from the mean beat.
+
+        The mean beats of the two views differ too.
+        """
         p, expected = self._params, self._expected
         if not expected.beats:
             return
@@ -142,7 +145,10 @@ class MotionCovariance:
             )
 
     def _free(self, frames: slice) -> Iterator[tuple[int, Array]]:
-        """Yield each catheter's offset, tilt and bend over the beat; the view itself determines their sizes."""
+        """Yield each catheter's offset, tilt and bend over the beat.
+
+        The view itself determines their sizes.
+        """
         offset_sd = np.hypot(self._expected.offset_sd_mm[frames], self._params.beat_sd_mm)
         slow, fast = (_over_cycle(self._phases[frames], k) for k in (_SHAPE_HARMONICS, _OFFSET_HARMONICS))
         for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):

@@ -1,4 +1,4 @@
-"""Depth over the whole cardiac cycle: motion expected from two views, refined by the pixels of one view."""
+"""Depth over the cardiac cycle: expected motion, refined by the pixels of one view."""
 
 from __future__ import annotations
 
@@ -246,7 +246,10 @@ def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Arr
 
 
 def _windows(phases: Array) -> Iterator[slice]:
-    """Yield windows of about one beat: from one wrap of the phase to the next, never longer than 64 frames."""
+    """Yield windows of about one beat.
+
+    They reach from one wrap of the phase to the next and are never longer than 64 frames.
+    """
     wraps = np.flatnonzero(np.diff(phases) < -0.5) + 1
     edges = [0, *wraps.tolist(), len(phases)]
     for first, last in pairwise(edges):

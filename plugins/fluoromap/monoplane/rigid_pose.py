@@ -111,7 +111,10 @@ class RigidPose:
         return track
 
     def _shown_rigid(self, view: MonoplaneView, electrodes: ViewElectrodes) -> bool:
-        """Return True where cycles from two views confirm a rigid body; raise Refusal where they contradict one."""
+        """Return True where cycles from two views confirm a rigid body.
+
+        Raise Refusal where they contradict one.
+        """
         cycles = view.others if view.cycle is None else (view.cycle,)
         whole = [cycle for cycle in cycles if covers_body(cycle, electrodes.labels)]
         known = [rigid_error_mm(view.camera, cycle, electrodes.labels) for cycle in whole or cycles]

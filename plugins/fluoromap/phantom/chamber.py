@@ -1,4 +1,4 @@
-"""The left ventricle at diastole: an ellipsoid, the focus on its wall, and the spread of activation along the wall."""
+"""The left ventricle at diastole: an ellipsoid with a focus, and activation along its wall."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ _SWEEPS = 60
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
-    """Endocardial wall of the ventricle at diastole, between breaths; millimetres along LPS axes from the isocentre.
+    """Endocardial wall of the ventricle at diastole, between breaths.
+
+    Coordinates are millimetres along LPS axes from the isocentre.
 
     Parameters
     ----------
@@ -91,7 +93,10 @@ class Chamber:
         return times
 
     def _pull_tight(self, before: Array, points: Array, after: Array) -> Array:
-        """Move points of the unit sphere, as images of wall points, along the wall to the middle of their neighbours."""
+        """Move points along the wall to the middle of their neighbours.
+
+        Points are those of the unit sphere that is the image of the wall.
+        """
         pull = ((before + after) / 2 - points) * self.semi_axes_mm
         normal = _unit(points / self.semi_axes_mm)
         pull -= (pull * normal).sum(axis=-1, keepdims=True) * normal

@@ -71,7 +71,10 @@ def _noisy_pixels(run: SimulatedRun, noise_px: float, rng: np.random.Generator) 
 def _phases(
     runs: Sequence[SimulatedRun], pixels: Sequence[dict[str, Array]], cameras: tuple[Camera, Camera], r_waves: bool
 ) -> list[Array] | list[None]:
-    """Return the phases of both runs from R waves and motion; None for both where one of them is unknown."""
+    """Return the phases of both runs from R waves and motion.
+
+    Both are None where one of them is unknown.
+    """
     phases, folded = [], []
     for run, own, camera in zip(runs, pixels, cameras, strict=True):
         segmentation = _ideal_segmentation(run, own, r_waves)
@@ -116,7 +119,10 @@ def _observations(pixels: dict[str, Array], phases: Array | None, noise_px: floa
 
 
 def _phase_from_rest(observation: Observation) -> float:
-    """Return the distance of an observation's phase from rest, in cycles; 1 where its phase is unknown."""
+    """Return the distance of an observation's phase from rest, in cycles.
+
+    The result is 1 where its phase is unknown.
+    """
     if observation.phase is None:
         return 1.0
     return abs((observation.phase - DIASTOLIC_PHASE + 0.5) % 1.0 - 0.5)

@@ -98,7 +98,10 @@ def add_tube(
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def absorb(thickness: Image, touched: NDArray[np.uint8], absorbed: Image, weight: float) -> None:
-    """Add ``weight`` times the absorbed share of each touched pixel to ``absorbed``; clear ``thickness`` and ``touched``."""
+    """Add ``weight`` times the absorbed share of each touched pixel to ``absorbed``.
+
+    Clear ``thickness`` and ``touched``.
+    """
     rows, columns = touched.shape
     ss = SUPERSAMPLING
     share = np.float32(1.0 / (ss * ss))

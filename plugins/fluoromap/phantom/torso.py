@@ -1,4 +1,4 @@
-"""The torso behind the catheters as one image: heart shadow, diaphragm, ribs, spine, ECG wires and soft tissue.
+"""The torso behind the catheters: heart shadow, diaphragm, ribs, spine, ECG wires, soft tissue.
 
 Sizes are millimetres at the isocentre; attenuation is in log units.
 """
@@ -119,7 +119,10 @@ def _rib(x: Image, y: Image, rng: np.random.Generator) -> Image:
 
 
 def _spine(x: Image, y: Image, rng: np.random.Generator) -> Image:
-    """Draw vertebral bodies and discs; each body has two pedicles, dark ovals of about an electrode's contrast."""
+    """Draw vertebral bodies and discs.
+
+    Each body has two pedicles, dark ovals of about an electrode's contrast.
+    """
     middle, pitch = rng.normal(0, 4.3), rng.uniform(16.5, 20)
     first = rng.uniform(0, pitch)
     from_middle = np.abs(x - middle)

@@ -110,7 +110,7 @@ def read_backgrounds(folder: Path) -> tuple[Image, ...]:
 def _attenuation(pixels: Image) -> Image:
     grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels.astype(np.float32)
     brightest = max(float(np.percentile(grey, 99.8)), 1.0)
-    return -np.log(_DARKEST + np.minimum(grey / brightest, 1.0)).astype(np.float32)
+    return np.asarray(-np.log(_DARKEST + np.minimum(grey / brightest, 1.0)), dtype=np.float32)
 
 
 def from_backgrounds(random: Generator, size: int, frames: Sequence[Image]) -> Image:

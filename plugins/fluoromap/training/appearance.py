@@ -92,8 +92,8 @@ def _stored(random: Generator, grey: Image) -> NDArray[np.uint8]:
     picture = PillowImage.fromarray(levels.astype(np.uint8))
     if chance(random, 0.1):
         text = "".join(random.choice(list(_LETTERS), int(random.integers(2, 9))))
-        at = tuple(int(x) for x in random.integers(-10, len(grey), 2))
-        ImageDraw.Draw(picture).text(at, text, fill=int(random.choice([0, 230, 255])))
+        u, v = random.integers(-10, len(grey), 2)
+        ImageDraw.Draw(picture).text((float(u), float(v)), text, fill=int(random.choice([0, 230, 255])))
     if chance(random, 0.5):
         stored = io.BytesIO()
         picture.save(stored, "JPEG", quality=int(between(random, 30.0, 96.0)))

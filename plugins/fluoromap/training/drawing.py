@@ -41,7 +41,7 @@ class Canvas:
 
     @property
     def size(self) -> int:
-        return self.depth.shape[0]
+        return int(self.depth.shape[0])
 
     def stroke(
         self,

@@ -47,7 +47,7 @@ def fit(
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(True)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    network = ElectrodeNetwork().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network: ElectrodeNetwork = ElectrodeNetwork().to(device, memory_format=torch.channels_last)
     averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=_DECAY)
     random = np.random.default_rng([seed, 1])
@@ -72,7 +72,8 @@ def fit(
             step += 1
         report(Progress(number + 1, tuple((sums / STEPS_A_SHARD).tolist()), time.monotonic() - started))
     network.load_state_dict(averaged)
-    return network.cpu().eval()
+    network.cpu().eval()
+    return network
 
 
 def _batches(random: np.random.Generator, kept: deque[list[Prepared]]) -> Iterator[tuple[Tensor, Tensor]]:

@@ -20,7 +20,7 @@ def between(random: Generator, low: float, high: float) -> float:
 
 def scaled(random: Generator, low: float, high: float) -> float:
     """Draw uniformly in the logarithm."""
-    return low * (high / low) ** float(random.random())
+    return float(low * (high / low) ** random.random())
 
 
 def chance(random: Generator, probability: float) -> bool:
@@ -105,8 +105,7 @@ def smooth_field(random: Generator, size: int, grain_px: float) -> Image:
     """Draw a random field of standard deviation about 1 whose detail is as large as ``grain_px``, (size, size)."""
     weights = _spline(size, max(4, int(size / grain_px) + 4))
     small = random.standard_normal((weights.shape[1], weights.shape[1]), dtype=np.float32)
-    field: Image = 1.5 * (weights @ small @ weights.T)
-    return field
+    return np.asarray(1.5 * (weights @ small @ weights.T), dtype=np.float32)
 
 
 @functools.lru_cache(maxsize=256)

@@ -193,7 +193,10 @@ def _plausible(points_mm: Array) -> bool:
 
 
 def _jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
-    """Return the error source of a jump, in either direction: either view may show the true place."""
+    """Return the error source of a jump, in either direction.
+
+    Either view may show the true place.
+    """
     own, none = jump.displacement_mm[:, None], np.zeros((3, 1))
     effect = effect_px(jacobians(cameras, points_mm), *((own, none) if jump.view == "a" else (none, own)))
     return ErrorSource(effect, np.eye(1), ("breathing",))

@@ -48,7 +48,10 @@ def locate_study(
 def calibrate_and_locate(
     sites: Sequence[MatchedSite], catalogue: Catalogue, context: Context, params: UncertaintyParams, method: Method
 ) -> Triangulation:
-    """Locate every site after checking the study for moved tables, wrong spacings and a wrong gantry."""
+    """Locate every site after checks of the whole study.
+
+    The checks are for moved tables, wrong spacings and a wrong gantry.
+    """
     usable, rejected, notes = _usable_sites(sites, catalogue)
     first = [_first_look(site, catalogue, params) for site in usable]
     resting = frozenset(catalogue.names) - {catalogue.mapping}
@@ -125,7 +128,10 @@ def _first_look(
 
 
 def _same_gantry(sites: Sequence[MatchedSite]) -> list[int]:
-    """Return the indices of the most sites with the same two gantry positions: only they share the gantry's errors."""
+    """Return the indices of the most sites with the same two gantry positions.
+
+    Only such sites share the gantry's errors.
+    """
     best: list[int] = []
     for one in sites:
         alike = [
@@ -169,7 +175,10 @@ def _calibration_note(calibration: Calibration) -> str:
 
 
 def _budget(moments: Sequence[Moment]) -> ErrorBudget | None:
-    """Return the RMS of each source of error over all located electrodes; None where no electrode was located."""
+    """Return the RMS of each source of error over all located electrodes.
+
+    The result is None where no electrode was located.
+    """
     count = sum(len(moment.found.points_mm) for moment in moments)
     if not count:
         return None

@@ -106,7 +106,10 @@ def _site_jump(
 
 
 def _common_displacement(displacements_mm: Array) -> Array:
-    """Return the displacement (3,) common to k catheters (k, 3): their mean, or the least where one of them slipped."""
+    """Return the displacement (3,) common to k catheters (k, 3).
+
+    It is their mean, or the smallest where one of them slipped.
+    """
     mean = displacements_mm.mean(axis=0)
     if np.linalg.norm(displacements_mm - mean, axis=1).max() <= _SLIP_MM:
         return np.asarray(mean)

@@ -46,7 +46,7 @@ class CommandGroup(TyperGroup):
 
 def load(name: str) -> Any:
     """Import the module of a command and return the command."""
-    module = import_module(f"fluoromap_service.cli.{name.replace('-', '_')}")
+    module = import_module(f"fluoromap_service.cli.commands.{name.replace('-', '_')}")
     return typer.main.get_command(module.app)
 
 

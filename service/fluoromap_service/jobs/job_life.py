@@ -311,7 +311,7 @@ def _settle(session: Session, job: Job) -> None:
     The caller holds the lock of the job's row.
     """
     rows = _stages(session, job.id)
-    broken = [row for row in rows if row.state == StageState.FAILED and STAGES[row.name].fails == "job"]
+    broken = _broken(rows)
     if broken:
         job.error = job.error or {"subject": broken[0].name, **(broken[0].error or {})}
         lost = {name for row in broken for name in after(STAGES[row.name].name)}
@@ -329,6 +329,16 @@ def _settle(session: Session, job: Job) -> None:
             job.state = JobState.FAILED if broken else JobState.SUCCEEDED
         job.finished = session.scalar(select(db_now()))
         _report_job(session, job)
+
+
+def _broken(rows: Sequence[StageRow]) -> list[StageRow]:
+    """Return the failed stages that fail the job: without their results nothing can follow."""
+    failed = [row for row in rows if row.state == StageState.FAILED]
+    alive = {row.name for row in rows if row.state != StageState.FAILED}
+    return [
+        row for row in failed
+        if STAGES[row.name].fails == "job" or (row.name not in alive and after(STAGES[row.name].name))
+    ]  # fmt: skip
 
 
 def _stages(session: Session, job_id: str) -> Sequence[StageRow]:

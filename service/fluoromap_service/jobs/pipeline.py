@@ -34,7 +34,8 @@ class Stage:
     title : str
         What a progress bar calls it.
     fails : "job" or "subject"
-        Whether its failure fails the whole job, or only the run or site that it is about.
+        Whether its failure fails the whole job, or only the run or site that it is about. When all stages of a row fail
+        that others depend on, the job fails too.
     """
 
     name: StageName

@@ -139,15 +139,13 @@ def add(
             [("SOPInstanceUID", "already stored with other content")],
         )
     if known is None:
-        files.keep(session, path, "application/dicom", sha256=sha256)
+        files.keep(session, path, sha256=sha256)
         session.add(
             Instance(
                 sop_instance_uid=facts.sop_instance_uid,
                 sha256=sha256,
                 study_instance_uid=facts.study_instance_uid,
                 series_instance_uid=facts.series_instance_uid,
-                series_number=facts.series_number,
-                acquired=facts.acquired.isoformat() if facts.acquired else None,
                 facts=facts.to_json(),
             )
         )

@@ -202,7 +202,7 @@ def _is_empty(row: Site, runs: SiteRuns) -> bool:
     return runs.a is None and runs.b is None and all(fact is None for fact in facts)
 
 
-def one(session: Session, study: Study, name: str) -> BoundSite:
+def site_of(session: Session, study: Study, name: str) -> BoundSite:
     """Return one site of a study.
 
     Raises
@@ -216,8 +216,8 @@ def one(session: Session, study: Study, name: str) -> BoundSite:
     raise not_found("site in this study")
 
 
-def one_or_empty(session: Session, study: Study, name: str) -> BoundSite:
-    """Return one site as :func:`one` does, also when a change has just emptied it."""
+def site_or_empty(session: Session, study: Study, name: str) -> BoundSite:
+    """Return one site as :func:`site_of` does, also when a change has just emptied it."""
     row = mention(session, study.id, name)
     runs = runs_of(session, study.id)
     return _bound(row, _pairing(rows_of(session, study.id), runs).sites[name], _with_geometry(runs))

@@ -1,4 +1,4 @@
-"""What cannot be ruled out is kept and told; what contradicts the views is refused."""
+"""Pairings that cannot be ruled out are reported; sites that contradict the geometry are rejected."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ LOOK_ALIKES = {"reference", "pacing"}
 
 
 def level(study) -> None:  # type: ignore[no-untyped-def]
-    """The look-alikes at one height, side by side and moving alike: two views cannot tell which belongs to which."""
+    """The look-alikes at one height, side by side and moving alike: two views cannot distinguish them."""
     study.pacing_roams_mm = 0.0
     study.places = {"reference": np.array([20.0, -8.0, 0.0]), "pacing": np.array([6.0, -30.0, 0.0])}
     study.directions = dict.fromkeys(LOOK_ALIKES, np.array([0.1, 0.1, 1.0]))

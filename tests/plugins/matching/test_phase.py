@@ -48,7 +48,7 @@ def test_without_r_waves_the_motion_tells_cycle_and_start_of_systole(cycle_frame
     phases = rhythm.phases
     truth = (np.arange(120) / cycle_frames + 0.4) % 1.0
     assert phase_distance(phases, truth).max() < 0.12
-    # The same moment of every beat has the same phase, wherever zero lies.
+    # The same moment of every beat has the same phase; the position of zero does not matter.
     drift = np.unwrap(phases - truth, period=1.0)
     assert np.ptp(drift) < 0.06
 

@@ -1,4 +1,4 @@
-"""R waves told to the frame, of hearts that beat steadily and of others."""
+"""R waves to the nearest frame, of hearts that beat steadily and of others."""
 
 import numpy as np
 import numpy.typing as npt
@@ -49,7 +49,7 @@ def test_steady_beats_and_the_catheters_tell_r_waves_more_finely_than_frames_do(
         finer.extend(found - beats)
         lengths.append(float(np.diff(found).mean()) - cycle_ms)
     assert np.std(finer) < np.std(told)
-    # Two frames' ends tell a length to 0.41 frames; catheters that come back tell it far better.
+    # The ends of two frames give a length to 0.41 frames; returning catheters give it far better.
     assert np.std(lengths) < (0.08 if with_places else 0.5) * FRAME_MS
 
 

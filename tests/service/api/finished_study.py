@@ -35,7 +35,7 @@ from fluoromap_service.dicom import InstanceFacts, deterministic_uid, read_insta
 from fluoromap_service.jobs import job_life
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import MEDIA_TYPE, encode
+from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
 from fluoromap_service.study.catheters import StudyCatheter
@@ -94,7 +94,7 @@ class FinishedStudy:
 
     def end(self, name: str, subject: str | None, result: Any, rows: list[Base] | None = None) -> None:
         with self.claimed(name, subject) as (session, held):
-            sha256 = files.keep_bytes(session, encode(result), MEDIA_TYPE)
+            sha256 = files.keep_bytes(session, encode(result))
             stored = job_life.StoredResult(sha256, tuple(rows or ()))
             assert job_life.finish(session, held, stored, reused=False)
 
@@ -220,11 +220,11 @@ def _cine(uid: str, view: str) -> tuple[bytes, InstanceFacts]:
 def _stored_run(session: Session, uid: str, view: str) -> RunSnapshot:
     gantry = GANTRIES[view]
     content, facts = _cine(uid, view)
-    sha256 = files.keep_bytes(session, content, "application/dicom")
+    sha256 = files.keep_bytes(session, content)
     session.add(
         Instance(
             sop_instance_uid=uid, sha256=sha256, study_instance_uid=facts.study_instance_uid,
-            series_instance_uid=facts.series_instance_uid, series_number=1, acquired=None, facts=facts.to_json(),
+            series_instance_uid=facts.series_instance_uid, facts=facts.to_json(),
         )
     )  # fmt: skip
     plan = GantrySnapshot(
@@ -281,8 +281,9 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
 
 
 def followed_site(relative: bool = False) -> SiteTracks:
-    """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
-    is not seen in frame 2.
+    """Return the tracks of reference electrodes 1 and 2 and of the tip.
+
+    The reference moves by 1 mm in frame 1. Frame 3 does not show the reference, frame 2 does not show the tip.
     """
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
     half = np.array([0.0, 0.0, 2.0])

@@ -1,4 +1,4 @@
-"""One moment of the cardiac cycle in one view of a simulated study: exact and single-view positions of the sites.
+"""One moment of the cycle in one view of a simulated study: exact and single-view positions.
 
 The electrodes' pixels are the true ones with noise, so that the figures show depth alone. Names and the gantry are correct.
 Everything else is as in a study: the two runs of a site are taken one after the other, frames are matched by cardiac phase,
@@ -62,7 +62,7 @@ class SiteAtMoment:
 
 @dataclass(frozen=True, eq=False)
 class MomentInView:
-    """All located sites of a study at one moment of the cycle, from runs of one view, and the maps of both depths."""
+    """One moment in runs of one view: all located sites, and the maps of exact and single-view depth."""
 
     view: PhantomView
     sites: tuple[SiteAtMoment, ...]
@@ -85,7 +85,9 @@ def farthest_phase(study: SimulatedStudy) -> float:
 
 
 def moment_in_views(study: SimulatedStudy, phase: float, context: Context) -> dict[PhantomView, MomentInView]:
-    """Return both views at a phase of the cycle; the default solver tracks every site in one view at a time.
+    """Return both views at a phase of the cycle.
+
+    The default solver tracks every site in one view at a time.
 
     Raises
     ------

@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import Request, Response
 
 MEDIA_TYPE = "text/csv"
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def wants_csv(request: Request) -> bool:
@@ -34,8 +35,13 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(columns)
-    writer.writerows(rows)
+    writer.writerows([_plain_text(value) for value in row] for row in rows)
     return stream.getvalue()
+
+
+def _plain_text(value: Any) -> Any:
+    """Return the value of a cell that a spreadsheet shows as text and never runs as a formula (OWASP, CSV injection)."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
 
 
 def csv_response(text: str, file_name: str) -> Response:

@@ -1,10 +1,10 @@
-"""Jobs as clients see them."""
+"""Jobs in the shape of the answers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from http import HTTPStatus
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import func, select
@@ -12,29 +12,30 @@ from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http.problems import ProblemDocument
 from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
+from fluoromap_service.jobs.pipeline import StageName
 from fluoromap_service.jobs.stage_results import stages_of
 from fluoromap_service.store.models import ENDED_JOB, ENDED_STAGE, Event, Job, JobState, StageRow, StageState
 
 _FAULTS = frozenset({"plugin_failed", "worker_lost"})
-"""Codes of errors that are nobody's data's fault: status 500; all others: 422."""
+"""Codes of errors that the data do not cause: status 500. All other codes have status 422."""
 
 
 class StageAnswer(BaseModel):
-    """One stage of a job for one run, site or study."""
+    """One stage of a job, for one run, one site or the study."""
 
-    name: Literal["segment", "match", "triangulate", "monoplane", "fuse"]
-    subject: str = Field(description="SOPInstanceUID, site or study that the stage is about.")
+    name: StageName
+    subject: str = Field(description="SOP Instance UID, site or study of the stage.")
     plugin: str
     version: str
     state: StageState
-    attempt: int = Field(description="How often it was begun; more than 1 after a worker died.")
+    attempt: int = Field(description="Number of times that the stage began; more than 1 after a worker died.")
     progress: float = Field(ge=0, le=1)
-    reused: bool = Field(description="The result of the same work in an earlier job was taken.")
+    reused: bool = Field(description="Whether the result comes from an earlier job with the same inputs.")
     error: ProblemDocument | None
 
 
 class Links(BaseModel):
-    """Where the results are, each as soon as its stage is done."""
+    """Addresses of the results; each is available as soon as its stage is done."""
 
     points: str
     tracks: str
@@ -85,6 +86,7 @@ class JobAnswer(BaseModel):
 
 
 def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
+    """Return a job with its stages in the shape of the answer."""
     root = f"/v1/jobs/{job.id}"
     return JobAnswer(
         id=job.id,
@@ -107,11 +109,12 @@ def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
 
 
 def read_job(session: Session, job: Job) -> JobAnswer:
+    """Return the answer of one job."""
     return job_answer(job, stages_of(session, job.id))
 
 
 def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
-    """The answers of several jobs by their ids, with one query for all stages."""
+    """Return the answers of several jobs by their ids, with one query for all stages."""
     ids = [job.id for job in jobs]
     stages: dict[str, list[StageRow]] = {job_id: [] for job_id in ids}
     for row in session.scalars(select(StageRow).where(StageRow.job_id.in_(ids)).order_by(StageRow.id)):
@@ -120,7 +123,7 @@ def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
 
 
 def etag_of(session: Session, job: Job) -> str:
-    """Changes with every claim, beat that tells progress, end and request to cancel."""
+    """Return an entity tag that changes with every event and every change of the job."""
     last = session.scalar(select(func.max(Event.id)).where(Event.job_id == job.id))
     return f'"{job.id}-{job.version}-{last or 0}"'
 
@@ -149,7 +152,7 @@ def _stage(row: StageRow) -> StageAnswer:
 
 
 def _problem(error: dict[str, Any] | None) -> ProblemDocument | None:
-    """What a stage stored of its failure as a problem document."""
+    """Return the stored error of a stage or job as a problem document."""
     if error is None:
         return None
     code = str(error.get("code", "plugin_failed"))

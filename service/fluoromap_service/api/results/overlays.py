@@ -23,7 +23,7 @@ from fluoromap_service.results.finished import job_of
 from fluoromap_service.results.fusion import Fusion, LocatedView, draw_fusion, fusion_of, located_views
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.renderings import Rendered, rendered
+from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
 router = APIRouter(tags=["results"])
 
@@ -59,7 +59,7 @@ class Overlays(BaseModel):
     overlays: list[Overlay]
 
 
-def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> Rendered:
+def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> KeptFile:
     """Return the kept PNG of an overlay, or the GIF of its propagation; draw it when there is none."""
 
     def make() -> bytes:
@@ -69,8 +69,7 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
             raise Problem(409, "run_deleted", detail)
         return run_in_pool(Task.DRAW_PICTURE, draw_fusion, path, fusion, look, moving)
 
-    depends_on = overlay_dependencies(fusion, look, moving=moving)
-    return rendered(job_id, depends_on, "image/gif" if moving else "image/png", make)
+    return kept_rendering(job_id, overlay_dependencies(fusion, look, moving=moving), make)
 
 
 @router.get(

@@ -14,7 +14,7 @@ from fluoromap_service.results.dependencies import report_dependencies
 from fluoromap_service.results.finished import job_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import ENDED_JOB, Study
-from fluoromap_service.store.renderings import rendered
+from fluoromap_service.store.renderings import kept_rendering
 
 router = APIRouter(tags=["results"])
 
@@ -42,5 +42,5 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
             raise Problem(409, "not_ready", detail)
         study = session.get(Study, job.study_id)
         depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None)
-    page = rendered(job_id, depends_on, "text/html", lambda: report_page(job_id).encode())
+    page = kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
     return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)

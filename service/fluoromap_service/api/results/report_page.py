@@ -99,7 +99,7 @@ def _values(job_id: str) -> dict[str, Any]:
             "calibration": calibration_line(triangulation.calibration) if triangulation else None,
             "notes": triangulation.notes if triangulation else (),
             "plugins": [
-                (stage, getattr(snapshot, stage)) for stage in ("segmenter", "triangulator", "monoplane", "fuser")
+                (kind, getattr(snapshot, kind)) for kind in ("segmenter", "triangulator", "monoplane", "fuser")
             ],
             "catheters": snapshot.catheters,
             "runs": sorted(snapshot.runs.items()),

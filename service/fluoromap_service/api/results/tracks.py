@@ -98,7 +98,7 @@ class Tracks(BaseModel):
                     "rejected": [
                         {
                             "site": "S07", "view": "b", "reasons": ["no_a_priori"],
-                            "message": "No biplane position is known here; a single view alone cannot tell depth.",
+                            "message": "This site has no biplane position, and a single view does not show depth.",
                         }
                     ],
                 }

@@ -78,14 +78,14 @@ def test_waiting_ends_when_the_state_changes(
     client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked = threading.Event()
-    look = job_routes._look
+    look = job_routes._state
 
     def noticed(job_id: str) -> tuple[str, str]:
         seen = look(job_id)
         looked.set()
         return seen
 
-    monkeypatch.setattr(job_routes, "_look", noticed)
+    monkeypatch.setattr(job_routes, "_state", noticed)
     answers: list[dict[str, Any]] = []
     waiting = threading.Thread(target=lambda: answers.append(client.get(f"{_path(study)}?wait=60").json()))
     waiting.start()

@@ -104,6 +104,10 @@ def test_meshes_are_read_by_others(
     assert answer.headers["content-disposition"] == f'attachment; filename="chamber-{origin}.{file_type}"'
     mesh = trimesh.load(io.BytesIO(answer.content), file_type=file_type, force="mesh")
     assert mesh.is_watertight
+    if file_type == "glb":
+        # glTF: metres, +Y up (head), +Z forward (front).
+        left, head, front = 1e3 * mesh.vertices.T
+        mesh.vertices = np.stack([left, -front, head], axis=1)
     np.testing.assert_allclose(mesh.bounds, [shift - 10, shift + 10], atol=1e-5)
     assert mesh.volume == pytest.approx(4 / 3 * 10**3, rel=1e-5)
 

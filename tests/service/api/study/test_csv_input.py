@@ -79,8 +79,8 @@ def test_every_mistake_is_told_at_once() -> None:
         "row 3, column site",
         "row 3, column lat_ms",
     ]
-    assert caught.value.detail.startswith("The table has 3 mistakes;")
-    with pytest.raises(Problem, match="has 1 mistake;"):
+    assert caught.value.detail.startswith("The table has 3 mistakes,")
+    with pytest.raises(Problem, match="has 1 mistake,"):
         activation_times("site,lat_ms\nA,x\n")
 
 

@@ -172,7 +172,7 @@ def test_a_binding_that_cannot_be(service: TestClient, study_path: str, upload: 
 
 def _reasons(study_path: str, site: str) -> tuple[Reason, ...]:
     with reading() as session:
-        return sites.one(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
+        return sites.site_of(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
 
 
 def test_what_makes_a_site_unusable(service: TestClient, study_path: str, upload: Upload, tmp_path: Path) -> None:
