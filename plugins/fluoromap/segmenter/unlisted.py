@@ -46,7 +46,7 @@ def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_p
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    """Return whether three or more points go on in the chain's line beyond one of its ends, no farther apart than its electrodes are.
+    """Return whether three or more points go on in the chain's line beyond one end, no farther apart than its electrodes.
 
     Parameters
     ----------
