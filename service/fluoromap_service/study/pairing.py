@@ -1,8 +1,13 @@
 """The rules that join two runs to a mapping site, as pure functions on plain values.
 
-The rules apply in this order: runs set by PUT or PATCH, runs that the activation-time table names, the site given at upload,
-the row order of the table. Runs without any of these are paired when they follow each other in acquisition time and their
-views are 30 degrees or more apart.
+The rules apply in this order:
+
+1. Runs that a PUT or PATCH gave to a site.
+2. Runs that the activation-time table names.
+3. Runs whose upload named a site.
+4. The other runs form pairs in order of acquisition time: two runs are a pair when they follow each other and their views are
+   30 degrees or more apart. When the table has as many rows without runs as there are such pairs, the rows name the pairs in
+   order. Otherwise the service names the pairs.
 """
 
 from __future__ import annotations
@@ -13,12 +18,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from fluoromap.geometry import view_axes
+from fluoromap.geometry import direction_angle_deg, view_axes
 
 PAIRING_ANGLE_DEG = 30.0
 """Smallest angle between the views of two runs that acquisition time pairs."""
-PARALLEL_ANGLE_DEG = 20.0
-"""Smallest angle between the views of a usable site."""
 ROUNDING_DEG = 1e-6
 """Tolerance of the comparison of angles, so that 30 degrees count as 30 degrees."""
 TABLE_STILL_MM = 1.0
@@ -284,16 +287,15 @@ def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
     return x, y, z
 
 
-def ray_angle_deg(first: Run, second: Run) -> float | None:
+def view_angle_deg(first: Run, second: Run) -> float | None:
     """Return the angle between two runs' central rays, folded to 0..90 degrees; None while angles are missing."""
     if first.direction is None or second.direction is None:
         return None
-    cosine = abs(sum(a * b for a, b in zip(first.direction, second.direction, strict=True)))
-    return math.degrees(math.acos(min(cosine, 1.0)))
+    return direction_angle_deg(first.direction, second.direction)
 
 
 def _apart(first: Run, second: Run) -> bool:
-    angle = ray_angle_deg(first, second)
+    angle = view_angle_deg(first, second)
     return angle is not None and angle >= PAIRING_ANGLE_DEG - ROUNDING_DEG
 
 

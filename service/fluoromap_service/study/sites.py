@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.models import Job, Site, Study
 from fluoromap_service.study import pairing
 from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
-from fluoromap_service.study.pairing import PARALLEL_ANGLE_DEG, ROUNDING_DEG, Pairing, SiteRuns
+from fluoromap_service.study.pairing import Pairing, SiteRuns
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +98,9 @@ def resolve(session: Session, study: Study) -> list[BoundSite]:
 def settle(session: Session, study: Study) -> None:
     """Pair runs by acquisition time and name the pairs.
 
-    Call it in every transaction that changes the study's runs. The first pairing of a run gives a name, which stays with this
-    run. The other run of the pair may still change while runs arrive out of order. The pair is final when the site has an
-    activation time, or when the study has a job.
+    Call it in every transaction that changes the study's runs. A new pair gets the next free name (S01, S02, ...). Runs may
+    arrive out of order, so a later call may pair a run with another one: the site keeps its name as long as one run of its
+    pair stays. The pair is final when the site has an activation time or a row of the table, or when the study has a job.
     """
     rows, runs = rows_of(session, study.id), runs_of(session, study.id)
     has_job = session.scalar(select(Job.id).where(Job.study_id == study.id).limit(1)) is not None
@@ -177,10 +178,10 @@ def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
     unusable: Reason | None = None
     angle: float | None = None
     if runs.a is not None and runs.b is not None:
-        angle = pairing.ray_angle_deg(runs.a, runs.b)
+        angle = pairing.view_angle_deg(runs.a, runs.b)
         if pairing.table_moved(runs.a, runs.b):
             unusable = Reason.TABLE_MOVED
-        elif angle is not None and angle < PARALLEL_ANGLE_DEG - ROUNDING_DEG:
+        elif angle is not None and angle < PARALLEL_BELOW_DEG:
             unusable = Reason.VIEWS_PARALLEL
     return BoundSite(
         site=row.name,

@@ -16,8 +16,8 @@ from fluoromap_service.study.pairing import (
     named_run,
     pair_runs,
     pairs_by_time,
-    ray_angle_deg,
     table_moved,
+    view_angle_deg,
 )
 
 START = datetime(2026, 3, 1, 9, 30, tzinfo=UTC)
@@ -62,7 +62,7 @@ def test_most_pairs_win_then_the_shortest_time_within_pairs_then_the_earliest() 
 def test_runs_without_time_or_angles_stay_alone() -> None:
     assert pairs_by_time([run(1, LAT, None), run(2, PA)]) == []
     assert pairs_by_time([run(1, None), run(2, PA)]) == []
-    assert ray_angle_deg(run(1, None), run(2, PA)) is None
+    assert view_angle_deg(run(1, None), run(2, PA)) is None
 
 
 def test_a_table_that_moved_prevents_pairing_by_time() -> None:
