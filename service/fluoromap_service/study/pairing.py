@@ -196,7 +196,10 @@ class _Draft:
             slots.put(view, self.free.pop(run.uid), by)
 
     def take_members(self, by: Rule) -> None:
-        """Fill the free views of each site with the runs put there, in order of arrival; a third run stays free."""
+        """Fill the free views of each site with its own runs.
+
+        The runs come in order of arrival; a third run stays free.
+        """
         for name, slots in self.slots.items():
             members = [run for run in self._runs if run.uid in self.free and run.site == name and run.site_by == by]
             while members and len(slots.runs) < 2:
@@ -208,7 +211,10 @@ class _Draft:
                 slots.put(view, self.free.pop(chosen.uid), by)
 
     def take_earlier_pairs(self) -> list[tuple[Site, Pair]]:
-        """Take the pairs that acquisition time joined before, where both runs and the site are still free."""
+        """Take the pairs that acquisition time joined before.
+
+        Both runs and the site must still be free.
+        """
         earlier: list[tuple[Site, Pair]] = []
         for site in self._sites:
             first, second = self.free.get(site.paired_a or ""), self.free.get(site.paired_b or "")
@@ -217,7 +223,10 @@ class _Draft:
         return earlier
 
     def rows_without_runs(self, paired: Sequence[Site]) -> list[Site]:
-        """Return the table's sites that have no run, name no run and have no earlier pair, in row order."""
+        """Return the table's sites without runs, in row order.
+
+        They have no run, name no run and have no earlier pair.
+        """
         rows = [
             site
             for site in self._sites
@@ -231,7 +240,10 @@ class _Draft:
 
 
 def named_run(text: str, runs: Sequence[Run]) -> Run | None:
-    """Return the run that a table names by SOP Instance UID, series number or file name; None unless it is just one."""
+    """Return the run that a table names.
+
+    The name is a SOP Instance UID, a series number or a file name. None unless it fits just one run.
+    """
     text = text.strip()
     tests: tuple[Callable[[Run], bool], ...] = (
         lambda run: run.uid == text,
@@ -251,10 +263,11 @@ def _base_name(path: str) -> str:
 
 
 def pairs_by_time(runs: Sequence[Run]) -> list[Pair]:
-    """Pair runs next in acquisition time, 30 degrees or more apart and with the table at rest.
+    """Pair runs that follow each other in acquisition time.
 
-    A run that repeats a direction stays alone. Of all ways to pair neighbours, the one with most pairs wins; then the one
-    with the least time between the runs of a pair; then the earliest.
+    Their views are 30 degrees or more apart, and the table is at rest. A run that repeats a direction stays alone. Of
+    all ways to pair neighbours, the one with most pairs wins; then the one with the least time between the runs of a
+    pair; then the earliest.
     """
     timed = sorted((run for run in runs if run.acquired is not None), key=_moment)
     Best = tuple[int, float, list[Pair]]
@@ -288,7 +301,10 @@ def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
 
 
 def view_angle_deg(first: Run, second: Run) -> float | None:
-    """Return the angle between two runs' central rays, folded to 0..90 degrees; None while angles are missing."""
+    """Return the angle between two runs' central rays, 0..90 degrees.
+
+    None while angles are missing.
+    """
     if first.direction is None or second.direction is None:
         return None
     return direction_angle_deg(first.direction, second.direction)
@@ -307,5 +323,8 @@ def table_moved(first: Run, second: Run) -> bool:
 
 
 def _lateral_share(run: Run) -> float:
-    """Return 1 for a lateral view, 0 for a frontal one, -1 where angles are missing."""
+    """Return 1 for a lateral view, 0 for a frontal one.
+
+    -1 where angles are missing.
+    """
     return -1.0 if run.direction is None else abs(run.direction[0])

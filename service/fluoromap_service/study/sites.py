@@ -198,7 +198,10 @@ def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
 
 
 def _is_empty(row: Site, runs: SiteRuns) -> bool:
-    """Return whether a site has neither runs nor facts: another site took over the pair that gave it its name."""
+    """Return whether a site has neither runs nor facts.
+
+    Another site took over the pair that gave it its name.
+    """
     facts = (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b)
     return runs.a is None and runs.b is None and all(fact is None for fact in facts)
 
@@ -218,7 +221,10 @@ def site_of(session: Session, study: Study, name: str) -> BoundSite:
 
 
 def site_or_empty(session: Session, study: Study, name: str) -> BoundSite:
-    """Return one site as :func:`site_of` does, also when a change has just emptied it."""
+    """Return one site as :func:`site_of` does.
+
+    It works also when a change has just emptied the site.
+    """
     row = mention(session, study.id, name)
     runs = runs_of(session, study.id)
     return _bound(row, _pairing(rows_of(session, study.id), runs).sites[name], _with_geometry(runs))
@@ -280,14 +286,19 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
 
 
 def _has_its_runs(entry: ActivationTime, site: BoundSite) -> bool:
-    """Return whether a row of the table has the runs that it names, or any run when it names none."""
+    """Return whether a row of the table has the runs it names.
+
+    A row that names none needs any run.
+    """
     if entry.view_a is None and entry.view_b is None:
         return site.view_a is not None or site.view_b is not None
     return (entry.view_a is None or site.view_a is not None) and (entry.view_b is None or site.view_b is not None)
 
 
 def put_views(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
-    """Bind runs to a site by hand; a run leaves the site that it was in.
+    """Bind runs to a site by hand.
+
+    A run leaves the site that it was in.
 
     Parameters
     ----------
@@ -321,7 +332,10 @@ def put_views(session: Session, study: Study, name: str, views: dict[str, str | 
 
 
 def move_run(session: Session, study: Study, run: StudyRun, site: str | None) -> None:
-    """Put a run into a site by hand; None takes it out of every site, and the rules apply again."""
+    """Put a run into a site by hand.
+
+    None takes it out of every site, and the rules apply again.
+    """
     for row in rows_of(session, study.id):
         row.explicit_a = None if row.explicit_a == run.uid else row.explicit_a
         row.explicit_b = None if row.explicit_b == run.uid else row.explicit_b

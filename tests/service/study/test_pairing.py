@@ -25,7 +25,10 @@ LAT, PA = -90.0, 0.0
 
 
 def run(number: int, primary_deg: float | None, seconds: float | None = -1.0, **facts: Any) -> Run:
-    """Run ``number``; it begins 20 s after the run before unless ``seconds`` says otherwise, None: unknown."""
+    """Return run ``number``.
+
+    It begins 20 s after the run before unless ``seconds`` says otherwise. None: unknown.
+    """
     moment = None if seconds is None else START + timedelta(seconds=20.0 * number if seconds < 0 else seconds)
     direction = None if primary_deg is None else central_ray(primary_deg, 0.0)
     return Run(f"1.2.{number}", number, direction, moment, **facts)

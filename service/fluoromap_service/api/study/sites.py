@@ -78,10 +78,10 @@ def get_site(study_id: StudyId, site: SiteName, caller: Reader) -> SiteOut:
 
 @router.put("/{site}", responses=responses(400, 401, 403, 404, 422))
 def put_site(study_id: StudyId, site: SiteName, body: SitePut, caller: Writer) -> SiteOut:
-    """Set a site's activation time or its runs; these values come before every other rule.
+    """Set a site's activation time or its runs.
 
-    A job computes a pair between 20 and 30 degrees, and its covariance shows the uncertainty. A job rejects a pair under 20
-    degrees.
+    These values come before every other rule. A job computes a pair between 20 and 30 degrees, and its covariance shows
+    the uncertainty. A job rejects a pair under 20 degrees.
     """
     with writing() as session:
         study = studies.lock(session, study_id)
