@@ -32,7 +32,10 @@ class FinishedMap:
     warnings: tuple[Reason, ...]
 
     def shift_mm(self, origin: Origin) -> Array:
-        """Return the vector (3,) to add to the map's coordinates so that they count from ``origin``."""
+        """Return the vector (3,) to add to the map's coordinates.
+
+        The sums count from ``origin``.
+        """
         if origin is Origin.REFERENCE or self.reference_mm is None:
             return np.zeros(3)
         return self.reference_mm

@@ -122,7 +122,9 @@ def add(
     file_name: str | None,
     site: str | None,
 ) -> bool:
-    """Store an incoming file and refer to it from the study; return False when both exist already.
+    """Store an incoming file and refer to it from the study.
+
+    Return False when both exist already.
 
     Raises
     ------
@@ -174,7 +176,9 @@ def add(
 
 
 def remove(session: Session, study_id: str, uid: str) -> list[str]:
-    """Take a run out of a study; delete the instance when no other study refers to it.
+    """Take a run out of a study.
+
+    The instance is deleted when no other study refers to it.
 
     Returns
     -------

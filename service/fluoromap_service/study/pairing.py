@@ -18,12 +18,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from fluoromap.geometry import view_axes
+from fluoromap.geometry import direction_angle_deg, view_axes
 
 PAIRING_ANGLE_DEG = 30.0
 """Smallest angle between the views of two runs that acquisition time pairs."""
-PARALLEL_ANGLE_DEG = 20.0
-"""Smallest angle between the views of a usable site."""
 ROUNDING_DEG = 1e-6
 """Tolerance of the comparison of angles, so that 30 degrees count as 30 degrees."""
 TABLE_STILL_MM = 1.0
@@ -195,7 +193,10 @@ class _Draft:
             slots.put(view, self.free.pop(run.uid), by)
 
     def take_members(self, by: Rule) -> None:
-        """Fill the free views of each site with the runs put there, in order of arrival; a third run stays free."""
+        """Fill the free views of each site with its own runs.
+
+        The runs come in order of arrival; a third run stays free.
+        """
         for name, slots in self.slots.items():
             members = [run for run in self._runs if run.uid in self.free and run.site == name and run.site_by == by]
             while members and len(slots.runs) < 2:
@@ -227,7 +228,10 @@ class _Draft:
 
 
 def named_run(text: str, runs: Sequence[Run]) -> Run | None:
-    """Return the run that a table names by SOP Instance UID, series number or file name; None unless it is just one."""
+    """Return the run that a table names.
+
+    The name is a SOP Instance UID, a series number or a file name. None unless it fits just one run.
+    """
     text = text.strip()
     tests: tuple[Callable[[Run], bool], ...] = (
         lambda run: run.uid == text,
@@ -247,10 +251,11 @@ def _base_name(path: str) -> str:
 
 
 def pairs_by_time(runs: Sequence[Run]) -> list[Pair]:
-    """Pair runs next in acquisition time, 30 degrees or more apart and with the table at rest.
+    """Pair runs that follow each other in acquisition time.
 
-    A run that repeats a direction stays alone. Of all ways to pair neighbours, the one with most pairs wins; then the one
-    with the least time between the runs of a pair; then the earliest.
+    Their views are 30 degrees or more apart, and the table is at rest. A run that repeats a direction stays alone. Of
+    all ways to pair neighbours, the one with most pairs wins; then the one with the least time between the runs of a
+    pair; then the earliest.
     """
     timed = sorted((run for run in runs if run.acquired is not None), key=_moment)
     Best = tuple[int, float, list[Pair]]
@@ -283,16 +288,18 @@ def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
     return x, y, z
 
 
-def ray_angle_deg(first: Run, second: Run) -> float | None:
-    """Return the angle between two runs' central rays, folded to 0..90 degrees; None while angles are missing."""
+def view_angle_deg(first: Run, second: Run) -> float | None:
+    """Return the angle between two runs' central rays, 0..90 degrees.
+
+    None while angles are missing.
+    """
     if first.direction is None or second.direction is None:
         return None
-    cosine = abs(sum(a * b for a, b in zip(first.direction, second.direction, strict=True)))
-    return math.degrees(math.acos(min(cosine, 1.0)))
+    return direction_angle_deg(first.direction, second.direction)
 
 
 def _apart(first: Run, second: Run) -> bool:
-    angle = ray_angle_deg(first, second)
+    angle = view_angle_deg(first, second)
     return angle is not None and angle >= PAIRING_ANGLE_DEG - ROUNDING_DEG
 
 
@@ -310,5 +317,8 @@ def lateral_first(first: Run, second: Run) -> Pair:
 
 
 def _lateral_share(run: Run) -> float:
-    """Return 1 for a lateral view, 0 for a frontal one, -1 where angles are missing."""
+    """Return 1 for a lateral view, 0 for a frontal one.
+
+    -1 where angles are missing.
+    """
     return -1.0 if run.direction is None else abs(run.direction[0])

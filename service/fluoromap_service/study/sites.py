@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.models import Site, Study
 from fluoromap_service.study import pairing
 from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
-from fluoromap_service.study.pairing import PARALLEL_ANGLE_DEG, ROUNDING_DEG, Pairing, SiteRuns
+from fluoromap_service.study.pairing import Pairing, SiteRuns
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,10 +208,10 @@ def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
     """Return why a job cannot use a pair of runs, and the angle between their rays."""
     if runs.a is None or runs.b is None:
         return None, None
-    angle_deg = pairing.ray_angle_deg(runs.a, runs.b)
+    angle_deg = pairing.view_angle_deg(runs.a, runs.b)
     if pairing.table_moved(runs.a, runs.b):
         return Reason.TABLE_MOVED, angle_deg
-    if angle_deg is not None and angle_deg < PARALLEL_ANGLE_DEG - ROUNDING_DEG:
+    if angle_deg is not None and angle_deg < PARALLEL_BELOW_DEG:
         return Reason.VIEWS_PARALLEL, angle_deg
     return None, angle_deg
 
@@ -285,7 +286,10 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
 
 
 def _has_its_runs(entry: ActivationTime, site: BoundSite) -> bool:
-    """Return whether a row of the table has the runs that it names, or any run when it names none."""
+    """Return whether a row of the table has the runs it names.
+
+    A row that names none needs any run.
+    """
     if entry.view_a is None and entry.view_b is None:
         return site.view_a is not None or site.view_b is not None
     return (entry.view_a is None or site.view_a is not None) and (entry.view_b is None or site.view_b is not None)
@@ -310,7 +314,9 @@ def confirm_order(session: Session, study: Study, name: str, views: dict[str, st
 
 
 def put_views(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
-    """Bind runs to a site by hand; a run leaves the site that it was in.
+    """Bind runs to a site by hand.
+
+    A run leaves the site that it was in.
 
     Parameters
     ----------
@@ -344,7 +350,10 @@ def put_views(session: Session, study: Study, name: str, views: dict[str, str | 
 
 
 def move_run(session: Session, study: Study, run: StudyRun, site: str | None) -> None:
-    """Put a run into a site by hand; None takes it out of every site, and the rules apply again."""
+    """Put a run into a site by hand.
+
+    None takes it out of every site, and the rules apply again.
+    """
     for row in rows_of(session, study.id):
         row.explicit_a = None if row.explicit_a == run.uid else row.explicit_a
         row.explicit_b = None if row.explicit_b == run.uid else row.explicit_b

@@ -18,8 +18,8 @@ from fluoromap_service.study.pairing import (
     named_run,
     pair_runs,
     pairs_by_time,
-    ray_angle_deg,
     table_moved,
+    view_angle_deg,
 )
 
 START = datetime(2026, 3, 1, 9, 30, tzinfo=UTC)
@@ -27,7 +27,10 @@ LAT, PA = -90.0, 0.0
 
 
 def run(number: int, primary_deg: float | None, seconds: float | None = -1.0, **facts: Any) -> Run:
-    """Run ``number``; it begins 20 s after the run before unless ``seconds`` says otherwise, None: unknown."""
+    """Return run ``number``.
+
+    It begins 20 s after the run before unless ``seconds`` says otherwise. None: unknown.
+    """
     moment = None if seconds is None else START + timedelta(seconds=20.0 * number if seconds < 0 else seconds)
     direction = None if primary_deg is None else central_ray(primary_deg, 0.0)
     return Run(f"1.2.{number}", number, direction, moment, **facts)
@@ -64,7 +67,7 @@ def test_most_pairs_win_then_the_shortest_time_within_pairs_then_the_earliest() 
 def test_runs_without_time_or_angles_stay_alone() -> None:
     assert pairs_by_time([run(1, LAT, None), run(2, PA)]) == []
     assert pairs_by_time([run(1, None), run(2, PA)]) == []
-    assert ray_angle_deg(run(1, None), run(2, PA)) is None
+    assert view_angle_deg(run(1, None), run(2, PA)) is None
 
 
 def test_a_table_that_moved_prevents_pairing_by_time() -> None:

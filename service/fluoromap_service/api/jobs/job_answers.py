@@ -118,7 +118,10 @@ def read_job(session: Session, job: Job) -> JobAnswer:
 
 
 def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
-    """Return the answers of several jobs by their ids, with one query for all stages."""
+    """Return the answers of several jobs by their ids.
+
+    One query reads all stages.
+    """
     ids = [job.id for job in jobs]
     stages: dict[str, list[StageRow]] = {job_id: [] for job_id in ids}
     for row in session.scalars(select(StageRow).where(StageRow.job_id.in_(ids)).order_by(StageRow.id)):
@@ -127,7 +130,10 @@ def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
 
 
 def etag_of(session: Session, job: Job) -> str:
-    """Return an entity tag that changes with every event and every change of the job."""
+    """Return the job's entity tag.
+
+    It changes with every event and every change of the job.
+    """
     last = session.scalar(select(func.max(Event.id)).where(Event.job_id == job.id))
     return f'"{job.id}-{job.version}-{last or 0}-{len(warnings_of(session, job))}"'
 

@@ -31,10 +31,10 @@ router = APIRouter(tags=["results"])
     },
 )
 def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
-    """Return the report of a job as one HTML file without links to other files; 409 until the job has ended.
+    """Return the report of a job as one HTML file.
 
-    The page contains pictures, a 3D view, tables with grades and reasons, the error budget, parameters, versions and the
-    hashes of the input files.
+    The file has no links to other files. The answer is 409 until the job has ended. The page contains pictures, a 3D
+    view, tables with grades and reasons, the error budget, parameters, versions and the hashes of the input files.
     """
     with reading() as session:
         job = job_of(session, job_id)

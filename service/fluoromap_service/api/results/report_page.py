@@ -171,7 +171,10 @@ def _inline(content: bytes, media_type: str) -> str:
 
 
 def _json(value: Any) -> Markup:
-    """Return JSON for a script element, which would end at the first "</" even inside a text."""
+    """Return JSON for a script element.
+
+    The element would end at the first "</" even inside a text.
+    """
     return Markup(json.dumps(value, separators=(",", ":")).replace("<", "\\u003c"))
 
 

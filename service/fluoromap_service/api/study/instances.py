@@ -157,7 +157,10 @@ async def upload_instances(
     caller: Writer,
     site: Annotated[str | None, Query(description=SITE, examples=["S03"])] = None,
 ) -> Response:
-    """Send X-ray runs, one or many; a problem of one file does not affect the others."""
+    """Send X-ray runs, one or many.
+
+    A problem of one file does not affect the others.
+    """
     await run_in_threadpool(_check_study, study_id)
     with ExitStack() as stack:
         parts, site_field = await receive(request, stack)

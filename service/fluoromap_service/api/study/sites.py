@@ -84,7 +84,7 @@ def get_site(study_id: StudyId, site: SiteName, caller: Reader) -> SiteOut:
 
 @router.put("/{site}", responses=responses(400, 401, 403, 404, 422))
 def put_site(study_id: StudyId, site: SiteName, body: SitePut, caller: Writer) -> SiteOut:
-    """Set a site's activation time or its runs; these values come before every other rule.
+    """Set a site's activation time or its runs.
 
     A site whose runs are a guess by row order (`paired_by_order`) keeps them, and the request confirms the guess for this
     site, unless the request names other runs.

@@ -144,7 +144,7 @@ def test_jobs_are_listed_newest_first_a_page_at_a_time(client: TestClient, study
 
 @pytest.fixture
 def published(monkeypatch: pytest.MonkeyPatch, study: FinishedStudy) -> list[int]:
-    """Starts jobs on the finished study's own snapshot; notes how many jobs stood committed at each announcement."""
+    """Starts jobs on the finished study's own snapshot; counts the committed jobs at each announcement."""
     counts: list[int] = []
 
     def announce() -> int:

@@ -121,7 +121,7 @@ def test_a_smooth_plateau_is_not_saturation(service: TestClient, study_path: str
     assert answer.json()["lat_ms"] == pytest.approx(41.3, abs=0.2)
 
 
-def test_an_unknown_study_is_told_before_its_table_is_read(service: TestClient) -> None:
+def test_an_unknown_study_is_reported_before_its_table_is_read(service: TestClient) -> None:
     answer = service.put("/v1/studies/nope/electrograms/x", content="?", headers={"Content-Type": "text/csv"})
     assert answer.status_code == 404
 

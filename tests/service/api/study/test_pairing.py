@@ -254,7 +254,7 @@ def test_a_pair_between_20_and_30_degrees_is_computed(service: TestClient, study
     assert _reasons(study_path, "X") == ()
 
 
-def test_a_table_that_moved_is_not_paired_and_refused_when_told(
+def test_a_table_that_moved_is_not_paired_and_refused_when_named(
     service: TestClient, study_path: str, upload: Upload, tmp_path: Path, site_list: Any
 ) -> None:
     upload((1, LAT))

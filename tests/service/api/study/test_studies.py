@@ -65,7 +65,7 @@ def test_studies_that_cannot_be(service: TestClient, body: dict[str, Any], where
     assert service.get("/v1/studies").json() == {"items": [], "next": None}
 
 
-def test_a_mistake_is_told_in_plain_words(service: TestClient) -> None:
+def test_a_mistake_is_explained_in_plain_words(service: TestClient) -> None:
     catheter = {"name": "mapping", "electrodes": 4, "spacing_mm": [4.65, 6.3], "tip_mm": 4, "ring_mm": 1.3}
     answer = service.post("/v1/studies", json={"label": "one spacing short", "catheters": [catheter]})
     assert answer.status_code == 422
