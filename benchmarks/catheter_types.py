@@ -67,7 +67,10 @@ def main() -> None:
 
 
 def _scene(random: np.random.Generator, catheters: tuple[Catheter, ...], missing: int | None) -> LabelledRun:
-    """Make a run of one scene with all catheters, and a catalogue without the ``missing`` one, whose electrodes have no labels."""
+    """Make a run of one scene with all catheters, and a catalogue.
+
+    The catalogue lacks the ``missing`` catheter, whose electrodes have no labels.
+    """
     px_per_mm = float(random.uniform(3.0, 4.4))
     canvas = Canvas.empty(SIZE_PX)
     draw_distractors(random, canvas, px_per_mm)

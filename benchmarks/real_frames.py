@@ -69,7 +69,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--catheter", action="append", default=[], metavar="NAME=TYPE", help=", ".join(CATHETER_TYPES))
     parser.add_argument("--frames", type=int, default=1000, help="at most so many of each run")
     parser.add_argument("--single", action="store_true", help="every frame on its own, as stills are")
-    parser.add_argument("--draw", type=Path, metavar="FOLDER", help="draw what was found, crosses for labels")
+    parser.add_argument("--draw", type=Path, metavar="FOLDER", help="draw the chains, with crosses for labels")
     return parser.parse_args()
 
 
@@ -157,7 +157,7 @@ def _segment(segmenter: Segmenter, one: LabelledRun, single: bool) -> list[Frame
 
 
 def score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDArray[np.int64]:
-    """Found, missed, false, named and numbered electrodes of one frame."""
+    """Count found, missed, false, named and numbered electrodes of one frame."""
     there = [(name, number, uv) for name, electrodes in labels.items() for number, uv in electrodes.items()]
     seen = [
         (max(chain.kinds, key=lambda kind: kind[1])[0], number, uv)

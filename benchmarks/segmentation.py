@@ -169,7 +169,10 @@ def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
 
 
 def _displayed(seed: int, frames: int) -> dict[float, StudySpec]:
-    """Return the studies whose runs are shown as 8 bit JPEG, by the width of the field on the detector, mm."""
+    """Return the studies whose runs are shown as 8 bit JPEG.
+
+    The key is the width of the field on the detector, mm.
+    """
     return {
         width_mm: StudySpec(
             seed,
@@ -191,7 +194,10 @@ def _gantries(width_mm: float) -> tuple[Gantry, Gantry]:
 
 
 def _as_jpeg(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Return a frame as a lab displays and stores it: logarithm, sharpened, 8 bit, JPEG of quality 85."""
+    """Return a frame as a lab displays and stores it.
+
+    The steps are logarithm, sharpening, 8 bit and JPEG of quality 85.
+    """
     level = np.log(frame.astype(np.float64) + 1.0)
     level += 0.8 * (level - gaussian_filter(level, 3.0))
     low, high = np.percentile(level, [0.5, 99.5])

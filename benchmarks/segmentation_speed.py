@@ -183,7 +183,10 @@ def decoding() -> None:
 
 
 def starting() -> None:
-    """Print the start time of a worker process; the modules' byte code exists, as after any first start."""
+    """Print the start time of a worker process.
+
+    The modules' byte code exists, as after any first start.
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
         environment["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "code")
@@ -252,7 +255,7 @@ def _twins() -> Any:
 
 
 def _peer(name: str) -> Any:
-    """Return a peer's module, limited to one thread; None where it is not installed."""
+    """Return a peer's module with one thread; None if not installed."""
     try:
         module: Any = importlib.import_module(name)
     except ImportError:

@@ -116,7 +116,10 @@ class Catalogue:
 
 
 def _alternating(pairs: int, pair_mm: float, apart_mm: float) -> tuple[float, ...]:
-    """Edge gaps of ``pairs`` pairs of electrodes, as 2-5-2 names them."""
+    """Return the edge gaps of ``pairs`` pairs of electrodes.
+
+    ``pair_mm`` lies within a pair and ``apart_mm`` between pairs; a name like 2-5-2 lists such gaps.
+    """
     return tuple(pair_mm if index % 2 == 0 else apart_mm for index in range(2 * pairs - 1))
 
 
@@ -144,7 +147,9 @@ them. Makers differ by some tenths of a millimetre; lengths given with a study c
 
 
 def catheter_type(type_name: str, name: str) -> Catheter:
-    """Return the catheter of a named type, for example ``decapolar-2-5-2``, under a name of its own.
+    """Return the catheter of a named type under its own name.
+
+    A type is for example ``decapolar-2-5-2``.
 
     Raises
     ------

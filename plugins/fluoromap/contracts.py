@@ -120,7 +120,10 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
 
 
 def _is_frozen(array: NDArray[Any]) -> bool:
-    """Return whether nobody can write to the array, neither through it nor through the memory that it shows."""
+    """Return whether nobody can write to the array.
+
+    Neither the array nor the memory that it shows is writeable.
+    """
     if array.flags.writeable or not array.flags.c_contiguous:
         return False
     owner = array.base

@@ -68,7 +68,10 @@ STAGES = (*BUILT_IN, MATCHING)
 
 
 def numbers(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield (field, content) of all contents of a result, depth first."""
+    """Yield all contents of a result as (field, content).
+
+    The order is depth first.
+    """
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             yield from numbers(getattr(value, field.name), f"{type(value).__name__}.{field.name}")
@@ -103,7 +106,7 @@ def fingerprint(result: object) -> dict[str, Any]:
 
 @functools.cache
 def study() -> SimulatedStudy:
-    """Five sites of a heart, two seconds a view."""
+    """Simulate five sites of a heart, two seconds a view."""
     return simulate_study(StudySpec(41, sites=5, frames=24, breathing_mm=1.0))
 
 
@@ -135,7 +138,10 @@ def tracked(name: str) -> object:
 
 
 def rigid_view() -> MonoplaneView:
-    """A view of the first site's electrodes that move as one rigid body, which a beating heart does not."""
+    """Return a view of the first site's electrodes as a rigid body.
+
+    They move as one, which a beating heart does not.
+    """
     place = located().sites[0]
     points = np.array([point.position_mm for point in place.points])
     noise = np.random.default_rng(7)
@@ -177,7 +183,10 @@ def matched() -> object:
 
 
 def chains_of(run: SimulatedRun, seed: int) -> Segmentation:
-    """The true chains of a run with noise, the tip's length being the only sign of the catheter."""
+    """Return the true chains of a run with noise.
+
+    The tip's length is the only sign of the catheter.
+    """
     rng = np.random.default_rng(seed)
     n = len(run.frame_times_ms)
 

@@ -47,7 +47,7 @@ def _job(service: TestClient, study_path: str, **body: Any) -> dict[str, Any]:
 
 
 def _fresh_stages(job: dict[str, Any]) -> Counter[str]:
-    """How many stages of each kind were really computed."""
+    """Count the stages of each kind that were really computed."""
     return Counter(row["name"] for row in job["stages"] if row["state"] == "done" and not row["reused"])
 
 
@@ -91,7 +91,7 @@ def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sen
         job_row = session.get_one(Job, job["id"])
         fusions = [fusion_of(session, job_row, overlay["sop_instance_uid"], None) for overlay in overlays]
     for fusion in fusions:
-        # The heart stood elsewhere in each of a site's runs; on the frame the site must stand where its tip is seen.
+        # The heart lay elsewhere in each of a site's runs; on the frame the site must lie where its tip is seen.
         drawn = next(site.position_mm for site in fusion.chamber.sites if site.site == fusion.site) + fusion.shift_mm
         assert np.linalg.norm(fusion.camera.project(drawn) - fusion.tip_uv) < 3
     tracks = service.get(f"{base}/tracks", params={"site": tips[0]["site"], "view": "a"}).json()["tracks"]

@@ -121,5 +121,8 @@ def vertex_colours(chamber: ChamberMap) -> Colours:
 
 
 def milliseconds(lat_ms: float) -> str:
-    """Return a time in whole milliseconds, as written beside a site. (Pillow's typeface has no true minus sign.)"""
+    """Return a time in whole milliseconds, as written beside a site.
+
+    Pillow's typeface has no true minus sign.
+    """
     return str(round(lat_ms))

@@ -33,7 +33,10 @@ def text_size(text: str, size: int) -> tuple[int, int]:
 
 
 def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, ink: RGB, halo: RGB) -> None:
-    """Draw a text centred on a point, with a rim that keeps it legible on any background."""
+    """Draw a text centred on a point.
+
+    A rim keeps it legible on any background.
+    """
     stroke = max(1, size // 9)
     draw.text(middle, text, fill=ink, font=font(size), anchor="mm", stroke_width=stroke, stroke_fill=halo)
 
@@ -79,9 +82,9 @@ def bar_box(scale: Scale, picture: tuple[int, int], size: int) -> Box:
 
 
 def draw_colour_bar(image: Image.Image, scale: Scale, size: int, *, dark: bool, mark_ms: float | None = None) -> None:
-    """Draw the bands with their times in ms, earliest on top, and the hatch "no data".
+    """Draw the bands with their times in ms, and the hatch "no data".
 
-    ``mark_ms`` adds a mark at a time.
+    The earliest band is on top. ``mark_ms`` adds a mark at a time.
     """
     ink, ground = (WHITE, (0, 0, 0, 150)) if dark else ((40, 40, 40), (255, 255, 255, 255))
     left, top, right, bottom = bar_box(scale, image.size, size)

@@ -151,7 +151,10 @@ class _Canvas:
         return self.to_picture(np.where(behind[:, None], OUT_OF_SIGHT_PX, uv)), depth
 
     def ellipse(self, point_mm: Array, covariance_mm2: Array) -> Array:
-        """Return the outline (k, 2) in the picture of the 95 % ellipse of a point's projection, to first order."""
+        """Return the outline (k, 2) of a point's 95 % ellipse.
+
+        It is the ellipse of the point's projection into the picture, to first order.
+        """
         step = 1e-3
         ends = self.project(point_mm + step * np.concatenate([np.eye(3), -np.eye(3)]))[0]
         jacobian = (ends[:3] - ends[3:]).T / (2 * step)
@@ -184,7 +187,10 @@ def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale) -> None:
 def _draw_lines(
     image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale, look: Look
 ) -> None:
-    """Draw isochrones, outline and ellipses at twice the size and average them, for smooth lines."""
+    """Draw isochrones, outline and ellipses.
+
+    They are drawn at twice the size and averaged, for smooth lines.
+    """
     thickness = max(2, round(2 * canvas.unit))
 
     def draw(lines: Sequence[Array], colour: RGB, share: float, width: int) -> None:

@@ -25,7 +25,10 @@ def is_outlier(site: SurfaceSite) -> bool:
 
 
 def time_text(site: SurfaceSite) -> str:
-    """Return the site's time in ms, with a question mark where its neighbours contradict it."""
+    """Return the site's time in ms.
+
+    A question mark follows where its neighbours contradict it.
+    """
     return milliseconds(site.lat_ms) + ("?" if is_outlier(site) else "")
 
 
@@ -49,7 +52,10 @@ def draw_time(
     draw: ImageDraw.ImageDraw, labels: Labels, place: Point, site: SurfaceSite, unit: float, size: int, *,
     near: bool, on_light: bool = False,
 ) -> None:  # fmt: skip
-    """Draw the site's time beside its dot, in dark letters where the picture's background is light."""
+    """Draw the site's time beside its dot.
+
+    The letters are dark where the picture's background is light.
+    """
     text = time_text(site)
     if on_light:
         ink, halo = DARK_OUTLIER_RGB if is_outlier(site) else DARK_RGB, WHITE

@@ -31,7 +31,7 @@ _QUARTILE_OF_NORMAL = 0.31863936396437514
 
 
 class UnusableElectrogram(ValueError):
-    """This electrogram gives no activation time; the message says why."""
+    """An electrogram without an activation time; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +154,9 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
 
 
 def _steepest_place(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[float, float]:
-    """Return (time, standard deviation) of the steepest place near a sample.
+    """Return the steepest place near a sample.
 
-    The cubics are as wide as the deflection.
+    The result is (time, standard deviation). The cubics are as wide as the deflection.
     """
     spacing = float(np.median(np.diff(times)))
     if cubic[3] <= 0:

@@ -39,9 +39,9 @@ class SurfacePoints:
 
 
 def hull_surface(points_mm: Array) -> tuple[Array, IntArray]:
-    """Return the convex hull of points (k, 3) as a closed outward surface of its extreme points.
+    """Return the convex hull of points (k, 3).
 
-    There are at least four points, not all in one plane.
+    It is a closed outward surface of its extreme points. There are at least four points, not all in one plane.
     """
     hull = ConvexHull(points_mm)
     if not is_watertight(np.asarray(hull.simplices, dtype=np.int64)):
@@ -64,7 +64,10 @@ def is_watertight(faces: IntArray) -> bool:
 
 
 def face_normals(vertices_mm: Array, faces: IntArray) -> Array:
-    """Return the outward normals (f, 3); the length of each is twice its face's area in mm²."""
+    """Return the outward normals (f, 3).
+
+    The length of each is twice its face's area in mm².
+    """
     corners = vertices_mm[faces]
     normals: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals
@@ -160,7 +163,10 @@ def nearest_on_surface(vertices_mm: Array, faces: IntArray, points_mm: Array) ->
 
 
 def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
-    """Return the face nearest to a point, of faces with corners (f, 3, 3), and the barycentric weights (3,) there."""
+    """Return the face nearest to a point.
+
+    The faces have corners (f, 3, 3). The second value is the barycentric weights (3,) there.
+    """
     a, ab, ac = corners_mm[:, 0], corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     bc = corners_mm[:, 2] - corners_mm[:, 1]
     aa, bb, cc = (np.maximum((edge**2).sum(axis=1), 1e-12) for edge in (ab, ac, bc))

@@ -184,7 +184,7 @@ def _choose(study: _Study, own_cost: Array, centres_mm: Array, variance_mm2: Arr
 
 
 def _refine(study: _Study, configuration: _Configuration) -> _Configuration:
-    """Alternate between estimating places and gantry, and choosing rows."""
+    """Estimate places and gantry, and choose rows, in turns."""
     for _ in range(_ROUNDS):
         turns = {gantry: _fit_turn(study, configuration, gantry) for gantry in dict.fromkeys(study.gantries)}
         prior = sum(float(turn @ np.linalg.solve(PRIOR_TURN[1], turn)) / 2 for turn, _ in turns.values())

@@ -30,7 +30,10 @@ def to_gltf_m(points_mm: Array) -> Array:
 
 
 def glb_bytes(chamber: ChamberMap, vertices_mm: Array) -> bytes:
-    """Return the file: one mesh with colours and scalars; unit and axes as ``extras``."""
+    """Return the file: one mesh with colours and scalars.
+
+    Unit and axes are ``extras``.
+    """
     n = len(vertices_mm)
     colours = np.full((n, 4), 255, dtype=np.uint8)
     colours[:, :3] = vertex_colours(chamber)

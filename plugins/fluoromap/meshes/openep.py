@@ -117,7 +117,10 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
 
 
 def _no_ablation() -> dict[str, Any]:
-    """Return the ablation data of a study without ablation: every field that OpenEP's readers ask for, empty."""
+    """Return the ablation data of a study without ablation.
+
+    Every field that OpenEP's readers ask for exists and is empty.
+    """
     none = np.zeros((0, 1))
     return {
         "ablparams": dict.fromkeys(("time", "power", "impedance", "distaltemp"), none),

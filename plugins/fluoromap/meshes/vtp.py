@@ -62,7 +62,10 @@ def _array(parent: ElementTree.Element, name: str, values: NDArray[Any]) -> Elem
 
 
 def _text(parent: ElementTree.Element, name: str, values: list[str]) -> None:
-    """Add strings as VTK writes them: the codes of their bytes, with a 0 after each string."""
+    """Add strings as VTK writes them.
+
+    VTK writes the codes of their bytes, with a 0 after each string.
+    """
     codes = " ".join(str(code) for value in values for code in (*value.encode("utf-8"), 0))
     attributes = {"type": "String", "Name": name, "NumberOfTuples": str(len(values)), "format": "ascii"}
     ElementTree.SubElement(parent, "DataArray", attributes).text = codes

@@ -157,7 +157,10 @@ class ChainDetector:
         return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
 
     def _of_catalogue(self, chains: tuple[Chain, ...], proposed: Proposals) -> tuple[Chain, ...]:
-        """Return the chains that are not part of a catheter with more electrodes than the catalogue has."""
+        """Return the chains that can be catheters of the catalogue.
+
+        A chain that is part of a catheter with more electrodes than the catalogue has is dropped.
+        """
         sure = proposed.points_uv[proposed.probability >= SURE]
         free = not_on(sure, chains, self.px_per_mm)
         kept = []
@@ -179,10 +182,10 @@ class ChainDetector:
         return all(chain.score >= weights[list(chain.candidates)].sum() - _WORST_FIT for chain in linked)
 
     def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
-        """Return a chain of another frame at its place in this image, or None.
+        """Return another frame's chain at its place in this image.
 
-        A rigid search gives a first guess, which is refined. The refined positions are weighed against
-        the guess:
+        None when the image does not show it. A rigid search gives a first guess, which is refined. The refined
+        positions are weighed against the guess:
 
         - An electrode that the refinement moves by more than 5 px stays at the guess with a larger covariance.
         - An electrode behind another catheter is predicted from the others, of which there must be two.

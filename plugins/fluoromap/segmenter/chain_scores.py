@@ -52,7 +52,10 @@ def score_paths(
 def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
     chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out
 ):  # fmt: skip
-    """Write places and variances of each path, and its score without spacings and shaft."""
+    """Write places, variances and score of each path.
+
+    The score excludes spacings and shaft.
+    """
     count, m = chosen.shape
     total = 0.0
     for k in range(m - 1):

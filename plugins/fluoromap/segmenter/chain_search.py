@@ -56,7 +56,10 @@ def find_paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write all paths with one more electrode and their spacing ratios; return their number."""
+    """Write all paths with one more electrode; return their number.
+
+    Their spacing ratios are written too.
+    """
     count = 0
     spacing = spacing_px[step]
     shortest = SHORTEST * _END_SLACK[0] * spacing

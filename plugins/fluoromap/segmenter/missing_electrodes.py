@@ -49,9 +49,10 @@ def complete_chains(
     families: Sequence[CatheterFamily],
     px_per_mm: float,
 ) -> CompletedChains:
-    """Complete all chains of candidates that lack one electrode, or a few of many.
+    """Complete all chains of candidates that lack electrodes.
 
-    The missing electrode is predicted on a smooth curve through the others.
+    A chain may lack one electrode, or a few of many. The missing electrode is predicted on a smooth curve through the
+    others.
 
     Parameters
     ----------

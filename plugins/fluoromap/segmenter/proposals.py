@@ -71,19 +71,31 @@ class ImageEvidence(Protocol):
     def likeness(self) -> Likeness: ...
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
-        """Electrodes where ``allowed`` (rows, columns); what is much weaker than the ``expected``-th best may be left out."""
+        """Return the electrodes where ``allowed`` (rows, columns).
+
+        Electrodes much weaker than the ``expected``-th best may be left out.
+        """
 
     def probability_at(self, points_uv: Array) -> Array:
-        """Probability that electrodes are at points of the frame, (n,)."""
+        """Return the probability that electrodes are at points, (n,)."""
 
     def unseen_probability_at(self, points_uv: Array) -> Array:
-        """Probability of electrodes that were not proposed, (n,); 0 where an electrode would have the place of a proposed one."""
+        """Return the probability of electrodes that were not proposed, (n,).
+
+        It is 0 where an electrode would have the place of a proposed one.
+        """
 
     def variance_at(self, points_uv: Array) -> Array:
-        """Variance of each coordinate of electrodes that are proposed at these points, (n,) pixels squared."""
+        """Return the variance of each coordinate, (n,) pixels squared.
+
+        It is that of electrodes that are proposed at these points.
+        """
 
     def scores_at(self, points_uv: Array) -> Array:
-        """Return the proposer's own measure of how clearly the electrodes of one chain show, (n,): ``Chain.scores``."""
+        """Return how clearly the electrodes of one chain show, (n,).
+
+        It is the proposer's own measure: ``Chain.scores``.
+        """
 
 
 Proposer = Callable[[Image], ImageEvidence]
@@ -94,7 +106,10 @@ _EVEN_CONTRAST = 4.0
 
 
 def probability_of_contrast(contrast_over_noise: Array) -> Array:
-    """Return the probability of an electrode where all that is known is its contrast: its odds are that over 4 sigma."""
+    """Return the probability of an electrode by its contrast alone.
+
+    Its odds are the contrast over 4 sigma.
+    """
     contrast = np.maximum(contrast_over_noise, 1e-3)
     probability: Array = contrast / (contrast + _EVEN_CONTRAST)
     return probability

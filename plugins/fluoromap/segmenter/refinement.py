@@ -77,13 +77,12 @@ def refine(
     hidden: BoolArray,
     without_blob: BoolArray,
 ) -> ElectrodeFit:
-    """Move each electrode to where a band of its length and width fits best.
+    """Move each electrode to where its band fits best.
 
-    Along the axis the profile is compared with a box of the electrode's foreshortened length (the tip's far end is
-    rounded),
-    across the axis with the chord of a cylinder. The fit maximises the zero-mean correlation with a parabola through the
-    best
-    shift, in two rounds. Then points far off the catalogue's spacing are pulled towards it according to their uncertainty.
+    The band has the electrode's length and width. Along the axis the profile is compared with a box of the electrode's
+    foreshortened length (the tip's far end is rounded), across the axis with the chord of a cylinder. The fit maximises
+    the zero-mean correlation with a parabola through the best shift, in two rounds. Then points far off the catalogue's
+    spacing are pulled towards it according to their uncertainty.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ def segment_run(
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
 ) -> Segmentation:
-    """Segment a run: chains of all frames with their tracks, and chains at diastole.
+    """Segment a run: tracked chains of all frames, and diastolic chains.
 
     Chains at diastole come from the mean of the quiet frames round diastole. Marks replace the automatic chains of their
     frames, and the tracks start from the first marked frame. At diastole a mark counts as follows:

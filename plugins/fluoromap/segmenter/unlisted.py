@@ -21,7 +21,9 @@ _ROW, _ROW_STEP_MM = 4, 10.0
 
 
 def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> int:
-    """Count points on the way from the chain's first electrode to its last that are none of its electrodes.
+    """Count points within the chain that are none of its electrodes.
+
+    They lie on the way from its first electrode to its last.
 
     Parameters
     ----------
@@ -46,7 +48,9 @@ def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_p
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    """Return whether three or more points go on in the chain's line beyond one end, no farther apart than its electrodes.
+    """Return whether points go on in the chain's line beyond an end.
+
+    Three or more points are needed, no farther apart than the chain's electrodes are.
 
     Parameters
     ----------
@@ -68,7 +72,10 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
 
 
 def shows_row(points_uv: Array, px_per_mm: float) -> bool:
-    """Return whether four or more of these sure proposals lie in a row like the electrodes of a catheter, (n, 2)."""
+    """Return whether four or more points (n, 2) lie in a row.
+
+    The points are sure proposals, and the row is like the electrodes of a catheter.
+    """
     reach = _ROW_STEP_MM * px_per_mm
     for first in range(len(points_uv)):
         for second in range(len(points_uv)):
@@ -82,7 +89,10 @@ def shows_row(points_uv: Array, px_per_mm: float) -> bool:
 
 
 def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
-    """Count the points met when going on in the line from ``before`` to ``at``, none farther than ``reach`` from the last."""
+    """Count the points that go on in a line past ``at``.
+
+    The line comes from ``before``. Each point is at most ``reach`` from the last.
+    """
     count = 0
     while len(left):
         way = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)

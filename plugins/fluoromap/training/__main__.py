@@ -29,7 +29,10 @@ _VALIDATION_KEY = 9_999_999
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Train, calibrate on scenes not seen, write the weights and what is known about them."""
+    """Train and calibrate, then write the weights and their facts.
+
+    The calibration uses scenes that the training did not see.
+    """
     given = _parser().parse_args(arguments)
     catalogue = tuple(_catheter(entry) for entry in json.loads(given.catalogue.read_text())) if given.catalogue else ()
     backgrounds = read_backgrounds(given.backgrounds) if given.backgrounds else ()
@@ -76,7 +79,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _catheter(entry: dict[str, object]) -> Catheter:
-    """Build a catheter by its type, or by its electrodes, spacing_mm, tip_mm and ring_mm."""
+    """Build a catheter by its type, or by its measures.
+
+    The measures are electrodes, spacing_mm, tip_mm and ring_mm.
+    """
     if "type" in entry:
         return catheter_type(str(entry["type"]), str(entry.get("name", entry["type"])))
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}

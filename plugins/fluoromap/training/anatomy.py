@@ -51,7 +51,10 @@ def _draw_ribs(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _draw_spine(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Bodies, discs, end plates and pedicles; a pedicle's ring is of electrode size."""
+    """Draw bodies, discs, end plates and pedicles.
+
+    A pedicle's ring is of electrode size.
+    """
     angle = between(random, -0.3, 0.3) + (0.5 * math.pi if chance(random, 0.8) else between(random, 0.0, math.pi))
     axis, square = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
     middle = random.uniform(0.0, canvas.size, 2)
@@ -71,7 +74,10 @@ def _draw_spine(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _draw_borders(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Heart, diaphragm, vertebral line: half the scene darker behind a smooth border."""
+    """Draw heart, diaphragm and vertebral line.
+
+    Each darkens half the scene behind a smooth border.
+    """
     at, angle = random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3)
     size = between(random, 25.0, 90.0) * px_per_mm
     canvas.disc(at + size * np.array([math.cos(angle), math.sin(angle)]), size, size * between(random, 0.6, 1.3), angle,
@@ -88,7 +94,9 @@ def _draw_lung_vessels(random: Generator, canvas: Canvas, px_per_mm: float) -> N
 
 
 def read_backgrounds(folder: Path) -> tuple[Image, ...]:
-    """Read a lab's own frames without catheters: PNG, TIFF or JPEG files of 8 or 16 bit, dark where X-rays are absorbed.
+    """Read a lab's own frames without catheters.
+
+    The files are PNG, TIFF or JPEG of 8 or 16 bit, dark where X-rays are absorbed.
 
     Returns
     -------
@@ -114,7 +122,10 @@ def _attenuation(pixels: Image) -> Image:
 
 
 def from_backgrounds(random: Generator, size: int, frames: Sequence[Image]) -> Image:
-    """Cut a turned, mirrored and scaled piece out of one of a lab's frames, at a random contrast; (size, size) log units."""
+    """Cut a piece out of a lab's frame, (size, size) log units.
+
+    The piece is turned, mirrored and scaled, at a random contrast.
+    """
     frame = frames[int(random.integers(len(frames)))]
     angle, scale = between(random, 0.0, 2.0 * math.pi), scaled(random, 0.65, 1.6)
     turn = scale * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])

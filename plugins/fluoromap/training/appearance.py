@@ -33,7 +33,10 @@ class Picture:
 
 
 def take_picture(random: Generator, things: Image, body: Image) -> Picture:
-    """Make the picture of a body with things in it; both are attenuations, (size, size) log units."""
+    """Make the picture of a body with things in it.
+
+    Both are attenuations, (size, size) log units.
+    """
     size = len(things)
     focus = between(random, 0.25, 0.9) if chance(random, 0.8) else between(random, 0.9, 1.6)
     attenuation = body + np.maximum(gaussian(things, focus), 0.0) * np.float32(between(random, 0.75, 1.0))
@@ -63,7 +66,10 @@ def _collimator(random: Generator, size: int) -> Image:
 
 
 def _noise(random: Generator, intensity: Image) -> Image:
-    """Quantum noise of 60 to 10000 photons a pixel, grainy where detector or processing blur it."""
+    """Draw quantum noise of 60 to 10000 photons per pixel.
+
+    It is grainy where detector or processing blur it.
+    """
     noise = random.standard_normal(intensity.shape, dtype=np.float32)
     noise *= np.sqrt(np.maximum(intensity, 1e-3) / np.float32(scaled(random, 60.0, 10000.0)))
     grain = between(random, 0.0, 1.2)
@@ -82,7 +88,10 @@ def _grey_levels(random: Generator, intensity: Image) -> Image:
 
 
 def _stored(random: Generator, grey: Image) -> NDArray[np.uint8]:
-    """Window, local vendor contrast, burnt-in text, 8 bit, JPEG or a codec's blocks."""
+    """Convert grey values to a stored picture.
+
+    The steps are window, local vendor contrast, burnt-in text, 8 bit, and JPEG or a codec's blocks.
+    """
     if chance(random, 0.1):
         grey = grey * (1.0 + between(random, 0.0, 0.3) * smooth_field(random, len(grey), 40.0))
     low, high = np.percentile(grey[::2, ::2], [between(random, 0.0, 2.0), between(random, 98.0, 100.0)])

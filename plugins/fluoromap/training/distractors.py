@@ -38,7 +38,10 @@ def _placed(random: Generator, canvas: Canvas, curve: Curve, px_per_mm: float) -
 def _long_line(
     random: Generator, canvas: Canvas, px_per_mm: float, bend: float, step_mm: float = _STEP_MM
 ) -> tuple[Array, Array]:
-    """Points (pixels) and headings of a line across the scene, about in the image plane."""
+    """Draw points (pixels) and headings of a line across the scene.
+
+    The line is about in the image plane.
+    """
     length = between(random, 0.6, 2.2) * canvas.size / px_per_mm
     curve = random_curve(random, length, step_mm, bend, tilt=0.0, tilt_change=between(random, 0.0, 0.5))
     return _placed(random, canvas, curve, px_per_mm), curve.heading
@@ -49,7 +52,10 @@ def _square(heading: Array) -> Array:
 
 
 def _cable(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw ECG cables and other lines of any width, sometimes a bundle of them."""
+    """Draw ECG cables and other lines of any width.
+
+    Sometimes it is a bundle of them.
+    """
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.0, 1.2))
     hollow = between(random, 0.3, 0.8) if chance(random, 0.3) else 0.0
     radius = scaled(random, 0.15, 2.3) * px_per_mm
@@ -120,7 +126,10 @@ def _sheath(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _plain_catheter(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw an angiography catheter or a swan-ganz: a shaft that ends without electrodes, hooked or curled."""
+    """Draw an angiography catheter or a Swan-Ganz catheter.
+
+    It is a shaft that ends without electrodes, hooked or curled.
+    """
     curve = random_curve(random, between(random, 40.0, 120.0), 0.5, between(random, 0.8, 4.0), tilt_change=0.3)
     line = _placed(random, canvas, curve, px_per_mm)
     canvas.stroke(
@@ -147,7 +156,10 @@ def _coil(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _vessels(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw vessels filled with contrast medium; in places beaded, interrupted, or mixed with blood."""
+    """Draw vessels filled with contrast medium.
+
+    In places they are beaded, interrupted, or mixed with blood.
+    """
     _branch(
         random, canvas, px_per_mm, random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3), between(random, 0.5, 2.4),
         scaled(random, 0.08, 1.4), int(random.integers(1, 4)),
@@ -183,7 +195,10 @@ def _branch(
 
 
 def _beads(random: Generator, count: int) -> Array:
-    """Shares from 0 to 1 along a line that swell and fade with an irregular period of 2 to 10 mm."""
+    """Draw shares from 0 to 1 along a line.
+
+    They swell and fade with an irregular period of 2 to 10 mm.
+    """
     pace = 2.0 * math.pi * 0.5 / scaled(random, 2.0, 10.0)
     phase = np.cumsum(pace * np.exp(0.5 * np.convolve(random.normal(size=count + 8), np.ones(9) / 3.0, "valid")))
     wave = 0.5 + 0.5 * np.sin(phase + between(random, 0.0, 6.3))
@@ -194,7 +209,10 @@ def _beads(random: Generator, count: int) -> Array:
 
 
 def _drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw a vessel or tube that the contrast medium has left but for a few plugs and rims, which lie in a row like electrodes."""
+    """Draw a vessel or tube that the contrast medium has left.
+
+    A few plugs and rims remain, which lie in a row like electrodes.
+    """
     curve = random_curve(random, between(random, 15.0, 70.0), 0.5, between(random, 0.2, 2.0), tilt=0.0)
     line = _placed(random, canvas, curve, px_per_mm)
     radius, dark = between(random, 0.7, 2.2) * px_per_mm, scaled(random, 0.1, 1.5)
@@ -236,7 +254,10 @@ def _residue(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _echo_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw a transoesophageal echo probe: a box with parts inside, and a thick shaft of many segments."""
+    """Draw a transoesophageal echo probe.
+
+    It is a box with parts inside, and a thick shaft of many segments.
+    """
     at = random.uniform(-0.1, 1.1, 2) * canvas.size
     angle = between(random, 0.0, 6.3)
     half = between(random, 4.0, 7.0) * px_per_mm
@@ -282,7 +303,10 @@ def _segments(random: Generator, canvas: Canvas, px_per_mm: float, start: Array,
 
 
 def _temperature_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw an oesophageal temperature probe: a soft shaft with one to five olives wider than itself, or a metal cap at its end."""
+    """Draw an oesophageal temperature probe.
+
+    It is a soft shaft with one to five olives wider than itself, or a metal cap at its end.
+    """
     line, heading = _long_line(random, canvas, px_per_mm, between(random, 0.2, 1.2), 0.5)
     radius = between(random, 1.0, 2.5) * px_per_mm
     canvas.stroke(line, radius, scaled(random, 0.04, 0.4), between(random, 0.0, 0.8))
@@ -294,7 +318,10 @@ def _temperature_probe(random: Generator, canvas: Canvas, px_per_mm: float) -> N
 
 
 def _clip(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw surgical clips and staples: short dense strokes, alone, as a V or in a row."""
+    """Draw surgical clips and staples.
+
+    They are short dense strokes, alone, as a V or in a row.
+    """
     at, angle = random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3)
     length, radius, dark = (
         between(random, 1.5, 7.0) * px_per_mm,
@@ -312,7 +339,10 @@ def _clip(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _blob(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw one dense thing of electrode size without a catheter: calcium, a bead, a screw's head, a marker."""
+    """Draw one dense thing of electrode size without a catheter.
+
+    It is calcium, a bead, a screw's head or a marker.
+    """
     at = random.uniform(0.0, canvas.size, 2)
     canvas.disc(at, scaled(random, 0.4, 2.5) * px_per_mm, scaled(random, 0.4, 2.0) * px_per_mm, between(random, 0.0, 6.3),
                 scaled(random, 0.1, 1.3), between(random, 0.6, 2.0), between(random, 2.0, 5.0))  # fmt: skip
@@ -336,7 +366,10 @@ def _sternal_wire(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
 
 
 def _valve_ring(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw a valve's ring or a stent: an ellipse of wire, perhaps with struts or a row of cells."""
+    """Draw a valve's ring or a stent.
+
+    It is an ellipse of wire, perhaps with struts or a row of cells.
+    """
     at, turn = random.uniform(0.0, canvas.size, 2), between(random, 0.0, 6.3)
     wide, high = between(random, 7.0, 16.0) * px_per_mm, between(random, 0.5, 12.0) * px_per_mm
     angle = np.linspace(0.0, 2.0 * math.pi, 72)

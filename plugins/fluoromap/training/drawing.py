@@ -77,7 +77,10 @@ class Canvas:
         self, at_uv: Array, angle: float, half_px: float, radius_px: float, strength: float, hollow: float, dome: bool,
         edge_px: float,
     ) -> None:  # fmt: skip
-        """Add a metal band: a short tube with square ends along the direction ``angle``; ``dome`` rounds the forward end."""
+        """Add a metal band.
+
+        It is a short tube with square ends along the direction ``angle``; ``dome`` rounds the forward end.
+        """
         _band(
             self.depth, float(at_uv[0]), float(at_uv[1]), angle, max(half_px, 0.2), max(radius_px, 0.3), strength, hollow, dome,
             edge_px,
@@ -86,13 +89,19 @@ class Canvas:
     def disc(
         self, at_uv: Array, half_u: float, half_v: float, angle: float, strength: float, edge_px: float, power: float
     ) -> None:
-        """Add a filled ellipse; ``power`` 2 is an ellipse, more of it a box with rounded corners."""
+        """Add a filled ellipse.
+
+        ``power`` 2 is an ellipse, a larger one a box with rounded corners.
+        """
         _disc(self.depth, float(at_uv[0]), float(at_uv[1]), half_u, half_v, angle, strength, edge_px, power)
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _stroke(depth, nearest, strengths, points, radius, strength, hollow, flat):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Every pixel takes the nearest piece of the line only, so that bends are not counted twice."""
+    """Write the line's depth into the pixels.
+
+    Every pixel takes the nearest piece of the line only, so that bends are not counted twice.
+    """
     rows, columns = depth.shape
     left, right, top, bottom = columns, -1, rows, -1
     for k in range(points.shape[0] - 1):

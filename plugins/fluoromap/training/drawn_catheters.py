@@ -38,7 +38,10 @@ def design_of(catheter: Catheter) -> Design:
 
 
 def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Design:
-    """Draw a catheter: half of them from a lab's own ``catalogue`` where it has one, else of all makers' kinds."""
+    """Draw the design of a catheter.
+
+    Half of the designs come from a lab's own ``catalogue`` where it has one; the others from all makers' kinds.
+    """
     if catalogue and chance(random, 0.5):
         return design_of(catalogue[int(random.integers(len(catalogue)))])
     kind = random.random()
@@ -63,7 +66,7 @@ def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Desi
 
 
 def _gaps(random: Generator, count: int) -> Array:
-    """Between the edges of neighbouring electrodes, mm."""
+    """Draw the gaps between edges of neighbouring electrodes, mm."""
     pattern = random.random()
     if pattern < 0.5:
         pair, gap = (
@@ -163,7 +166,10 @@ def _draw_electrodes(
 
 
 def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, metal: float, px_per_mm: float) -> None:
-    """Darken short gaps: wires, glue and blur merge a tip with its ring, or a pair of rings."""
+    """Fill short gaps with dark metal.
+
+    Wires, glue and blur merge a tip with its ring, or a pair of rings.
+    """
     share = between(random, 0.3, 0.95)
     only_tip = chance(random, 0.5)
     for number in range(1 if only_tip else len(places) - 1):
@@ -177,7 +183,10 @@ def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, me
 
 
 def _draw_sheath(random: Generator, canvas: Canvas, line: Array, radius: float, px_per_mm: float) -> None:
-    """Draw a long sheath over the shaft, perhaps with a marker band, which is no electrode."""
+    """Draw a long sheath over the shaft.
+
+    It may have a marker band, which is no electrode.
+    """
     if len(line) < 4:
         return
     wide = radius * between(random, 1.2, 1.6)

@@ -16,7 +16,7 @@ from fluoromap.training.network import ElectrodeNetwork
 
 
 def folded(network: ElectrodeNetwork) -> dict[str, NDArray[np.float32]]:
-    """Return taps and biases of each layer with its batch normalisation folded in.
+    """Return each layer's taps and biases, batch normalisation folded in.
 
     Returns
     -------
@@ -45,7 +45,10 @@ def halved(network: ElectrodeNetwork) -> dict[str, NDArray[np.float16]]:
 def write_weights(
     path: Path, weights: dict[str, NDArray[np.float16]], calibration: tuple[float, float, float], facts: dict[str, Any]
 ) -> None:
-    """Write weights and calibration, and beside them, as ``.json``, these facts and the SHA-256 of the file."""
+    """Write weights and calibration, and a ``.json`` file beside them.
+
+    It holds these facts and the SHA-256 of the file.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     stored: dict[str, Any] = {**weights, "calibration": np.asarray(calibration, np.float32)}
     np.savez(path, **stored)

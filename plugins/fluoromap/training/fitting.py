@@ -39,9 +39,10 @@ class Progress:
 def fit(
     scenes: Iterable[list[Prepared]], shard_count: int, seed: int, threads: int, report: Callable[[Progress], None]
 ) -> ElectrodeNetwork:
-    """Train on the scenes and return the network whose weights are a running mean over the last steps.
+    """Train on the scenes and return the network.
 
-    The same seed, scenes and ``threads`` give the same weights on the same kind of processor.
+    Its weights are a running mean over the last steps. The same seed, scenes and ``threads`` give the same weights on
+    the same kind of processor.
     """
     torch.manual_seed(seed)
     torch.set_num_threads(threads)
@@ -77,7 +78,10 @@ def fit(
 
 
 def _batches(random: np.random.Generator, kept: deque[list[Prepared]]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Batches of scenes of the last shards, the newest shard's as often as the others'."""
+    """Yield batches of scenes of the last shards.
+
+    The newest shard's scenes come as often as the others'.
+    """
     for _ in range(STEPS_A_SHARD):
         pairs = []
         for _ in range(BATCH):

@@ -56,7 +56,10 @@ def random_curve(
     tilt: float | None = None,
     tilt_change: float = 0.3,
 ) -> Curve:
-    """Draw a smooth curve; ``bend`` 0 is straight, 1 a catheter in a heart. ``tilt`` is its mean angle to the image plane."""
+    """Draw a smooth curve.
+
+    ``bend`` 0 is straight, 1 a catheter in a heart. ``tilt`` is its mean angle to the image plane.
+    """
     count = max(4, int(length_mm / step_mm))
     arc = np.arange(count) * step_mm
     heading = np.full(count, between(random, 0.0, 2.0 * math.pi))
@@ -71,7 +74,10 @@ def random_curve(
 
 
 def loop_curve(random: Generator, radius_mm: float, turns: float, shaft_mm: float, step_mm: float) -> Curve:
-    """Draw a circle in space, from its free end on, and the shaft that leaves it, about square to its plane."""
+    """Draw a circle in space, and the shaft that leaves it.
+
+    The circle begins at its free end. The shaft is about square to its plane.
+    """
     arc = np.arange(0.0, 2.0 * math.pi * radius_mm * turns, step_mm)
     angle = arc / radius_mm
     circle = np.stack([-np.sin(angle), np.cos(angle), np.full(len(arc), 0.05)], axis=1)
@@ -96,13 +102,19 @@ def _curve(heading: Array, shortening: Array, step_mm: float) -> Curve:
 
 
 def _rotation(random: Generator) -> Array:
-    """Draw a random rotation of space; a plane of a circle seen nearly edge-on is rare."""
+    """Draw a random rotation of space.
+
+    A plane of a circle seen nearly edge-on is rare.
+    """
     axes, _ = np.linalg.qr(random.normal(size=(3, 3)) + 0.8 * np.eye(3))
     return np.asarray(axes)
 
 
 def smooth_field(random: Generator, size: int, grain_px: float) -> Image:
-    """Draw a random field of standard deviation about 1 whose detail is as large as ``grain_px``, (size, size)."""
+    """Draw a random field of standard deviation about 1, (size, size).
+
+    Its detail is as large as ``grain_px``.
+    """
     weights = _spline(size, max(4, int(size / grain_px) + 4))
     small = random.standard_normal((weights.shape[1], weights.shape[1]), dtype=np.float32)
     return np.asarray(1.5 * (weights @ small @ weights.T), dtype=np.float32)
@@ -110,7 +122,7 @@ def smooth_field(random: Generator, size: int, grain_px: float) -> Image:
 
 @functools.lru_cache(maxsize=256)
 def _spline(size: int, knots: int) -> Image:
-    """Weights of the knots of a uniform cubic B-spline at each pixel, (size, knots)."""
+    """Return a uniform cubic B-spline's weights at each pixel, (size, knots)."""
     place = np.linspace(1.0, knots - 2.001, size)[:, None] - np.arange(knots)
     away = np.abs(place)
     near = 2.0 / 3.0 - away**2 + 0.5 * away**3

@@ -82,7 +82,10 @@ def make_scene(
 
 
 def _clearness(picture: Picture, drawn: Array) -> Array:
-    """Contrast of each electrode over noise, times the root of its area; 0 where the picture is black, white or flat."""
+    """Return how clearly each electrode shows.
+
+    It is the contrast over noise, times the root of its area; 0 where the picture is black, white or flat.
+    """
     size = len(picture.pixels)
     u, v = np.clip(np.rint(drawn[:, :2]), 0, size - 1).astype(np.int64).T
     attenuation, half, radius = drawn[:, 3:].T

@@ -33,7 +33,10 @@ class Validation:
     scenes: int
 
     def calibration(self) -> tuple[float, float, float]:
-        """Gain and offset of the log-odds, by logistic regression; gain of the variance, by the median squared error."""
+        """Return gain and offset of the log-odds, and the variance's gain.
+
+        The first two follow from logistic regression, the last from the median squared error.
+        """
         design = np.stack([self.logits, np.ones_like(self.logits)], axis=1)
         answer = np.array([1.0, 0.0])
         for _ in range(_ROUNDS):
@@ -45,7 +48,10 @@ class Validation:
         return float(answer[0]), float(answer[1]), variance
 
     def figures(self) -> dict[str, float]:
-        """Recall, precision and false proposals a scene where the calibrated probability is 0.5 or more."""
+        """Return recall, precision and false proposals per scene.
+
+        A proposal counts where the calibrated probability is 0.5 or more.
+        """
         gain, offset, _ = self.calibration()
         taken = gain * self.logits + offset >= 0
         right = float(self.right[taken].sum())
@@ -57,7 +63,10 @@ class Validation:
 
 
 def validate(network: ElectrodeNetwork, scenes: Sequence[Scene]) -> Validation:
-    """Compare the network's proposals with the electrodes of the scenes; proposals on electrodes nobody could find are left out."""
+    """Compare the network's proposals with the electrodes of the scenes.
+
+    Proposals on electrodes that nobody could find are left out.
+    """
     trained = Trained(network, 1.0, 4.0, 1.0)
     logits, right, squared = [], [], []
     electrodes = 0

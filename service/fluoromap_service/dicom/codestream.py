@@ -39,7 +39,10 @@ class Codestream:
 
 
 def largest_codestream(layout: PixelLayout) -> int:
-    """Return the largest plausible size of a compressed frame in bytes: twice its pixels, and some for headers."""
+    """Return the largest plausible size of a compressed frame in bytes.
+
+    It is twice its pixels, and some for headers.
+    """
     return 2 * layout.frame_bytes + _SLACK_BYTES
 
 
@@ -148,7 +151,10 @@ def _parse_jpeg(codestream: bytes) -> tuple[Codestream, bytes] | None:
 
 
 def _parse_jpeg_2000(codestream: bytes) -> Codestream | None:
-    """Parse the SIZ marker segment of ITU-T T.800 A.5.1, which comes first in a bare codestream."""
+    """Parse the SIZ marker segment of ITU-T T.800 A.5.1.
+
+    It comes first in a bare codestream.
+    """
     if codestream[:4] != b"\xff\x4f\xff\x51":
         return None
     x1, y1, x0, y0, tile_width, tile_height, _, _, components, depth, dx, dy = struct.unpack_from(
@@ -162,9 +168,10 @@ def _parse_jpeg_2000(codestream: bytes) -> Codestream | None:
 
 
 def _decode_rle(layout: PixelLayout, codestream: bytes) -> Pixels:
-    """Decode RLE of PS3.5 annex G: one segment a byte plane, the most significant first.
+    """Decode RLE of PS3.5 annex G.
 
-    pydicom's decoder expands a segment fully before it checks the frame's size; this one stops at that size.
+    There is one segment for each byte plane, the most significant first. pydicom's decoder expands a segment fully
+    before it checks the frame's size; this one stops at that size.
     """
     planes = layout.bits_allocated // 8
     if len(codestream) < 64:

@@ -183,7 +183,10 @@ class InstanceFacts:
 
 
 def is_uid(value: str) -> bool:
-    """Return whether ``value`` is a UID of PS3.5 section 9.1; leading zeros pass, because real systems write them."""
+    """Return whether ``value`` is a UID of PS3.5 section 9.1.
+
+    Leading zeros pass, because real systems write them.
+    """
     return len(value) <= 64 and _UID.fullmatch(value) is not None
 
 

@@ -110,7 +110,10 @@ class Header:
         self._groups = [*shared[:1], *self._per_frame[:1]]
 
     def numbers(self, keyword: str) -> tuple[float, ...]:
-        """Return all values of a numeric attribute; none when it is absent, empty, unreadable or not finite."""
+        """Return all values of a numeric attribute.
+
+        There are none when it is absent, empty, unreadable or not finite.
+        """
         for dataset in self._places(keyword):
             if values := self._numbers(dataset, keyword):
                 return values
@@ -126,12 +129,18 @@ class Header:
         return values[0] if values else None
 
     def integer(self, keyword: str) -> int | None:
-        """Return the first value of an attribute that counts; None also when it is not a whole number."""
+        """Return the first value of an attribute that counts.
+
+        None also when it is not a whole number.
+        """
         value = self.number(keyword)
         return int(value) if value is not None and value == int(value) else None
 
     def texts(self, keyword: str) -> tuple[str, ...]:
-        """Return all values of a text or UID attribute, stripped; none when absent or unreadable."""
+        """Return all values of a text or UID attribute, stripped.
+
+        There are none when it is absent or unreadable.
+        """
         for dataset in self._places(keyword):
             if values := self._texts(dataset, keyword):
                 return values
@@ -143,7 +152,10 @@ class Header:
         return values[0] if values else ""
 
     def numbers_per_frame(self, keyword: str) -> list[tuple[float, ...]]:
-        """Return the values in each frame's own functional groups; none for objects without such groups."""
+        """Return the values in each frame's own functional groups.
+
+        There are none for objects without such groups.
+        """
         return [self._numbers(item, keyword) for item in self._macro_items(keyword)]
 
     def texts_per_frame(self, keyword: str) -> list[tuple[str, ...]]:

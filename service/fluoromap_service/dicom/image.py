@@ -34,7 +34,10 @@ def window(header: Header) -> Pair | None:
 
 
 def r_wave_frames(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[int, ...]:
-    """Return the frames of R waves, counted from 0, ascending; RWavePointer (0028,6040) counts from 1."""
+    """Return the frames of R waves, counted from 0, ascending.
+
+    RWavePointer (0028,6040) counts from 1.
+    """
     pointers = {int(value) - 1 for value in header.numbers("RWavePointer")}
     inside = tuple(sorted(frame for frame in pointers if 0 <= frame < frames))
     if len(inside) < len(pointers):

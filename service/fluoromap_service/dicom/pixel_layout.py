@@ -254,7 +254,10 @@ def _group(
 
 
 def _starts_by_table(fragments: _Fragments) -> list[int]:
-    """Return the number of each frame's first fragment; nothing when the table is empty or wrong."""
+    """Return the number of each frame's first fragment.
+
+    The list is empty when the table is empty or wrong.
+    """
     table, extents = fragments.offset_table, fragments.extents
     if not table or table[0] != 0:
         return []

@@ -103,7 +103,10 @@ def _pixel_spacing_mm(header: Header, rows: int, columns: int, warnings: list[He
 
 
 def image_axes(header: Header, gantry: GantryFacts, warnings: list[HeaderWarning]) -> ImageAxes:
-    """Return the image axes by the field of view's rotation and flip, otherwise by PatientOrientation."""
+    """Return the image axes.
+
+    They follow from the field of view's rotation and flip, otherwise from PatientOrientation.
+    """
     by_view = _by_field_of_view(header, warnings)
     orientation = orientation_letters(header)
     by_patient: ImageAxes | None = None

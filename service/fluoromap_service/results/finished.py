@@ -46,7 +46,10 @@ def done_stage(session: Session, job: Job, name: str, subject: str | None = None
 
 
 def not_ready(job: Job, name: str, stage: StageRow | None) -> Problem:
-    """Return the 409 for a result whose stage is not done yet, or will never be."""
+    """Return the 409 for a result whose stage is not done.
+
+    The stage is not done yet, or will never be.
+    """
     if stage is not None and stage.state in (StageState.PENDING, StageState.READY, StageState.RUNNING):
         wait = f"The stage '{name}', which makes this result, is not done yet; follow the job and ask again."
         return Problem(409, "not_ready", wait, headers={"Retry-After": str(RETRY_SECONDS)})

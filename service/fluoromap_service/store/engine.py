@@ -62,13 +62,19 @@ def forget_connections() -> None:
 
 @contextmanager
 def reading() -> Iterator[Session]:
-    """Open a transaction that only reads; never write in it, because SQLite cannot upgrade its lock."""
+    """Open a transaction that only reads.
+
+    Never write in it, because SQLite cannot upgrade its lock.
+    """
     with Session(engine(), expire_on_commit=False) as session:
         yield session
 
 
 @contextmanager
 def writing() -> Iterator[Session]:
-    """Open a transaction that writes: it commits at the end and rolls back on any exception."""
+    """Open a transaction that writes.
+
+    It commits at the end and rolls back on any exception.
+    """
     with Session(engine().execution_options(writes=True), expire_on_commit=False) as session, session.begin():
         yield session

@@ -30,7 +30,10 @@ def path_of(sha256: str) -> Path:
 
 @contextmanager
 def incoming() -> Iterator[Path]:
-    """Give a path on the store's own disk for a file that arrives; remove the file at the end unless it was kept."""
+    """Give a path on the store's own disk for an arriving file.
+
+    The file is removed at the end unless it was kept.
+    """
     folder = settings().files_dir / "incoming"
     folder.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=folder)
@@ -61,9 +64,10 @@ def lock(session: Session) -> None:
 
 
 def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
-    """Move an incoming file to its content address, add its row and return its hash.
+    """Move an incoming file to its content address; return its hash.
 
-    A caller that knows the hash gives it. Then the transaction does not read a long file again.
+    The file's row is added. A caller that knows the hash gives it. Then the transaction does not read a long file
+    again.
     """
     sha256 = sha256 or sha256_of(path)
     lock(session)

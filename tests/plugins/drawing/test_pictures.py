@@ -155,7 +155,10 @@ def test_faces_side_by_side_share_no_pixel_and_miss_none(seed):
 
 
 def _bands_pixel_by_pixel(raster, chamber, times, until):
-    """What every pixel shows, from its own time; -9 where a vertex past the covered part has a say in it."""
+    """Return the content of every pixel by its own time.
+
+    -9 where a vertex past the covered part takes part.
+    """
     pixels = np.flatnonzero(raster.face >= 0)
     lat = raster.sample(pixels, chamber.lat_ms, chamber.cycle_length_ms)
     wanted = np.full(raster.face.size, NOTHING)
@@ -211,7 +214,10 @@ def test_the_rim_takes_the_times_of_its_neighbours(sparse_ball):
 
 
 def circling(cycle):
-    """Return a re-entry whose times go round once, and its vertices along the axis of the circuit: each its own angle."""
+    """Return a re-entry whose times go round once.
+
+    Also return its vertices along the axis of the circuit: each its own angle.
+    """
     chamber = fused(sphere(20, slope_ms_per_mm=1.0), edge_mm=4)
     middle = chamber.vertices_mm.mean(axis=0)
     turn = np.degrees(np.arctan2(*(chamber.vertices_mm - middle)[:, [1, 0]].T)) % 360 * cycle / 360

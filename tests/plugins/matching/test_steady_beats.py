@@ -34,7 +34,7 @@ def test_a_steady_rhythm_is_never_farther_than_a_frame_from_the_truth(cycle_ms: 
 
 
 @pytest.mark.parametrize("with_places", [False, True])
-def test_steady_beats_and_the_catheters_tell_r_waves_more_finely_than_frames_do(with_places: bool) -> None:
+def test_steady_beats_and_the_catheters_time_r_waves_more_finely_than_frames_do(with_places: bool) -> None:
     rng = np.random.default_rng(5)
     times = np.linspace(0, 14 * FRAME_MS, 15)
     told: list[float] = []
@@ -53,6 +53,6 @@ def test_steady_beats_and_the_catheters_tell_r_waves_more_finely_than_frames_do(
     assert np.std(lengths) < (0.08 if with_places else 0.5) * FRAME_MS
 
 
-def test_beats_that_differ_by_more_than_frames_explain_stay_as_told() -> None:
+def test_beats_that_differ_by_more_than_frames_explain_stay_as_given() -> None:
     told = to_frames(np.array([100.0, 900.0, 1400.0, 2300.0]))
     assert (steady_beats_ms(told, FRAME_MS / 2, np.zeros(0), None) == told).all()

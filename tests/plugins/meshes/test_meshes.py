@@ -38,7 +38,10 @@ def test_unknown_format_is_refused(ball):
 
 
 def in_mm_lps(points_m):
-    """Points as a glTF viewer places them, in metres with +Y up and +Z forward, along the patient's axes in mm."""
+    """Return points of a glTF viewer along the patient's axes, mm.
+
+    The viewer places them in metres with +Y up and +Z forward.
+    """
     left, up, forward = np.transpose(points_m)
     return 1e3 * np.stack([left, -forward, up], axis=1)
 

@@ -10,7 +10,10 @@ PX = 5.75
 
 
 def drawn(curves, noise=0.02, size=320):
-    """A log image with dark spots at the electrodes and a fainter shaft behind; curves: list of (points, shaft end)."""
+    """Draw a log image with dark spots at the electrodes.
+
+    A fainter shaft follows behind. curves: list of (points, shaft end).
+    """
     v, u = np.mgrid[0:size, 0:size].astype(float)
     x = np.random.default_rng(3).normal(6, noise, (size, size))
     for points, end in curves:

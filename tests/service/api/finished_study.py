@@ -58,7 +58,7 @@ REFERENCE_MM = np.array([5.0, -4.0, 3.0])
 STEP_MM = np.array([1.0, 0.0, 0.0])
 TIP_MM = np.array([12.0, 6.0, 9.0])
 BREATH_MM = {"a": np.array([0.0, 0.0, 3.0]), "b": np.array([0.0, 0.0, -3.0])}
-"""How much higher the heart stands in each run than where two views locate it."""
+"""How much higher the heart lies in each run than where two views locate it."""
 REFERENCE_ELECTRODES_MM = REFERENCE_MM + np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
 DIASTOLE = 1
 """Index of the diastolic frame in every run."""
@@ -66,7 +66,7 @@ TIP_PIXEL = {"a": (70.0, 20.0), "b": (25.0, 30.0)}
 COVARIANCE_A = np.diag([4.0, 0.01, 0.01])
 """Of view a's track: the ray of a lateral view is the patient's left-right axis."""
 RELATIVE_COVARIANCE_A = np.diag([0.49, 0.01, 0.01])
-"""The same less the reference of the same frame, by solvers that tell it."""
+"""The same less the reference of the same frame, by solvers that state it."""
 
 
 @dataclass
@@ -159,7 +159,10 @@ class FinishedStudy:
 
 
 def make_study() -> FinishedStudy:
-    """Store two sites' runs as DICOM files and a job whose first stages are ready."""
+    """Store two sites' runs, and a job.
+
+    The runs are DICOM files, and the job's first stages are ready.
+    """
     uids = {(site, view): deterministic_uid("output", site, view) for site in ("S01", "S02") for view in ("a", "b")}
     with writing() as session:
         study = Study(
@@ -308,7 +311,10 @@ def followed_site(relative: bool = False) -> SiteTracks:
 
 
 def map_result() -> MapResult:
-    """An octahedron of 10 mm about the reference, one vertex without a time."""
+    """Return an octahedron of 10 mm about the reference.
+
+    One vertex has no time.
+    """
     vertices = 10.0 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     covered = np.array([True, True, True, True, True, False])

@@ -102,7 +102,7 @@ def _job(job_id: str) -> Job:
 
 
 def _silence(stage_id: int) -> None:
-    """As if the stage's worker had died long ago."""
+    """Set the stage's heartbeat as if its worker had died long ago."""
     with writing() as session:
         session.execute(update(StageRow).where(StageRow.id == stage_id).values(lease_until=db_now() - 1))
 

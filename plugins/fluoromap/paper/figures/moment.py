@@ -75,7 +75,10 @@ class MomentInView:
 
 
 def farthest_phase(study: SimulatedStudy) -> float:
-    """Return the phase at which the tips are farthest from their diastolic places, averaged over sites and runs."""
+    """Return the phase at which the tips are farthest from diastole.
+
+    The distances from the diastolic places are averaged over sites and runs.
+    """
     phases = np.concatenate([run.truth.phases for site in study.sites for run in site.runs])
     moved = np.concatenate([_moved_mm(study.catalogue, site, run) for site in study.sites for run in site.runs])
     part = np.minimum((phases * _PHASES).astype(np.int64), _PHASES - 1)
@@ -187,7 +190,10 @@ def _mapped_site(
 
 
 def _moved_mm(catalogue: Catalogue, site: SimulatedSite, run: SimulatedRun) -> Array:
-    """Return the distance (n,) of the true tip from its place at diastole, both minus the reference catheter's mean."""
+    """Return the distance (n,) of the true tip from diastole.
+
+    Both positions are minus the reference catheter's mean.
+    """
     points = run.truth.points_mm
     tip = points[catalogue.mapping][:, 0] - points[catalogue.reference].mean(axis=1)
     moved: Array = np.linalg.norm(tip - site.truth.relative_mm[catalogue.mapping][0], axis=1)

@@ -63,7 +63,10 @@ class PaperFigures:
     numbers: FigureNumbers
 
     def files(self) -> dict[str, bytes]:
-        """Return name and content of every file: a PNG for each figure, and ``figures.json``."""
+        """Return the content of every file by its name.
+
+        The files are a PNG for each figure, and ``figures.json``.
+        """
         content = {f"figure{number}.png": encode_png(picture) for number, picture in self.pictures.items()}
         text = json.dumps(asdict(self.numbers), indent=2, allow_nan=False)
         return {**content, "figures.json": f"{text}\n".encode()}

@@ -76,10 +76,10 @@ class BlobResponse:
         return Likeness(self.best, self.reduction, 0.5 * (self.reduction - 1))
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
-        """Return the maxima over u, v and scale above 4 robust standard deviations, strongest response first.
+        """Return the maxima over u, v and scale, strongest response first.
 
-        Scales compete by response. With response over noise, a long tip would split in two. Candidates weaker than a fifth
-        of the ``expected``-th best are dropped.
+        They are above 4 robust standard deviations. Scales compete by response. With response over noise, a long tip
+        would split in two. Candidates weaker than a fifth of the ``expected``-th best are dropped.
         """
         scale, v, u = self._maxima(allowed[:: self.reduction, :: self.reduction])
         strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
@@ -98,9 +98,10 @@ class BlobResponse:
         )
 
     def _maxima(self, allowed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Return (scale, v, u) of the maxima over place and scale.
+        """Return scale, v and u of the maxima.
 
-        ``allowed`` is False at the border. skimage.feature.peak_local_max takes 10 to 50 times as long.
+        A maximum is over place and scale. ``allowed`` is False at the border. skimage.feature.peak_local_max takes 10
+        to 50 times as long.
         """
         first, second, third = self.stack
         top = np.maximum(np.maximum(first, second), third).reshape(-1)
@@ -137,7 +138,10 @@ class BlobResponse:
     unseen_probability_at = probability_at
 
     def variance_at(self, points_uv: Array) -> Array:
-        """Return the variance of the places of maxima as strong as the response here, (n,) pixels squared."""
+        """Return the variance of places at these points, (n,) pixels squared.
+
+        It is that of maxima as strong as the response there.
+        """
         return self._variance(self.scores_at(points_uv))
 
     def _variance(self, snr: Array) -> Array:

@@ -57,7 +57,10 @@ class CatheterChain:
 
 
 def blob_chains(catalogue: Catalogue, field: FieldMask, px_per_mm: float) -> ChainDetector:
-    """Return the detector of one run: blobs of the size of the catalogue's electrodes, and the chains of them."""
+    """Return the detector of one run.
+
+    It finds blobs of the size of the catalogue's electrodes, and the chains of them.
+    """
     ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
 
     def blobs(x: Image) -> BlobResponse:

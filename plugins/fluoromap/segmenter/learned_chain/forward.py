@@ -64,7 +64,10 @@ class Layer:
         return _finished(out, self.bias, rows, columns, wide, self.shape.rectified)
 
     def _start(self, tap: int, wide: int, border: int) -> tuple[int, int]:
-        """Which phase of the picture a tap reads, and how far into it the first output's pixel lies."""
+        """Return the phase of the picture that a tap reads, and an offset.
+
+        The offset is how far into the phase the first output's pixel lies.
+        """
         down, right = divmod(tap, self.shape.width)
         if self.shape.stride == 1:
             return 0, down * self.shape.dilation * wide + right * self.shape.dilation
@@ -76,7 +79,10 @@ class Layer:
         return phase, shift_down * wide + shift_right
 
     def _gathered(self, x: Image) -> Image:
-        """For one input channel: its windows side by side, then one product."""
+        """Gather one input channel's windows and multiply them with the taps.
+
+        The windows lie side by side, so one product is enough.
+        """
         width, stride = self.shape.width, self.shape.stride
         rows, columns = x.shape[0] // stride, x.shape[1] // stride
         padded = np.pad(x[..., 0], width // 2)
@@ -166,7 +172,10 @@ def _finished(flat: Image, bias: Image, rows: int, columns: int, wide: int, rect
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _add_bias(flat, bias, wide, rectified, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the first columns of each row of ``wide`` pixels, the bias added, negative values cut off where rectified."""
+    """Write the first columns of each row with the bias added.
+
+    A row has ``wide`` pixels. Negative values become 0 where ``rectified``.
+    """
     least = np.float32(0.0) if rectified else np.float32(-1e30)
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):

@@ -89,7 +89,7 @@ class NetworkResponse:
         return Likeness(np.float32(_CLEAR_LIKENESS) * _highest_near(self.probability), self.cell_px, self.first_px)
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
-        """Electrodes found where ``allowed``, most probable first."""
+        """Return the electrodes found where ``allowed``, most probable first."""
         rows, columns = allowed.shape
         column, row = np.rint(self.found.points_uv).astype(np.int64).T
         within = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
@@ -112,9 +112,9 @@ class NetworkResponse:
         return probability
 
     def scores_at(self, points_uv: Array) -> Array:
-        """Probability of the electrode found nearest to each point, each counted for one point only, (n,).
+        """Return the probability of the electrode nearest to each point, (n,).
 
-        Points without one have the probability of their own cell.
+        Each electrode counts for one point only. Points without one have the probability of their own cell.
         """
         rows, columns = self.probability.shape
         u, v = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64).T
@@ -133,7 +133,7 @@ class NetworkResponse:
         return scores
 
     def variance_at(self, points_uv: Array) -> Array:
-        """Of the places of electrodes at these points, (n,) pixels squared."""
+        """Return the variance of electrodes' places at points, (n,) pixels squared."""
         v, u = self._best_cells(points_uv)
         return _variance_px2(self.answers[v, u, _LOG_VARIANCE].astype(np.float64), self.variance_gain, self.cell_px)
 
@@ -149,7 +149,10 @@ class NetworkResponse:
 
 
 def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, variance_gain: float) -> Proposals:
-    """Cells that no neighbour exceeds, 0.03 or more, each 1.2 cells from all better ones; most probable first."""
+    """Return the cells that no neighbour exceeds, most probable first.
+
+    Each has 0.03 or more and is 1.2 cells from all better ones.
+    """
     v, u = np.nonzero((probability >= _LEAST_PROBABILITY) & (probability >= _highest_near(probability)))
     best = np.argsort(-probability[v, u], kind="stable")[: 2 * _MOST]
     v, u = v[best], u[best]
@@ -166,13 +169,19 @@ def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, 
 
 
 def _variance_px2(log_variance: Array, gain: float, cell_px: float) -> Array:
-    """Add a floor to what the network states: real electrodes are not drawn by the rules it learned from."""
+    """Add a floor to the variance that the network states.
+
+    The rules that it learned from do not draw real electrodes.
+    """
     variance: Array = (gain * np.exp(np.clip(log_variance, -8.0, 4.0)) + _FLOOR_CELLS**2) * cell_px**2
     return variance
 
 
 def network_scale(px_per_mm: float) -> float:
-    """Return how much a frame is reduced, or enlarged, for the network; near its own scale a frame stays as it is."""
+    """Return how much the network's input is reduced or enlarged.
+
+    A frame near the network's own scale stays unchanged.
+    """
     scale = NETWORK_PX_PER_MM / px_per_mm
     return 1.0 if _TAKEN_AS_IS[0] <= scale <= _TAKEN_AS_IS[1] else scale
 
@@ -193,7 +202,10 @@ def _highest_near(values: Image) -> Image:
 
 
 def _apart(cells: Array) -> BoolArray:
-    """Which of these, best first, lie 1.2 cells or more from all kept before, (n,)."""
+    """Return which cells lie apart from all better ones, (n,).
+
+    The best come first. A cell is kept when it is 1.2 cells or more from all that were kept before.
+    """
     keep = np.ones(len(cells), np.bool_)
     if len(cells) > 1:
         pairs = cKDTree(cells).query_pairs(_APART_CELLS, output_type="ndarray")

@@ -13,9 +13,10 @@ from fluoromap.segmenter.log_image import Image
 
 
 def resampled(x: Image, scale: float) -> Image:
-    """Return the picture at ``scale`` times its size; enlarged linearly, reduced by area means.
+    """Return the picture at ``scale`` times its size.
 
-    Pixel j of the answer has its centre at (j + 0.5) / scale - 0.5 of the picture.
+    It is enlarged linearly, or reduced by area means. Pixel j of the answer has its centre at (j + 0.5) / scale - 0.5
+    of the picture.
     """
     if scale == 1.0:
         return x
@@ -29,7 +30,10 @@ def resampled(x: Image, scale: float) -> Image:
 
 @functools.lru_cache(maxsize=16)
 def _shares(size: int, count: int, scale: float) -> tuple[IntArray, Image]:
-    """First pixel of each mean, (count,), and the weights of the pixels from there on, (count, taps); rows add up to 1."""
+    """Return the first pixel of each mean, (count,), and its weights.
+
+    The weights (count, taps) are those of the pixels from there on; rows add up to 1.
+    """
     middle = (np.arange(count) + 0.5) / scale - 0.5
     # A box as wide as the new pixel; a triangle between pixels where the picture is enlarged.
     half = 0.5 * max(1.0 / scale, 1.0)

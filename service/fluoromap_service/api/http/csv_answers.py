@@ -31,7 +31,10 @@ def _number(text: str) -> float:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return CSV with a header line; None becomes an empty field. Lines end in CRLF (RFC 4180)."""
+    """Return CSV with a header line.
+
+    None becomes an empty field. Lines end in CRLF (RFC 4180).
+    """
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(columns)
@@ -40,7 +43,10 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _plain_text(value: Any) -> Any:
-    """Return the value of a cell that a spreadsheet shows as text and never runs as a formula (OWASP, CSV injection)."""
+    """Return a cell's value that a spreadsheet shows as text.
+
+    The spreadsheet never runs it as a formula (OWASP, CSV injection).
+    """
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
 
 

@@ -75,10 +75,10 @@ def create_job(
     once: OnceJson,
     body: JobRequest | None = None,
 ) -> Response:
-    """Freeze the study and run the pipeline over it; the job reuses the results of earlier jobs.
+    """Freeze the study and run the pipeline over it.
 
-    At least one site needs both views, their geometry and an activation time. Otherwise 422 lists the missing values of each
-    site.
+    The job reuses the results of earlier jobs. At least one site needs both views, their geometry and an activation
+    time. Otherwise 422 lists the missing values of each site.
     """
     wanted = body or JobRequest()
 

@@ -60,7 +60,10 @@ class Overlays(BaseModel):
 
 
 def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> KeptFile:
-    """Return the kept PNG of an overlay, or the GIF of its propagation; draw it when there is none."""
+    """Return the kept PNG or GIF of an overlay.
+
+    The GIF shows the propagation. The picture is drawn when none is kept.
+    """
 
     def make() -> bytes:
         path = files.path_of(fusion.sha256)
@@ -152,9 +155,10 @@ def get_overlay(
         ),
     ] = None,
 ) -> Response:
-    """Return a frame with the map: isochrones, hull outline, sites with times in ms, star at the tip, colour bar in ms.
+    """Return a frame with the map.
 
-    The picture is in stored pixels.
+    The picture has isochrones, hull outline, sites with times in ms, a star at the tip and a colour bar in ms. The
+    picture is in stored pixels.
     """
     with reading() as session:
         fusion = fusion_of(session, job_of(session, job_id), uid, frame)

@@ -12,6 +12,7 @@ from fluoromap_service.api.results.report_page import report_page, template_sha2
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import report_dependencies
 from fluoromap_service.results.finished import job_of
+from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import ENDED_JOB, Study
 from fluoromap_service.store.renderings import kept_rendering
@@ -30,10 +31,10 @@ router = APIRouter(tags=["results"])
     },
 )
 def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
-    """Return the report of a job as one HTML file without links to other files; 409 until the job has ended.
+    """Return the report of a job as one HTML file.
 
-    The page contains pictures, a 3D view, tables with grades and reasons, the error budget, parameters, versions and the
-    hashes of the input files.
+    The file has no links to other files. The answer is 409 until the job has ended. The page contains pictures, a 3D
+    view, tables with grades and reasons, the error budget, parameters, versions and the hashes of the input files.
     """
     with reading() as session:
         job = job_of(session, job_id)
@@ -41,6 +42,7 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
             detail = "The report is available when the job has ended; follow the job and ask again."
             raise Problem(409, "not_ready", detail)
         study = session.get(Study, job.study_id)
-        depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None)
+        guessed = sites_by_row_order(session, job)
+        depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None, guessed)
     page = kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
     return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)

@@ -92,7 +92,10 @@ _CHECKS: dict[Literal["database", "broker", "files", "worker"], tuple[Callable[[
 
 @router.get("/v1/health", summary="Alive", response_model=Health)
 async def health() -> Health:
-    """Answer as long as the process lives, also when all its threads are busy; open to all."""
+    """Answer as long as the process lives; open to all.
+
+    It answers also when all threads are busy.
+    """
     return Health()
 
 

@@ -42,7 +42,10 @@ class Plugin(BaseModel):
 
 @router.get("/v1/plugins", summary="Installed plugins", response_model=list[Plugin], responses=responses(401, 403))
 def list_plugins(caller: Reader) -> list[Plugin]:
-    """List all installed segmenters, triangulators, monoplane solvers and fusers, broken ones with their error."""
+    """List all installed segmenters, triangulators, monoplane solvers and fusers.
+
+    A broken plugin is listed with its error.
+    """
     return [
         Plugin(
             kind=row.kind,

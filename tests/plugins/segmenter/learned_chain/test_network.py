@@ -26,7 +26,10 @@ def weights():
 
 
 def plain_convolution(x, taps, bias, layer):
-    """One layer in double precision, window by window; x (rows, columns, channels)."""
+    """Compute one layer in double precision, window by window.
+
+    x is (rows, columns, channels).
+    """
     reach = layer.width // 2 * layer.dilation
     padded = np.pad(x.astype(np.float64), ((reach, reach), (reach, reach), (0, 0)))
     rows, columns = x.shape[0] // layer.stride, x.shape[1] // layer.stride

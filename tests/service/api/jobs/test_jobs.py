@@ -23,7 +23,7 @@ def _path(study: FinishedStudy) -> str:
 def test_a_job_has_exactly_the_promised_members(client: TestClient, study: FinishedStudy) -> None:
     job = client.get(_path(study)).json()
     assert set(job) == {
-        "id", "study", "state", "progress", "stages", "error", "created", "started", "finished", "links",
+        "id", "study", "state", "progress", "stages", "error", "warnings", "created", "started", "finished", "links",
     }  # fmt: skip
     assert set(job["stages"][0]) == {
         "name", "subject", "plugin", "version", "state", "attempt", "progress", "reused", "error",
@@ -144,7 +144,7 @@ def test_jobs_are_listed_newest_first_a_page_at_a_time(client: TestClient, study
 
 @pytest.fixture
 def published(monkeypatch: pytest.MonkeyPatch, study: FinishedStudy) -> list[int]:
-    """Starts jobs on the finished study's own snapshot; notes how many jobs stood committed at each announcement."""
+    """Starts jobs on the finished study's own snapshot; counts the committed jobs at each announcement."""
     counts: list[int] = []
 
     def announce() -> int:

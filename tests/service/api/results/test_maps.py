@@ -35,7 +35,7 @@ def test_the_map_is_relative_to_the_reference(client: TestClient, study: Finishe
     assert (answer["conduction_velocity"], answer["cycle_length_ms"]) == (None, None)
 
 
-def test_the_map_tells_conduction_velocity_and_cycle(client: TestClient, study: FinishedStudy) -> None:
+def test_the_map_shows_conduction_velocity_and_cycle(client: TestClient, study: FinishedStudy) -> None:
     outcome = map_result()
     assert outcome.chamber is not None
     chamber = replace(outcome.chamber, conduction_velocity=ConductionVelocity(0.8, 0.7, 0.9), cycle_length_ms=240.0)

@@ -52,7 +52,7 @@ def test_the_job_links_to_it(client: TestClient, study: FinishedStudy) -> None:
     assert client.get(link, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
 
 
-def test_it_tells_every_site_reason_plugin_and_input(client: TestClient, study: FinishedStudy) -> None:
+def test_it_shows_every_site_reason_plugin_and_input(client: TestClient, study: FinishedStudy) -> None:
     study.finish()
     page = _page(client, study)
     for site in ("S01", "S03"):

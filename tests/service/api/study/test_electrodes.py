@@ -112,7 +112,7 @@ def test_electrodes_that_cannot_be(service: TestClient, frame: str, change: dict
     assert service.get(frame).json() == []
 
 
-def test_an_electrode_stands_once(service: TestClient, frame: str) -> None:
+def test_an_electrode_occurs_once(service: TestClient, frame: str) -> None:
     answer = service.put(frame, json=[TIP, TIP])
     assert [error["where"] for error in answer.json()["errors"]] == ["body.1.electrode"]
 
