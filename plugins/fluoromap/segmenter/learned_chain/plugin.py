@@ -10,8 +10,10 @@ from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
+from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.learned_chain.joint_evidence import JointEvidence
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.linking import Trust
@@ -53,7 +55,7 @@ class LearnedChainParams(BaseModel, extra="forbid"):
 
 
 class LearnedChain:
-    """Electrodes that a small network proposes, catheters as chains of them that fit the catalogue, the best set of chains.
+    """Electrodes that a small network and blobs propose, chains of them that fit the catalogue, the best set of chains.
 
     The network was trained on synthetic fluoroscopy with cables, wires, probes and contrast-filled vessels. Everything after it
     is shared with ``catheter-chain``.
@@ -75,11 +77,15 @@ class LearnedChain:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
         acceptance = _IN_A_RUN if len(run.frames) > 1 else _ALONE
+        ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
         least_noise = _COARSE_NOISE if run.pixels.bits_stored <= _COARSE_BITS else 0.0
 
         def detector_of(field: FieldMask) -> ChainDetector:
-            def ask(x: Image) -> NetworkResponse:
-                return NetworkResponse.of_image(x, field.inside, trained, run.px_per_mm, least_noise)
+            def ask(x: Image) -> JointEvidence:
+                network = NetworkResponse.of_image(x, field.inside, trained, run.px_per_mm, least_noise)
+                return JointEvidence(
+                    network, BlobResponse.of_image(x, field.inside, ring_mm, run.px_per_mm), run.px_per_mm
+                )
 
             return ChainDetector(catalogue, field, run.px_per_mm, ask, acceptance)
 
