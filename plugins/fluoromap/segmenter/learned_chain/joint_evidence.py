@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.contracts import Array, BoolArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
@@ -98,5 +98,5 @@ class JointEvidence:
         return scores
 
 
-def _taken(proposals: Proposals, which: Array | BoolArray) -> Proposals:
+def _taken(proposals: Proposals, which: IntArray | BoolArray) -> Proposals:
     return Proposals(proposals.points_uv[which], proposals.probability[which], proposals.covariance_px2[which])
