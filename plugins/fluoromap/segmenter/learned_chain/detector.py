@@ -46,7 +46,8 @@ def electrode_chains(
     least_noise = _COARSE_NOISE if pixels.bits_stored <= _COARSE_BITS else 0.0
 
     def ask(x: Image) -> JointEvidence:
-        network = NetworkResponse.of_image(x, field.inside, trained, px_per_mm, least_noise)
-        return JointEvidence(network, BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm), px_per_mm)
+        network = NetworkResponse.of_image(x, trained, px_per_mm)
+        blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
+        return JointEvidence(network, blobs, px_per_mm, least_noise)
 
     return ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else _IN_A_RUN)

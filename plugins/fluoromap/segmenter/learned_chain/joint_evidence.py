@@ -25,30 +25,33 @@ _FAINT_LOG_ODDS = 2.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointEvidence:
-    """Network and blobs of one log image.
+    """Network and blobs of one log image, see :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
 
-    See :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
+    network : may be that of the frame before. least_noise : of a pixel, for pictures of 8 bits. reach_cells : how far from a
+    place the network's answer for it may lie.
     """
 
     network: NetworkResponse
     blobs: BlobResponse
     px_per_mm: float
+    least_noise: float
+    reach_cells: int = 1
 
     @property
     def smooth(self) -> Image:
-        return self.network.smooth
+        return self.blobs.smooth
 
     @property
     def reduction(self) -> int:
-        return self.network.reduction
+        return self.blobs.reduction
 
     @property
     def pixel_noise(self) -> float:
-        return self.network.pixel_noise
+        return max(self.blobs.pixel_noise, self.least_noise)
 
     @property
     def likeness(self) -> Likeness:
-        return self.network.likeness
+        return self.blobs.likeness
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
         """Return blobs that the network does not exclude, and its own proposals away from these.
@@ -70,12 +73,15 @@ class JointEvidence:
         )
         return _taken(together, np.argsort(-probability, kind="stable"))
 
+    def _network_at(self, points_uv: Array) -> Array:
+        return self.network.probability_at(points_uv, self.reach_cells)
+
     def probability_at(self, points_uv: Array) -> Array:
         """Return the probability of electrodes at points, (n,).
 
         Its log-odds are the mean of those of the network and twice those of the contrast.
         """
-        of_network = log_odds(self.network.probability_at(points_uv))
+        of_network = log_odds(self._network_at(points_uv))
         of_contrast = 2.0 * log_odds(probability_of_contrast(self.blobs.scores_at(points_uv)))
         probability: Array = 1.0 / (1.0 + np.exp(-_EVEN_SHARE * (of_network + of_contrast)))
         return probability
@@ -93,7 +99,7 @@ class JointEvidence:
         """
         contrast = self.blobs.scores_at(points_uv)
         excuse = _FAINT_LOG_ODDS * np.clip((_CLEAR - contrast) / (_CLEAR - _FAINT), 0.0, 1.0)
-        odds = log_odds(self.network.probability_at(points_uv)) + excuse
+        odds = log_odds(self._network_at(points_uv)) + excuse
         scores: Array = 1.0 / (1.0 + np.exp(-odds))
         return scores
 
