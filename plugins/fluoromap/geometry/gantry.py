@@ -109,9 +109,8 @@ def view_axes(primary_deg: float, secondary_deg: float) -> Array:
 def camera_from_gantry(gantry: Gantry) -> Camera:
     """Return the perspective camera of a gantry position, for stored pixels.
 
-    The same position returns the same object. The axes are those of :func:`view_axes`; the isocentre projects to the middle
-    of the
-    field (DICOM PS3.17 FFF.2.1.5.2).
+    The same position returns the same object. The axes are those of :func:`view_axes`; the isocentre projects to the
+    middle of the field (DICOM PS3.17 FFF.2.1.5.2).
     """
     axes = view_axes(gantry.primary_deg, gantry.secondary_deg)
     # Millimetres on the detector are turned like the image, then converted to stored pixels.

@@ -30,9 +30,9 @@ class SiteChoice:
     """The chosen pairing of one site.
 
     pairs : (s, 2) chain of view a and of view b in each slot of the catalogue, -1 where empty; over the study, one slot
-    of a group of look-alikes contains one catheter. alternative : the next best pairing, or None. probability : of the
-    alternative,
-    0 to 0.5.
+    of a group of look-alikes contains one catheter.
+    alternative : the next best pairing, or None.
+    probability : of the alternative, 0 to 0.5.
     """
 
     pairs: IntArray
@@ -63,9 +63,11 @@ class _Study:
 class _Configuration:
     """One explanation of the whole study.
 
-    chosen : the row chosen at each site. order : the order in which its slots fill the places. own_cost : (N,) cost of each
-    row,
-    given the gantry. centres_mm, variance_mm2 : of the places. cost : over all sites.
+    chosen : the row chosen at each site.
+    order : the order in which its slots fill the places.
+    own_cost : (N,) cost of each row, given the gantry.
+    centres_mm, variance_mm2 : of the places.
+    cost : over all sites.
     """
 
     chosen: IntArray
@@ -82,8 +84,7 @@ def choose_pairings(
     """Choose the pairings that make the study as a whole most likely.
 
     All catheters but the roving one hardly move between the sites. The gantry's angles have the same error at all sites
-    with the
-    same angles. So the other sites can rule out a pairing that fits well at its own site.
+    with the same angles. So the other sites can rule out a pairing that fits well at its own site.
 
     Parameters
     ----------
