@@ -194,8 +194,10 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
 
     Writes the standard deviations along and across for a pixel noise of 1, and the share of the variance along the axis
     that stays unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a
-    dome of its radius. ``shifts`` and ``sides`` : largest shift and half length of the template, in steps. ``scratch``
-    : three lines of work space.
+    dome of its radius.
+
+    shifts, sides : largest shift and half length of the template, in steps.
+    scratch : three lines of work space.
     """
     highest_u, highest_v = x.shape[1] - 1.001, x.shape[0] - 1.001
     template, profile, scores = scratch[0], scratch[1], scratch[2]
