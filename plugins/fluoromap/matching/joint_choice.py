@@ -13,7 +13,7 @@ from fluoromap.matching.hypotheses import PRIOR_TURN, Hypotheses
 from fluoromap.matching.pairs import student_cost
 
 PLACE_SD_MM = 4.0
-"""Prior variation of a catheter's diastolic place from site to site, an axis."""
+"""Prior variation of a catheter's diastolic place from site to site, per axis."""
 _PLACE_PRIOR_SITES = 3.0
 _NEUTRAL = float(student_cost(np.array(3.0), 3))
 _ANCHORS_PER_SITE = 6
@@ -210,7 +210,7 @@ def _place_positions(study: _Study, configuration: _Configuration) -> Array:
 
 
 def _places(positions: Array, otherwise: Array) -> tuple[Array, Array]:
-    """Return centre (p, 3) and variance an axis (p,) of each place.
+    """Return centre (p, 3) and variance per axis (p,) of each place.
 
     ``otherwise`` is the centre of a place that no site shows.
     """
