@@ -15,28 +15,29 @@ LEAST_VISIBLE = 3
 """A chain with fewer visible electrodes may be background, and its tip may be at either end."""
 
 
-def visible_part(found: Segmentation) -> Segmentation:
+def visible_part(found: Segmentation, dim_below: float = DIM_BELOW) -> Segmentation:
     """Return the segmentation without electrodes that were only predicted; see :data:`DIM_BELOW`."""
-    diastole = None if found.diastole is None else _visible_chains(found.diastole)
-    return replace(found, frames=tuple(map(_visible_chains, found.frames)), diastole=diastole)
+    diastole = None if found.diastole is None else _visible_chains(found.diastole, dim_below)
+    frames = tuple(_visible_chains(entry, dim_below) for entry in found.frames)
+    return replace(found, frames=frames, diastole=diastole)
 
 
-def _visible_chains(entry: FrameChains) -> FrameChains:
+def _visible_chains(entry: FrameChains, dim_below: float) -> FrameChains:
     """Return the entry without electrodes that the image does not show.
 
     Where no chain is left, ``manual_needed`` is set.
     """
-    chains = tuple(visible for chain in entry.chains if (visible := _visible_part(chain)) is not None)
+    chains = tuple(visible for chain in entry.chains if (visible := _visible_part(chain, dim_below)) is not None)
     reason = entry.manual_needed
     if entry.chains and not chains:
         reason = reason or Reason.MANUAL_NEEDED
     return replace(entry, chains=chains, manual_needed=reason)
 
 
-def _visible_part(chain: Chain) -> Chain | None:
+def _visible_part(chain: Chain, dim_below: float) -> Chain | None:
     if chain.manual:
         return chain
-    visible = np.flatnonzero(chain.scores >= DIM_BELOW * chain.scores.max())
+    visible = np.flatnonzero(chain.scores >= dim_below * chain.scores.max())
     if len(visible) == len(chain.electrodes):
         return chain
     if len(visible) < LEAST_VISIBLE:

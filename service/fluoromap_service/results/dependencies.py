@@ -55,7 +55,9 @@ def mesh_dependencies(map_sha256: str, mesh_format: str, origin: Origin) -> Depe
     }
 
 
-def report_dependencies(template_sha256: str, job_version: int, label: str | None) -> Dependencies:
+def report_dependencies(
+    template_sha256: str, job_version: int, label: str | None, guessed_sites: tuple[str, ...]
+) -> Dependencies:
     """Return the dependencies of a job's report, which prints the version of the package."""
     return {
         "kind": "report",
@@ -64,6 +66,7 @@ def report_dependencies(template_sha256: str, job_version: int, label: str | Non
         "template": template_sha256,
         "job": job_version,
         "label": label,
+        "guessed_sites": list(guessed_sites),
     }
 
 

@@ -141,8 +141,8 @@ class Site(Base):
     explicit_b: Mapped[str | None] = mapped_column(String(64))
     csv_a: Mapped[str | None] = mapped_column(Text)  # UID, series number or file name in the table
     csv_b: Mapped[str | None] = mapped_column(Text)
-    paired_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs that acquisition time joined
-    paired_b: Mapped[str | None] = mapped_column(String(64))
+    ordered_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs that acquisition time joined
+    ordered_b: Mapped[str | None] = mapped_column(String(64))
 
 
 class Correction(Base):

@@ -199,8 +199,8 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
     for site in session.scalars(select(Site).where(Site.study_id == study_id)):
         site.explicit_a = None if site.explicit_a == uid else site.explicit_a
         site.explicit_b = None if site.explicit_b == uid else site.explicit_b
-        if uid in (site.paired_a, site.paired_b):
-            site.paired_a = site.paired_b = None
+        if uid in (site.ordered_a, site.ordered_b):
+            site.ordered_a = site.ordered_b = None
     # Kept pictures show the run itself: delete them with it.
     ended = select(Job.id).where(Job.study_id == study_id)
     kept = list(session.scalars(select(Rendering.sha256).where(Rendering.job_id.in_(ended))))

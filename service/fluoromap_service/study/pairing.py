@@ -1,13 +1,13 @@
 """The rules that join two runs to a mapping site, as pure functions on plain values.
 
-The rules apply in this order:
-
-1. Runs that a PUT or PATCH gave to a site.
+1. Runs set by PUT or PATCH.
 2. Runs that the activation-time table names.
-3. Runs whose upload named a site.
-4. The other runs form pairs in order of acquisition time: two runs are a pair when they follow each other and their views are
-   30 degrees or more apart. When the table has as many rows without runs as there are such pairs, the rows name the pairs in
-   order. Otherwise the service names the pairs.
+3. The site given at upload.
+4. Runs that follow each other in acquisition time, with views 30 degrees or more apart, make a pair without a name.
+5. Row order: when nobody has named a run or a pair, and the table has as many rows as there are pairs, the pairs in the
+   order of time take the rows in their order. The result says so (``bound_by`` is "order"), because it is a guess.
+
+A name comes from a person, an upload or a table. No rule invents one.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ TABLE_STILL_MM = 1.0
 
 Direction = tuple[float, float, float]
 """Unit vector from the isocentre to the detector in patient axes (LPS)."""
-Rule = Literal["explicit", "csv", "upload", "order", "time"]
-_STRENGTH: tuple[Rule, ...] = ("explicit", "csv", "upload", "order", "time")
+Rule = Literal["explicit", "csv", "upload", "order"]
+_STRENGTH: tuple[Rule, ...] = ("explicit", "csv", "upload", "order")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,27 +73,24 @@ class Site:
     Parameters
     ----------
     name : str
-    has_time : bool
-        Whether the site has an activation time.
     csv_row : int or None
         Row of the last activation-time table that named the site.
     explicit_a, explicit_b : str or None
         SOP Instance UIDs set by PUT.
     csv_a, csv_b : str or None
         Run that the table names: UID, series number or file name.
-    paired_a, paired_b : str or None
-        SOP Instance UIDs of an earlier pairing by acquisition time.
+    ordered_a, ordered_b : str or None
+        SOP Instance UIDs of a pairing by row order, stored when a person confirmed it for another site.
     """
 
     name: str
-    has_time: bool = False
     csv_row: int | None = None
     explicit_a: str | None = None
     explicit_b: str | None = None
     csv_a: str | None = None
     csv_b: str | None = None
-    paired_a: str | None = None
-    paired_b: str | None = None
+    ordered_a: str | None = None
+    ordered_b: str | None = None
 
 
 Pair = tuple[Run, Run]
@@ -110,7 +107,7 @@ class SiteRuns:
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
-    """The runs of all sites by the site's name, and the pairs by time that have no name yet."""
+    """The runs of all sites by the site's name, and the pairs without a name in the order of acquisition."""
 
     sites: Mapping[str, SiteRuns]
     unnamed: tuple[Pair, ...]
@@ -123,20 +120,23 @@ def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
     draft.take_members("explicit")
     draft.take_table_views()
     draft.take_members("upload")
-    earlier = draft.take_earlier_pairs()
+    draft.take_ordered_pairs()
     unnamed = pairs_by_time(list(draft.free.values()))
-    # A pair of an anonymous site has a name that the service invented: a row of the table may take it over.
-    anonymous = [(site, pair) for site, pair in earlier if site.csv_row is None and not site.has_time]
-    pairs = sorted([*(pair for _, pair in anonymous), *unnamed], key=lambda pair: _moment(pair[0]))
-    rows = draft.rows_without_runs([site for site, _ in earlier])
-    if rows and len(rows) == len(pairs):
-        for site, pair in zip(rows, pairs, strict=True):
+    rows = draft.rows_without_runs()
+    if rows and len(rows) == len(unnamed) and _nobody_named(sites, runs):
+        for site, pair in zip(rows, unnamed, strict=True):
             draft.slots[site.name] = _Slots(*pair, "order")
-        earlier = [entry for entry in earlier if entry not in anonymous]
         unnamed = []
-    for site, pair in earlier:
-        draft.slots[site.name] = _Slots(*pair, "time")
     return Pairing({name: slots.result() for name, slots in draft.slots.items()}, tuple(unnamed))
+
+
+def _nobody_named(sites: Sequence[Site], runs: Sequence[Run]) -> bool:
+    """Return whether all that is known of the sites is a table's rows without views."""
+    bare = [
+        site.csv_row is not None and not any((site.explicit_a, site.explicit_b, site.csv_a, site.csv_b))
+        for site in sites
+    ]
+    return all(bare) and all(run.site is None for run in runs)
 
 
 @dataclass(eq=False)
@@ -161,10 +161,7 @@ class _Slots:
         """Return the runs; view a is the one nearer to lateral unless somebody named the views."""
         if self.a is None or self.b is None or self.named:
             return SiteRuns(self.a, self.b, self.by)
-        share_a, share_b = _lateral_share(self.a), _lateral_share(self.b)
-        if min(share_a, share_b) >= 0 and share_b > share_a + 1e-9:
-            return SiteRuns(self.b, self.a, self.by)
-        return SiteRuns(self.a, self.b, self.by)
+        return SiteRuns(*lateral_first(self.a, self.b), self.by)
 
 
 class _Draft:
@@ -210,29 +207,20 @@ class _Draft:
                 view = wanted if getattr(slots, wanted) is None else other
                 slots.put(view, self.free.pop(chosen.uid), by)
 
-    def take_earlier_pairs(self) -> list[tuple[Site, Pair]]:
-        """Take the pairs that acquisition time joined before.
-
-        Both runs and the site must still be free.
-        """
-        earlier: list[tuple[Site, Pair]] = []
+    def take_ordered_pairs(self) -> None:
+        """Take the pairs that row order joined and a person confirmed, where both runs and the site are still free."""
         for site in self._sites:
-            first, second = self.free.get(site.paired_a or ""), self.free.get(site.paired_b or "")
+            first, second = self.free.get(site.ordered_a or ""), self.free.get(site.ordered_b or "")
             if first is not None and second is not None and not self.slots[site.name].runs:
-                earlier.append((site, (self.free.pop(first.uid), self.free.pop(second.uid))))
-        return earlier
+                self.slots[site.name] = _Slots(self.free.pop(first.uid), self.free.pop(second.uid), "order")
 
-    def rows_without_runs(self, paired: Sequence[Site]) -> list[Site]:
-        """Return the table's sites without runs, in row order.
-
-        They have no run, name no run and have no earlier pair.
-        """
+    def rows_without_runs(self) -> list[Site]:
+        """Return the table's sites that have no run and name none, in row order."""
         rows = [
             site
             for site in self._sites
             if site.csv_row is not None
             and self.slots[site.name].by is None
-            and site not in paired
             and site.csv_a is None
             and site.csv_b is None
         ]
@@ -320,6 +308,12 @@ def table_moved(first: Run, second: Run) -> bool:
     if first.table_mm is None or second.table_mm is None:
         return False
     return math.dist(first.table_mm, second.table_mm) > TABLE_STILL_MM
+
+
+def lateral_first(first: Run, second: Run) -> Pair:
+    """Return a pair with the run nearer to lateral first; in the given order where angles are missing."""
+    shares = _lateral_share(first), _lateral_share(second)
+    return (second, first) if min(shares) >= 0 and shares[1] > shares[0] + 1e-9 else (first, second)
 
 
 def _lateral_share(run: Run) -> float:

@@ -20,22 +20,24 @@ from fluoromap.segmenter.run_segmentation import segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
 
-_TRUST = Trust(share=0.25, chain=0.6)
+_TRUST = Trust(share=0.25, chain=0.7)
 _IN_A_RUN = Acceptance(
     least_clearness=0.1,
     again_clearness=0.1,
     sure_clearness=0.1,
     extra_clearness=0.3,
-    least_score=0.3,
-    seen_score=0.1,
+    least_score=0.4,
+    seen_score=0.15,
     least_seen=0.85,
     unseen_evidence=-1.5,
     strict=True,
     trust=_TRUST,
 )
-_ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.35, seen_score=0.15)
+_ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
+_DIM_BELOW = 0.02
+"""Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""
 _COARSE_BITS = 8
 _COARSE_NOISE = 0.004
 
@@ -81,4 +83,4 @@ class LearnedChain:
 
             return ChainDetector(catalogue, field, run.px_per_mm, ask, acceptance)
 
-        return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True))
+        return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True), _DIM_BELOW)

@@ -10,10 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from fluoromap.reasons import Reason
 from fluoromap_service.api.http.problems import ProblemDocument
 from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
 from fluoromap_service.jobs.pipeline import StageName
 from fluoromap_service.jobs.stage_results import stages_of
+from fluoromap_service.results.row_order import warnings_of
 from fluoromap_service.store.models import ENDED_JOB, ENDED_STAGE, Event, Job, JobState, StageRow, StageState
 
 _STATUS = HTTPStatus.INTERNAL_SERVER_ERROR
@@ -59,7 +61,7 @@ class JobAnswer(BaseModel):
                             "version": "1", "state": "done", "attempt": 1, "progress": 1.0, "reused": False, "error": None,
                         }
                     ],
-                    "error": None, "created": "2026-03-01T09:30:00.000Z", "started": "2026-03-01T09:30:00.210Z",
+                    "error": None, "warnings": [], "created": "2026-03-01T09:30:00.000Z", "started": "2026-03-01T09:30:00.210Z",
                     "finished": None,
                     "links": {
                         "points": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/points",
@@ -79,13 +81,14 @@ class JobAnswer(BaseModel):
     progress: float = Field(ge=0, le=1, description="Mean over the stages; 1 when the job has ended.")
     stages: list[StageAnswer]
     error: ProblemDocument | None
+    warnings: list[Reason] = Field(description="Doubts about all results: paired_by_order until it is confirmed.")
     created: str
     started: str | None
     finished: str | None
     links: Links
 
 
-def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
+def job_answer(job: Job, stages: Sequence[StageRow], warnings: Sequence[Reason] = ()) -> JobAnswer:
     """Return a job with its stages in the shape of the answer."""
     root = f"/v1/jobs/{job.id}"
     return JobAnswer(
@@ -95,6 +98,7 @@ def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
         progress=_progress(job, stages),
         stages=[_stage(row) for row in stages],
         error=_problem(job.error),
+        warnings=list(warnings),
         created=rfc3339(job.created),
         started=rfc3339_or_none(job.started),
         finished=rfc3339_or_none(job.finished),
@@ -110,7 +114,7 @@ def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
 
 def read_job(session: Session, job: Job) -> JobAnswer:
     """Return the answer of one job."""
-    return job_answer(job, stages_of(session, job.id))
+    return job_answer(job, stages_of(session, job.id), warnings_of(session, job))
 
 
 def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
@@ -122,7 +126,7 @@ def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
     stages: dict[str, list[StageRow]] = {job_id: [] for job_id in ids}
     for row in session.scalars(select(StageRow).where(StageRow.job_id.in_(ids)).order_by(StageRow.id)):
         stages[row.job_id].append(row)
-    return {job.id: job_answer(job, stages[job.id]) for job in jobs}
+    return {job.id: job_answer(job, stages[job.id], warnings_of(session, job)) for job in jobs}
 
 
 def etag_of(session: Session, job: Job) -> str:
@@ -131,7 +135,7 @@ def etag_of(session: Session, job: Job) -> str:
     It changes with every event and every change of the job.
     """
     last = session.scalar(select(func.max(Event.id)).where(Event.job_id == job.id))
-    return f'"{job.id}-{job.version}-{last or 0}"'
+    return f'"{job.id}-{job.version}-{last or 0}-{len(warnings_of(session, job))}"'
 
 
 def _progress(job: Job, stages: Sequence[StageRow]) -> float:

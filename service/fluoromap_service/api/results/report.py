@@ -11,6 +11,7 @@ from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.report_page import report_page, template_sha256
 from fluoromap_service.results.dependencies import report_dependencies
 from fluoromap_service.results.finished import ended_job_of
+from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
 from fluoromap_service.store.renderings import kept_rendering
@@ -37,6 +38,7 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
     with reading() as session:
         job = ended_job_of(session, job_id, "report")
         study = session.get(Study, job.study_id)
-        depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None)
+        guessed = sites_by_row_order(session, job)
+        depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None, guessed)
     page = kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
     return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)

@@ -208,7 +208,6 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
             raise Problem(first.status, first.code, first.detail, first.errors, extra={"rejected": documents})
         if site is not None:
             sites.mention(session, study_id, site)
-        sites.settle(session, study)
         body = {"instances": _shapes(session, study, stored), "rejected": documents}
         return JSONResponse(body, 201 if new else 200)
 
@@ -231,7 +230,7 @@ def _of_part(problem: Problem, number: int) -> Problem:
 
 
 def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, Any]]:
-    views = sites.views_of(sites.resolve(session, study))
+    views = sites.views_of(sites.binding_of(session, study.id))
     runs = {run.uid: run for run in instances.runs_of(session, study.id)}
     return [instance_shape(runs[uid], views).model_dump() for uid in dict.fromkeys(uids)]
 
@@ -241,14 +240,14 @@ def list_instances(study_id: StudyId, pages: Pages, caller: Reader) -> Page[Inst
     """List the study's runs in the order of arrival."""
     with reading() as session:
         study = studies.get(session, study_id)
-        views = sites.views_of(sites.resolve(session, study))
+        views = sites.views_of(sites.binding_of(session, study.id))
         runs = instances.runs_of(session, study_id)
         return pages.page_of_all(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
 
 
 def _one(session: Session, study: Study, uid: str) -> InstanceOut:
     run = instances.run_of(session, study.id, uid)
-    return instance_shape(run, sites.views_of(sites.resolve(session, study)))
+    return instance_shape(run, sites.views_of(sites.binding_of(session, study.id)))
 
 
 @router.get("/{uid}", responses=responses(401, 403, 404, 422))
@@ -272,7 +271,6 @@ def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, ca
             run.link.gantry = {name: value for name, value in {**before, **changes}.items() if value is not None}
             _check_gantry(run)
         session.flush()
-        sites.settle(session, study)
         return _one(session, study, uid)
 
 
@@ -302,7 +300,6 @@ def delete_instance(study_id: StudyId, uid: InstanceUid, caller: Writer) -> None
     The service deletes the file when no other study refers to it.
     """
     with writing() as session:
-        study = studies.lock(session, study_id)
+        studies.lock(session, study_id)
         unreferenced = instances.remove(session, study_id, uid)
-        sites.settle(session, study)
     instances.unlink_unreferenced(unreferenced)

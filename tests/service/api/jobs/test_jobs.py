@@ -23,7 +23,7 @@ def _path(study: FinishedStudy) -> str:
 def test_a_job_has_exactly_the_promised_members(client: TestClient, study: FinishedStudy) -> None:
     job = client.get(_path(study)).json()
     assert set(job) == {
-        "id", "study", "state", "progress", "stages", "error", "created", "started", "finished", "links",
+        "id", "study", "state", "progress", "stages", "error", "warnings", "created", "started", "finished", "links",
     }  # fmt: skip
     assert set(job["stages"][0]) == {
         "name", "subject", "plugin", "version", "state", "attempt", "progress", "reused", "error",

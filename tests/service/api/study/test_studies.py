@@ -117,7 +117,7 @@ def test_pages(service: TestClient) -> None:
 
 def test_pages_of_a_study(service: TestClient, study_path: str, upload: Upload) -> None:
     upload((1, -90.0), (2, 0.0), (3, -90.0), (4, 0.0))
-    for what, key, expected in (("instances", "sop_instance_uid", 4), ("sites", "site", 2)):
+    for what, key, expected in (("instances", "sop_instance_uid", 4), ("sites", "pair", 2)):
         first = service.get(f"{study_path}/{what}?limit=1").json()
         rest = service.get(f"{study_path}/{what}", params={"cursor": first["next"]}).json()
         assert len({item[key] for item in [*first["items"], *rest["items"]]}) == expected
