@@ -1,9 +1,10 @@
-"""Send a folder of runs and activation times to the service, and wait for the job."""
+"""Send a folder of runs, activation times and settings to the service, and wait for the job."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,37 +12,115 @@ from rich.progress import Progress
 
 from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.failures import CommandFailed
+from fluoromap_service.cli.study_file import NAME, StudyFile, read_study_file
 from fluoromap_service.jobs.pipeline import PIPELINE
 
 
 @dataclass(frozen=True, slots=True)
 class StudyFiles:
-    """The files of one study: DICOM runs and the table of activation times."""
+    """The files of one study: DICOM runs, the table of activation times and ``study.toml``.
 
+    Parameters
+    ----------
+    folder : Path
+    runs : tuple of Path
+        DICOM files below the folder.
+    activation_times : Path or None
+        None when ``study.toml`` gives all times.
+    settings : StudyFile
+        Content of ``study.toml``; empty without that file.
+    """
+
+    folder: Path
     runs: tuple[Path, ...]
-    activation_times: Path
+    activation_times: Path | None
+    settings: StudyFile = field(default_factory=StudyFile)
+
+    def name_of(self, run: Path) -> str:
+        """Return a run's path below the folder, with slashes."""
+        # A file name may have bytes that are no UTF-8; neither a request nor a terminal takes them.
+        return os.fsencode(run.relative_to(self.folder).as_posix()).decode("utf-8", "replace")
+
+    def bindings(self) -> Iterator[tuple[str, str, Path]]:
+        """Yield site, view ("view_a" or "view_b") and run of each binding of ``study.toml``.
+
+        Raises
+        ------
+        CommandFailed
+            When a binding names no run, several runs, or a run that another binding names.
+        """
+        by_run: dict[Path, str] = {}
+        for site, entry in self.settings.sites.items():
+            for view, name in entry.files.items():
+                key = f"sites.{site}.{view}"
+                run = self._named_run(key, name)
+                if run in by_run:
+                    raise CommandFailed(
+                        f"{self.folder / NAME}: {key}: {by_run[run]} has the same file {name!r}; "
+                        "a run belongs to one view of one site."
+                    )
+                by_run[run] = key
+                yield site, view, run
+
+    def _named_run(self, key: str, name: str) -> Path:
+        names = {self.name_of(run): run for run in self.runs}
+        if name in names:
+            return names[name]
+        found = [path for path in names if path.rsplit("/", 1)[-1] == name]
+        if len(found) == 1:
+            return names[found[0]]
+        allowed = f"several files have this name: {', '.join(found)}" if found else _some_names(list(names))
+        raise CommandFailed(
+            f"{self.folder / NAME}: {key}: {name!r} is not one DICOM file of this folder; {allowed}. "
+            "Write the path below the folder."
+        )
+
+
+def _some_names(names: Sequence[str]) -> str:
+    listed = ", ".join(names[:10])
+    return f"the DICOM files are {listed}" + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """A study that was sent.
+
+    Parameters
+    ----------
+    study : str
+        Id of the study.
+    files : dict of str to str
+        SOP Instance UID -> path below the folder, of the accepted runs.
+    notes : tuple of str
+        One sentence for each rejected file and for each site without runs.
+    """
+
+    study: str
+    files: Mapping[str, str]
+    notes: tuple[str, ...]
 
 
 def find_files(folder: Path) -> StudyFiles:
-    """Find the DICOM files below a folder and its activation-time table.
+    """Find the DICOM files below a folder, its activation-time table and its ``study.toml``.
 
     Raises
     ------
     CommandFailed
-        When there are no runs or no table, or when several tables are possible.
+        When there are no runs or no activation times, when several tables are possible, or when ``study.toml`` is wrong.
     """
     if not folder.is_dir():
         raise CommandFailed(f"{folder} is not a folder; name a folder of DICOM files.")
     runs = tuple(sorted(path for path in folder.rglob("*") if path.is_file() and _is_dicom(path)))
     if not runs:
         raise CommandFailed(f"There is no DICOM file in {folder}; copy the runs there.")
+    settings = read_study_file(folder / NAME) if (folder / NAME).is_file() else StudyFile()
     default = folder / "activation_times.csv"
     tables = [default] if default.is_file() else sorted(folder.glob("*.csv"))
-    if not tables:
+    if not tables and all(entry.lat_ms is None for entry in settings.sites.values()):
         raise CommandFailed(f"There is no activation-time table in {folder}; add activation_times.csv (site,lat_ms).")
     if len(tables) > 1:
         raise CommandFailed(f"There are several CSV files in {folder}; name one of them activation_times.csv.")
-    return StudyFiles(runs, tables[0])
+    return StudyFiles(folder, runs, tables[0] if tables else None, settings)
 
 
 def _is_dicom(path: Path) -> bool:
@@ -50,29 +129,92 @@ def _is_dicom(path: Path) -> bool:
         return stream.read(132)[128:] == b"DICM"
 
 
-def upload(client: Client, files: StudyFiles, label: str, progress: Progress) -> tuple[str, list[str]]:
-    """Make a study and send its files.
+def upload(client: Client, files: StudyFiles, label: str, progress: Progress) -> Submission:
+    """Make a study, send its files and apply its ``study.toml``.
 
-    Returns
-    -------
+    Raises
+    ------
+    CommandFailed
+        When ``study.toml`` names a run that the service rejected, or a value that the service refuses.
+    """
+    bindings = list(files.bindings())
+    study = client.make_study(label, **files.settings.study)
+    bar = progress.add_task("upload", total=len(files.runs))
+    uids: dict[Path, str] = {}
+    notes = []
+    for number, path in enumerate(files.runs, start=1):
+        sent = client.upload(study, path, files.name_of(path))
+        if sent.uid is not None:
+            uids[path] = sent.uid
+        # A note gives the number of a file, because its name can hold a patient's name.
+        notes += [f"file {number} of {len(files.runs)} was rejected: {reason}" for reason in sent.objections]
+        progress.advance(bar)
+    _complete_geometry(client, study, files)
+    if files.activation_times is not None:
+        client.put_activation_times(study, files.activation_times)
+    _bind_sites(client, study, files, bindings, uids)
+    notes += [
+        f"site {site['site']} has no runs"
+        for site in client.sites(study)
+        if site["site"] is not None and site["view_a"] is None and site["view_b"] is None
+    ]
+    return Submission(study, {uid: files.name_of(path) for path, uid in uids.items()}, tuple(notes))
+
+
+def _complete_geometry(client: Client, study: str, files: StudyFiles) -> None:
+    """Give each run the default geometry for the values that its header lacks."""
+    defaults = files.settings.default_gantry
+    for run in client.instances(study):
+        missing = {name: value for name, value in defaults.items() if run["gantry"][name] is None}
+        if missing:
+            try:
+                client.complete_gantry(study, run["sop_instance_uid"], missing)
+            except CommandFailed as failure:
+                raise CommandFailed(f"{files.folder / NAME}: gantry does not fit a run's header: {failure}") from None
+
+
+def _bind_sites(
+    client: Client,
+    study: str,
+    files: StudyFiles,
+    bindings: Sequence[tuple[str, str, Path]],
+    uids: Mapping[Path, str],
+) -> None:
+    """Set the runs and the times that ``study.toml`` gives."""
+    timed = {site["site"] for site in client.sites(study) if site["lat_ms"] is not None}
+    changes: dict[str, dict[str, Any]] = {}
+    for site, entry in files.settings.sites.items():
+        if entry.lat_ms is not None:
+            if site in timed:
+                # A time alone would also confirm the runs that row order gave the site.
+                raise CommandFailed(
+                    f"{files.folder / NAME}: sites.{site}.lat_ms: the table of activation times has a time for this site too; "
+                    "keep one of them."
+                )
+            changes.setdefault(site, {})["lat_ms"] = entry.lat_ms
+    for site, view, run in bindings:
+        if run not in uids:
+            raise CommandFailed(
+                f"{files.folder / NAME}: sites.{site}.{view}: the service rejected {files.name_of(run)!r}; name another file."
+            )
+        changes.setdefault(site, {})[view] = uids[run]
+    for site, change in changes.items():
+        client.put_site(study, site, change)
+
+
+def run_job(
+    client: Client, study: str, progress: Progress, request: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Run a job with a progress bar for each kind of stage.
+
+    Parameters
+    ----------
+    client : Client
     study : str
         Id of the study.
-    notes : list of str
-        One sentence for each rejected file and for each site without runs.
-    """
-    study = client.make_study(label)
-    notes = []
-    bar = progress.add_task("upload", total=len(files.runs))
-    for number, path in enumerate(files.runs, start=1):
-        # A note gives the number of a file, because its name can hold a patient's name.
-        notes += [f"file {number} of {len(files.runs)} was rejected: {reason}" for reason in client.upload(study, path)]
-        progress.advance(bar)
-    notes += [f"site {site} has no runs" for site in client.put_activation_times(study, files.activation_times)]
-    return study, notes
-
-
-def run_job(client: Client, study: str, progress: Progress) -> dict[str, Any]:
-    """Run a job with a progress bar for each kind of stage.
+    progress : Progress
+    request : mapping, optional
+        Plugins and views as ``POST /v1/studies/{id}/jobs`` takes them; by default the default plugins.
 
     Returns
     -------
@@ -84,9 +226,10 @@ def run_job(client: Client, study: str, progress: Progress) -> dict[str, Any]:
     CommandFailed
         When the job fails.
     """
+    job_id = client.start_job(study, request or {})
     bars = {stage.name: progress.add_task(stage.title, total=1.0) for stage in PIPELINE}
     job: dict[str, Any] = {}
-    for job in client.follow(client.start_job(study)):
+    for job in client.follow(job_id):
         for name, bar in bars.items():
             progress.update(bar, completed=_progress_of([row for row in job["stages"] if row["name"] == name]))
     if job["state"] != "succeeded":
