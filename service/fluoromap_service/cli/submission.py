@@ -15,6 +15,23 @@ from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.study_file import NAME, StudyFile, read_study_file
 from fluoromap_service.jobs.pipeline import PIPELINE
 
+LISTED_NAMES = 10
+"""Most file names that a message lists."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedRun:
+    """A run that ``study.toml`` gives to a view ("view_a" or "view_b") of a site."""
+
+    site: str
+    view: str
+    run: Path
+
+    @property
+    def key(self) -> str:
+        """The key in ``study.toml``."""
+        return f"sites.{self.site}.{self.view}"
+
 
 @dataclass(frozen=True, slots=True)
 class StudyFiles:
@@ -29,56 +46,52 @@ class StudyFiles:
         None when ``study.toml`` gives all times.
     settings : StudyFile
         Content of ``study.toml``; empty without that file.
+    named_runs : tuple of NamedRun
+        The runs that ``study.toml`` names.
     """
 
     folder: Path
     runs: tuple[Path, ...]
     activation_times: Path | None
     settings: StudyFile = field(default_factory=StudyFile)
+    named_runs: tuple[NamedRun, ...] = ()
 
     def name_of(self, run: Path) -> str:
         """Return a run's path below the folder, with slashes."""
-        # A file name may have bytes that are no UTF-8; neither a request nor a terminal takes them.
-        return os.fsencode(run.relative_to(self.folder).as_posix()).decode("utf-8", "replace")
-
-    def bindings(self) -> Iterator[tuple[str, str, Path]]:
-        """Yield site, view ("view_a" or "view_b") and run of each binding of ``study.toml``.
-
-        Raises
-        ------
-        CommandFailed
-            When a binding names no run, several runs, or a run that another binding names.
-        """
-        by_run: dict[Path, str] = {}
-        for site, entry in self.settings.sites.items():
-            for view, name in entry.files.items():
-                key = f"sites.{site}.{view}"
-                run = self._named_run(key, name)
-                if run in by_run:
-                    raise CommandFailed(
-                        f"{self.folder / NAME}: {key}: {by_run[run]} has the same file {name!r}; "
-                        "a run belongs to one view of one site."
-                    )
-                by_run[run] = key
-                yield site, view, run
-
-    def _named_run(self, key: str, name: str) -> Path:
-        names = {self.name_of(run): run for run in self.runs}
-        if name in names:
-            return names[name]
-        found = [path for path in names if path.rsplit("/", 1)[-1] == name]
-        if len(found) == 1:
-            return names[found[0]]
-        allowed = f"several files have this name: {', '.join(found)}" if found else _some_names(list(names))
-        raise CommandFailed(
-            f"{self.folder / NAME}: {key}: {name!r} is not one DICOM file of this folder; {allowed}. "
-            "Write the path below the folder."
-        )
+        return _name_below(self.folder, run)
 
 
-def _some_names(names: Sequence[str]) -> str:
-    listed = ", ".join(names[:10])
-    return f"the DICOM files are {listed}" + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+def _name_below(folder: Path, run: Path) -> str:
+    # A file name may have bytes that are no UTF-8; neither a request nor a terminal takes them.
+    return os.fsencode(run.relative_to(folder).as_posix()).decode("utf-8", "replace")
+
+
+def _named_runs(folder: Path, runs: Sequence[Path], settings: StudyFile) -> Iterator[NamedRun]:
+    """Yield the runs that ``study.toml`` names; each must name one file that no other key names."""
+    names = {_name_below(folder, run): run for run in runs}
+    keys: dict[Path, str] = {}
+    for site, entry in settings.sites.items():
+        for view, name in entry.files.items():
+            named = NamedRun(site, view, _run_named(name, names, f"{folder / NAME}: sites.{site}.{view}"))
+            other = keys.setdefault(named.run, named.key)
+            if other != named.key:
+                raise CommandFailed(
+                    f"{folder / NAME}: {named.key}: {other} has the same file {name!r}; give each view its own run."
+                )
+            yield named
+
+
+def _run_named(name: str, names: Mapping[str, Path], where: str) -> Path:
+    """Return the run of a path below the folder, or of a file name that only one run has."""
+    if name in names:
+        return names[name]
+    found = [path for path in names if path.rsplit("/", 1)[-1] == name]
+    if len(found) == 1:
+        return names[found[0]]
+    if found:
+        raise CommandFailed(f"{where}: several files have the name {name!r}; write one of {', '.join(found)}.")
+    listed = ", ".join(list(names)[:LISTED_NAMES]) + (", ..." if len(names) > LISTED_NAMES else "")
+    raise CommandFailed(f"{where}: the folder has no DICOM file {name!r}; write one of {listed}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +105,7 @@ class Submission:
     files : dict of str to str
         SOP Instance UID -> path below the folder, of the accepted runs.
     notes : tuple of str
-        One sentence for each rejected file and for each site without runs.
+        One sentence for each rejected file.
     """
 
     study: str
@@ -120,7 +133,7 @@ def find_files(folder: Path) -> StudyFiles:
         raise CommandFailed(f"There is no activation-time table in {folder}; add activation_times.csv (site,lat_ms).")
     if len(tables) > 1:
         raise CommandFailed(f"There are several CSV files in {folder}; name one of them activation_times.csv.")
-    return StudyFiles(folder, runs, tables[0] if tables else None, settings)
+    return StudyFiles(folder, runs, tables[0] if tables else None, settings, tuple(_named_runs(folder, runs, settings)))
 
 
 def _is_dicom(path: Path) -> bool:
@@ -137,7 +150,6 @@ def upload(client: Client, files: StudyFiles, label: str, progress: Progress) ->
     CommandFailed
         When ``study.toml`` names a run that the service rejected, or a value that the service refuses.
     """
-    bindings = list(files.bindings())
     study = client.make_study(label, **files.settings.study)
     bar = progress.add_task("upload", total=len(files.runs))
     uids: dict[Path, str] = {}
@@ -152,12 +164,7 @@ def upload(client: Client, files: StudyFiles, label: str, progress: Progress) ->
     _complete_geometry(client, study, files)
     if files.activation_times is not None:
         client.put_activation_times(study, files.activation_times)
-    _bind_sites(client, study, files, bindings, uids)
-    notes += [
-        f"site {site['site']} has no runs"
-        for site in client.sites(study)
-        if site["site"] is not None and site["view_a"] is None and site["view_b"] is None
-    ]
+    _bind_sites(client, study, files, uids)
     return Submission(study, {uid: files.name_of(path) for path, uid in uids.items()}, tuple(notes))
 
 
@@ -173,38 +180,30 @@ def _complete_geometry(client: Client, study: str, files: StudyFiles) -> None:
                 raise CommandFailed(f"{files.folder / NAME}: gantry does not fit a run's header: {failure}") from None
 
 
-def _bind_sites(
-    client: Client,
-    study: str,
-    files: StudyFiles,
-    bindings: Sequence[tuple[str, str, Path]],
-    uids: Mapping[Path, str],
-) -> None:
+def _bind_sites(client: Client, study: str, files: StudyFiles, uids: Mapping[Path, str]) -> None:
     """Set the runs and the times that ``study.toml`` gives."""
-    timed = {site["site"] for site in client.sites(study) if site["lat_ms"] is not None}
-    changes: dict[str, dict[str, Any]] = {}
+    path = files.folder / NAME
+    with_time = {site["site"] for site in client.sites(study) if site["lat_ms"] is not None}
+    changes: dict[str, dict[str, Any]] = {site: {} for site in files.settings.sites}
     for site, entry in files.settings.sites.items():
-        if entry.lat_ms is not None:
-            if site in timed:
-                # A time alone would also confirm the runs that row order gave the site.
-                raise CommandFailed(
-                    f"{files.folder / NAME}: sites.{site}.lat_ms: the table of activation times has a time for this site too; "
-                    "keep one of them."
-                )
-            changes.setdefault(site, {})["lat_ms"] = entry.lat_ms
-    for site, view, run in bindings:
-        if run not in uids:
+        if entry.lat_ms is None:
+            continue
+        if site in with_time:
+            # A time alone would also confirm the runs that row order gave the site.
             raise CommandFailed(
-                f"{files.folder / NAME}: sites.{site}.{view}: the service rejected {files.name_of(run)!r}; name another file."
+                f"{path}: sites.{site}.lat_ms: the table of activation times has this site too; keep one of the two times."
             )
-        changes.setdefault(site, {})[view] = uids[run]
+        changes[site]["lat_ms"] = entry.lat_ms
+    for named in files.named_runs:
+        if named.run not in uids:
+            name = files.name_of(named.run)
+            raise CommandFailed(f"{path}: {named.key}: the service rejected the file {name!r}; name another one.")
+        changes[named.site][named.view] = uids[named.run]
     for site, change in changes.items():
         client.put_site(study, site, change)
 
 
-def run_job(
-    client: Client, study: str, progress: Progress, request: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
+def run_job(client: Client, study: str, progress: Progress, request: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Run a job with a progress bar for each kind of stage.
 
     Parameters
