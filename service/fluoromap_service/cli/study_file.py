@@ -105,7 +105,8 @@ def mistakes_of(error: ValidationError, model: type[BaseModel], prefix: tuple[st
         message = part["msg"].removeprefix("Value error, ")
         if part["type"] == "extra_forbidden":
             message = f"there is no such key; allowed are {', '.join(_keys(schema, place[:-1])) or 'none'}"
-        found.append((".".join(str(key) for key in (*prefix, *place)), message))
+        keys = [f"number {key + 1}" if isinstance(key, int) else key for key in place]
+        found.append((".".join([*prefix, *keys]), message))
     return found
 
 
