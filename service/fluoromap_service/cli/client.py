@@ -61,7 +61,10 @@ class Client:
         self._http.close()
 
     def make_study(self, label: str, **more: Any) -> str:
-        """Make a mapping study and return its id; ``more`` are further members of the request."""
+        """Make a mapping study and return its id.
+
+        ``more`` are further members of the request.
+        """
         study: str = self._json("POST", "/v1/studies", json={"label": label, **more})["id"]
         return study
 

@@ -109,7 +109,7 @@ class SiteTable:
         return list(dict.fromkeys([*site["warnings"], *(code for run in runs for code in run["warnings"])]))
 
     def explanations(self) -> list[str]:
-        """Return one sentence for each warning of the table, and for each run that no site has."""
+        """Return one sentence for each warning and for each unused run."""
         codes = dict.fromkeys(code for site in self.sites for code in self._warnings(site))
         unused = [uid for uid, run in self.runs.items() if _UNBOUND in run["warnings"]]
         return [f"{code}: {_sentence(code)}" for code in codes] + [
@@ -117,7 +117,7 @@ class SiteTable:
         ]
 
     def not_ready(self) -> list[str]:
-        """Return one sentence for each site or pair that a job cannot use."""
+        """Return one sentence for each site or pair that is not ready."""
         return [
             f"{'site ' if site['site'] else ''}{_name(site)} is not ready: {', '.join(self._needs(site))}"
             for site in self.sites
@@ -129,7 +129,10 @@ class SiteTable:
         return [f"missing {', '.join(missing)}"] if missing else list(site["warnings"])
 
     def refusal(self) -> str | None:
-        """Return why the service would refuse a job and what to do; None when it would not."""
+        """Return why the service would refuse a job and what to do.
+
+        None when the service would accept a job.
+        """
         rows, pairs = self.rows_without_runs, self.pairs
         if rows and pairs:
             return (
@@ -158,7 +161,10 @@ class SiteTable:
         yield from (_sentence(code) for code in sorted(codes))
 
     def lines_to_confirm(self) -> str:
-        """Return the lines of ``study.toml`` that name the guessed runs and the pairs without a name; "" without any."""
+        """Return lines of ``study.toml`` for guessed runs and unnamed pairs.
+
+        An empty text when there are none.
+        """
         return "\n\n".join(self._entry(site) for site in (*self.guesses, *self.pairs))
 
     def _entry(self, site: dict[str, Any]) -> str:

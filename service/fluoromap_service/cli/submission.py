@@ -67,7 +67,10 @@ def _name_below(folder: Path, run: Path) -> str:
 
 
 def _named_runs(folder: Path, runs: Sequence[Path], settings: StudyFile) -> Iterator[NamedRun]:
-    """Yield the runs that ``study.toml`` names; each must name one file that no other key names."""
+    """Yield the runs that ``study.toml`` names.
+
+    Each key must name one file that no other key names.
+    """
     names = {_name_below(folder, run): run for run in runs}
     keys: dict[Path, str] = {}
     for site, entry in settings.sites.items():
@@ -82,7 +85,10 @@ def _named_runs(folder: Path, runs: Sequence[Path], settings: StudyFile) -> Iter
 
 
 def _run_named(name: str, names: Mapping[str, Path], where: str) -> Path:
-    """Return the run of a path below the folder, or of a file name that only one run has."""
+    """Return the run of a path below the folder.
+
+    A file name is enough where only one run has it.
+    """
     if name in names:
         return names[name]
     found = [path for path in names if path.rsplit("/", 1)[-1] == name]
