@@ -41,6 +41,10 @@ class SiteOut(BaseModel):
     warnings: list[str] = Field(
         description="Reasons why the pair is doubtful or a job will reject it.", examples=[["table_moved"]]
     )
+    angle_deg: float | None = Field(
+        description="Angle between the central rays of the two views, 0 to 90 degrees.", examples=[90.0]
+    )
+    ready: bool = Field(description="Whether a job can use the site.", examples=[False])
 
 
 class SitePut(BaseModel):
@@ -63,13 +67,18 @@ def _shape(site: BoundSite) -> SiteOut:
             "bound_by": site.bound_by,
             "missing": list(site.missing),
             "warnings": list(site.warnings),
+            "angle_deg": site.angle_deg,
+            "ready": site.ready,
         }
     )
 
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
 def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]:
-    """List the study's sites in the order of first mention, then the pairs of runs that have no name yet."""
+    """List the study's sites in the order of first mention.
+
+    The pairs of runs that have no name yet follow.
+    """
     with reading() as session:
         binding = sites.binding_of(session, studies.get(session, study_id).id)
         return pages.page_of_all((*binding.sites, *binding.pairs), _shape, lambda site: site.site or f"/{site.pair}")
