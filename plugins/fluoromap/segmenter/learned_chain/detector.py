@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import PixelFacts
+from fluoromap.contracts import Chain, PixelFacts
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
@@ -26,7 +26,7 @@ _IN_A_RUN = Acceptance(
     least_score=0.4,
     seen_score=0.15,
     least_seen=0.85,
-    unseen_evidence=-1.5,
+    unseen_evidence=-0.9,
     strict=True,
     trust=_TRUST,
 )
@@ -37,6 +37,11 @@ _NEXT_FRAME_CELLS = 3
 """A catheter moves so far in a frame of a fast run, 2 mm."""
 _COARSE_BITS = 8
 _COARSE_NOISE = 0.004
+
+
+def confirms(chain: Chain) -> bool:
+    """Return whether a chain that was found again shows its catheter as clearly as one that was found."""
+    return _IN_A_RUN.accepts(chain.scores)
 
 
 def electrode_chains(
