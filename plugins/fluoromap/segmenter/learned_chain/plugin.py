@@ -20,7 +20,7 @@ from fluoromap.segmenter.run_segmentation import Detector, segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
 
-_LEAST_DETECTED = 0.5
+_LEAST_DETECTED = 0.7
 """Beads of contrast medium are found again in every frame, but are a catheter for the network in some only."""
 _DIM_BELOW = 0.02
 """Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""
@@ -46,7 +46,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "1"
+    version: ClassVar[str] = "2"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
