@@ -13,7 +13,7 @@ from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.alternating import LONGEST_MS, AlternatingDetector, LatestNetwork
-from fluoromap.segmenter.learned_chain.joint_evidence import JointEvidence
+from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import Trust
@@ -68,7 +68,8 @@ def electrode_chains(
 
     def ask(x: Image) -> JointEvidence:
         blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
-        return JointEvidence(network(x), blobs, px_per_mm, least_noise, _NEXT_FRAME_CELLS if network.borrowed else 1)
+        reach = _NEXT_FRAME_CELLS if network.borrowed else 1
+        return JointEvidence(network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, reach)
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else _IN_A_RUN)
     return AlternatingDetector(detector, network) if frame_ms <= LONGEST_MS else detector

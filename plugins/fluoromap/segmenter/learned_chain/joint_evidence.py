@@ -21,14 +21,16 @@ _EVEN_SHARE = 0.5
 _LEAST_PROBABILITY = 0.05
 _APART_MM = 0.6
 _FAINT, _CLEAR = 5.0, 9.5
-_FAINT_LOG_ODDS = 4.5
+FAINT_LOG_ODDS = 4.5
+"""Of an electrode that is too faint for the network to be sure, where other frames confirm it."""
 
 
 @dataclass(slots=True, eq=False)
 class JointEvidence:
     """Network and blobs of one log image, see :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
 
-    network : may be that of the frame before. least_noise : of a pixel, for pictures of 8 bits. reach_cells : how far from a
+    network : may be that of the frame before. least_noise : of a pixel, for pictures of 8 bits. faint_log_odds :
+    what little contrast adds to the network's log-odds in the scores. reach_cells : how far from a
     place the network's answer for it may lie.
     """
 
@@ -36,6 +38,7 @@ class JointEvidence:
     blobs: BlobResponse
     px_per_mm: float
     least_noise: float
+    faint_log_odds: float = FAINT_LOG_ODDS
     reach_cells: int = 1
     _proposed: Proposals | None = None
 
@@ -114,7 +117,7 @@ class JointEvidence:
         What is clearly visible and yet not clear to the network is no electrode.
         """
         contrast = self.blobs.scores_at(points_uv)
-        excuse = _FAINT_LOG_ODDS * np.clip((_CLEAR - contrast) / (_CLEAR - _FAINT), 0.0, 1.0)
+        excuse = self.faint_log_odds * np.clip((_CLEAR - contrast) / (_CLEAR - _FAINT), 0.0, 1.0)
         odds = log_odds(self._network_at(points_uv)) + excuse
         scores: Array = 1.0 / (1.0 + np.exp(-odds))
         return scores
