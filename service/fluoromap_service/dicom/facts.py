@@ -63,7 +63,7 @@ _SENTENCES: dict[HeaderWarning, str] = {
         "PatientOrientation or FieldOfViewRotation does not fit the gantry angles; the service assumes an upright image."
     ),
     HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; the service uses its first position only.",
-    HeaderWarning.TABLE_MOVED: "The table moved during this run.",
+    HeaderWarning.TABLE_MOVED: "The table moved during this run; the service uses its first position only.",
     HeaderWarning.PIXEL_INTENSITY_UNKNOWN: (
         "PixelIntensityRelationship is missing; the service assumes pixels prepared for display."
     ),
