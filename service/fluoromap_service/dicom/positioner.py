@@ -140,7 +140,9 @@ def orientation_letters(header: Header) -> tuple[str, str] | None:
 
 
 def table_position(header: Header) -> tuple[Point | None, TableOrigin | None]:
-    """Return the table top along the patient's axes (LPS), mm, and its origin; None unless all three values exist.
+    """Return the table top's position and the origin it counts from.
+
+    The position is in millimetres along the patient's axes (LPS). Both are None unless all three values exist.
 
     The standard's words "lateral" and "longitudinal" are those of an operator at the table's side, who faces the patient:
     lateral is towards the head, longitudinal towards the patient's left (PS3.3 C.8.7.4.1.3, C.8.19.6.11). In GE's private

@@ -303,9 +303,9 @@ def _apart(first: Run, second: Run) -> bool:
 
 
 def tables_comparable(first: Run, second: Run) -> bool:
-    """Return whether both table positions count from one origin, or both are unknown.
+    """Return whether the table's displacement can be computed, or no run states it.
 
-    Otherwise the table's displacement between the runs is unknown although a header states a position.
+    Two positions can be compared when they count from the same origin. Otherwise the table's displacement between the runs is unknown although a header states a position.
     """
     return first.table_origin == second.table_origin
 

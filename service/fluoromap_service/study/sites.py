@@ -222,7 +222,7 @@ def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
 
 
 def _doubts(runs: SiteRuns) -> tuple[Reason, ...]:
-    """Return why the positions of a pair deserve less trust although a job can use it."""
+    """Return why the positions of a usable pair deserve less trust."""
     if runs.a is None or runs.b is None or pairing.tables_comparable(runs.a, runs.b):
         return ()
     return (Reason.TABLE_MOVED,)

@@ -32,13 +32,19 @@ def gantry(run: str) -> Gantry:
 
 
 def table_mm(run: str) -> np.ndarray:
-    """Return the table's position (3,) by GE's private block: lateral = +X, vertical = +Y, longitudinal = +Z."""
+    """Return the table's position (3,) by GE's private block.
+
+    Lateral is +X, vertical +Y, longitudinal +Z.
+    """
     values = EXTRACT["runs"][run]
     return np.array([values["(0019,1023)"], values["(0019,1021)"], values["(0019,1022)"]])
 
 
 def cameras(signs: tuple[float, float, float]) -> dict[str, Camera]:
-    """Return the cameras in the frame of the phantom at run 1; ``signs``: of the table's displacement along X, Y, Z."""
+    """Return the cameras in the frame of the phantom at run 1.
+
+    ``signs`` are those of the table's displacement along X, Y and Z.
+    """
     return {
         run: camera_from_gantry(gantry(run)).translated(np.multiply(signs, table_mm(run) - table_mm(RUNS[0])))
         for run in RUNS
@@ -79,7 +85,10 @@ def test_exchanged_lateral_and_longitudinal_are_far_worse() -> None:
 
 
 def epipolar_px(first: Camera, second: Camera, pixels: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the distances (N,) of pixels (N, 2) of the second view from the epipolar lines of the first view's."""
+    """Return the distances (N,) of pixels from their epipolar lines in the second view.
+
+    pixels, others : (N, 2) of the first and of the second view.
+    """
     near, far = (first.back_project(pixels, depth) for depth in (600.0, 850.0))
     start, end = second.project(near), second.project(far)
     along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
