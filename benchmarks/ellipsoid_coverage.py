@@ -50,7 +50,7 @@ SITES = 4
 FRAMES = 30
 FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
 GANTRIES = {"gantry as assumed": (0.5, 0.5), "gantry exact": (0.0, 0.0), "gantry 0.7 deg, 1.4 mm a view": (0.7, 1.4)}
-"""Standard deviation, an axis, of a view's rotation in degrees and of its offset in mm."""
+"""Standard deviation per axis of a view's rotation in degrees and of its offset in mm."""
 
 
 @dataclass(frozen=True, eq=False)

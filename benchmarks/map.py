@@ -181,7 +181,7 @@ SETTINGS: dict[str, tuple[Placing, float]] = {
 def main(first: int, chambers: int) -> None:
     """Print all tables, on seeds ``first`` to ``first + chambers - 1``."""
     print(
-        f"{chambers} chambers from seed {first}, 20 sites with that noise an axis, times read to {TIME_SD_MS} ms; "
+        f"{chambers} chambers from seed {first}, 20 sites with that noise per axis, times read to {TIME_SD_MS} ms; "
         "mean (95 % interval)"
     )
     table: dict[str, list[dict[str, float]]] = {}

@@ -1,7 +1,7 @@
 """Correct pairing and naming of catheters: ``python benchmarks/matching.py [first seed] [studies] [rendered studies]``.
 
 The first part tests matching alone, on the true electrodes of simulated hearts. They have pixel noise, 1 degree gantry error
-an axis and view, different breathing in the two runs, wrong votes for the tip and, in some runs, a chain without its tip.
+per axis and view, different breathing in the two runs, wrong votes for the tip and, in some runs, a chain without its tip.
 Two more designs have an irregular rhythm, and conditions so hard that pairs are in doubt. The last part runs a few rendered
 studies through the real segmenter. Each part prints:
 

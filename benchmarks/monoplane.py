@@ -165,7 +165,7 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
 
     The a-priori positions are exact, then wrong.
     """
-    yield f"\nA-priori positions with errors up to a limit an axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
+    yield f"\nA-priori positions with errors up to a limit per axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
     yield (
         f"{'limit':>9}{'frames':>10}{'fixed':>10}{'adjusted':>10}{'bound':>8}{'ratio':>7}{'in 95 %':>9}"
         f"{'smooth path':>13}{'bound':>8}{'in 95 %':>9}"
@@ -305,7 +305,7 @@ def beating_hearts(rng: np.random.Generator) -> Iterator[str]:
     The solver is rigid-pose, once with known_rigid and once with a known cycle.
     """
     yield (
-        f"\nThree catheters in {HEARTS} beating hearts, two views, 30 frames at 15/s; a-priori positions within 0.15 mm an axis.\n"
+        f"\nThree catheters in {HEARTS} beating hearts, two views, 30 frames at 15/s; a-priori positions within 0.15 mm per axis.\n"
         "Runs that rigid-pose refuses, at full and at reduced motion, and RMS 3D of the other runs, mm.\n"
         "Without a cycle and without known_rigid it refuses all of them"
     )

@@ -182,9 +182,8 @@ def follows_tip(
 ) -> NDArray[np.float64]:
     """Return each electrode's displacement for a displaced tip, (..., N, 3, 3).
 
-    The shaft is not stretched: along it all electrodes move with the tip. The vessel holds the shaft, which bends: across
-    it,
-    electrodes farther back move less.
+    The shaft is not stretched: along it all electrodes move with the tip. The vessel holds the shaft, which bends:
+    across it, electrodes farther back move less.
     """
     follows = np.empty((*points_mm.shape, 3))
     for catheter in {name for name, _ in labels}:

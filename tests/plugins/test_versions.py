@@ -41,7 +41,7 @@ from fluoromap.contracts import (
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.phantom import SimulatedRun, SimulatedStudy, StudySpec, simulate_study
-from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.registry import Kind, build_fuser, build_monoplane, build_segmenter, build_triangulator, plugins
 from fluoromap.segmenter.warm_up import SyntheticFrames
 

@@ -196,7 +196,7 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     site = next(site["site"] for site in sites if failed[0]["subject"] in (site["view_a"], site["view_b"]))
     points = [p for p in service.get(f"/v1/jobs/{job['id']}/points").json()["points"] if p["site"] == site]
     assert {p["grade"] for p in points} == {"rejected"}
-    assert {tuple(p["reasons"]) for p in points} == {("plugin_failed",)}
+    assert {tuple(p["reasons"]) for p in points} == {("plugin_failed", "paired_by_order")}
 
 
 REFUSALS = {
@@ -224,7 +224,7 @@ def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
     if kind in ("segmenter", "triangulator"):
         points = service.get(f"{base}/points").json()["points"]
         assert len(points) == 5 * 12
-        assert {tuple(point["reasons"]) for point in points} == {(str(reason),)}
+        assert {tuple(point["reasons"]) for point in points} == {(str(reason), "paired_by_order")}
     elif kind == "monoplane":
         answer = service.get(f"{base}/tracks").json()
         assert answer["tracks"] == []

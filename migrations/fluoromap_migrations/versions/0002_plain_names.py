@@ -45,7 +45,10 @@ def upgrade() -> None:
 
 
 def _keep_chosen_pairs_only() -> None:
-    """Remove the names that the service gave to pairs by time, unless a person gave such a site a time."""
+    """Remove the names that the service gave to pairs by time.
+
+    A name stays when a person gave such a site a time.
+    """
     by_time = "paired_a IS NOT NULL AND csv_row IS NULL AND explicit_a IS NULL AND explicit_b IS NULL"
     op.execute(f"DELETE FROM site WHERE {by_time} AND lat_ms IS NULL")
     op.execute(f"UPDATE site SET explicit_a = paired_a, explicit_b = paired_b WHERE {by_time}")

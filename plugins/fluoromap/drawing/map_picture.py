@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, ChamberMap
+from fluoromap.drawing.colour_bar import draw_colour_bar
 from fluoromap.drawing.colours import Scale, scale_of
 from fluoromap.drawing.isochrones import Isochrone, isochrones
-from fluoromap.drawing.lettering import Labels, Point, draw_colour_bar, font
+from fluoromap.drawing.lettering import Labels, Point, font
 from fluoromap.drawing.raster import rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_time, is_outlier
 from fluoromap.drawing.wall import colour_table, line_parts, outline_edges, pixel_bands

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, ChamberMap
+from fluoromap.drawing.colour_bar import bar_box, draw_colour_bar
 from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, bar_box, draw_colour_bar, halo_text
+from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
 from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, colour_table, line_parts, outline_edges, pixel_bands

@@ -85,11 +85,11 @@ def track_body(
 def solve_poses(
     camera: Camera, model_mm: Array, pixels_uv: Array, rotations: Array, centres: Array, iterations: int
 ) -> tuple[Array, Array]:
-    """Solve the least-squares poses of B images of one body by compiled Levenberg-Marquardt steps.
+    """Solve the least-squares poses of one body in B images.
 
-    A point is ``R A + c``. The update is ``R <- exp([w]x) R``, ``c <- c + t``, solved from 6x6 normal equations. The
-    iteration works in the camera's axes. Where these are left-handed, the transform into them is a reflection too, so that
-    R stays a rotation.
+    The compiled steps are Levenberg-Marquardt's. A point is ``R A + c``. The update is ``R <- exp([w]x) R``, ``c <- c +
+    t``, solved from 6x6 normal equations. The iteration works in the camera's axes. Where these are left-handed, the
+    transform into them is a reflection too, so that R stays a rotation.
 
     Parameters
     ----------

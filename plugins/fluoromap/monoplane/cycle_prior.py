@@ -37,7 +37,10 @@ class CycleCurve:
         return found
 
     def sd_mm(self, phases: Array) -> Array:
-        """Return the standard deviation (n,) of one coordinate at phases (n,), from gaps and scatter of the moments."""
+        """Return the standard deviation (n,) of one coordinate at phases (n,).
+
+        Gaps between the moments and their scatter make it larger.
+        """
         waves = _waves(phases)
         found: Array = np.sqrt(np.einsum("nk,kl,nl->n", waves, self.covariance, waves))
         return found

@@ -159,7 +159,10 @@ class MotionCovariance:
             yield BEND, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
 
     def _looseness(self, name: str) -> tuple[float, float]:
-        """Return a catheter's deviation from its expected shape: tilt in radians, bend in mm at the ends."""
+        """Return a catheter's deviation from its expected shape.
+
+        Tilt in radians, and bend in mm at the ends.
+        """
         if self._expected.own_cycle:
             return 0.02, 0.08
         return (0.045, 0.2) if name == self._mapping else (0.02, 0.05)
@@ -202,7 +205,10 @@ def _shapes(catalogue: Catalogue, labels: tuple[tuple[str, int], ...], name: str
 
 
 def _over_cycle(phases: Array, harmonics: int) -> Array:
-    """Return unit-variance courses (n, 1 + 2 h) over the cycle: a constant, and waves whose strength falls as h^-1.5."""
+    """Return unit-variance courses (n, 1 + 2 h) over the cycle.
+
+    They are a constant, and waves whose strength falls as h^-1.5.
+    """
     order = np.arange(1, harmonics + 1)
     shares = order**-3.0 / (order**-3.0).sum() * (1 - _LASTING_SHARE)
     angle = 2 * np.pi * phases[:, None] * order

@@ -148,7 +148,10 @@ class MotionPrior:
         return positions, _with_baseline(paths.covariance_mm2, outside, alone), np.broadcast_to(closed, outside.shape)
 
     def _gated_catheters(self, electrodes: ViewElectrodes, used: BoolArray, deeper: Array, usual: Array) -> BoolArray:
-        """Return the electrodes (m,) of catheters whose depth the view changes by more than the prior allows."""
+        """Return the electrodes (m,) of catheters whose depth moved too far.
+
+        The view changes that depth by more than the prior allows.
+        """
         closed = np.zeros(used.shape[1], dtype=np.bool_)
         names = np.array(electrodes.catheters)
         for name in dict.fromkeys(electrodes.catheters):
@@ -235,7 +238,10 @@ class _Run:
 
 
 def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Array:
-    """Return the root mean square over each catheter's visible electrodes, repeated for each electrode (n, m)."""
+    """Return the root mean square over each catheter's visible electrodes.
+
+    It is repeated for each electrode, (n, m).
+    """
     names = np.array(electrodes.catheters)
     together = np.zeros_like(found)
     for name in dict.fromkeys(electrodes.catheters):

@@ -14,9 +14,9 @@ _CONVERGED = 1e-9
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _normal_equations(focal, model, offsets, turn, centre, rows, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill the lower half of the 7x7 ``normal``: J'J, below it J'r, in the corner r'r.
+    """Fill the lower half of the 7x7 ``normal`` and return r'r.
 
-    Return r'r.
+    It holds J'J, below it J'r, in the corner r'r.
     """
     m = model.shape[1]
     nearest = 2 * _NEAREST_MM

@@ -131,7 +131,10 @@ def _ventricles(rng: np.random.Generator) -> tuple[Chamber, Shaft, Shaft]:
 
 
 def _mapping_shaft(chamber: Chamber, contact_mm: Array, rng: np.random.Generator) -> Shaft:
-    """Draw the mapping catheter: through aorta and valve, with its tip's end on the wall."""
+    """Draw the mapping catheter through aorta and valve.
+
+    Its tip's end lies on the wall.
+    """
     inward = chamber.inward(contact_mm)
     valve = chamber.centre_mm - 34 * chamber.axes[2] + rng.normal(0, 2, 3)
     to_valve = valve - contact_mm

@@ -118,10 +118,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def spread_over_wall(chamber: Chamber, count: int, rng: np.random.Generator) -> Array:
-    """Return wall points (count, 3) far from each other, apex and basal ring included, in random order.
+    """Return wall points (count, 3) far from each other, in random order.
 
-    The valve plane leaves the basal quarter of the ellipsoid without wall. Each next point is, of 1500 random candidates,
-    the farthest from the points chosen so far.
+    Apex and basal ring are included. The valve plane leaves the basal quarter of the ellipsoid without wall. Each next
+    point is, of 1500 random candidates, the farthest from the points chosen so far.
     """
     candidates = chamber._from_sphere(_unit(rng.normal(size=(6000, 3))))
     height = (candidates - chamber.centre_mm) @ chamber.axes[2] / chamber.semi_axes_mm[2]

@@ -27,7 +27,9 @@ from fluoromap.phantom.simulated_study import SimulatedRun, SimulatedStudy
 def matched_sites(
     study: SimulatedStudy, noise_px: float = 0.5, seed: int = 0, exact_phases: bool = False, r_waves: bool = True
 ) -> tuple[MatchedSite, ...]:
-    """Return all sites as after matching, with every electrode segmented to ``noise_px`` an axis.
+    """Return all sites as after matching.
+
+    Every electrode is segmented to ``noise_px`` an axis.
 
     - Default phases come from matching: from R waves at the nearest frame, as files state them.
     - Without ``r_waves``, phases come from the motion alone.

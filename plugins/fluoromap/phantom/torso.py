@@ -91,7 +91,10 @@ def _attenuation(
 
 
 def _tissue(rows: int, columns: int, rng: np.random.Generator) -> Image:
-    """Draw noise whose amplitude falls as frequency to the power -1.4, with mean 0 and standard deviation 1."""
+    """Draw noise whose amplitude falls as frequency to the power -1.4.
+
+    It has mean 0 and standard deviation 1.
+    """
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None, :])
     amplitude = np.maximum(frequency, 2 / max(rows, columns)) ** -1.4
     amplitude[0, 0] = 0
@@ -144,5 +147,8 @@ def _wire(x: Image, y: Image, rng: np.random.Generator) -> Image:
 
 
 def _step(value: NDArray[np.floating[Any]], width: float) -> Image:
-    """Return a smooth step from 0 where ``value`` is negative to 1, over about ``width``."""
+    """Return a smooth step from 0 to 1, over about ``width``.
+
+    It is 0 where ``value`` is negative.
+    """
     return np.asarray(expit(value / np.float32(width)), dtype=np.float32)

@@ -96,9 +96,8 @@ class ChainDetector:
     def find_chains(self, x: Image, frame: int) -> FrameChains:
         """Return the chains of one log image, or the reason why there are none.
 
-        One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are accepted
-        too.
-        Weaker chains alone come with ``manual_needed``.
+        One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
+        accepted too. Weaker chains alone come with ``manual_needed``.
         """
         if min(x.shape) < 16:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)

@@ -99,10 +99,9 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
 def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, px_per_mm: float) -> Array:
     """Return the log-likelihood of these spacings at the places, up to a constant, (n,).
 
-    One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2``
-    (n, electrodes) is the variance of each place. The variance of each ratio between visible and true spacing contains
-    those of
-    its two ends and of the bend.
+    One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2`` (n,
+    electrodes) is the variance of each place. The variance of each ratio between visible and true spacing contains
+    those of its two ends and of the bend.
     """
     out = np.empty(len(places))
     if len(spacing_px) >= _MANY_SPACINGS:
@@ -208,9 +207,9 @@ def shaft_evidence(
 def _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add, over three pieces, the mean of the darker side less the middle.
 
-    Pixels outside the image do not count. A piece has the direction from its first to its second electrode. ``reach`` is
-    where it
-    begins and ends beyond the second electrode: in millimetres behind and before the catheter, in parts of the gap between.
+    Pixels outside the image do not count. A piece has the direction from its first to its second electrode. ``reach``
+    is where it begins and ends beyond the second electrode: in millimetres behind and before the catheter, in parts of
+    the gap between.
     """
     rows, columns = smooth.shape
     shift = 0.5 / reduction - 0.5

@@ -139,11 +139,10 @@ def link_candidates(
     - rings of unlike weight.
 
     A dark shaft between the electrodes and behind the last one raises the score; a dark shaft before the tip lowers it.
-    The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third, weaker
-    catheter is not dropped, nor a part of a long one preferred. Crossing
-    catheters may share one candidate at a price, but two chains must not lie at the same place. A set has at most as many
-    chains
-    of a family as the catalogue has catheters.
+    The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
+    weaker catheter is not dropped, nor a part of a long one preferred. Crossing catheters may share one candidate at a
+    price, but two chains must not lie at the same place. A set has at most as many chains of a family as the catalogue
+    has catheters.
 
     Parameters
     ----------
@@ -230,9 +229,8 @@ def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_pe
 def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage) -> Array:
     """Return how clearly each chain (n, electrodes, 2) shows a shaft.
 
-    The result (n,) lies between -3 and 3. Dark pixels in the widest gap and behind the last electrode count for a shaft,
-    dark
-    pixels before the tip against it.
+    The result (n,) lies between -3 and 3. Dark pixels in the widest gap and behind the last electrode count for a
+    shaft, dark pixels before the tip against it.
     """
     return chain_scores.shaft_evidence(
         points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,

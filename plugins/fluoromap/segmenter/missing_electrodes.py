@@ -29,9 +29,8 @@ _MOST = 100
 class CompletedChains:
     """Chains of candidates with one predicted electrode each.
 
-    points_uv, weights, variance_px2 : the candidates, then the predicted electrodes. rows : for each family, the indices of
-    its
-    chains from the tip on, (n, electrodes).
+    points_uv, weights, variance_px2 : the candidates, then the predicted electrodes.
+    rows : for each family, the indices of its chains from the tip on, (n, electrodes).
     """
 
     points_uv: Array

@@ -71,8 +71,7 @@ def segment_run(
 
     - A mark in one of the averaged frames replaces the automatic chain of the same catheter or place.
     - A mark elsewhere, of a catheter that is missing at diastole, moves diastole to the quietest marked frame. The
-    automatic
-      chains of that frame are added.
+      automatic chains of that frame are added.
 
     Parameters
     ----------

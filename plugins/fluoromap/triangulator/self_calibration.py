@@ -99,7 +99,7 @@ class _SiteEquations:
 
 @dataclass(frozen=True, slots=True)
 class _Scale:
-    """This study's breathing and beat variation, as multiples of the parameters' values."""
+    """Breathing and beat variation of a study, as multiples of the parameters' values."""
 
     breathing: float = 1.0
     beats: float = 1.0
@@ -305,7 +305,10 @@ def _posterior_over_kinds(
 
 
 def _misfit(rows: Sequence[_SiteEquations]) -> float:
-    """Return the mean squared misfit an equation; 1 where pixels, breathing and beats explain it."""
+    """Return the mean squared misfit per equation.
+
+    It is 1 where pixels, breathing and beats explain it.
+    """
     total = sum(float(one.residual @ np.linalg.solve(one.covariance(_Scale()), one.residual)) for one in rows)
     return total / sum(len(one.residual) for one in rows)
 

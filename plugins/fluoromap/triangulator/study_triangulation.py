@@ -118,7 +118,10 @@ def _locate_sites(
 def _first_look(
     site: MatchedSite, catalogue: Catalogue, params: UncertaintyParams
 ) -> tuple[Cameras, TwoViewPixels, Array, Array]:
-    """Return nominal cameras, pixels, points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise."""
+    """Return a site's nominal cameras, pixels and first points.
+
+    Points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise.
+    """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
     points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
     sources = error_sources(cameras, points, pixels.labels, catalogue, params, GANTRY_PRIOR, None)

@@ -50,7 +50,10 @@ def table_jumps(
 
 
 def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]:
-    """Return a sentence for each view that jumped: at which sites, and how far."""
+    """Return a sentence for each view that jumped.
+
+    It says at which sites, and how far.
+    """
     notes = []
     for view in ("a", "b"):
         at = [index for index, jump in enumerate(jumps) if jump is not None and jump.view == view]

@@ -18,7 +18,7 @@ from fluoromap_service.cli.failures import sentence_of
 
 COMMANDS = {
     "demo": "Simulate a study, run it through the real service and compare the results with the truth.",
-    "up": "Run the API and a worker; by default they use SQLite and files, no server.",
+    "up": "Run the API and a worker.",
     "run": "Run the pipeline over a folder, on a private service.",
     "simulate": "Simulate a study: DICOM runs, activation times and the truth.",
     "tables": "Print the paper's tables beside our own, computed on simulated data.",

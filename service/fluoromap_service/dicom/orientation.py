@@ -44,7 +44,9 @@ def field_of_view_of(image_axes: ImageAxes) -> tuple[int, bool]:
     for turns, flipped in itertools.product(range(4), (False, True)):
         if image_axes_from_field_of_view(90.0 * turns, flipped) == image_axes:
             return 90 * turns, flipped
-    raise ValueError("image_axes must be a flip, a quarter turn or both")
+    raise ValueError(
+        f"image_axes is {image_axes}; it must be a turn by 0, 90, 180 or 270 degrees, with or without a flip"
+    )
 
 
 def image_axes_from_orientation(

@@ -188,7 +188,11 @@ def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
 
 
 def _spread(header: Header, increments: str, *per_frame: str) -> float:
-    """Return the largest change during the run; legacy increments count from the first frame."""
+    """Return the largest change of a value during the run.
+
+    Legacy XA gives each frame's difference from the first frame (``increments``): the largest absolute value counts.
+    Enhanced XA gives the value of each frame (``per_frame``): the largest value less the smallest counts.
+    """
     spreads = [max((abs(value) for value in header.numbers(increments)), default=0.0)]
     for keyword in per_frame:
         values = [numbers[0] for numbers in header.numbers_per_frame(keyword) if numbers]

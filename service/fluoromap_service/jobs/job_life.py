@@ -221,7 +221,8 @@ def cancel(session: Session, job_id: str) -> bool:
 def reap(session: Session) -> int:
     """Free the stages whose workers fell silent and return how many.
 
-    After its last attempt a stage fails.
+    This is the retry after a crash. A stage whose worker crashed becomes ready, so that a worker can try again. It fails after
+    its last attempt. It is cancelled when somebody has cancelled the job.
     """
     expired = session.execute(
         select(StageRow.id, StageRow.job_id)
@@ -229,7 +230,7 @@ def reap(session: Session) -> int:
         .order_by(StageRow.job_id, StageRow.id)
     ).all()
     for stage_id, job_id in expired:
-        # A transaction that holds the job now either renews the lease or is another reaper.
+        # A transaction that holds the job now renews the lease, or is another reaper. Skip the stage until the next sweep.
         free = session.scalar(select(Job.id).where(Job.id == job_id).with_for_update(skip_locked=True))
         if free is None:
             continue

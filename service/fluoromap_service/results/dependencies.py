@@ -23,7 +23,11 @@ Dependencies = dict[str, Any]
 """JSON values."""
 
 _BY_HASH = frozenset({"facts", "chamber", "covariances_mm2"})
-"""Fields of a fusion that other values imply: the hash of the file, the hash of the map, and the look."""
+"""Fields of a fusion that other dependencies replace.
+
+The hash of the run's file replaces ``facts``, and the hash of the map replaces ``chamber``. The look says whether a picture
+shows ``covariances_mm2``; they are the same in all pictures of a job.
+"""
 
 
 def overlay_dependencies(fusion: Fusion, look: Look, *, moving: bool) -> Dependencies:

@@ -130,7 +130,7 @@ def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
 
 
 def _nobody_named(sites: Sequence[Site], runs: Sequence[Run]) -> bool:
-    """Return whether all that is known of the sites is a table's rows without views."""
+    """Return whether the sites are only rows of a table without views."""
     bare = [
         site.csv_row is not None and not any((site.explicit_a, site.explicit_b, site.csv_a, site.csv_b))
         for site in sites
@@ -207,14 +207,20 @@ class _Draft:
                 slots.put(view, self.free.pop(chosen.uid), by)
 
     def take_ordered_pairs(self) -> None:
-        """Take the pairs that row order joined and a person confirmed, where both runs and the site are still free."""
+        """Take the pairs by row order that a person confirmed.
+
+        Both runs and the site must still be free.
+        """
         for site in self._sites:
             first, second = self.free.get(site.ordered_a or ""), self.free.get(site.ordered_b or "")
             if first is not None and second is not None and not self.slots[site.name].runs:
                 self.slots[site.name] = _Slots(self.free.pop(first.uid), self.free.pop(second.uid), "order")
 
     def rows_without_runs(self) -> list[Site]:
-        """Return the table's sites that have no run and name none, in row order."""
+        """Return the table's sites without runs, in row order.
+
+        They name no run either.
+        """
         rows = [
             site
             for site in self._sites
@@ -305,13 +311,17 @@ def _apart(first: Run, second: Run) -> bool:
 def tables_comparable(first: Run, second: Run) -> bool:
     """Return whether the table's displacement can be computed, or no run states it.
 
-    Two positions can be compared when they count from the same origin. Otherwise the table's displacement between the runs is unknown although a header states a position.
+    Two positions can be compared when they count from the same origin. Otherwise the displacement between the runs is unknown
+    although a header states a position.
     """
     return first.table_origin == second.table_origin
 
 
 def lateral_first(first: Run, second: Run) -> Pair:
-    """Return a pair with the run nearer to lateral first; in the given order where angles are missing."""
+    """Return a pair with the run nearer to lateral first.
+
+    Where angles are missing, the given order stays.
+    """
     shares = _lateral_share(first), _lateral_share(second)
     return (second, first) if min(shares) >= 0 and shares[1] > shares[0] + 1e-9 else (first, second)
 

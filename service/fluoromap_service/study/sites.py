@@ -106,9 +106,9 @@ class Binding:
 
 
 def binding_of(session: Session, study_id: str, *, also: str | None = None) -> Binding:
-    """Return which runs belong to which site of a study, by the rules of :mod:`pairing`.
+    """Return which runs belong to which site of a study.
 
-    A site without runs and facts is left out, unless ``also`` is its name.
+    The rules are those of :mod:`pairing`. A site without runs and facts is left out, unless ``also`` is its name.
     """
     runs = runs_of(session, study_id)
     with_runs = {run.link.site for run in runs} | {also}
@@ -201,7 +201,10 @@ def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundS
 
 
 def _is_empty(row: Site) -> bool:
-    """Return whether nothing is known of a site but its name: a table that named it was replaced."""
+    """Return whether nothing is known of a site but its name.
+
+    Such a row stays when a table that named the site was replaced.
+    """
     return all(fact is None for fact in (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b))
 
 
@@ -212,7 +215,7 @@ def _missing_runs(runs: SiteRuns, with_geometry: set[str]) -> list[str]:
 
 
 def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
-    """Return why a job cannot use a pair of runs, and the angle between their rays."""
+    """Return why a job cannot use a pair, and the rays' angle."""
     if runs.a is None or runs.b is None:
         return None, None
     angle_deg = pairing.view_angle_deg(runs.a, runs.b)
@@ -229,7 +232,9 @@ def _doubts(runs: SiteRuns) -> tuple[Reason, ...]:
 
 
 def site_of(session: Session, study: Study, name: str, *, also_empty: bool = False) -> BoundSite:
-    """Return one site of a study; ``also_empty``: even when nothing is known of it but its name.
+    """Return one site of a study.
+
+    ``also_empty``: even when nothing is known of it but its name.
 
     Raises
     ------
@@ -308,9 +313,10 @@ def _has_its_runs(entry: ActivationTime, site: BoundSite) -> bool:
 
 
 def confirm_order(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
-    """Bind a site by hand to the runs that row order gave it, unless ``views`` asks for others.
+    """Bind a site by hand to the runs that row order gave it.
 
-    The other sites keep their runs by row order, with the warning: only this one was looked at.
+    Nothing happens when ``views`` asks for other runs. The other sites keep their runs by row order, with the warning:
+    only this one was looked at.
     """
     guessed = {site.site: site for site in binding_of(session, study.id).by_row_order}
     confirmed = guessed.get(name)
@@ -376,7 +382,10 @@ def move_run(session: Session, study: Study, run: StudyRun, site: str | None) ->
 
 
 def views_of(binding: Binding) -> dict[str, tuple[BoundSite, str]]:
-    """Return site or pair, and view ("a" or "b"), of each bound run, by SOP Instance UID."""
+    """Return site and view of each bound run, by SOP Instance UID.
+
+    The view is "a" or "b". The site may be a pair without a name.
+    """
     found: dict[str, tuple[BoundSite, str]] = {}
     for site in (*binding.sites, *binding.pairs):
         for view, uid in (("a", site.view_a), ("b", site.view_b)):

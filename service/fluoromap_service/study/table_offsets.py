@@ -13,9 +13,9 @@ _LAST = datetime.max.replace(tzinfo=UTC)
 def table_offsets_mm(runs: Iterable[InstanceFacts]) -> dict[str, Point]:
     """Return the displacement of the table since the first run.
 
-    Keys are SOP Instance UIDs. Displacements are in millimetres along the patient's axes (LPS). The first run is the earliest by acquisition time. Positions that
-    different attributes state have different origins, so that each origin has a first run of its own. A run without a known
-    position is left out.
+    Keys are SOP Instance UIDs. Displacements are in millimetres along the patient's axes (LPS). The first run is the earliest
+    by acquisition time. Positions that different attributes state have different origins, so that each origin has a first run
+    of its own. A run without a known position is left out.
     """
     first: dict[TableOrigin, Point] = {}
     offsets: dict[str, Point] = {}

@@ -12,9 +12,9 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOImage import vtkPNGReader
 
 from fluoromap.drawing.animation import PICTURES, draw_propagation
+from fluoromap.drawing.colour_bar import bar_box
 from fluoromap.drawing.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import bar_box
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.drawing.png import encode_png

@@ -170,6 +170,7 @@ def test_ray_angle_is_folded_to_ninety_degrees(a: float, b: float) -> None:
     [
         {"primary_deg": 181.0}, {"secondary_deg": float("nan")}, {"source_isocentre_mm": 1000.0},
         {"source_isocentre_mm": 50.0}, {"pixel_spacing_mm": (0.0, 0.3)}, {"rows": 0}, {"image_axes": ((1, 0), (1, 0))},
+        {"image_axes": ((1, 1), (0, 1))}, {"image_axes": ((2, 1), (1, 1))},
     ],
 )  # fmt: skip
 def test_impossible_gantries_are_refused(changes: dict[str, object]) -> None:

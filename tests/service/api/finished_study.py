@@ -98,8 +98,8 @@ class FinishedStudy:
             stored = job_life.StoredResult(sha256, tuple(rows or ()))
             assert job_life.finish(session, held, stored, reused=False)
 
-    def fail(self, name: str, subject: str | None = None) -> None:
-        error = {"code": "plugin_failed", "detail": f"The stage {name!r} failed: it broke."}
+    def fail(self, name: str, subject: str | None = None, code: str = "plugin_failed") -> None:
+        error = {"code": code, "detail": f"The stage {name!r} failed: it broke."}
         with self.claimed(name, subject) as (session, held):
             assert job_life.fail(session, held, error)
 

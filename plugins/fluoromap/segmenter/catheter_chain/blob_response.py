@@ -26,10 +26,11 @@ _BLUR_MM = 1.75
 class BlobResponse:
     """Response of one log image to dark blobs.
 
-    stack : (3, rows, columns) float32, scale-normalised half Laplacian in log units, positive where dark; image size over
-    ``reduction``. best : (rows, columns), the largest of the three scales, each over its noise. noise : (3,) robust
-    standard
-    deviation of ``stack`` inside the field. smooth : (rows, columns) the reduced log image at the smallest scale.
+    stack : (3, rows, columns) float32, scale-normalised half Laplacian in log units, positive where dark; image size
+    over ``reduction``.
+    best : (rows, columns), the largest of the three scales, each over its noise.
+    noise : (3,) robust standard deviation of ``stack`` inside the field.
+    smooth : (rows, columns) the reduced log image at the smallest scale.
     pixel_noise : standard deviation of a pixel of the reduced log image.
     """
 

@@ -25,9 +25,8 @@ _ACCEPTANCE = Acceptance(
 class CatheterChain:
     """Segmenter that links blobs at three scales to the best set of chains.
 
-    Every frame is searched on its own. A catheter that one frame does not show clearly is searched again along its track.
-    Frames
-    without a clear chain are left to the user.
+    Every frame is searched on its own. A catheter that one frame does not show clearly is searched again along its
+    track. Frames without a clear chain are left to the user.
     """
 
     name: ClassVar[str] = "catheter-chain"

@@ -79,9 +79,8 @@ def _radii(px_per_mm: float) -> tuple[float, float, float]:
 def _local_maxima(x, found):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write each positive maximum as (u, v, value); return their number.
 
-    No pixel within two of a maximum exceeds it. skimage.feature.peak_local_max takes 35 times as long, and SciPy's maximum
-    filter
-    three times.
+    No pixel within two of a maximum exceeds it. skimage.feature.peak_local_max takes 35 times as long, and SciPy's
+    maximum filter three times.
     """
     rows, columns = x.shape
     count = 0

@@ -135,9 +135,8 @@ class FourStepDetector:
 def _add_peaks(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:
     """Return the blobs, then the peaks that are not one of them.
 
-    The blobs lack two kinds of electrodes: steeply foreshortened rings are narrower than the opening disk, and electrodes
-    of
-    crossing catheters merge into one component.
+    The blobs lack two kinds of electrodes: steeply foreshortened rings are narrower than the opening disk, and
+    electrodes of crossing catheters merge into one component.
     """
     if not len(peaks_uv):
         return blobs_uv

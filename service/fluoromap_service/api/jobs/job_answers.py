@@ -18,8 +18,8 @@ from fluoromap_service.jobs.stage_results import stages_of
 from fluoromap_service.results.row_order import warnings_of
 from fluoromap_service.store.models import ENDED_JOB, ENDED_STAGE, Event, Job, JobState, StageRow, StageState
 
-_FAULTS = frozenset({"plugin_failed", "worker_lost"})
-"""Codes of errors that the data do not cause: status 500. All other codes have status 422."""
+_STATUS = HTTPStatus.INTERNAL_SERVER_ERROR
+"""Status of every stage's error. The plugin, the worker or the service caused it: data that a plugin refuses fail no stage."""
 
 
 class StageAnswer(BaseModel):
@@ -166,6 +166,5 @@ def _problem(error: dict[str, Any] | None) -> ProblemDocument | None:
     if error is None:
         return None
     code = str(error.get("code", "plugin_failed"))
-    status = 500 if code in _FAULTS else 422
     detail = str(error.get("detail", "The stage failed."))
-    return ProblemDocument(type="about:blank", title=HTTPStatus(status).phrase, status=status, detail=detail, code=code)
+    return ProblemDocument(type="about:blank", title=_STATUS.phrase, status=_STATUS, detail=detail, code=code)

@@ -9,12 +9,11 @@ from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.report_page import report_page, template_sha256
-from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import report_dependencies
-from fluoromap_service.results.finished import job_of
+from fluoromap_service.results.finished import ended_job_of
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import ENDED_JOB, Study
+from fluoromap_service.store.models import Study
 from fluoromap_service.store.renderings import kept_rendering
 
 router = APIRouter(tags=["results"])
@@ -37,10 +36,7 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
     view, tables with grades and reasons, the error budget, parameters, versions and the hashes of the input files.
     """
     with reading() as session:
-        job = job_of(session, job_id)
-        if job.state not in ENDED_JOB:
-            detail = "The report is available when the job has ended; follow the job and ask again."
-            raise Problem(409, "not_ready", detail)
+        job = ended_job_of(session, job_id, "report")
         study = session.get(Study, job.study_id)
         guessed = sites_by_row_order(session, job)
         depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None, guessed)

@@ -10,7 +10,7 @@ import io
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -22,6 +22,7 @@ from fluoromap.drawing.colours import vertex_colours
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
 from fluoromap.drawing.png import encode_png
+from fluoromap.registry import Kind
 from fluoromap_service.api.jobs.job_answers import read_job
 from fluoromap_service.api.results.overlays import picture_of
 from fluoromap_service.api.results.points import points_of
@@ -109,9 +110,7 @@ def _values(job_id: str) -> dict[str, Any]:
             "notes": triangulation.notes if triangulation else (),
             "bindings": [(site.site, BINDINGS[site.bound_by]) for site in snapshot.sites],
             "guessed": sites_by_row_order(session, job),
-            "plugins": [
-                (kind, getattr(snapshot, kind)) for kind in ("segmenter", "triangulator", "monoplane", "fuser")
-            ],
+            "plugins": [(kind, getattr(snapshot, kind)) for kind in get_args(Kind)],
             "catheters": snapshot.catheters,
             "runs": sorted(snapshot.runs.items()),
         }

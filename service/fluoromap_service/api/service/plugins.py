@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
@@ -29,7 +29,7 @@ class Plugin(BaseModel):
         }
     )  # fmt: skip
 
-    kind: Literal["segmenter", "triangulator", "monoplane", "fuser"]
+    kind: registry.Kind
     name: str
     version: str | None = Field(description="Null where the plugin did not load.")
     distribution: str | None = Field(description="The installed package of the plugin.")

@@ -69,7 +69,10 @@ def _shape(site: BoundSite) -> SiteOut:
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
 def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]:
-    """List the study's sites in the order of first mention, then the pairs of runs that have no name yet."""
+    """List the study's sites in the order of first mention.
+
+    The pairs of runs that have no name yet follow.
+    """
     with reading() as session:
         binding = sites.binding_of(session, studies.get(session, study_id).id)
         return pages.page_of_all((*binding.sites, *binding.pairs), _shape, lambda site: site.site or f"/{site.pair}")

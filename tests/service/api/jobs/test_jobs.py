@@ -54,6 +54,15 @@ def test_a_failed_stage_is_a_problem_in_its_stage_and_in_the_job(client: TestCli
     assert (job["state"], job["progress"]) == ("failed", 1.0)
 
 
+@pytest.mark.parametrize("code", ["internal", "plugin_failed", "worker_lost"])
+def test_a_failed_stage_is_no_fault_of_the_data(client: TestClient, study: FinishedStudy, code: str) -> None:
+    study.segmented()
+    study.fail("match", code=code)
+    job = client.get(_path(study)).json()
+    match = next(stage for stage in job["stages"] if stage["name"] == "match")
+    assert [(error["code"], error["status"]) for error in (job["error"], match["error"])] == [(code, 500)] * 2
+
+
 def test_unchanged_jobs_are_not_sent_again(client: TestClient, study: FinishedStudy) -> None:
     etag = client.get(_path(study)).headers["etag"]
     again = client.get(_path(study), headers={"If-None-Match": etag})
