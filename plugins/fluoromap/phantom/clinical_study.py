@@ -228,7 +228,7 @@ def _times(conditions: Conditions, rate_hz: float, catheters: int, site: int, vi
     """Draw beats and breathing of a run; both runs of a simultaneous pair share them."""
     view = 0 if conditions.simultaneous else view
     rng = np.random.default_rng([conditions.seed, _RUN, site, view])
-    frames = max(int(round(conditions.seconds * conditions.frame_rate_hz)), 5)
+    frames = max(round(conditions.seconds * conditions.frame_rate_hz), 5)
     times = np.arange(frames) / conditions.frame_rate_hz
     beats = _beats(conditions, rate_hz, float(times[-1]), catheters, rng)
     breathing = Breathing.draw(conditions.breathing_mm, np.random.default_rng([conditions.seed, _BREATH, site, view]))
