@@ -1,9 +1,12 @@
-"""How long one waits after a correction by hand: ``python benchmarks/correction.py [corrections]``.
+"""Waiting time after a correction by hand: ``python benchmarks/correction.py [corrections]``.
 
-Runs the demonstration's study (8 sites, 2 views, 30 frames, simulated) through the real service once, then moves one electrode
-of one frame by 2 px, asks for a new job and waits for its map; again and again at another site. Prints the seconds from the
-PUT of the electrode to the map in hand, beside the seconds of the first job up to its map, and what was computed again. Last
-the milliseconds from asking for each overlay of the last map, not drawn before, to having it.
+The benchmark runs the demonstration's study (8 sites, 2 views, 30 frames, simulated) through the real service once. Then, for
+each correction at another site, it moves one electrode of one frame by 2 px, starts a new job and waits for its map. It
+prints:
+
+- the seconds of the first job up to its map,
+- for each correction the seconds from the PUT of the electrode to the new map, and the stages that were computed again,
+- the milliseconds from the request of each overlay of the last map, not drawn before, to its arrival.
 """
 
 from __future__ import annotations
@@ -19,8 +22,10 @@ from typing import Any
 import httpx
 from rich.console import Console
 
-from fluoromap_service.cli.client import Client, inputs_of, progress_bars, send
-from fluoromap_service.cli.demonstration import SPEC
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.demo import SPEC
+from fluoromap_service.cli.progress import progress_bars
+from fluoromap_service.cli.submission import find_files, upload
 from fluoromap_service.cli.supervisor import private_service
 from fluoromap_service.dicom.simulation import simulate
 
@@ -33,23 +38,25 @@ def main(corrections: int) -> None:
         simulate(Path(folder) / "study", SPEC)
         with private_service(Path(folder) / "service") as url, httpx.Client(base_url=url, timeout=120) as http:
             with Client(url) as client, progress_bars(Console(stderr=True)) as progress:
-                study, _ = send(client, inputs_of(Path(folder) / "study"), "correction", progress)
+                study, _ = upload(client, find_files(Path(folder) / "study"), "correction", progress)
             first_s, job = _until_map(http, study)
             print(f"first job, up to the map: {first_s:.2f} s ({len(job['stages'])} stages)")
-            _ended(http, job["id"])
+            _wait_for_end(http, job["id"])
             sites = http.get(f"/v1/studies/{study}/sites").json()["items"]
-            taken = []
+            seconds = []
             for number in range(corrections):
                 site = sites[number % len(sites)]
-                path, marks = _moved_tip(http, study, site["view_a"], frame=1 + number)
+                path, electrodes = _electrodes_to_put(http, study, site["view_a"], frame=1 + number)
                 start = time.perf_counter()
-                http.put(path, json=marks).raise_for_status()
+                http.put(path, json=electrodes).raise_for_status()
                 _, job = _until_map(http, study)
-                taken.append(time.perf_counter() - start)
-                stages = Counter(stage["name"] for stage in _ended(http, job["id"])["stages"] if not stage["reused"])
+                seconds.append(time.perf_counter() - start)
+                stages = Counter(
+                    stage["name"] for stage in _wait_for_end(http, job["id"])["stages"] if not stage["reused"]
+                )
                 again = ", ".join(f"{count} {name}" for name, count in stages.items())
-                print(f"correction at {site['site']}: {taken[-1]:.2f} s to the new map; computed again: {again}")
-            print(f"median {median(taken):.2f} s, longest {max(taken):.2f} s")
+                print(f"correction at {site['site']}: {seconds[-1]:.2f} s to the new map; computed again: {again}")
+            print(f"median {median(seconds):.2f} s, longest {max(seconds):.2f} s")
             overlays = http.get(f"/v1/jobs/{job['id']}/overlays").json()["overlays"]
             for scale in (1, 2):
                 waits = [1000 * _seconds(http, f"{overlay['href']}?scale={scale}") for overlay in overlays]
@@ -59,16 +66,16 @@ def main(corrections: int) -> None:
                 )
 
 
-def _moved_tip(http: httpx.Client, study: str, uid: str, frame: int) -> tuple[str, list[dict[str, Any]]]:
-    """Where the electrodes of a frame are put, and the mapping catheter's with the first of them moved."""
+def _electrodes_to_put(http: httpx.Client, study: str, uid: str, frame: int) -> tuple[str, list[dict[str, Any]]]:
+    """Return the path of a frame's electrodes, and the mapping catheter's electrodes with the first displaced."""
     path = f"/v1/studies/{study}/instances/{uid}/frames/{frame}/electrodes"
     found = http.get(path).json()
     chosen = [entry for entry in found if entry["catheter"] == "mapping"] or found
     if not chosen:
-        raise SystemExit(f"no electrode was found in frame {frame}; ask for fewer corrections")
-    marks = [{name: entry[name] for name in ("catheter", "electrode", "u_px", "v_px")} for entry in chosen]
-    marks[0]["u_px"] += 2.0
-    return path, marks
+        raise SystemExit(f"no electrode was found in frame {frame}; give a smaller number of corrections")
+    electrodes = [{name: entry[name] for name in ("catheter", "electrode", "u_px", "v_px")} for entry in chosen]
+    electrodes[0]["u_px"] += 2.0
+    return path, electrodes
 
 
 def _until_map(http: httpx.Client, study: str) -> tuple[float, dict[str, Any]]:
@@ -87,7 +94,7 @@ def _seconds(http: httpx.Client, href: str) -> float:
     return time.perf_counter() - start
 
 
-def _ended(http: httpx.Client, job: str) -> dict[str, Any]:
+def _wait_for_end(http: httpx.Client, job: str) -> dict[str, Any]:
     while True:
         state: dict[str, Any] = http.get(f"/v1/jobs/{job}?wait=30").json()
         if state["state"] in ("succeeded", "failed", "cancelled"):

@@ -1,12 +1,14 @@
-"""How often a 95 % ellipsoid holds the truth: ``python benchmarks/ellipsoid_coverage.py [first seed] [hearts] [--given]``.
+"""Coverage of 95 % ellipsoids: ``python benchmarks/ellipsoid_coverage.py [first seed] [hearts] [--given]``.
 
-Hearts are drawn as the triangulator's parameters say (gantry angles 0.5 degrees, isocentre 0.5 mm, breathing 4 mm to head
-and feet) and go through the whole pipeline: a study is rendered, segmented by ``catheter-chain``, matched, triangulated.
-With ``--given`` nothing is rendered: true pixels with 0.5 px of noise go into matching, which is fast enough for hundreds of
-hearts, and hearts whose gantry is exact or worse than assumed are counted as well. Electrodes graded A to C count;
-misidentified ones (farther than 5 px from their place in a view) are counted apart. The interval is a bootstrap over
-hearts: the electrodes of one heart share their errors. Errors are RMS in 3D, beside what the covariances say. Below stand
-the mean error budget and in how many hearts the gantry was calibrated.
+Hearts are drawn with the triangulator's parameters (gantry angles 0.5 degrees, isocentre 0.5 mm, breathing 4 mm to head
+and feet). They go through the whole pipeline: a study is rendered, segmented by ``catheter-chain``, matched, triangulated.
+With ``--given`` nothing is rendered: true pixels with 0.5 px of noise go into matching. This is fast enough for hundreds of
+hearts; hearts with an exact gantry and with a worse one than assumed are then counted too.
+
+Electrodes graded A to C count. Misidentified electrodes (farther than 5 px from their place in a view) are counted
+separately. The interval is a bootstrap over hearts, because the electrodes of one heart share their errors. Errors are RMS
+in 3D, beside the errors that the covariances state. The last lines give the mean error budget and the share of hearts whose
+gantry was calibrated.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
@@ -53,7 +55,7 @@ GANTRIES = {"gantry as assumed": (0.5, 0.5), "gantry exact": (0.0, 0.0), "gantry
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """An estimate's error (3,) in mm beside its covariance (3, 3), or, ``misidentified``, what does not count."""
+    """An estimate's error (3,) in mm and its covariance (3, 3); a ``misidentified`` estimate does not count."""
 
     heading: str
     error_mm: Array
@@ -63,7 +65,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Heart:
-    """One simulated study on its way through the pipeline: truth, and what matching and triangulation made of it."""
+    """One simulated study with its truth, its matching and its triangulation."""
 
     study: SimulatedStudy
     matching: Matching
@@ -76,17 +78,17 @@ class Heart:
         return next(one for one in self.matching.sites if one.site == site)
 
 
-def rendered(run: SimulatedRun, seed: int) -> Segmentation:
-    """The run as ``catheter-chain`` sees it."""
+def segment_rendered(run: SimulatedRun, seed: int) -> Segmentation:
+    """Segment the rendered run by ``catheter-chain``."""
     camera = camera_from_gantry(run.gantry)
-    kept = KeptFrames(run.frames)
+    frames = MemoryFrames(run.frames)
     return CatheterChain().segment(
-        Run(kept, run.frame_times_ms, camera.px_per_mm, FACTS), DEFAULT_CATALOGUE, {}, Silent()
+        Run(frames, run.frame_times_ms, camera.px_per_mm, FACTS), DEFAULT_CATALOGUE, {}, Silent()
     )
 
 
-def given(run: SimulatedRun, seed: int) -> Segmentation:
-    """The run's true pixels with noise, as an ideal segmenter would give them; diastole by the segmenters' own rule."""
+def segment_ideally(run: SimulatedRun, seed: int) -> Segmentation:
+    """Return the run's true pixels with noise, as from an ideal segmenter; diastole by the segmenters' own rule."""
     rng = np.random.default_rng([seed, int(run.start_seconds * 1000)])
     names = DEFAULT_CATALOGUE.names
     n = len(run.frame_times_ms)
@@ -119,7 +121,7 @@ def given(run: SimulatedRun, seed: int) -> Segmentation:
     return Segmentation(frames, diastole, quiet, motion, run.frame_times_ms)
 
 
-def heart_of(spec: StudySpec, segment: Callable[[SimulatedRun, int], Segmentation]) -> Heart:
+def process_heart(spec: StudySpec, segment: Callable[[SimulatedRun, int], Segmentation]) -> Heart:
     """Simulate, segment, match and triangulate one study."""
     study = simulate_study(spec)
     runs = tuple(
@@ -137,11 +139,8 @@ def heart_of(spec: StudySpec, segment: Callable[[SimulatedRun, int], Segmentatio
     return Heart(study, matching, solver.triangulate(matching.sites, DEFAULT_CATALOGUE, Silent()))
 
 
-def of_points(heart: Heart) -> Iterator[Sample]:
-    """Every electrode located at diastole, from the isocentre and from the reference catheter.
-
-    What tracks state can be counted in the same table by another function of this form.
-    """
+def point_samples(heart: Heart) -> Iterator[Sample]:
+    """Yield every electrode located at diastole, from the isocentre and from the reference catheter."""
     for site in heart.triangulation.sites:
         truth, matched = heart.truth(site.site), heart.matched(site.site)
         for point in site.points:
@@ -150,7 +149,7 @@ def of_points(heart: Heart) -> Iterator[Sample]:
             place = truth.truth.diastole_mm[point.catheter][point.electrode - 1]
             yield Sample("points, absolute", point.position_mm - place, point.covariance_mm2, wrong)
             if point.relative_mm is not None and point.relative_covariance_mm2 is not None:
-                # The reference itself may be the misidentified one: then no relative position counts.
+                # Where the reference itself is misidentified, no relative position counts.
                 lost = wrong or any(
                     misidentified(matched, truth, (DEFAULT_CATALOGUE.reference, electrode)) for electrode in range(1, 5)
                 )
@@ -159,19 +158,19 @@ def of_points(heart: Heart) -> Iterator[Sample]:
 
 
 def misidentified(matched: MatchedSite, truth: SimulatedSite, label: tuple[str, int]) -> bool:
-    """Whether either view took something else for this electrode at diastole."""
-    for seen, run in zip((matched.diastole.a, matched.diastole.b), truth.runs, strict=True):
-        for chain in seen.chains:
+    """Return True where either view took something else for this electrode at diastole."""
+    for observation, run in zip((matched.diastole.a, matched.diastole.b), truth.runs, strict=True):
+        for chain in observation.chains:
             if chain.catheter == label[0] and label[1] in chain.electrodes:
                 pixel = chain.pixels_uv[chain.electrodes.index(label[1])]
-                if np.linalg.norm(pixel - run.truth.pixels_uv[label[0]][seen.frame, label[1] - 1]) > NEAR_PX:
+                if np.linalg.norm(pixel - run.truth.pixels_uv[label[0]][observation.frame, label[1] - 1]) > NEAR_PX:
                     return True
     return False
 
 
 @dataclass
 class Coverage:
-    """What the samples of each heart say, under each heading."""
+    """Samples of each heart under each heading."""
 
     hearts: dict[str, list[list[Sample]]] = field(default_factory=dict)
     studies: dict[str, list[Triangulation]] = field(default_factory=dict)
@@ -201,12 +200,12 @@ class Coverage:
             budgets = [asdict(study.budget) for study in studies if study.budget is not None]
             applied = np.mean([study.calibration is not None and study.calibration.applied for study in studies])
             mean = {key: float(np.mean([budget[key] for budget in budgets])) for key in budgets[0]}
-            told = ", ".join(f"{key.removesuffix('_mm').replace('_', ' ')} {value:.2f}" for key, value in mean.items())
-            print(f"{name}: calibrated {applied:.2f}; error budget in mm: {told}")
+            parts = ", ".join(f"{key.removesuffix('_mm').replace('_', ' ')} {value:.2f}" for key, value in mean.items())
+            print(f"{name}: calibrated {applied:.2f}; error budget in mm: {parts}")
 
 
 def _sums(samples: list[Sample]) -> list[float]:
-    """Inside, counted, squared error, stated variance, misidentified."""
+    """Return the sums: inside, counted, squared error, stated variance, misidentified."""
     counted = [sample for sample in samples if not sample.misidentified]
     errors = np.array([sample.error_mm for sample in counted]).reshape(-1, 3)
     covariances = np.array([sample.covariance_mm2 for sample in counted]).reshape(-1, 3, 3)
@@ -223,8 +222,8 @@ def main(first_seed: int, hearts: int, use_given: bool) -> None:
     for number, seed in enumerate(range(first_seed, first_seed + hearts)):
         for name, (angle_deg, offset_mm) in populations:
             spec = StudySpec(seed, sites=SITES, frames=FRAMES, gantry_error_deg=angle_deg, isocentre_error_mm=offset_mm)
-            heart = heart_of(spec, given if use_given else rendered)
-            table.add(name, of_points(heart))
+            heart = process_heart(spec, segment_ideally if use_given else segment_rendered)
+            table.add(name, point_samples(heart))
             table.studies.setdefault(name, []).append(heart.triangulation)
         if sys.stderr.isatty() or (number + 1) % 10 == 0:
             print(f"{number + 1} of {hearts} hearts", file=sys.stderr, flush=True)

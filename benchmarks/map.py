@@ -1,11 +1,12 @@
-"""How true the map is: ``python benchmarks/map.py [first seed] [chambers]``, 9000 and 100 where not given.
+"""Accuracy of the map: ``python benchmarks/map.py [first seed] [chambers]``; defaults 9000 and 100.
 
-Each seed draws a chamber that is no ellipsoid (semi-axes 18-28, 18-28, 30-48 mm, bumps and hollows of 8 %, bent), a focus on
-its wall, 0.6 to 1 m/s, and 20 sites that leave out the basal quarter where the valves are. Truth is the way along the wall
-on 5000 points. Both fusers get the same sites. Times are compared at the covered vertices, weighted by area, with the true
-time of the nearest wall; beside them SciPy's thin-plate RBFInterpolator through space on the same sites and vertices. Then
-velocity where sites are dense, seconds and memory, and milliseconds of an overlay on a rendered frame (both of one thread's
-processor time). Means over chambers with 95 % bootstrap intervals.
+Each seed draws a chamber that is not an ellipsoid (semi-axes 18-28, 18-28, 30-48 mm, bumps and hollows of 8 %, bent), a focus
+on its wall, a velocity of 0.6 to 1 m/s, and 20 sites outside the basal quarter with the valves. True times come from the way
+along the wall over 5000 points. Both fusers get the same sites. Times at the covered vertices, weighted by area, are compared
+with the true time of the nearest wall. SciPy's thin-plate RBFInterpolator through space gets the same sites and vertices.
+
+The next tables give the velocity with dense sites, seconds and memory, and milliseconds of an overlay on a rendered frame
+(both in processor time of one thread). All figures are means over chambers with 95 % bootstrap intervals.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ STEP_MM = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """points_mm (n, 3) on the wall; lat_ms (n,) there; wall: those that sites may touch."""
+    """Truth of a chamber: points_mm (n, 3) on the wall, lat_ms (n,), and ``wall``, indices of points for sites."""
 
     points_mm: Array
     lat_ms: Array
@@ -53,7 +54,7 @@ class Truth:
     velocity_m_per_s: float
 
     def times_at(self, places_mm: Array) -> Array:
-        """True time (m,) at the nearest wall, between its three nearest points."""
+        """Return the true time (m,) at the nearest wall, interpolated between its three nearest points."""
         distance, nearest = cKDTree(self.points_mm).query(places_mm, k=3)
         weight: Array = 1 / (np.asarray(distance) + 1e-3)
         times: Array = (weight * self.lat_ms[nearest]).sum(axis=1) / weight.sum(axis=1)
@@ -70,11 +71,11 @@ def draw_chamber(rng: np.random.Generator) -> Truth:
     bumps = np.exp((unit @ centres.T - 1) / 0.25) @ rng.normal(0, 0.08, 8)
     points = unit * semi_axes * (1 + bumps)[:, None]
     points[:, :2] += rng.normal(0, 4, 2) * (unit[:, 2:] ** 2 - 1 / 3)
-    turned, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    points = points @ (turned * np.sign(np.linalg.det(turned))) + rng.normal(0, 10, 3)
+    axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    points = points @ (axes * np.sign(np.linalg.det(axes))) + rng.normal(0, 10, 3)
     wall = np.flatnonzero(unit[:, 2] > -0.5)
     tree = cKDTree(points)
-    # Straight steps of up to 6 mm between wall points: within 0.5 % of the way along the wall.
+    # Straight steps of up to 6 mm between wall points are within 0.5 % of the way along the wall.
     steps = tree.sparse_distance_matrix(tree, STEP_MM, output_type="coo_matrix").tocsr()
     velocity = float(rng.uniform(0.6, 1.0))
     lat = dijkstra(steps, indices=[int(rng.choice(wall))], min_only=True) / velocity - rng.uniform(0, 60)
@@ -87,7 +88,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def spread(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
-    """Wall points far from each other, as an operator who wants the whole chamber places them."""
+    """Choose wall points far from each other, as an operator does who maps the whole chamber."""
     candidates = rng.permutation(truth.wall)
     chosen = [int(candidates[0])]
     nearest = np.full(len(candidates), np.inf)
@@ -98,7 +99,7 @@ def spread(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
 
 
 def scattered(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
-    """Wall points by chance: some walls crowded, some empty."""
+    """Choose wall points at random: some walls are crowded, some empty."""
     return rng.choice(truth.wall, count, replace=False)
 
 
@@ -148,7 +149,7 @@ def _weighted_median(values: Array, weight: Array) -> float:
 
 
 def _show(table: dict[str, list[dict[str, float]]]) -> None:
-    """One line a figure, one column a setting and fuser."""
+    """Print one line for each figure, one column for each setting and fuser."""
     headings = list(table)
     for line in zip(*(heading.split(", ") for heading in headings), strict=True):
         print(" " * 13 + "".join(f"{cell:>23}" for cell in line))
@@ -195,17 +196,17 @@ def main(first: int, chambers: int) -> None:
             for count, found in velocities.items():
                 rng = np.random.default_rng([seed, count])
                 sites = sites_at(truth, scattered(truth, count, rng), 0.7, rng)
-                told = build_fuser("smooth-surface", {}).fuse(sites, Silent()).conduction_velocity
-                if told is not None:
+                stated = build_fuser("smooth-surface", {}).fuse(sites, Silent()).conduction_velocity
+                if stated is not None:
                     true = truth.velocity_m_per_s
-                    found.append((told.median_m_per_s / true, told.low_m_per_s / true, told.high_m_per_s / true))
+                    found.append((stated.median_m_per_s / true, stated.low_m_per_s / true, stated.high_m_per_s / true))
     _show(table)
     for count, found in velocities.items():
         if found:
             ratio, low, high = np.array(found).T
             inside = np.mean((low <= 1) & (high >= 1))
             print(
-                f"velocity, {count} scattered sites: told in {len(found)} of {chambers // 4}, median over truth "
+                f"velocity, {count} scattered sites: stated in {len(found)} of {chambers // 4}, median over truth "
                 f"{ratio.mean():.3f} (sd {ratio.std():.3f}), truth in the interval {inside:.2f}"
             )
     for name in FUSERS:
@@ -216,7 +217,7 @@ def main(first: int, chambers: int) -> None:
 
 
 def _overlays(seed: int) -> None:
-    """Milliseconds to draw the map of 20 sites into a frame and to make the PNG of it, medians."""
+    """Print the median milliseconds to draw a map of 20 sites into a frame and to encode its PNG."""
     rng = np.random.default_rng(seed)
     truth = draw_chamber(rng)
     sites = sites_at(truth, spread(truth, 20, rng), 0.7, rng)
@@ -239,7 +240,7 @@ def _overlays(seed: int) -> None:
 
 
 def _cost(seed: int, name: str, count: int) -> tuple[float, float, float]:
-    """Seconds, most MB of arrays at one time, and highest MB of a process of its own that imports all plugins."""
+    """Return seconds, peak MB of arrays, and peak MB of a separate process that imports all plugins."""
     rng = np.random.default_rng(seed)
     truth = draw_chamber(rng)
     sites = sites_at(truth, spread(truth, count, rng), 0.7, rng)

@@ -1,11 +1,14 @@
-"""How often catheters are paired and named right: ``python benchmarks/matching.py [first seed] [studies] [rendered studies]``.
+"""Correct pairing and naming of catheters: ``python benchmarks/matching.py [first seed] [studies] [rendered studies]``.
 
-First matching alone: the true electrodes of simulated hearts with pixel noise, 1 degree gantry error an axis and view, other
-breaths in the two runs, wrong votes for the tip and, in some runs, a chain without its tip; then the same with a rhythm
-that is not regular, and so hard that pairs are in doubt. Prints the share of catheters
-rightly paired and named, with a bootstrap interval over studies; how many of the wrong ones were flagged and kept the right
-answer as their alternative; whether stated probabilities come true; the error of the cardiac phase. Then the same through
-the real segmenter on a few rendered studies.
+The first part tests matching alone, on the true electrodes of simulated hearts. They have pixel noise, 1 degree gantry error
+an axis and view, different breathing in the two runs, wrong votes for the tip and, in some runs, a chain without its tip.
+Two more designs have an irregular rhythm, and conditions so hard that pairs are in doubt. The last part runs a few rendered
+studies through the real segmenter. Each part prints:
+
+- the share of catheters with correct pair and name, with a bootstrap interval over studies,
+- how many wrong answers were flagged, and how many kept the correct answer as their alternative,
+- the share of wrong answers for each stated probability,
+- the error of the cardiac phase.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -37,8 +40,8 @@ from fluoromap.matching import SiteRuns, match_study
 from fluoromap.matching.phase import cardiac_phases
 from fluoromap.matching.run_catheters import gather
 from fluoromap.phantom import FRONTAL, LATERAL, HeartKind, StudySpec, simulate_study
+from fluoromap.phantom.anatomy import Anatomy, draw_anatomy
 from fluoromap.phantom.motion import DIASTOLIC_PHASE, Beats, Breathing
-from fluoromap.phantom.placement import Anatomy, draw_anatomy
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 
@@ -61,7 +64,7 @@ BINS = (0.0, 0.02, 0.1, 0.25, 0.5)
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What matching gets, and the truth: for each site the pixels and the phases (n,) of its two runs."""
+    """Input of matching, and its truth: for each site the pixels and the phases (n,) of its two runs."""
 
     sites: tuple[SiteRuns, ...]
     pixels: tuple[tuple[Truth, Truth], ...]
@@ -70,8 +73,11 @@ class Study:
 
 @dataclass(frozen=True)
 class Design:
-    """What kind of study. bad : share of chains of which some electrodes are grossly wrong all through the run, as where
-    catheters cross. wrong_tips : share of frames in which the tip speaks for another catheter."""
+    """A kind of study.
+
+    bad : share of chains with some electrodes grossly wrong in the whole run, as where catheters cross. wrong_tips : share
+    of frames in which the tip votes for another catheter.
+    """
 
     sites: int = 8
     irregular: bool = False
@@ -81,7 +87,7 @@ class Design:
 
 
 def true_chains(seed: int, design: Design) -> Study:
-    """A study without pictures: a lateral and a frontal view, or any two at least 60 degrees apart."""
+    """Simulate a study without pictures: a lateral and a frontal view, or any two at least 60 degrees apart."""
     rng = np.random.default_rng([seed, 20])
     heart: HeartKind = "human" if seed % 2 else "dog"
     anatomy = draw_anatomy(heart, design.sites, rng)
@@ -89,7 +95,7 @@ def true_chains(seed: int, design: Design) -> Study:
     nominal = (camera_from_gantry(LATERAL), camera_from_gantry(FRONTAL))
     if design.any_views:
         nominal = _any_views(rng)
-    true = tuple(_turned(camera, rng) for camera in nominal)
+    true = tuple(_camera_with_gantry_error(camera, rng) for camera in nominal)
     sites, pixels, phases = [], [], []
     for index in range(design.sites):
         runs = [_run(anatomy, index, camera, rate_hz, design, rng) for camera in true]
@@ -110,10 +116,10 @@ def _any_views(rng: np.random.Generator) -> tuple[Camera, Camera]:
             return cameras
 
 
-def _turned(camera: Camera, rng: np.random.Generator) -> Camera:
-    turned = np.eye(4)
-    turned[:3, :3] = Rotation.from_rotvec(rng.normal(0, GANTRY_ERROR_DEG, 3), degrees=True).as_matrix()
-    return Camera(camera.matrix @ turned, camera.rows, camera.columns)
+def _camera_with_gantry_error(camera: Camera, rng: np.random.Generator) -> Camera:
+    error = np.eye(4)
+    error[:3, :3] = Rotation.from_rotvec(rng.normal(0, GANTRY_ERROR_DEG, 3), degrees=True).as_matrix()
+    return Camera(camera.matrix @ error, camera.rows, camera.columns)
 
 
 def _run(
@@ -132,7 +138,7 @@ def _run(
     pulses, rest = beats.pulses(times), beats.rest_mm(times)
     truth = {}
     for number, resident in enumerate(residents):
-        line = resident.shaft.moved(pulses @ resident.vectors_mm + rest[:, number])
+        line = resident.shaft.lines_mm(pulses @ resident.vectors_mm + rest[:, number])
         truth[resident.shaft.catheter.name] = camera.project(resident.shaft.electrodes_mm(line) + breath)
     phases = np.interp(times, r_waves, np.arange(len(r_waves))) % 1.0
     return _segmentation(truth, phases, rate_hz, design, rng), truth, phases
@@ -141,7 +147,7 @@ def _run(
 def _segmentation(
     truth: Truth, phases: Array, rate_hz: float, design: Design, rng: np.random.Generator
 ) -> Segmentation:
-    """What a good segmenter would make of it."""
+    """Return the segmentation of a good segmenter."""
     n = len(phases)
     order = list(rng.permutation(len(NAMES)))
     first = {name: int(name == "mapping" and rng.random() < WITHOUT_TIP) for name in NAMES}
@@ -182,13 +188,13 @@ def _segmentation(
 DESIGNS = {
     "true chains, regular rhythm": Design(),
     "true chains, irregular rhythm": Design(irregular=True),
-    "one site alone, any two views, bad chains, tips that tell nothing": Design(1, False, True, 0.4, 0.5),
+    "one site alone, any two views, bad chains, uninformative tips": Design(1, False, True, 0.4, 0.5),
 }
 
 
 @dataclass
 class Score:
-    """What came of one study. stated : (probability of the alternative, whether the answer was wrong) of each site."""
+    """Result of one study. stated : (probability of the alternative, True for a wrong answer) of each site."""
 
     catheters: int = 0
     missing: int = 0
@@ -208,7 +214,7 @@ class Score:
 
 
 def score(study: Study) -> Score:
-    """Match a study and compare with its truth: those catheters that the runs of both views hold."""
+    """Match a study and compare the catheters that both views contain with the truth."""
     offered = _offered(study)
     result = Score(catheters=sum(map(len, offered.values())))
     before = time.process_time()
@@ -222,7 +228,7 @@ def score(study: Study) -> Score:
 
 
 def _offered(study: Study) -> dict[str, set[str]]:
-    """Site -> catheters that are there to be paired."""
+    """Return site -> catheters that both views contain."""
     offered = {}
     for runs, truths in zip(study.sites, study.pixels, strict=True):
         views = ((runs.segmentation_a, runs.camera_a), (runs.segmentation_b, runs.camera_b))
@@ -235,7 +241,7 @@ def _offered(study: Study) -> dict[str, set[str]]:
                 for name in [_nearest(one.diastole.electrodes, one.diastole.pixels_uv, truth, one.diastole_frame)]
                 if _apart_px(one.diastole.electrodes, one.diastole.pixels_uv, truth[name][one.diastole_frame]) < NEAR_PX
             }
-        # Without its mapping catheter a site is not one.
+        # A site without its mapping catheter does not count.
         offered[runs.site] = there if "mapping" in there else set()
     return offered
 
@@ -244,43 +250,43 @@ def _score_pairs(result: Score, matching: Matching, study: Study, offered: Mappi
     number = {runs.site: index for index, runs in enumerate(study.sites)}
     for site in matching.sites:
         pixels = study.pixels[number[site.site]]
-        shown = _really(site.diastole, pixels)
-        other = None if site.alternative is None else _really(site.alternative.diastole, pixels)
+        shown = _true_names(site.diastole, pixels)
+        other = None if site.alternative is None else _true_names(site.alternative.diastole, pixels)
         wrong_here = False
         for name in NAMES:
-            seen = shown.get(name)
-            if seen is None:
+            true = shown.get(name)
+            if true is None:
                 result.missing += name in offered[site.site]
                 continue
             if name not in offered[site.site]:
                 result.catheters += 1
             noted = (name, Reason.IDENTITY_UNCERTAIN) in site.notes
             result.noted += noted
-            if seen == (name, name):
+            if true == (name, name):
                 continue
-            if seen[0] == seen[1]:
+            if true[0] == true[1]:
                 result.wrong_name += 1
             else:
                 result.wrong_pair += 1
-            if seen[0] != seen[1] or "mapping" in (name, seen[0]):
-                # Look-alikes exchanged in both views are no matter of pairing; all else is.
+            if true[0] != true[1] or "mapping" in (name, true[0]):
+                # Look-alikes exchanged in both views are paired correctly; every other exchange is a wrong pair.
                 wrong_here = True
                 result.kept += other is not None and other.get(name, ("", ""))[0] == other.get(name, ("", "."))[1]
             result.flagged += noted
         result.stated.append((0.0 if site.alternative is None else site.alternative.probability, wrong_here))
 
 
-def _really(pair: PhasePair, pixels: tuple[Truth, Truth]) -> dict[str, tuple[str, str]]:
-    """Name given -> the catheter it really is in view a and in view b."""
+def _true_names(pair: PhasePair, pixels: tuple[Truth, Truth]) -> dict[str, tuple[str, str]]:
+    """Return given name -> true name in view a and in view b."""
     views = [
-        {chain.catheter: _nearest(chain.electrodes, chain.pixels_uv, truth, seen.frame) for chain in seen.chains}
-        for seen, truth in zip((pair.a, pair.b), pixels, strict=True)
+        {chain.catheter: _nearest(chain.electrodes, chain.pixels_uv, truth, shown.frame) for chain in shown.chains}
+        for shown, truth in zip((pair.a, pair.b), pixels, strict=True)
     ]
     return {name: (views[0][name], views[1][name]) for name in views[0] if name in views[1]}
 
 
 def _nearest(electrodes: Sequence[int], pixels_uv: Array, truth: Truth, frame: int) -> str:
-    # A mean over some quiet frames lies a little off its middle frame.
+    # The nearest catheter is taken, because a mean over quiet frames differs a little from its middle frame.
     return min(truth, key=lambda name: _apart_px(electrodes, pixels_uv, truth[name][frame]))
 
 
@@ -289,7 +295,7 @@ def _apart_px(electrodes: Sequence[int], pixels_uv: Array, truth: Array) -> floa
 
 
 def phase_errors(study: Study) -> list[float]:
-    """Squared error of each frame's phase, the mean offset of its run (where zero lies) taken off; 0.25 where unknown."""
+    """Return the squared error of each frame's phase without the mean offset of its run; 0.25 where unknown."""
     squares: list[float] = []
     for runs, truths in zip(study.sites, study.phases, strict=True):
         views = ((runs.segmentation_a, runs.camera_a), (runs.segmentation_b, runs.camera_b))
@@ -306,27 +312,27 @@ def phase_errors(study: Study) -> list[float]:
 
 
 def _share(counts: Sequence[tuple[int, int]]) -> str:
-    """Share with its 95 % bootstrap interval over studies."""
+    """Return the share with its 95 % bootstrap interval over studies."""
     sums = np.array(counts, dtype=np.float64)
     drawn = np.random.default_rng(0).integers(0, len(sums), (2000, len(sums)))
-    again = sums[drawn].sum(axis=1)
-    low, high = np.percentile(again[:, 0] / again[:, 1], [2.5, 97.5])
+    resampled = sums[drawn].sum(axis=1)
+    low, high = np.percentile(resampled[:, 0] / resampled[:, 1], [2.5, 97.5])
     total = sums.sum(axis=0)
     return f"{total[0] / total[1]:.4f} ({low:.4f}-{high:.4f})"
 
 
 def show(heading: str, scores: Sequence[Score]) -> None:
-    """One block of the report."""
+    """Print one block of the report."""
     total = {name: sum(getattr(one, name) for one in scores) for name in
              ("catheters", "missing", "wrong_pair", "wrong_name", "flagged", "kept", "noted")}  # fmt: skip
     cost = np.mean([ms for one in scores for ms in one.milliseconds])
     print(f"\n{heading}: {len(scores)} studies, {total['catheters']} catheters, {cost:.1f} ms a site")
-    print("  right in pair and name", _share([(one.right, one.catheters) for one in scores]))
+    print("  pair and name correct ", _share([(one.right, one.catheters) for one in scores]))
     paired = [(one.catheters - one.wrong_pair - one.missing, one.catheters) for one in scores]
-    print("  right in pair         ", _share(paired))
+    print("  pair correct          ", _share(paired))
     print(
         f"  missing {total['missing']}, wrong pair {total['wrong_pair']}, wrong name {total['wrong_name']}; of the wrong "
-        f"{total['flagged']} flagged identity_uncertain, {total['kept']} with the right pair as alternative; "
+        f"{total['flagged']} flagged identity_uncertain, {total['kept']} with the correct pair as alternative; "
         f"{total['noted']} flagged in all"
     )
     reasons = [reason for one in scores for reason in one.rejected]
@@ -342,7 +348,7 @@ def show(heading: str, scores: Sequence[Score]) -> None:
 
 
 def main(first: int, studies: int, rendered: int) -> None:
-    """All tables, on seeds ``first`` to ``first + studies - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + studies - 1``."""
     print(f"seeds {first} to {first + studies - 1}; 95 % bootstrap intervals over studies")
     for heading, design in DESIGNS.items():
         scores, squares = [], []
@@ -353,11 +359,11 @@ def main(first: int, studies: int, rendered: int) -> None:
         show(heading, scores)
         print(f"  phase error {np.sqrt(np.mean(squares)):.3f} of a cycle RMS")
     if rendered:
-        show("through the segmenter", [score(segmented(seed)) for seed in range(first, first + rendered)])
+        show("through the segmenter", [score(segment_study(seed)) for seed in range(first, first + rendered)])
 
 
-def segmented(seed: int) -> Study:
-    """A rendered study of 8 sites, a lateral and a postero-anterior view of 2 s at 15 frames/s, through the segmenter."""
+def segment_study(seed: int) -> Study:
+    """Segment a rendered study of 8 sites: a lateral and a postero-anterior view of 2 s at 15 frames/s."""
     spec = StudySpec(seed, sites=8, contrast=("LAT", "PA"), gantry_error_deg=GANTRY_ERROR_DEG)
     simulated = simulate_study(spec)
     segmenter = CatheterChain()
@@ -366,7 +372,7 @@ def segmented(seed: int) -> Study:
         cameras = [camera_from_gantry(run.gantry) for run in site.runs]
         found = [
             segmenter.segment(
-                Run(KeptFrames(run.frames), run.frame_times_ms, camera.px_per_mm, PixelFacts(False, 12, False)),
+                Run(MemoryFrames(run.frames), run.frame_times_ms, camera.px_per_mm, PixelFacts(False, 12, False)),
                 DEFAULT_CATALOGUE, {}, Silent(),
             )
             for run, camera in zip(site.runs, cameras, strict=True)

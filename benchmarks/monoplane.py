@@ -1,10 +1,15 @@
-"""How well and how fast a rigid body is followed in one view: ``python benchmarks/monoplane.py [seed]``.
+"""Accuracy and speed of rigid-body tracking in one view: ``python benchmarks/monoplane.py [seed]``.
 
-Prints, for the paper's simulation (a helix of 30 points that turns 0.5 degrees about each axis and moves 1 mm along each from
-frame to frame, 0.5 px noise), the 3D RMS beside the Cramer-Rao bound; what becomes of a-priori positions that are 2 mm wrong;
-how the compiled pose compares with OpenCV's, where installed, on the same images; and what is refused: one catheter, and
-three in a beating heart. H77 is the helix that reproduces the paper's Table 1, H18 one that fits into the image.
-Processor time of one thread; OpenCV is called from Python image by image, the compiled pose once a batch.
+The data are the paper's simulation: a helix of 30 points that rotates by 0.5 degrees about each axis and moves by 1 mm along
+each from frame to frame, with 0.5 px noise. H77 is the helix that reproduces the paper's Table 1; H18 fits into the image.
+The benchmark prints:
+
+- the 3D RMS beside the Cramer-Rao bound,
+- the result for a-priori positions that are 2 mm wrong,
+- the compiled pose beside OpenCV's, where installed, on the same images,
+- refusals: one catheter alone, and three catheters in a beating heart.
+
+Times are processor time of one thread. OpenCV is called from Python image by image, the compiled pose once a batch.
 """
 
 from __future__ import annotations
@@ -58,7 +63,7 @@ class Simulation:
 
 
 def helix(name: str) -> Array:
-    """30 points over two turns, both ends included: (30, 3) mm from the isocentre."""
+    """Return 30 points over two turns, both ends included: (30, 3) mm from the isocentre."""
     radius, length, axis, centre = {
         "H18": (18.0, 60.0, 1, (-12, -13, -16)),
         "H77": (77.0, 250.0, 2, (-12, -15, -19)),
@@ -69,8 +74,8 @@ def helix(name: str) -> Array:
     return points
 
 
-def simulated(name: str, view: str, frames: int) -> Simulation:
-    """The paper's motion, X' = Rz Ry Rx X + (1, 1, 1) mm, in a right-handed camera 500 mm from the isocentre."""
+def simulate(name: str, view: str, frames: int) -> Simulation:
+    """Simulate the paper's motion, X' = Rz Ry Rx X + (1, 1, 1) mm, in a right-handed camera 500 mm from the isocentre."""
     intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])
     camera = Camera(intrinsic @ np.column_stack([ROTATIONS[view], [0, 0, 500]]), 512, 512)
     about = rotation_of(np.radians(0.5) * np.eye(3))
@@ -81,7 +86,7 @@ def simulated(name: str, view: str, frames: int) -> Simulation:
 
 
 def bound_mm(camera: Camera, points_mm: Array) -> float:
-    """Cramer-Rao bound of one frame's points (m, 3), RMS 3D."""
+    """Return the Cramer-Rao bound of one frame's points (m, 3), RMS 3D."""
     m = len(points_mm)
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (m, 2, 2))
     covariance = pose_covariance_mm2(camera, points_mm, points_mm.mean(axis=0), noise, np.ones(m, dtype=bool))
@@ -93,13 +98,13 @@ def rms(errors: Array) -> float:
 
 
 def accuracy(rng: np.random.Generator) -> Iterator[str]:
-    """A-priori positions exact: RMS 3D and depth alone beside the bound; the last frame's RMS over its own bound."""
-    yield f"A body whose shape is known, {POSES} frames a row. RMS 3D over frames 2..n, mm; ratios to the bound"
+    """Yield RMS 3D and depth error beside the bound for exact a-priori positions; the last frame's RMS over its bound."""
+    yield f"A body of known shape, {POSES} frames a row. RMS 3D over frames 2..n, mm; ratios to the bound"
     yield f"{'':10}{'frames':>7}{'RMS':>9}{'depth':>9}{'bound':>9}{'ratio':>8}{'last frame':>12}{'noise-free, dz 0..5':>22}"
     for name in ("H18", "H77"):
         for view in ("LAT", "AP"):
             for frames in FRAMES:
-                s = simulated(name, view, frames)
+                s = simulate(name, view, frames)
                 body = s.points_mm[0] - s.points_mm[0].mean(axis=0)
                 batch = POSES // (frames - 1)
                 rotations = np.broadcast_to(np.eye(3), (batch, 3, 3))
@@ -118,19 +123,19 @@ def accuracy(rng: np.random.Generator) -> Iterator[str]:
 
 
 def noise_free_mm(s: Simulation) -> float:
-    """Largest error from exact pixels over starts of 0 to 5 mm too deep a frame."""
-    seen = np.ones(s.pixels_uv.shape[:2], dtype=bool)
+    """Return the largest error from exact pixels over start values of 0 to 5 mm depth a frame."""
+    visible = np.ones(s.pixels_uv.shape[:2], dtype=bool)
     body = s.points_mm[0] - s.points_mm[0].mean(axis=0)
     largest = 0.0
     for depth_step_mm in range(6):
-        rotations, centres = track_body(s.camera, s.points_mm[0], s.pixels_uv, seen, 0, float(depth_step_mm), 6)
+        rotations, centres = track_body(s.camera, s.points_mm[0], s.pixels_uv, visible, 0, float(depth_step_mm), 6)
         errors = body @ np.swapaxes(rotations, 1, 2) + centres[:, None] - s.points_mm
         largest = max(largest, float(np.abs(errors).max()))
     return largest
 
 
 def view_of(s: Simulation, pixels: Array, a_priori: Array, covariance_mm2: Array) -> MonoplaneView:
-    """A simulation as the solver gets it; positions of frame 1 known with these errors."""
+    """Return a simulation as solver input; the positions of frame 1 are known with this covariance."""
     electrodes = tuple(range(1, 31))
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (30, 2, 2))
     return MonoplaneView(
@@ -144,10 +149,10 @@ def view_of(s: Simulation, pixels: Array, a_priori: Array, covariance_mm2: Array
 
 
 def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
-    """A-priori positions exact or wrong: the pose that believes them, and what is adjusted together with them."""
-    yield f"\nA-priori positions wrong by up to so much an axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
+    """Yield the RMS with fixed a-priori positions and with adjusted ones, for exact and for wrong positions."""
+    yield f"\nA-priori positions with errors up to a limit an axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
     yield (
-        f"{'wrong by':>9}{'frames':>10}{'believed':>10}{'adjusted':>10}{'bound':>8}{'ratio':>7}{'in 95 %':>9}"
+        f"{'limit':>9}{'frames':>10}{'fixed':>10}{'adjusted':>10}{'bound':>8}{'ratio':>7}{'in 95 %':>9}"
         f"{'smooth path':>13}{'bound':>8}{'in 95 %':>9}"
     )
     solvers = [
@@ -159,8 +164,8 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
     for wrong_mm in (0.0, 2.0):
         for name in ("H18", "H77"):
             for frames in (6, 15):
-                s = simulated(name, "LAT", frames)
-                believed = []
+                s = simulate(name, "LAT", frames)
+                fixed_errors = []
                 errors: list[list[Array]] = [[], []]
                 stated: list[list[Array]] = [[], []]
                 for _ in range(BODIES):
@@ -168,7 +173,7 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
                     a_priori = s.points_mm[0] + rng.uniform(-wrong_mm, wrong_mm, (30, 3))
                     poses = track_body(s.camera, a_priori, pixels, np.ones(pixels.shape[:2], dtype=bool), 0, 0.0, 10)
                     body = a_priori - a_priori.mean(axis=0)
-                    believed.append((body @ np.swapaxes(poses[0], 1, 2) + poses[1][:, None] - s.points_mm)[1:])
+                    fixed_errors.append((body @ np.swapaxes(poses[0], 1, 2) + poses[1][:, None] - s.points_mm)[1:])
                     view = view_of(s, pixels, a_priori, wrong_mm**2 / 3 * np.eye(3))
                     for k, solver in enumerate(solvers):
                         track = solver.track(view, Silent())
@@ -182,11 +187,11 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
                     share = f"{100 * (squared <= CHI2_95_3D).mean():.1f} %"
                     ratio = f"{rms(error) / bound:>7.2f}" if k == 0 else ""
                     cells += f"{rms(error):>{10 if k == 0 else 13}.2f}{bound:>8.2f}{ratio}{share:>9}"
-                yield f"{wrong_mm:>6.0f} mm {name}{frames:>6}{rms(np.array(believed)):>10.2f}{cells}"
+                yield f"{wrong_mm:>6.0f} mm {name}{frames:>6}{rms(np.array(fixed_errors)):>10.2f}{cells}"
 
 
 def opencv_poses(cv2: Any, s: Simulation) -> dict[str, Callable[[Array], tuple[Array, Array]]]:
-    """OpenCV's ways to a pose: pixels (30, 2) to rotation vector and translation in the camera's axes."""
+    """Return OpenCV's pose solvers: pixels (30, 2) to rotation vector and translation in the camera's axes."""
     body = np.ascontiguousarray(s.points_mm[0] - s.points_mm[0].mean(axis=0))
     intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])
     view = np.linalg.solve(intrinsic, s.camera.matrix)
@@ -214,7 +219,7 @@ def opencv_poses(cv2: Any, s: Simulation) -> dict[str, Callable[[Array], tuple[A
 
 
 def speed(rng: np.random.Generator) -> Iterator[str]:
-    """Accuracy and poses a second on the same images, from the pose of the frame before."""
+    """Yield accuracy and poses a second on the same images, from the pose of the frame before."""
     yield f"\nThe same {SPEED_POSES} images of 30 points (LAT), each from the pose of the frame before; one thread"
     yield f"{'':32}{'RMS mm':>9}{'to best':>9}{'poses/s':>10}{'rigid-pose is':>16}"
     try:
@@ -224,7 +229,7 @@ def speed(rng: np.random.Generator) -> Iterator[str]:
         cv2 = None
         yield "(OpenCV is not installed: pip install opencv-python-headless)"
     for name in ("H18", "H77"):
-        s = simulated(name, "LAT", 2)
+        s = simulate(name, "LAT", 2)
         body = s.points_mm[0] - s.points_mm[0].mean(axis=0)
         pixels = s.pixels_uv[1] + rng.normal(0, NOISE_PX, (SPEED_POSES, 30, 2))
         start = (
@@ -256,10 +261,10 @@ def speed(rng: np.random.Generator) -> Iterator[str]:
 
 
 def one_catheter(_: np.random.Generator) -> Iterator[str]:
-    """Bound of the mapping catheter's four electrodes as a rigid body of known shape."""
+    """Yield the bound of the mapping catheter's four electrodes as a rigid body of known shape."""
     yield "\nOne catheter of four electrodes, shape exactly known: bound of a frame, RMS 3D, mm"
     yield f"{'bend radius':>12}" + "".join(f"{f'tilt {tilt} deg':>14}" for tilt in (0, 30, 60))
-    camera = simulated("H18", "AP", 1).camera
+    camera = simulate("H18", "AP", 1).camera
     arc = DEFAULT_CATALOGUE["mapping"].arc_lengths_mm
     for radius in (20.0, 30.0, 60.0):
         cells = ""
@@ -271,13 +276,13 @@ def one_catheter(_: np.random.Generator) -> Iterator[str]:
 
 
 def beating_hearts(rng: np.random.Generator) -> Iterator[str]:
-    """Whether three catheters in a beating heart pass for one rigid body: where somebody says so, and by their cycle."""
+    """Yield refusals for three catheters in a beating heart, with known_rigid and with a known cycle."""
     yield (
         f"\nThree catheters in {HEARTS} beating hearts, two views, 30 frames at 15/s; a-priori positions within 0.15 mm an axis.\n"
-        "What rigid-pose refuses of hearts that move all they do, or less, and RMS 3D of what it does not refuse, mm.\n"
-        "Without a cycle it refuses all of them, unless it is told that they are rigid"
+        "Runs that rigid-pose refuses, at full and at reduced motion, and RMS 3D of the other runs, mm.\n"
+        "Without a cycle and without known_rigid it refuses all of them"
     )
-    yield f"{'':8}{'told that they are rigid':^36}{'cycle known':^36}"
+    yield f"{'':8}{'known_rigid':^36}{'cycle known':^36}"
     yield f"{'motion':>8}" + 2 * f"{'refused':>14}{'RMS':>11}{'stated':>11}"
     first = int(rng.integers(1_000_000))
     studies = [
@@ -316,7 +321,10 @@ def heart_view(
     cycle_known: bool,
     rng: np.random.Generator,
 ) -> MonoplaneView:
-    """Catheters of four electrodes each, points (n, m, 3), as one view shows them; frame 1, or all of a cycle, known from two."""
+    """Return one view of catheters with four electrodes each, points (n, m, 3).
+
+    Frame 1, or all of a cycle, is known from two views.
+    """
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (4, 2, 2))
     pixels = camera.project(points_mm) + rng.normal(0, NOISE_PX, (*points_mm.shape[:2], 2))
     measured = points_mm + rng.normal(0, 0.15, points_mm.shape)

@@ -1,10 +1,10 @@
 """Depth over the cardiac cycle from one view: ``python benchmarks/motion_prior.py [first seed] [hearts] [hearts for coverage]``.
 
-Dog hearts at 30 frames/s (14 to 19 frames a cycle), runs of 48 frames, 12 electrodes, true pixels with 0.5 px of noise;
-nothing is rendered. Every table names what the two views of the site, or of 19 other sites, had told before. Errors are 3D
-RMS in mm over all frames and electrodes, lateral ; frontal view; "worst phase" is the RMS over hearts in the worst
-of 15 parts of the cycle. Where a row says so the geometry is exact and the solver is told (its parameters are 0); the
-coverage table draws gantry and breathing as the default parameters say. Seeds below 5000 were used while it was made.
+The data are dog hearts at 30 frames/s (14 to 19 frames a cycle), runs of 48 frames, 12 electrodes, true pixels with 0.5 px of
+noise; nothing is rendered. Every table names the prior knowledge: two views of the site, or of 19 other sites. Errors are 3D
+RMS in mm over all frames and electrodes, lateral ; frontal view. "Worst phase" is the RMS over hearts in the worst of 15
+parts of the cycle. Where a row says so the geometry is exact and the solver's parameters for its errors are 0. The coverage
+table draws gantry and breathing with the default parameters. Seeds below 5000 were used during development.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from fluoromap.contracts import (
 from fluoromap.monoplane.a_priori_lm import APrioriLM
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.phantom import HeartKind, SimulatedRun, StudySpec, simulate_study
-from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_triangulator
 
@@ -46,7 +46,7 @@ STRESSED = ("NON_AFFINE_MM", "BEAT_AMPLITUDE", "BEAT_TIMING_CYCLE", "BEAT_POSITI
 
 @dataclass(frozen=True)
 class Scene:
-    """What is known before, and how the followed run differs from it."""
+    """Prior knowledge, and the differences of the tracked run from it."""
 
     name: str
     own_cycle: bool = True
@@ -76,7 +76,10 @@ class Scene:
 
 @dataclass
 class Score:
-    """Squared errors (n, m) of one followed run and whether the ellipsoids hold the truth (n, m); empty where none is stated."""
+    """Squared errors (n, m) of one tracked run, and True where an ellipsoid holds the truth (n, m).
+
+    The latter is empty where the track states no relative covariance.
+    """
 
     phases: Array
     squared: Array
@@ -98,7 +101,7 @@ class Scores:
 
 @contextmanager
 def stressed(factor: float) -> Iterator[None]:
-    """Hearts whose catheters move more on their own and whose beats differ more."""
+    """Make hearts whose catheters move more on their own and whose beats vary more."""
     from fluoromap.phantom import motion
 
     with patch.multiple(motion, **{name: factor * getattr(motion, name) for name in STRESSED}):
@@ -106,7 +109,7 @@ def stressed(factor: float) -> Iterator[None]:
 
 
 def biplane(scene: Scene, seed: int) -> tuple[tuple[MatchedSite, ...], Triangulation, SimulatedRun, SimulatedRun]:
-    """The followed site first, as matched and located, with its two runs as they are followed."""
+    """Return matched and located sites, the tracked site first, and its two runs."""
 
     def study(breathing_mm: float) -> tuple[tuple[MatchedSite, ...], tuple[SimulatedRun, SimulatedRun]]:
         spec = StudySpec(
@@ -126,7 +129,7 @@ def biplane(scene: Scene, seed: int) -> tuple[tuple[MatchedSite, ...], Triangula
 
 
 def monoplane_view(matched: MatchedSite, located: LocatedSite, a: bool, others: Sequence[LocatedSite]) -> MonoplaneView:
-    """What the solver gets to follow view a or b; the site's own cycle only without ``others``."""
+    """Return the solver's input for view a or b; it has the site's own cycle only without ``others``."""
     return MonoplaneView(
         site=matched.site,
         view="a" if a else "b",
@@ -203,7 +206,7 @@ def worst_phase(view: Sequence[Score]) -> float:
 
 
 def share(of: Sequence[NDArray[np.bool_]]) -> str:
-    """Percentage with a 95 % bootstrap interval over hearts."""
+    """Return the percentage with a 95 % bootstrap interval over hearts."""
     means = np.array([one.mean() for one in of])
     drawn = np.random.default_rng(0).choice(means, (2000, len(means))).mean(axis=1)
     low, high = np.percentile(drawn, [2.5, 97.5])
@@ -247,13 +250,13 @@ def main(first: int, hearts: int, coverage_hearts: int) -> None:
 
 
 def frame_rates(seeds: Sequence[int]) -> None:
-    """The error at lower frame rates, and what it is times the error at 60 frames/s."""
+    """Print the error at lower frame rates, also as a multiple of the error at 60 frames/s."""
     print("\nhuman hearts, runs of 2 s, own cycle, breath held: 12 electrodes (times the error at 60 frames/s)")
     print(f"frames/s{'true phases':>30}{'R waves to the frame':>30}{'no R waves':>30}")
-    told: dict[bool | None, list[list[float]]] = {True: [], False: [], None: []}
+    by_phase_source: dict[bool | None, list[list[float]]] = {True: [], False: [], None: []}
     for rate in (60.0, 30.0, 15.0, 7.5):
         cells = []
-        for r_waves, errors in told.items():
+        for r_waves, errors in by_phase_source.items():
             scene = Scene(
                 "", heart="human", rate_hz=rate, frames=int(2 * rate), exact_phases=r_waves is None,
                 r_waves=r_waves is not False,
@@ -266,7 +269,10 @@ def frame_rates(seeds: Sequence[int]) -> None:
 
 
 def coverage(seeds: range) -> None:
-    """Shares of ellipsoids that hold the truth; the field of other sites takes 20 times as long, so on an eighth of the hearts."""
+    """Print the shares of ellipsoids that hold the truth.
+
+    The field of other sites takes 20 times as long, so that it is computed on an eighth of the hearts.
+    """
     default = Scene("defaults: breathing, gantry 0.5 deg and 0.5 mm", True, 4.0, 4.0, 0.5)
     own = Scene("own cycle, breath held")
     apart = Scene("own cycle, every run breathes on its own", biplane_breathing_mm=4.0, breathing_mm=4.0)
@@ -282,8 +288,8 @@ def coverage(seeds: range) -> None:
             f"{scene.name:48s} {absolute} | {relative}   {len(pairs)} hearts, RMS {both(scores, 'squared')}", flush=True
         )
         for dz in range(len(pairs[0][0].paper)):
-            told = share([np.concatenate([s.paper[dz].inside for s in heart]) for heart in pairs])
-            print(f"{f'   the same by a-priori-lm, dz {dz}':48s} {told}", flush=True)
+            paper = share([np.concatenate([s.paper[dz].inside for s in heart]) for heart in pairs])
+            print(f"{f'   the same by a-priori-lm, dz {dz}':48s} {paper}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""How fast the phantom renders: ``python benchmarks/phantom.py [frames]`` prints milliseconds a frame.
+"""Rendering speed of the phantom: ``python benchmarks/phantom.py [frames]`` prints milliseconds a frame.
 
-Processor time of one thread, so that a busy machine gives nearly the figures of an idle one.
+Times are processor time of one thread, so that a busy machine gives nearly the figures of an idle machine.
 """
 
 from __future__ import annotations

@@ -1,9 +1,15 @@
-"""How well electrodes are found: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
+"""Accuracy of segmentation: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
 
-Prints, for both segmenters on runs of the phantom at 60 frames a second, recall, precision, the share of frames with all
-electrodes of the reference and the mapping catheter, RMS, how many catheter-frames are on the right track and how many 95 %
-ellipses hold the truth, each with a bootstrap interval over the runs; then what is accepted in runs without catheters.
-A detection is right within 5 px of the truth. Speed: ``benchmarks/segmentation_speed.py``.
+Both segmenters process runs of the phantom at 60 frames a second. The benchmark prints, with a bootstrap interval over runs:
+
+- recall and precision; a detection is correct within 5 px of the truth,
+- the share of frames with all electrodes of the reference and the mapping catheter,
+- RMS,
+- the share of catheter-frames on the correct track,
+- the share of 95 % ellipses that hold the truth.
+
+The last lines count frames without catheters in which a segmenter accepts one. ``benchmarks/segmentation_speed.py`` measures
+speed.
 """
 
 from __future__ import annotations
@@ -14,7 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -40,7 +46,7 @@ VIEWS: tuple[Contrast, Contrast] = ("LAT", "PA")
 
 @dataclass
 class Counts:
-    """What was right in one run, or a part of it."""
+    """Counts of correct detections in one run, or a part of it."""
 
     right: int = 0
     there: int = 0
@@ -102,7 +108,7 @@ def _ratio(sums: Array, name: str) -> float:
 
 
 def main(first: int, seeds: int, frames: int) -> None:
-    """All tables, on seeds ``first`` to ``first + seeds - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + seeds - 1``."""
     table = Table()
     spent = {name: [0.0, 0] for name in SEGMENTERS}
     for seed in range(first, first + seeds):
@@ -120,7 +126,7 @@ def main(first: int, seeds: int, frames: int) -> None:
 
 
 def _without_catheters(first: int, seeds: int) -> None:
-    """Single frames of the phantom's torso alone: none should be accepted."""
+    """Segment single frames of the phantom's torso without catheters: none should be accepted."""
     for name, segmenter in SEGMENTERS.items():
         accepted = count = 0
         for seed in range(first, first + seeds):
@@ -129,9 +135,9 @@ def _without_catheters(first: int, seeds: int) -> None:
                 behind = torso(gantry, appearance, np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.0)
                 photons = expected_photons(behind, np.ones((gantry.rows, gantry.columns), np.float32), appearance, 1.0)
                 for key in range(3):
-                    kept = KeptFrames([detect(photons, appearance.photons, 10 * seed + key)])
+                    frames = MemoryFrames([detect(photons, appearance.photons, 10 * seed + key)])
                     found = segmenter().segment(
-                        Run(kept, np.zeros(1), 1024 / 178, FACTS), DEFAULT_CATALOGUE, {}, Silent()
+                        Run(frames, np.zeros(1), 1024 / 178, FACTS), DEFAULT_CATALOGUE, {}, Silent()
                     )
                     accepted += bool(found.frames[0].chains)
                     count += 1
@@ -151,10 +157,10 @@ def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
 def _score_run(
     table: Table, spent: dict[str, list[float]] | None, view: str, simulated: SimulatedRun, names: tuple[str, ...]
 ) -> None:
-    kept = KeptFrames(simulated.frames)
+    in_memory = MemoryFrames(simulated.frames)
     gantry = simulated.gantry
     px_per_mm = gantry.source_detector_mm / gantry.source_isocentre_mm / gantry.pixel_spacing_mm[0]
-    run = Run(kept, simulated.frame_times_ms, px_per_mm, FACTS)
+    run = Run(in_memory, simulated.frame_times_ms, px_per_mm, FACTS)
     truth = simulated.truth.pixels_uv
     moved = np.linalg.norm(np.diff(np.concatenate(list(truth.values()), axis=1), axis=0), axis=2).max(axis=1)
     moving = np.concatenate([moved[:1], moved]) > MOVING_PX
@@ -163,8 +169,8 @@ def _score_run(
         found = SEGMENTERS[name]().segment(run, DEFAULT_CATALOGUE, {}, Silent())
         if spent is not None:
             spent[name][0] += time.process_time() - start
-            spent[name][1] += len(kept)
-        parts = {"": np.ones(len(kept), bool)} if spent is None else {" quiet": ~moving, " moving": moving}
+            spent[name][1] += len(in_memory)
+        parts = {"": np.ones(len(in_memory), bool)} if spent is None else {" quiet": ~moving, " moving": moving}
         for part, chosen in parts.items():
             frames = np.flatnonzero(chosen)
             counts = Counts()
@@ -200,7 +206,7 @@ def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -
 
 
 def _matched(points: Array, truth: Array) -> Array:
-    """Distances of the detections that are right, each true electrode taken once."""
+    """Return the distances of the correct detections; each true electrode counts once."""
     if not len(points):
         return np.zeros(0)
     distance = np.linalg.norm(points[:, None] - truth[None], axis=2)
@@ -210,7 +216,11 @@ def _matched(points: Array, truth: Array) -> Array:
 
 
 def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array], frames: NDArray[np.int64]) -> None:
-    """A catheter-frame is right when the track that is this catheter's in most of the run lies on all its electrodes."""
+    """Count correct catheter-frames.
+
+    A catheter's track is the track that lies on it in most frames. A catheter-frame is correct where this track lies on all
+    electrodes of the catheter.
+    """
     of_track: dict[int, dict[str, list[int]]] = {}
     for entry in found.frames:
         for chain in entry.chains:

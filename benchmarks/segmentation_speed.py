@@ -1,14 +1,14 @@
-"""How fast frames are segmented: ``python benchmarks/segmentation_speed.py [sites] [frames] [seed]``.
+"""Speed of segmentation: ``python benchmarks/segmentation_speed.py [sites] [frames] [seed]``.
 
-Processor time of one thread throughout, so that a busy machine gives nearly the figures of an idle one. In one run:
+All times are processor time of one thread, so that a busy machine gives nearly the figures of an idle machine. Measured are:
 
 1. each filter of the four steps on one simulated 512x512 frame a view, beside its plain NumPy/SciPy/scikit-image twin (the
    oracle of the tests) and beside SimpleITK, OpenCV and medpy where installed (the same sweeps or radii on the same input);
 2. both segmenters on runs of several lengths, everything included, in ms a frame;
 3. decoding of real compressed frames, where FLUOROMAP_SAMPLE_DATA names a folder of them;
-4. what a new worker process does before it takes work, with an empty folder of compiled kernels and with a full one;
-5. a study of ``sites`` x 2 views x ``frames`` uncompressed frames (20 x 2 x 120) from the files to chains and tracks; the time
-   in which the phantom renders it is left out.
+4. the start of a worker process before it takes work, with an empty and with a full folder of compiled kernels;
+5. a study of ``sites`` x 2 views x ``frames`` uncompressed frames (20 x 2 x 120) from the files to chains and tracks, without
+   the time in which the phantom renders it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kept_frames import KeptFrames
+from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
 from skimage.measure import label, regionprops
-from skimage.morphology import disk
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
@@ -44,7 +43,7 @@ from fluoromap.segmenter.four_step.blobs import find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.four_step.frame_chains import FourStepDetector, FourStepParams
 from fluoromap.segmenter.four_step.homomorphic import homomorphic
-from fluoromap.segmenter.four_step.morphology import disk_morphology
+from fluoromap.segmenter.four_step.morphology import disk, disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.four_step.plugin import FourStep
 from fluoromap.segmenter.log_image import Image, LogTransform
@@ -77,18 +76,18 @@ def main(sites: int, frames: int, seed: int) -> None:
     longest = max(LENGTHS)
     spec = StudySpec(seed, sites=1, frames=longest, frame_rate_hz=60.0, heart="dog", contrast=VIEWS)
     runs = simulate_study(spec).sites[0].runs
-    # Before hundreds of frames are kept: beside those every new array costs page faults, which no worker has.
+    # Filters come before hundreds of frames fill the memory: then every new array costs page faults, which no worker has.
     for view, run in zip(VIEWS, runs, strict=True):
         filters(view, run.frames[0], camera_from_gantry(run.gantry).px_per_mm)
-    kept = [list(run.frames) for run in runs]
-    lengths(runs, kept)
+    pictures = [list(run.frames) for run in runs]
+    lengths(runs, pictures)
     decoding()
     starting()
     study(sites, frames, seed + 1)
 
 
 def milliseconds(work: Work, repeats: int = 9) -> float:
-    """Median over ``repeats`` after one for warming."""
+    """Return the median milliseconds over ``repeats`` after one warm-up."""
     work()
     times = []
     for _ in range(repeats):
@@ -100,7 +99,7 @@ def milliseconds(work: Work, repeats: int = 9) -> float:
 
 def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
     plain = _twins()
-    run = Run(KeptFrames([frame]), np.zeros(1), px_per_mm, FACTS)
+    run = Run(MemoryFrames([frame]), np.zeros(1), px_per_mm, FACTS)
     mask = find_field(run.frames, run.pixels)
     x: Image = mask.fill(LogTransform.of_run(run.pixels, mask.mean_level)(frame))
     steps = FourStepDetector(DEFAULT_CATALOGUE, mask, px_per_mm, FourStepParams())
@@ -144,23 +143,23 @@ def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
         print(f"  {name:30}{mine:8.2f}{theirs:10.1f}{theirs / mine:6.0f}x   {beside}")
     chain = milliseconds(lambda: steps.blobs(x))
     print(f"  {'four steps and labels':30}{chain:8.2f}{twins:10.1f}{twins / chain:6.0f}x   goal 14 ms, 30x")
-    print(f"  {'four-step, chains':30}{milliseconds(lambda: steps.find_chains(x, 0)):8.2f}")
-    print(f"  {'catheter-chain, chains':30}{milliseconds(lambda: blobs.find_chains(x, 0)):8.2f}")
+    print(f"  {'four-step, chains':30}{milliseconds(lambda: steps.chains(x, 0)):8.2f}")
+    print(f"  {'catheter-chain, chains':30}{milliseconds(lambda: blobs.chains(x, 0)):8.2f}")
     print(f"  {'field mask, once a run':30}{milliseconds(lambda: find_field(run.frames, run.pixels)):8.2f}")
 
 
-def lengths(runs: tuple[SimulatedRun, SimulatedRun], kept: list[list[NDArray[np.uint16]]]) -> None:
+def lengths(runs: tuple[SimulatedRun, SimulatedRun], frames: list[list[NDArray[np.uint16]]]) -> None:
     plans: list[tuple[str, Callable[[], Segmenter], tuple[int, ...]]] = [
         ("catheter-chain", CatheterChain, LENGTHS),
         ("four-step", FourStep, LENGTHS[:1]),
     ]
     print("runs with tracking and diastole, ms a frame" + "".join(f"{count:8} frames" for count in LENGTHS))
     for name, segmenter, counts in plans:
-        for view, run, pictures in zip(VIEWS, runs, kept, strict=True):
+        for view, run, pictures in zip(VIEWS, runs, frames, strict=True):
             cells = []
             for count in counts:
                 part = Run(
-                    KeptFrames(pictures[:count]),
+                    MemoryFrames(pictures[:count]),
                     run.frame_times_ms[:count],
                     camera_from_gantry(run.gantry).px_per_mm,
                     FACTS,
@@ -185,19 +184,19 @@ def decoding() -> None:
 
 
 def starting() -> None:
-    """The byte code of all modules is there beforehand, as after any first start."""
+    """Print the start time of a worker process; the modules' byte code exists, as after any first start."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
         environment["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "code")
         print("a worker process starts, s           imports   warm-up")
-        for what, kernels in (("", "first"), ("no kernels kept", "kept"), ("kernels kept", "kept")):
+        for label, kernels in (("", "first"), ("no compiled kernels", "second"), ("compiled kernels", "second")):
             environment["NUMBA_CACHE_DIR"] = str(Path(folder) / kernels)
             command = [sys.executable, "-c", START]
             done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
             imports, warm_up = (float(word) for word in done.stdout.split()[-2:])
-            if what:
-                print(f"  {what:30}{imports:12.2f}{warm_up:10.2f}")
-    print("  goal: 8 s with no kernels kept, 1 s with")
+            if label:
+                print(f"  {label:30}{imports:12.2f}{warm_up:10.2f}")
+    print("  goal: 8 s without compiled kernels, 1 s with them")
 
 
 def study(sites: int, frames: int, seed: int) -> None:
@@ -243,7 +242,7 @@ def _write(path: Path, run: SimulatedRun, name: str) -> None:
 
 
 def _twins() -> Any:
-    """The plain filters of the tests."""
+    """Return the module of the tests' plain filters."""
     path = Path(__file__).parents[1] / "tests" / "plugins" / "segmenter" / "test_filters.py"
     spec = importlib.util.spec_from_file_location("plain_filters", path)
     assert spec is not None
@@ -254,7 +253,7 @@ def _twins() -> Any:
 
 
 def _peer(name: str) -> Any:
-    """A peer's module, limited to one thread; None where it is not installed."""
+    """Return a peer's module, limited to one thread; None where it is not installed."""
     try:
         module: Any = importlib.import_module(name)
     except ImportError:
@@ -290,7 +289,7 @@ def _disk_peers(x: Image) -> dict[str, Work]:
 
         peers["SimpleITK"] = by_sitk
     if cv2 is not None:
-        large, small = disk(14), disk(2)  # type: ignore[no-untyped-call]
+        large, small = disk(14).astype(np.uint8), disk(2).astype(np.uint8)
 
         def by_cv2() -> object:
             return cv2.morphologyEx(cv2.morphologyEx(x, cv2.MORPH_BLACKHAT, large), cv2.MORPH_OPEN, small)

@@ -92,7 +92,7 @@ def _tracks(matching: Matching, triangulation: Triangulation) -> list[SiteTracks
 def _seconds_and_megabytes(
     results: Sequence[Any], encode: Callable[[Any], bytes], decode: Callable[[Any, bytes], Any]
 ) -> tuple[float, float]:
-    """Return the least seconds of encoding and decoding all results, and their megabytes."""
+    """Return the least seconds of encoding and decoding, and the megabytes."""
     best = np.inf
     for _ in range(REPEATS):
         start = time.perf_counter()

@@ -1,10 +1,12 @@
 """Two-view triangulation against its limits: ``python benchmarks/triangulation.py [first seed] [hearts]``.
 
-First the 3D RMS over the Cramer-Rao bound (sigma 0.5 px, 20 000 points within 35 mm of the isocentre) at several angles between
-the views, with OpenCV's ``triangulatePoints`` in the same run where it is installed, and points a second of processor time.
-Then self-calibration: 20 sites of simulated hearts, 12 electrodes each, still and seen with 0.5 px noise, view b's true camera
-turned about the isocentre and shifted against its header; mean over hearts. ``aligned`` is after the best rigid alignment. Hearts
-that beat and breathe between the runs: ``benchmarks/ellipsoid_coverage.py``.
+The first table gives the 3D RMS over the Cramer-Rao bound (sigma 0.5 px, 20 000 points within 35 mm of the isocentre) at
+several angles between the views, and points a second of processor time. OpenCV's ``triangulatePoints`` runs beside it where
+installed.
+
+The second table gives self-calibration: 20 sites of simulated hearts at rest, 12 electrodes each, 0.5 px noise. View b's true
+camera is rotated about the isocentre and shifted against its header. Figures are means over hearts; ``aligned`` is after the
+best rigid alignment. ``benchmarks/ellipsoid_coverage.py`` has hearts that beat and breathe between the runs.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ def camera(primary_deg: float) -> Camera:
 
 
 def bound_mm(cameras: tuple[Camera, Camera], points: Array) -> float:
-    """RMS of the Cramer-Rao bound of points (n, 3)."""
+    """Return the RMS Cramer-Rao bound of points (n, 3)."""
     jacobian = np.concatenate([one.jacobian(points) for one in cameras], axis=1)
     information = np.einsum("nki,nkj->nij", jacobian, jacobian) / NOISE_PX**2
     return float(np.sqrt(np.trace(np.linalg.inv(information), axis1=1, axis2=2).mean()))
@@ -110,7 +112,7 @@ def calibration(first_seed: int, hearts: int) -> None:
 
 
 def _wrong_catalogue() -> Catalogue:
-    """The mapping catheter described with its middle gap 2 mm too long."""
+    """Return a catalogue whose mapping catheter has a middle gap 2 mm too long."""
     mapping = DEFAULT_CATALOGUE["mapping"]
     first, second, third = mapping.spacing_mm
     wrong = replace(mapping, spacing_mm=(first, second + 2.0, third))
@@ -141,7 +143,10 @@ def _calibration_row(
 def still_sites(
     study: SimulatedStudy, angle_deg: float, offset_mm: float, rng: np.random.Generator
 ) -> tuple[tuple[MatchedSite, ...], Array]:
-    """The diastolic electrodes of all sites, seen at once by view a and by a view b that its header misstates; their truth."""
+    """Return all sites at diastole, and their true points.
+
+    Both views show the same moment; the true camera of view b differs from its header.
+    """
     turn, offset = rng.normal(size=3), rng.normal(size=3)
     displaced = np.eye(4)
     displaced[:3, :3] = Rotation.from_rotvec(angle_deg * turn / np.linalg.norm(turn), degrees=True).as_matrix()
@@ -157,12 +162,12 @@ def still_sites(
     return tuple(sites), np.concatenate(truth)
 
 
-def _observation(seen_by: Camera, points: Any, rng: np.random.Generator) -> Observation:
+def _observation(camera: Camera, points: Any, rng: np.random.Generator) -> Observation:
     chains = tuple(
         NamedChain(
             name,
             tuple(range(1, len(at) + 1)),
-            seen_by.project(at) + rng.normal(0, NOISE_PX, (len(at), 2)),
+            camera.project(at) + rng.normal(0, NOISE_PX, (len(at), 2)),
             np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(at), 2, 2)),
         )
         for name, at in points.items()
@@ -171,7 +176,7 @@ def _observation(seen_by: Camera, points: Any, rng: np.random.Generator) -> Obse
 
 
 def _pixels(site: MatchedSite) -> tuple[Array, Array]:
-    a, b = (np.concatenate([chain.pixels_uv for chain in seen.chains]) for seen in (site.diastole.a, site.diastole.b))
+    a, b = (np.concatenate([chain.pixels_uv for chain in view.chains]) for view in (site.diastole.a, site.diastole.b))
     return a, b
 
 

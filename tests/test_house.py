@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 import yaml
 
 from fluoromap.reasons import Reason
-from fluoromap_service.cli.app import app
+from fluoromap_service.cli.app import program
+from fluoromap_service.jobs.queue import celery_app
 from fluoromap_service.settings import Settings
 
 TOP = Path(__file__).parent.parent
@@ -27,8 +27,8 @@ PROJECT: dict[str, Any] = tomllib.loads((TOP / "pyproject.toml").read_text())["p
 
 
 def _parse(arguments: list[str]) -> None:
-    """Let the command line read the arguments without doing what they say; raises where they are wrong."""
-    command = typer.main.get_command(app)
+    """Parse the arguments as the program does, without running the command; raise where they are wrong."""
+    command = program
     context = command.make_context("fluoromap", list(arguments))
     while hasattr(command, "resolve_command"):
         rest = [*context._protected_args, *context.args]
@@ -87,8 +87,6 @@ def test_long_running_services_are_watched_and_may_end_their_work() -> None:
     for name in ("postgres", "redis", "api", "worker"):
         assert "healthcheck" in SERVICES[name]
         assert SERVICES[name]["restart"] == "unless-stopped"
-    from fluoromap_service.jobs.queue import celery_app
-
     assert (
         int(SERVICES["worker"]["stop_grace_period"].removesuffix("s")) > celery_app().conf.worker_soft_shutdown_timeout
     )
@@ -163,7 +161,7 @@ def test_scripts_are_executable_and_parse(script: str) -> None:
     subprocess.run(["bash", "-n", TOP / script], check=True)
 
 
-def test_run_tells_its_usage() -> None:
+def test_run_prints_its_usage() -> None:
     answer = subprocess.run([TOP / "run"], capture_output=True, text=True)
     assert answer.returncode == 2
     assert "usage: ./run demo" in answer.stderr

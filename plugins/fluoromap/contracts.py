@@ -296,6 +296,7 @@ class NamedChain:
     electrodes: tuple[int, ...]
     pixels_uv: Array
     covariance_px2: Array
+    track: int = -1
 
     def __post_init__(self) -> None:
         m = len(self.electrodes)
@@ -466,6 +467,14 @@ class LocatedSite:
             if point.catheter == catheter and point.electrode == electrode:
                 return point
         return None
+
+    def camera(self, view: View) -> Camera:
+        """Return the camera of a view."""
+        return self.camera_a if view == "a" else self.camera_b
+
+    def diastolic_frame(self, view: View) -> int:
+        """Return the diastolic frame of a view, counted from 0."""
+        return self.frame_a if view == "a" else self.frame_b
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
-"""Access tokens: made by the command line, kept as hashes, with scopes, an expiry and a way to revoke them.
+"""Access tokens with scopes and an expiry; the command line makes and revokes them, the store holds their hashes.
 
-``admin`` implies ``write``, ``write`` implies ``read``. A service that no token was ever made for is open on a loopback
-address and refuses every other one; a revoked or expired token still counts as made, so revoking never opens a service.
+``admin`` implies ``write``, ``write`` implies ``read``. A service without any token is open, and listens on a loopback
+address only. A revoked or expired token still counts, so that revoking a token never opens the service.
 """
 
 from __future__ import annotations
@@ -16,42 +16,35 @@ from enum import StrEnum
 from sqlalchemy import or_, select
 from sqlalchemy.exc import IntegrityError
 
+from fluoromap_service.problem import Problem
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Token
 
 
 class Scope(StrEnum):
-    """What a caller may do."""
+    """The kinds of things that a caller may do."""
 
     READ = "read"
     WRITE = "write"
     ADMIN = "admin"
 
 
-SHORTEST_GIVEN = 32
-"""Characters that a token drawn elsewhere needs at least."""
+SHORTEST_TOKEN = 32
+"""Fewest characters of a token that the installation brings."""
 
 _ORDER = (Scope.READ, Scope.WRITE, Scope.ADMIN)
 
 
-class TokenProblem(ValueError):
-    """A token that cannot be made or revoked; the message says why."""
-
-
-class StartRefused(RuntimeError):
-    """The service must not listen on that address; the message says what to do."""
-
-
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who sent a request, and what they may do."""
+    """The sender of a request, with the scopes of its token."""
 
     name: str
     scopes: frozenset[Scope]
 
     def may(self, scope: Scope) -> bool:
-        """Whether one of the caller's scopes is ``scope`` or implies it."""
+        """Return whether one of the caller's scopes is ``scope`` or implies it."""
         return any(_ORDER.index(own) >= _ORDER.index(scope) for own in self.scopes)
 
 
@@ -61,7 +54,7 @@ OPEN = Caller("open", frozenset({Scope.ADMIN}))
 
 @dataclass(frozen=True, slots=True)
 class TokenInfo:
-    """A token as listed. Times are seconds since 1970 UTC."""
+    """A token in a list, without its text. Times are seconds since 1970 UTC."""
 
     name: str
     scopes: tuple[Scope, ...]
@@ -73,27 +66,36 @@ class TokenInfo:
 def create_token(
     name: str, scopes: Iterable[str], expires_seconds: float | None = None, *, text: str | None = None
 ) -> str:
-    """Make a token and return its text, which is not kept and cannot be shown again.
+    """Make a token and return its text, which the store does not hold.
 
-    ``text`` gives one that was drawn elsewhere (a secret of the installation); by default it is drawn here.
+    Parameters
+    ----------
+    name : str
+        Unique, 1 to 100 characters.
+    scopes : iterable of str
+        At least one :class:`Scope`.
+    expires_seconds : float, optional
+        Lifetime; by default the token does not expire.
+    text : str, optional
+        A secret of the installation, at least :data:`SHORTEST_TOKEN` characters; by default a random text.
 
     Raises
     ------
-    TokenProblem
-        When the name is empty, too long or taken, a scope is unknown, the lifetime is not positive or ``text`` is short.
+    Problem
+        422 ``invalid_token`` when a parameter is wrong; 409 ``token_exists`` when the name or the text is in use.
     """
     if not name.strip() or len(name) > 100:
-        raise TokenProblem("a token needs a name of at most 100 characters")
+        raise _invalid("A token needs a name of at most 100 characters.")
     wanted = set(scopes)
     unknown = wanted - set(_ORDER)
     if unknown or not wanted:
-        raise TokenProblem(f"a token needs at least one scope of {', '.join(_ORDER)}")
+        raise _invalid(f"A token needs at least one scope of {', '.join(_ORDER)}.")
     if expires_seconds is not None and not expires_seconds > 0:
-        raise TokenProblem("a token must expire in the future")
+        raise _invalid("A token must expire in the future; give a lifetime above 0.")
     if text is None:
         text = f"fm_{secrets.token_urlsafe(32)}"
-    elif len(text) < SHORTEST_GIVEN:
-        raise TokenProblem(f"a given token needs at least {SHORTEST_GIVEN} characters; draw it at random")
+    elif len(text) < SHORTEST_TOKEN:
+        raise _invalid(f"A token needs at least {SHORTEST_TOKEN} characters; make a random one.")
     try:
         with writing() as session:
             now = session.scalars(select(db_now())).one()
@@ -107,12 +109,13 @@ def create_token(
                 )
             )
     except IntegrityError:
-        raise TokenProblem(f"there is already a token named {name!r}, or with this text; choose another") from None
+        detail = f"There is already a token named {name!r}, or with this text; choose another."
+        raise Problem(409, "token_exists", detail) from None
     return text
 
 
 def list_tokens() -> list[TokenInfo]:
-    """All tokens ever made, oldest first."""
+    """Return all tokens, also expired and revoked ones, oldest first."""
     with reading() as session:
         return [
             TokenInfo(row.name, tuple(Scope(scope) for scope in row.scopes), row.created, row.expires, row.revoked)
@@ -125,25 +128,25 @@ def revoke_token(name: str) -> None:
 
     Raises
     ------
-    TokenProblem
-        When there is no token of that name.
+    Problem
+        404 when there is no token of that name.
     """
     with writing() as session:
         row = session.scalar(select(Token).where(Token.name == name))
         if row is None:
-            raise TokenProblem(f"there is no token named {name!r}")
+            raise Problem(404, "not_found", f"There is no token named {name!r}; see 'fluoromap token list'.")
         if row.revoked is None:
             row.revoked = session.scalars(select(db_now())).one()
 
 
 def any_token() -> bool:
-    """Whether a token was ever made, valid or not."""
+    """Return whether there is any token, valid or not."""
     with reading() as session:
         return session.scalar(select(Token.id).limit(1)) is not None
 
 
 def verify(text: str) -> Caller | None:
-    """The caller that a token stands for; None when it is unknown, expired or revoked."""
+    """Return the caller of a token; None when the token is unknown, expired or revoked."""
     query = select(Token).where(
         Token.sha256 == _hash(text),
         Token.revoked.is_(None),
@@ -155,7 +158,7 @@ def verify(text: str) -> Caller | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name can only be reached from this machine."""
+    """Return whether only this machine can reach an address or name."""
     if host == "localhost":
         return True
     try:
@@ -165,18 +168,24 @@ def is_loopback(host: str) -> bool:
 
 
 def check_may_start(host: str) -> None:
-    """Refuse to listen where others could reach a service that asks for no token.
+    """Check that the service may listen on an address.
 
     Raises
     ------
-    StartRefused
-        When ``host`` is not a loopback address and no token was ever made.
+    Problem
+        403 ``token_needed`` when other machines can reach ``host`` and there is no token.
     """
     if not is_loopback(host) and not any_token():
-        raise StartRefused(
+        raise Problem(
+            403,
+            "token_needed",
             f"Listening on {host} needs an access token first: make one with "
-            "'fluoromap token create --name NAME --scope read --scope write', or listen on 127.0.0.1."
+            "'fluoromap token create --name NAME --scope read --scope write', or listen on 127.0.0.1.",
         )
+
+
+def _invalid(detail: str) -> Problem:
+    return Problem(422, "invalid_token", detail)
 
 
 def _hash(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Logs as JSON lines on standard error: events, ids and counts, never a name, a file name or a header's text."""
+"""Logs as JSON lines on standard error: events, ids and counts, no names, file names or header texts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import structlog
 
 
 def configure() -> None:
-    """Set the process's logging up; call it once, before anything is logged."""
+    """Set up the logging of this process; call it once, before the first log line."""
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,
@@ -16,6 +16,6 @@ def configure() -> None:
             structlog.processors.format_exc_info,
             structlog.processors.JSONRenderer(),
         ],
-        # The process's own: sys.stderr may be somebody's stand-in that is closed later.
+        # Not sys.stderr: a test may replace it and close the replacement.
         logger_factory=structlog.PrintLoggerFactory(sys.__stderr__),
     )

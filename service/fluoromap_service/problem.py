@@ -1,4 +1,4 @@
-"""The one way the service says no: a status, a stable code, and a sentence that says what to do."""
+"""The one way in which the service says no: a status, a stable code, and a sentence with the next step."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 
 
 class Problem(Exception):
-    """A request that the service cannot carry out; the routes send it as an RFC 9457 problem document.
+    """A request that the service cannot carry out; the API sends it as an RFC 9457 problem document.
 
     Parameters
     ----------
     status : int
-        HTTP status. It says who has to act.
+        HTTP status; it shows who has to act.
     code : str
         Stable code, snake_case.
     detail : str
-        A sentence that says what is wrong and what to do. It holds no patient data.
+        A sentence that says what is wrong and what to do, without patient data.
     errors : list of (where, message)
         The places in the request that are wrong.
     headers : mapping, optional
@@ -35,7 +35,6 @@ class Problem(Exception):
         headers: Mapping[str, str] | None = None,
         extra: dict[str, Any] | None = None,
     ) -> None:
-        # All arguments of the exception are its state: it crosses process borders by pickle.
         super().__init__(detail)
         self.status = status
         self.code = code
@@ -45,15 +44,16 @@ class Problem(Exception):
         self.extra = extra or {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _again, (self.status, self.code, self.detail, self.errors, self.headers, self.extra)
+        # By default an exception is rebuilt from its message alone, and a Problem also travels between processes.
+        return _rebuilt, (self.status, self.code, self.detail, self.errors, self.headers, self.extra)
 
 
-def _again(
+def _rebuilt(
     status: int, code: str, detail: str, errors: list[tuple[str, str]], headers: dict[str, str], extra: dict[str, Any]
 ) -> Problem:
     return Problem(status, code, detail, errors, headers=headers, extra=extra)
 
 
 def not_found(what: str) -> Problem:
-    """Return the 404 for a resource that does not exist, or that the caller may not know of."""
+    """Return the 404 for a resource that does not exist."""
     return Problem(404, "not_found", f"There is no such {what}.")

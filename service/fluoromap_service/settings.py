@@ -1,4 +1,4 @@
-"""All settings, each a ``FLUOROMAP_*`` environment variable."""
+"""The settings of a process, each a ``FLUOROMAP_*`` environment variable."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
 class Settings(BaseSettings):
-    """Settings of one process; the field ``data_dir`` is read from ``FLUOROMAP_DATA_DIR``, and so on."""
+    """The settings of one process; ``FLUOROMAP_DATA_DIR`` gives the field ``data_dir``, and so on."""
 
     model_config = SettingsConfigDict(env_prefix="FLUOROMAP_", frozen=True)
 
@@ -56,5 +56,5 @@ class Settings(BaseSettings):
 
 @functools.cache
 def settings() -> Settings:
-    """The process's settings, read once from the environment."""
+    """Return the process's settings, read once from the environment."""
     return Settings()

@@ -1,4 +1,4 @@
-"""The program's own processes, as a user starts them: embedded, or with servers beside."""
+"""The program's processes, as a user starts them: with the embedded database, or with servers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
+import httpx
 import psutil
 import pytest
 
@@ -20,7 +21,7 @@ PATIENCE_SECONDS = 240
 
 Fresh = Callable[[], AbstractContextManager[str]]
 Kill = Callable[[], None]
-"""Kills the worker without warning and sees to it that there will be another."""
+"""Kills the worker without warning. Afterwards another worker starts."""
 
 
 @contextmanager
@@ -49,7 +50,7 @@ def kill_group(pid: int) -> None:
 
 @contextmanager
 def embedded(environment: dict[str, str], port: int) -> Iterator[Kill]:
-    """``fluoromap up``, which restarts its worker by itself."""
+    """Start ``fluoromap up``, which restarts its worker by itself."""
     with process("up", "--port", str(port), environment=environment) as up:
 
         def kill() -> None:
@@ -62,7 +63,7 @@ def embedded(environment: dict[str, str], port: int) -> Iterator[Kill]:
 
 @contextmanager
 def with_servers(environment: dict[str, str], port: int) -> Iterator[Kill]:
-    """API and worker each by itself, as on many machines."""
+    """Start API and worker as separate programs, as on several machines."""
     subprocess.run([program(), "db", "upgrade"], env=environment, check=True)
     with ExitStack() as stack:
         stack.enter_context(process("api", "--port", str(port), environment=environment))
@@ -92,8 +93,6 @@ def environment_of(data_dir: Path, numba_cache: Path, **settings: str) -> dict[s
 
 
 def wait_until_ready(url: str, log_folder: Path) -> None:
-    import httpx
-
     end = time.monotonic() + PATIENCE_SECONDS
     answer = None
     while time.monotonic() < end:
@@ -105,4 +104,4 @@ def wait_until_ready(url: str, log_folder: Path) -> None:
             pass
         time.sleep(0.1)
     logs = "\n".join(f"{path.name}: {path.read_text()[-2000:]}" for path in log_folder.glob("*.log"))
-    pytest.fail(f"the service did not get ready: {answer and answer.text}\n{logs}")
+    pytest.fail(f"the service was not ready in time: {answer and answer.text}\n{logs}")

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from processes import environment_of, process, wait_until_ready
 
 from fluoromap.geometry import Gantry
-from fluoromap_service.cli.client import Client, inputs_of
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port
 from fluoromap_service.dicom import write_cine
 
 LARGEST_DIFFERENCE_MIB = 64
 PIXELS = 256
-"""1000 such frames are 125 MiB: held at once, they would be seen."""
+"""Rows and columns of a frame. 1000 such frames take 125 MiB, so a process that holds all of them exceeds the limit."""
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -32,7 +33,7 @@ def _noise(frames: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def _study(folder: Path, frames: int) -> Path:
-    """A site of two runs that show nothing but noise."""
+    """Write a site of two runs that contain noise only."""
     folder.mkdir()
     for number, primary_deg in enumerate((90.0, 0.0)):
         write_cine(
@@ -51,7 +52,7 @@ def _study(folder: Path, frames: int) -> Path:
 
 
 def _peak_mib(pid: int) -> float:
-    """Largest resident memory any process of a tree had so far."""
+    """Return the largest resident memory, so far, of any process of a tree."""
     root = psutil.Process(pid)
     peaks = []
     for member in (root, *root.children(recursive=True)):
@@ -73,7 +74,7 @@ def _peaks_of_a_job(tmp_path: Path, frames: int) -> tuple[float, float]:
         server = next(child.pid for child in children if "fluoromap api" in " ".join(child.cmdline()))
         client = stack.enter_context(Client(url))
         study = client.make_study("memory")
-        inputs = inputs_of(_study(tmp_path / f"study-{frames}", frames))
+        inputs = find_files(_study(tmp_path / f"study-{frames}", frames))
         assert [client.upload(study, path) for path in inputs.runs] == [[], []]
         client.put_activation_times(study, inputs.activation_times)
         *_, ended = client.follow(client.start_job(study))

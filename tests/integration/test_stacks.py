@@ -1,6 +1,6 @@
 """The whole flow through command line and HTTP alone, on both stacks: embedded, and PostgreSQL with Redis.
 
-Each runs a study undisturbed, and once more from nothing with the worker killed in the middle: the results must be the same.
+Each stack runs a study twice from nothing. In the second run the worker is killed in the middle. The results must be equal.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ from typing import Any
 import pytest
 from processes import Fresh, Kill, embedded, environment_of, wait_until_ready, with_servers
 
-from fluoromap_service.cli.client import Client, inputs_of
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port
 
 pytestmark = pytest.mark.timeout(900)
 
 
 def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Send the study, run a job, kill the worker while a run is being searched; the ended job and its points."""
+    """Send the study, run a job and kill the worker in the middle; return the ended job and its points."""
     with Client(url) as client:
         study = client.make_study("stack")
-        inputs = inputs_of(folder)
+        inputs = find_files(folder)
         assert [client.upload(study, path) for path in inputs.runs] == [[]] * len(inputs.runs)
         assert client.put_activation_times(study, inputs.activation_times) == []
         job: dict[str, Any] = {}
@@ -30,7 +31,7 @@ def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any],
             done = any(row["state"] == "done" for row in job["stages"])
             if kill is not None and done and _running(job):
                 kill()
-                # It may have died between two stages; what is left running without it was cut off.
+                # A worker can die between two stages. Only a stage that stays "running" was really interrupted.
                 if _running(next(client.follow(job["id"]))):
                     kill = None
         assert kill is None, "the job ended before the worker could be killed"
@@ -53,7 +54,7 @@ def test_a_killed_worker_changes_nothing(
     for disturbed in (False, True):
         data_dir = tmp_path / f"data-{disturbed}"
         with ExitStack() as opened:
-            # A busy machine may hold an undisturbed worker up for longer than a lease that makes the test quick.
+            # The short lease makes the test fast, but on a busy machine it can expire while the worker is alive.
             settings = {} if disturbed else {"FLUOROMAP_LEASE_SECONDS": "60"}
             if stack == "servers":
                 settings["FLUOROMAP_DATABASE_URL"] = opened.enter_context(fresh_postgres())

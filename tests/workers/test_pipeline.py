@@ -20,7 +20,7 @@ from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
-from fluoromap_service.api.results.overlays import fusion_of
+from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 

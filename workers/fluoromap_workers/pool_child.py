@@ -20,9 +20,10 @@ def limit_memory() -> None:
 
 
 def warm_up() -> None:
-    """Load the plugins and compile the kernels of the default ones, so that the first run does not wait.
+    """Load the plugins and compile the kernels of the default ones.
 
-    A plugin may offer a class method ``warm_up()``. A failure there is logged; later the stage reports it to the user.
+    So the first run does not wait. A plugin may offer a class method ``warm_up()``. A failure there is logged; later the
+    stage reports it to the user.
     """
     for row in plugins():
         if row.error is not None:

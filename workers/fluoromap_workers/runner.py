@@ -70,7 +70,10 @@ def run(stage_id: int, worker: str) -> str | None:
 
 
 def finish_known(job_id: str) -> None:
-    """End all ready stages of a job whose results are stored: after a correction nearly all of its runs."""
+    """End all ready stages of a job whose results are stored.
+
+    After a correction these are nearly all of its runs.
+    """
     try:
         with reading() as session:
             ready = job_life.ready(session, job_id)
@@ -128,7 +131,10 @@ def _prepare(claim: Claim) -> Work:
 
 @functools.lru_cache(maxsize=2)
 def _snapshot(job_id: str) -> Snapshot:
-    """Return a job's snapshot. It never changes, and a worker takes many stages of one job in a row."""
+    """Return a job's snapshot, parsed once.
+
+    It never changes, and a worker takes many stages of one job in a row.
+    """
     with reading() as session:
         return Snapshot.model_validate(session.get_one(Job, job_id).snapshot)
 
@@ -143,6 +149,9 @@ def _stored(work: Work) -> StoredResult | None:
 
 
 def _holds(session: Session, stored: StoredResult) -> bool:
-    """Return whether the store still holds a result; nobody can remove it until this transaction ends."""
+    """Return whether the store still holds a result.
+
+    Nobody can remove it until this transaction ends.
+    """
     files.lock(session)
     return session.get(File, stored.sha256) is not None

@@ -33,7 +33,7 @@ from fluoromap.contracts import (
     View,
 )
 from fluoromap.fuser.mapped_sites import map_origin, mapped_sites
-from fluoromap.matching import SiteRuns, match_study
+from fluoromap.matching import SiteComparisons, SiteRuns, match_study
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
 from fluoromap_service.dicom import InstanceFacts, open_frames
@@ -47,6 +47,9 @@ from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
 from fluoromap_workers.point_rows import point_rows
 
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
+
+# A process matches the same study after every correction: sites that did not change are compared once.
+_SITE_COMPARISONS = SiteComparisons()
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,10 +152,13 @@ def _match(job: StoredJob, study: str) -> Work:
     def compute(context: Context) -> Matching:
         found = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
-            SiteRuns(site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b])
+            SiteRuns(
+                site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b],
+                content=tuple((segments[uid].result, encode(cameras[uid])) for uid in (site.view_a, site.view_b)),
+            )
             for site in snapshot.sites
-        )
-        return match_study(sites, catalogue, context)
+        )  # fmt: skip
+        return match_study(sites, catalogue, context, _SITE_COMPARISONS)
 
     def refused(refusal: Refusal) -> Matching:
         return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
@@ -246,7 +252,10 @@ def _monoplane_view(
 
 
 def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
-    """Remove doubts about names: they move no electrode, and naming a catheter at one site must not redo the others."""
+    """Return the point without doubts about its name.
+
+    They move no electrode, and naming a catheter at one site must not redo the others.
+    """
     return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
 
 

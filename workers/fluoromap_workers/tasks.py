@@ -26,9 +26,9 @@ log = structlog.get_logger(__name__)
 
 @shared_task(name=queue.RUN_STAGE)  # type: ignore[untyped-decorator,unused-ignore]
 def run_stage(stage_id: int) -> None:
-    """Run the stage of that row if it can be claimed, then for a while more stages of the same job.
+    """Run the stage of that row, then for a while others of its job.
 
-    So the stages of a chain need no message each. Their messages find them claimed.
+    A stage that cannot be claimed is left alone. So the stages of a chain need no message each. Their messages find them claimed.
     """
     worker = f"{socket.gethostname()}:{os.getpid()}"
     end = time.monotonic() + queue.STAYS_SECONDS
@@ -47,7 +47,10 @@ def run_stage(stage_id: int) -> None:
 
 @worker_process_init.connect
 def prepare_child(**_: Any) -> None:
-    """Make a pool child ready: its own connections, bounded memory, plugins loaded and kernels compiled."""
+    """Make a pool child ready for its first stage.
+
+    It gets its own connections and bounded memory, loads the plugins and compiles the kernels.
+    """
     forget_connections()
     limit_memory()
     warm_up()

@@ -1,6 +1,6 @@
 """Local activation time: the steepest negative deflection of the mapping electrogram minus the reference's.
 
-The paper samples 1000 times a second; here the samples may lie anywhere, as long as times ascend.
+The paper samples 1000 times a second; here the samples may have any times, as long as these ascend.
 """
 
 from __future__ import annotations
@@ -31,13 +31,16 @@ _QUARTILE_OF_NORMAL = 0.31863936396437514
 
 
 class UnusableElectrogram(ValueError):
-    """No activation time can be read off this electrogram; the message says why."""
+    """This electrogram gives no activation time; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class ElectrogramResult:
-    """lat_ms : mapping minus reference. sd_ms : its standard deviation. reference_ms, mapping_ms : the deflections' times.
-    warnings : sentences about what to check."""
+    """The activation time of one site.
+
+    lat_ms : mapping minus reference. sd_ms : its standard deviation. reference_ms, mapping_ms : the deflections' times.
+    warnings : sentences about points to check.
+    """
 
     lat_ms: float
     sd_ms: float
@@ -47,13 +50,15 @@ class ElectrogramResult:
 
 
 def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike) -> ElectrogramResult:
-    """Local activation time of one site from its two electrograms.
+    """Return the local activation time of one site from its two electrograms.
 
     The slope at each sample is that of a cubic fitted to the samples within 5 ms on each side (Savitzky and Golay, Anal.
-    Chem. 36 (1964) 1627, for samples at any spacing), which follows a deflection of a few ms; its steepest place lies
-    between samples where the cubic's curvature vanishes. The standard deviation follows from how sharp that minimum is and
-    from the curvatures the same fits find in the quieter parts of the recording, so that hum, far field and filtered
-    noise count as they are and not as if samples erred one by one.
+    Chem. 36 (1964) 1627, for samples at any spacing), which follows a deflection of a few ms. The steepest place lies
+    between samples where the cubic's curvature vanishes. The standard deviation follows from two things: the sharpness of
+    that
+    minimum, and the curvatures that the same fits have in the quieter parts of the recording. So hum, far field and
+    filtered noise
+    count with their real size, and not as independent errors of the samples.
 
     Parameters
     ----------
@@ -63,8 +68,9 @@ def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike
     Raises
     ------
     UnusableElectrogram
-        Naming the signal that is too short, not finite, flat, saturated or without a deflection that stands out from noise;
-        or when times do not ascend.
+        When a signal is too short, not finite, flat, saturated or without a deflection above the noise; or when times do
+        not
+        ascend. The message names the signal.
     """
     times = np.asarray(time_ms, dtype=np.float64)
     if times.ndim != 1 or len(times) < _LEAST_SAMPLES:
@@ -83,12 +89,15 @@ def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike
 
 
 def local_cubics(times: Array, signal: Array, window_ms: float) -> Array:
-    """Coefficients (n, 4) of cubics fitted to ``window_ms`` on each side of each sample, in powers of ms from it."""
+    """Return the coefficients (n, 4) of a cubic fitted round each sample.
+
+    Each fit uses ``window_ms`` on each side. The coefficients are in powers of ms from the sample.
+    """
     n = len(times)
     index = np.arange(n)
     first = np.searchsorted(times, times - window_ms - 1e-9)
     last = np.searchsorted(times, times + window_ms + 1e-9)
-    # Where samples are sparse a fit still needs three on each side.
+    # Where samples are sparse, a fit still needs three on each side.
     first = np.minimum(first, np.maximum(index - _LEAST_WINDOW // 2, 0))
     last = np.maximum(last, np.minimum(index + _LEAST_WINDOW // 2 + 1, n))
     column = np.arange(int((last - first).max()))
@@ -106,7 +115,10 @@ def local_cubics(times: Array, signal: Array, window_ms: float) -> Array:
 
 
 def _quiet_sd(values: Array) -> float:
-    """Standard deviation of the quieter half of a recording, from the lower quartile, so that deflections do not count."""
+    """Return the standard deviation of the quieter half of a recording.
+
+    It follows from the lower quartile, so that deflections do not count.
+    """
     return float(np.percentile(np.abs(values), 25)) / _QUARTILE_OF_NORMAL
 
 
@@ -114,13 +126,13 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
     if signal.shape != times.shape:
         raise UnusableElectrogram(f"The {name} electrogram must have one value for each time.")
     if not np.isfinite(signal).all():
-        raise UnusableElectrogram(f"The {name} electrogram holds values that are not numbers.")
+        raise UnusableElectrogram(f"The {name} electrogram contains values that are not numbers.")
     extent = float(np.ptp(signal))
     if not extent > 0:
         raise UnusableElectrogram(f"The {name} electrogram is flat; check the electrode's connection.")
     for rail in (signal.min(), signal.max()):
         at_baseline = abs(rail - np.median(signal)) <= _BASELINE * extent
-        if not at_baseline and _clipped(signal, float(rail)):
+        if not at_baseline and _is_clipped(signal, float(rail)):
             raise UnusableElectrogram(f"The {name} electrogram is saturated; lower the amplifier's gain.")
     cubics = local_cubics(times, signal, _WINDOW_MS)
     slopes = cubics[:, 1]
@@ -128,9 +140,7 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
     steepest = int(np.argmin(slopes[inner])) + 3
     threshold = _LEAST_SLOPE_TO_NOISE * _quiet_sd(slopes[inner])
     if not slopes[steepest] < -max(threshold, 1e-9 * extent):
-        raise UnusableElectrogram(
-            f"The {name} electrogram has no steep negative deflection that stands out from noise."
-        )
+        raise UnusableElectrogram(f"The {name} electrogram has no steep negative deflection above the noise.")
     rivals = (slopes < _RIVAL * slopes[steepest]) & (np.abs(times - times[steepest]) > _RIVAL_AWAY_MS)
     if rivals[inner].any():
         warnings.append(
@@ -140,15 +150,18 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
         warnings.append(
             f"The deflection of the {name} electrogram lies at the edge of the recording; check the window."
         )
-    return _placed(times, signal, steepest, cubics[steepest])
+    return _steepest_place(times, signal, steepest, cubics[steepest])
 
 
-def _placed(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[float, float]:
-    """(time, standard deviation) of the steepest place near a sample, from cubics as wide as the deflection is."""
+def _steepest_place(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[float, float]:
+    """Return (time, standard deviation) of the steepest place near a sample.
+
+    The cubics are as wide as the deflection.
+    """
     spacing = float(np.median(np.diff(times)))
     if cubic[3] <= 0:
         return float(times[steepest]), 2.0 * spacing
-    # The derivative of a Gaussian of this standard deviation has such a slope and third power at its steepest place.
+    # At its steepest place the derivative of a Gaussian of this standard deviation has such a slope and third power.
     width = min(max(_WIDTHS * math.sqrt(-cubic[1] / (2.0 * cubic[3])), _WINDOW_MS), _WIDEST_MS)
     near = np.flatnonzero(np.abs(times - times[steepest]) <= max(_WINDOW_MS, spacing))
     places = []
@@ -156,20 +169,23 @@ def _placed(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[f
         cubics = local_cubics(times, signal, window)
         best = int(near[np.argmin(cubics[near, 1])])
         curvature, sharpness = cubics[best, 2], 3.0 * cubics[best, 3]
-        # The steepest of many noisy places looks sharper than it is: count on a standard deviation less.
+        # The steepest of many noisy places looks sharper than it is: assume one standard deviation less.
         sure = sharpness - 3.0 * _quiet_sd(cubics[:, 3])
         if sure <= 0:
             return float(times[best]), 2.0 * spacing
         before, behind = times[max(best - 1, 0)] - times[best], times[min(best + 1, len(times) - 1)] - times[best]
         places.append(float(times[best] + np.clip(-curvature / sharpness, before, behind)))
         noise_sd = _quiet_sd(cubics[:, 2]) / sure
-    # What lies under the deflection, far field above all, draws its steepest place away, a wider fit's more than a close one's.
+    # Signals under the deflection, above all far field, shift its steepest place, and shift it more for a wider fit.
     drawn = places[0] - places[1]
     return places[1], math.hypot(max(noise_sd, abs(drawn)), _PLACEMENT * spacing)
 
 
-def _clipped(signal: Array, rail: float) -> bool:
-    """Whether the signal is held at an extreme that it runs into at speed; a smooth plateau is reached slowly."""
+def _is_clipped(signal: Array, rail: float) -> bool:
+    """Return whether the signal stays at an extreme that it reaches at speed.
+
+    A smooth plateau is reached slowly.
+    """
     if _longest_hold(signal, rail) < _SATURATED_SAMPLES:
         return False
     held = np.concatenate([[True], signal == rail, [True]])
@@ -181,7 +197,7 @@ def _clipped(signal: Array, rail: float) -> bool:
 
 
 def _longest_hold(signal: Array, value: float) -> int:
-    """Longest run of samples that stay at ``value``."""
+    """Return the longest run of samples that stay at ``value``."""
     held = np.concatenate([[False], signal == value, [False]])
     edges = np.flatnonzero(np.diff(held.astype(np.int8)))
     return int((edges[1::2] - edges[::2]).max()) if edges.size else 0

@@ -1,8 +1,9 @@
-"""Catheter names across frames, runs and sites; cardiac phase; pairs across views."""
+"""Matching: catheter names across frames, runs and sites; cardiac phase; pairs across views."""
 
-from fluoromap.matching.study_matching import SiteRuns, match_study
+from fluoromap.matching.site_comparison import SiteComparisons, SiteRuns
+from fluoromap.matching.study_matching import match_study
 
-__all__ = ["VERSION", "SiteRuns", "match_study"]
+__all__ = ["VERSION", "SiteComparisons", "SiteRuns", "match_study"]
 
 VERSION = "3"
-"""Of the answers: raised whenever the same chains are matched otherwise; results are kept by it."""
+"""Version of the results: it changes whenever the same chains give another result; results are stored under it."""

@@ -1,4 +1,4 @@
-"""Each heart beat of a run marked by the catheters' own motion."""
+"""Heart beats of a run, detected from the catheters' own motion."""
 
 from __future__ import annotations
 
@@ -18,16 +18,22 @@ _UNLIKE_BELOW = 0.4
 
 
 def is_irregular(marks_ms: Array) -> bool:
-    """Whether beats that start at these times differ in length; never with fewer than two whole ones."""
+    """Return whether beats that start at these times differ in length.
+
+    Fewer than two whole beats are never irregular.
+    """
     lengths = np.diff(marks_ms)
     return len(lengths) >= 2 and float(np.ptp(lengths)) > IRREGULAR_ABOVE * float(lengths.mean())
 
 
 def systole_starts_ms(places: Array, step_ms: float) -> Array:
-    """Times, from the first place on, at which the systoles of a run start; empty where the motion shows no beats.
+    """Return the times of the starts of systole, from the first place on.
 
-    The catheters leave their resting place and come back to it once a beat. Along the direction in which they move most,
-    a beat is timed where it is steepest, half way up, and starts that much earlier than on the average of the beats.
+    The result is empty where the motion shows no beats. Once a beat the catheters leave their resting place and return to
+    it.
+    Along the direction of the largest motion, the time of a beat is half way up its rise, where the motion is steepest. The
+    start
+    of systole lies earlier by the mean difference over the beats.
 
     Parameters
     ----------
@@ -39,12 +45,12 @@ def systole_starts_ms(places: Array, step_ms: float) -> Array:
     smooth = gaussian_filter1d(places, max(SMOOTH_MS / step_ms, 0.5), axis=0)
     away = smooth - np.median(smooth, axis=0)
     along = away @ np.linalg.svd(away, full_matrices=False)[2][0]
-    # Longer at rest than away from it: the rarer side is systole.
+    # The heart is longer at rest than away from it: the rarer side is systole.
     along = along if along.mean() >= np.median(along) else -along
     low, high = np.percentile(along, [10, 95])
     if high - low <= 0:
         return np.zeros(0)
-    # A beat that is under way when the run ends has its upstroke all the same: the run goes on at rest.
+    # A resting value is appended, so that a beat at the end of the run has a peak too.
     padded = np.append(along, low)
     peaks, _ = find_peaks(padded, prominence=_PROMINENT * (high - low), distance=max(1.0, SHORTEST_BEAT_MS / step_ms))
     halfway, lead = [], []
@@ -57,11 +63,11 @@ def systole_starts_ms(places: Array, step_ms: float) -> Array:
     if not np.isfinite(lead).any():
         return np.zeros(0)
     marks = np.array(halfway) - float(np.nanmedian(lead))
-    return marks if _alike(along, marks / step_ms) else np.zeros(0)
+    return marks if _repeats(along, marks / step_ms) else np.zeros(0)
 
 
 def _rise(signal: Array, peak: int, level: float) -> float | None:
-    """Where, before ``peak``, the signal last rose through ``level``, in steps."""
+    """Return where the signal last rose through ``level`` before ``peak``, in steps."""
     below = np.flatnonzero(signal[:peak] < level)
     if not len(below):
         return None
@@ -69,8 +75,11 @@ def _rise(signal: Array, peak: int, level: float) -> float | None:
     return last + float((level - signal[last]) / (signal[last + 1] - signal[last]))
 
 
-def _alike(signal: Array, marks: Array) -> bool:
-    """Whether the signal does the same after each mark, as far as the shortest beat goes; noise does not."""
+def _repeats(signal: Array, marks: Array) -> bool:
+    """Return whether the signal repeats after each mark, over the shortest beat.
+
+    Noise does not.
+    """
     if len(marks) < 2:
         return False
     after = np.arange(int(np.diff(marks).min()))

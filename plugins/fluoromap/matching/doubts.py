@@ -1,4 +1,4 @@
-"""What speaks against the two views of a site: a mirrored image, a wrong geometry, a catheter too many."""
+"""Doubts about a site's views: a mirrored image, a wrong geometry, an extra catheter."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from fluoromap.matching.pairs import PairTable
 from fluoromap.matching.run_catheters import RunCatheter
 
 MIRRORED_SITE, MIRRORED_STUDY = 10.0, 15.0
-"""A mirrored view must fit this much better (nats), at a site or over the study, to be believed."""
+"""A mirrored view must fit this much better (nats), at a site or over the study, to be accepted."""
 MIRRORED_MAYBE, MIRRORED_UNDECIDED = 5.0, -2.0
-"""From here on, at a site or at the mean site of the study, it cannot be ruled out: the geometry is doubtful."""
+"""From this gain on, at a site or at the mean site of the study, a mirror cannot be ruled out: the geometry is doubtful."""
 DOUBTFUL_BELOW = 0.02
-"""Probability of epipolar distances as large as this, below which the geometry is called doubtful. The tolerances are wide:
-simulated studies with 1 degree of gantry error stay above 0.15."""
+"""Probability of epipolar distances as large as this, below which the geometry is doubtful.
+
+The tolerances are wide: simulated studies with 1 degree of gantry error stay above 0.15.
+"""
 _CLEARLY_NOT = -3.0
 _MISFIT = 12.0
 _ASKEW = 3.5
@@ -28,30 +30,38 @@ _EXTRA_APART_SD = 3.0
 
 
 def mirror(camera: Camera) -> Camera:
-    """The camera whose image is this one's with left and right exchanged: u becomes columns - 1 - u."""
+    """Return the camera for the image with left and right exchanged.
+
+    u becomes columns - 1 - u.
+    """
     matrix = camera.matrix.copy()
     matrix[0] = (camera.columns - 1) * matrix[2] - matrix[0]
     return Camera(matrix, camera.rows, camera.columns)
 
 
-def mirrored_gain(as_told: Hypotheses, mirrored: Sequence[Hypotheses]) -> float:
-    """How much better (nats) the site's chains fit with one of its views mirrored; not above 0 unless they fit well then."""
-    told = as_told.cost(*PRIOR_TURN)
+def mirrored_gain(original: Hypotheses, mirrored: Sequence[Hypotheses]) -> float:
+    """Return how much better (nats) the site's chains fit with one view mirrored.
+
+    The gain is not above 0 unless they fit well then.
+    """
+    cost_of_original = original.cost(*PRIOR_TURN)
     gains = []
     for one in mirrored:
         cost = one.cost(*PRIOR_TURN)
         best = int(np.argmin(cost))
         empty = int((one.pairs[best, :, 0] < 0).sum())
-        gain = float(told.min() - cost[best])
+        gain = float(cost_of_original.min() - cost[best])
         gains.append(gain if cost[best] - MISSING_COST * empty <= _MISFIT else min(gain, 0.0))
     return max(gains)
 
 
 def mirrored_sites(gains: Sequence[float]) -> tuple[list[bool], list[bool]]:
-    """Which sites have a mirrored view, and which of the others might.
+    """Return which sites have a mirrored view, and which other sites might.
 
-    Those that say so clearly; where the study as a whole does, all but those that deny it. Catheters near the central rays
-    look the same in the mirror, so that many sites say more than one.
+    A site is mirrored where its gain is clear. Where the gain of the whole study is clear, all sites are mirrored except
+    those that
+    clearly fit worse. Catheters near the central rays look the same in the mirror, so that many sites give more evidence
+    than one.
     """
     study = sum(gains)
     mirrored = [gain > (_CLEARLY_NOT if study > MIRRORED_STUDY else MIRRORED_SITE) for gain in gains]
@@ -61,13 +71,17 @@ def mirrored_sites(gains: Sequence[float]) -> tuple[list[bool], list[bool]]:
 
 
 def gantry_angles(camera_a: Camera, camera_b: Camera) -> tuple[float, ...]:
-    """What is equal for sites taken at the same gantry angles, to about a degree."""
+    """Return a key of the gantry angles, rounded to about a degree."""
     return tuple(np.round(np.concatenate([camera_a.axis_world, camera_b.axis_world]), 2) + 0.0)
 
 
 def geometry_is_doubtful(table: PairTable, pairs: IntArray, px_per_mm: float) -> bool:
-    """Whether the paired catheters (s, 2) lie farther from their epipolar lines than breathing and gantry explain, or
-    stand askew to them, and not one alone."""
+    """Return whether the paired catheters (s, 2) contradict the geometry.
+
+    They contradict it in two cases: they lie farther from their epipolar lines than breathing and gantry explain, or more
+    than one
+    of them lies askew to these lines.
+    """
     i, j = pairs[pairs[:, 0] >= 0].T
     if not len(i):
         return False
@@ -86,10 +100,11 @@ def groups_with_extra(
     catheters_a: Sequence[RunCatheter],
     catheters_b: Sequence[RunCatheter],
 ) -> list[int]:
-    """Groups of look-alikes of which the site shows one more than the catalogue has.
+    """Return the groups of look-alikes of which the site shows one too many.
 
-    A chain left over in view a and one in view b, both seen through much of their runs, that would pair as well as the
-    others do.
+    The evidence is a chain of view a and a chain of view b that are not paired, are present in much of their runs, and
+    would pair
+    as well as the others.
     """
     filled = pairs[pairs[:, 0] >= 0]
     if not len(filled):
@@ -109,6 +124,6 @@ def groups_with_extra(
             cost = table.shape_cost[i, j] + table.group_cost[:, i, j] + motion
             if abs(table.distance_px[i, j] - shift) <= _EXTRA_APART_SD * spread and cost.min() <= MISSING_COST:
                 found.append(int(np.argmin(cost)))
-    # A group that is not full has a catheter missing, not one too many; it would have taken this one.
+    # A group that is not full lacks a catheter; it would have taken this chain.
     full = {group for group in slots if all(pairs[k, 0] >= 0 for k, own in enumerate(slots) if own == group)}
     return sorted(set(found) & full)

@@ -1,4 +1,4 @@
-"""The ways to pair the catheters of one site across its views, and what each costs."""
+"""All ways to pair the catheters of one site across its views."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fluoromap.contracts import Array, IntArray
 from fluoromap.matching.pairs import GANTRY_SD_RAD, PairTable, student_cost
 
 SHIFT_SD_MM = 6.0
-"""Of the heart's place across the epipolar lines in one run against the other: breathing, or a moved table."""
+"""Displacement of the heart across the epipolar lines between the runs: breathing, or a moved table."""
 MISSING_COST = 18.0
-"""Leaving a catheter of the catalogue unpaired costs this: a pair that fits worse is not one."""
+"""Cost of a catheter of the catalogue without a pair: a pair that fits worse is none."""
 _KEPT = 300
 _WORTH_KEEPING = 30.0
 
@@ -22,10 +22,12 @@ _WORTH_KEEPING = 30.0
 class Hypotheses:
     """The h ways to fill the s slots of the catalogue with pairs of chains.
 
-    pairs : (h, s, 2) index of the chain in view a and in view b, -1 where the slot stays empty. fixed_cost : (h,) all that
-    does not hang on the gantry. distance_px, variance_px2 : (h, s), NaN where empty; turn_px : (h, s, 3), as in
-    :class:`~fluoromap.matching.pairs.PairTable`. position_mm : (h, s, 3), NaN where empty. shift_variance_px2 : how far
-    breathing may displace all alike.
+    pairs : (h, s, 2) index of the chain in view a and in view b, -1 where the slot is empty. fixed_cost : (h,) the part of
+    the cost
+    that does not depend on the gantry. distance_px, variance_px2 : (h, s), NaN where empty; turn_px : (h, s, 3), as in
+    :class:`~fluoromap.matching.pairs.PairTable`. position_mm : (h, s, 3), NaN where empty. shift_variance_px2 : variance of
+    a
+    common displacement by breathing.
     """
 
     pairs: IntArray
@@ -37,15 +39,18 @@ class Hypotheses:
     shift_variance_px2: float
 
     def cost(self, turn_rad: Array, turn_covariance: Array) -> Array:
-        """Cost (h,) of each, given how view b is turned against the other: rotation vector (3,), covariance (3, 3)."""
+        """Return the cost (h,) of each hypothesis for a rotation of view b.
+
+        The rotation against view a has a rotation vector (3,) and its covariance (3, 3).
+        """
         chi2, count = self.offset_chi2(turn_rad, turn_covariance)
         cost: Array = self.fixed_cost + student_cost(chi2, count)
         return cost
 
     def offset_chi2(self, turn_rad: Array, turn_covariance: Array) -> tuple[Array, Array]:
-        """What is left of the catheters' epipolar distances beside a displacement common to all: (h,), and how many.
+        """Return the chi-squared (h,) of the epipolar distances, and their number.
 
-        The displacement, because the heart was breathed elsewhere when the second run was taken, counts by its prior.
+        A displacement common to all catheters is subtracted: the heart breathed between the runs. It counts with its prior.
         """
         filled = self.pairs[:, :, 0] >= 0
         distance = np.where(filled, self.distance_px - self.turn_px @ turn_rad, 0.0)
@@ -56,8 +61,8 @@ class Hypotheses:
         chi2: Array = (weight * distance**2).sum(axis=1) - pull**2 / stiffness
         return np.maximum(chi2, 0.0), filled.sum(axis=1)
 
-    def only(self, rows: IntArray) -> Hypotheses:
-        """Some of them."""
+    def subset(self, rows: IntArray) -> Hypotheses:
+        """Return some of the hypotheses."""
         return Hypotheses(
             self.pairs[rows], self.fixed_cost[rows], self.distance_px[rows], self.variance_px2[rows],
             self.turn_px[rows], self.position_mm[rows], self.shift_variance_px2,
@@ -65,11 +70,11 @@ class Hypotheses:
 
 
 PRIOR_TURN = (np.zeros(3), GANTRY_SD_RAD**2 * np.eye(3))
-"""How view b is turned against view a before the study has told."""
+"""Prior rotation of view b against view a, before any evidence of the study."""
 
 
 def enumerate_pairings(table: PairTable, slots: Sequence[int], px_per_mm: float) -> Hypotheses:
-    """All likely ways to pair the chains of a site, the cheapest first.
+    """Return all likely pairings of a site's chains, the cheapest first.
 
     Parameters
     ----------
@@ -90,7 +95,7 @@ def enumerate_pairings(table: PairTable, slots: Sequence[int], px_per_mm: float)
         for so_far, chosen in partial:
             grown.append((so_far + MISSING_COST, (*chosen, -1)))
             for pair in fitting:
-                # Slots of one group are filled in rising order: which is which is not decided here.
+                # Slots of one group are filled in rising order: their names are decided elsewhere.
                 if again and pair < chosen[-1]:
                     continue
                 if any(k >= 0 and (k // n_b == pair // n_b or k % n_b == pair % n_b) for k in chosen):
@@ -117,4 +122,4 @@ def enumerate_pairings(table: PairTable, slots: Sequence[int], px_per_mm: float)
     )
     cost = found.cost(*PRIOR_TURN)
     order = np.argsort(cost, kind="stable")
-    return found.only(order[cost[order] <= cost[order[0]] + _WORTH_KEEPING])
+    return found.subset(order[cost[order] <= cost[order[0]] + _WORTH_KEEPING])

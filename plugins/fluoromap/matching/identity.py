@@ -1,4 +1,4 @@
-"""Which of the look-alikes is which."""
+"""Names of the look-alikes of a study."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from fluoromap.matching.run_catheters import RunCatheter
 from fluoromap.reasons import Reason
 
 CLEARLY_STILLER = 0.6
-"""The reference is told by motion when its variance between sites is below this share of any look-alike's."""
+"""The reference is identified by motion when its variance between sites is below this share of any look-alike's."""
 POSITION_VARIANCE_MM2 = 0.3
-"""Of a catheter's diastolic place for other causes than moving between sites: detection, beat to beat."""
+"""Variance of a catheter's diastolic place from other causes than motion between sites: detection, beat to beat."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairedCatheter:
     """One catheter in both views of a site.
 
-    position_mm : (3,) mean of its electrodes at diastole, from the isocentre. place : which of its group's places it
-    stands in; the same over all sites of the study.
+    position_mm : (3,) mean of its electrodes at diastole, from the isocentre. place : index within its group, the same over
+    all
+    sites of the study.
     """
 
     a: RunCatheter
@@ -34,15 +35,17 @@ class PairedCatheter:
 
     @property
     def manual_name(self) -> str | None:
+        """Name set by hand in either view, else None."""
         return self.a.manual_name or self.b.manual_name
 
     @property
     def motion_px(self) -> float:
+        """Mean motion in the two views, pixels."""
         return (self.a.motion_px + self.b.motion_px) / 2
 
 
 def look_alike_groups(catalogue: Catalogue) -> tuple[tuple[str, ...], ...]:
-    """The catalogue's names in groups that fluoroscopy cannot tell apart, each in the catalogue's order."""
+    """Group the catalogue's names by catheters that look alike, in the catalogue's order."""
     groups: list[list[str]] = []
     for catheter in catalogue.catheters:
         for group in groups:
@@ -57,12 +60,17 @@ def look_alike_groups(catalogue: Catalogue) -> tuple[tuple[str, ...], ...]:
 def name_look_alikes(
     names: tuple[str, ...], reference: str, sites: Sequence[Sequence[PairedCatheter]]
 ) -> tuple[list[list[str]], Reason | None]:
-    """Names of the catheters of one group of look-alikes at every site, and what to say about it.
+    """Name the catheters of one group of look-alikes at every site.
 
-    Each has its place, the same at all sites. Names given by hand at any site decide; else, where the reference is
-    among them, it is the one that moves least between the sites once breathing, which moves all alike and so is their
-    covariance, is taken off. Where that does not tell (one site, or a tie) the one that moves least through its own
-    runs is taken, and the answer says that they could be exchanged.
+    Each catheter has a place, the same at all sites. The name of a place is decided as follows:
+
+    1. Names set by hand at any site decide.
+    2. Else the reference is the catheter that moves least between the sites. Breathing moves all alike; it is their
+    covariance and
+       is subtracted.
+    3. With one site only, or where the motion is too similar, the reference is the catheter that moves least within its own
+    runs.
+       Then the reason says that two catheters could be exchanged.
 
     Parameters
     ----------
@@ -76,9 +84,9 @@ def name_look_alikes(
     Returns
     -------
     list of list of str
-        The names, as the catheters stand in ``sites``.
+        The names, in the order of ``sites``.
     Reason or None
-        IDENTITY_BY_MOTION, IDENTITY_UNCERTAIN, or None where nothing is in doubt.
+        IDENTITY_BY_MOTION, IDENTITY_UNCERTAIN, or None without doubt.
     """
     if len(names) == 1:
         return [[names[0] for _ in site] for site in sites], None
@@ -94,14 +102,14 @@ def name_look_alikes(
         for place, column in zip(*linear_sum_assignment(-by_hand), strict=True)
         if by_hand[place, column] > 0
     }
-    order, reason = _complete(names, reference, fixed, sites, places, count)
+    order, reason = _assign_names(names, reference, fixed, sites, places, count)
     named = []
     for site, indices in zip(sites, places, strict=True):
         given = [order[index] for index in indices]
         for k, one in enumerate(site):
             wanted = one.manual_name
             if wanted in names and given[k] != wanted:
-                # At its own site a name set by hand holds even against the place it has elsewhere.
+                # At its own site a name set by hand overrides the name of the place.
                 if wanted in given:
                     given[given.index(wanted)] = given[k]
                 given[k] = wanted
@@ -109,7 +117,7 @@ def name_look_alikes(
     return named, reason
 
 
-def _complete(
+def _assign_names(
     names: tuple[str, ...],
     reference: str,
     fixed: dict[int, str],
@@ -117,7 +125,10 @@ def _complete(
     places: list[list[int]],
     count: int,
 ) -> tuple[dict[int, str], Reason | None]:
-    """Name of every place, those by hand kept, and the doubt that is left."""
+    """Return the name of every place, and the remaining doubt.
+
+    Names set by hand are fixed.
+    """
     order = dict(fixed)
     shown = {place for indices in places for place in indices}
     free = [place for place in range(count) if place not in order and place in shown]
@@ -135,14 +146,14 @@ def _complete(
 
 
 def _positions_at(sites: Sequence[Sequence[PairedCatheter]], places: list[list[int]], place: int) -> dict[int, Array]:
-    """Site index -> position (3,) of the catheter that stands in this place there."""
+    """Return site index -> position (3,) of the catheter with this place."""
     return {s: site[places[s].index(place)].position_mm for s, site in enumerate(sites) if place in places[s]}
 
 
 def _stillest(
     sites: Sequence[Sequence[PairedCatheter]], places: list[list[int]], free: list[int]
 ) -> tuple[int, Reason]:
-    """The place, among ``free``, whose catheter moves least, and how sure that is."""
+    """Return the place in ``free`` whose catheter moves least, and the certainty."""
     shown = [set(_positions_at(sites, places, place)) for place in free]
     together = sorted(set.intersection(*shown))
     if len(free) > 1 and len(together) >= 3:

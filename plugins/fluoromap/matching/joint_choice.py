@@ -1,4 +1,4 @@
-"""The pairings of all sites of a study chosen together, with the probability of the next best at each."""
+"""Joint choice of the pairings of all sites, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fluoromap.matching.hypotheses import PRIOR_TURN, Hypotheses
 from fluoromap.matching.pairs import student_cost
 
 PLACE_SD_MM = 4.0
-"""An axis, of a catheter's diastolic place from site to site, before the study has told."""
+"""Prior variation of a catheter's diastolic place from site to site, an axis."""
 _PLACE_PRIOR_SITES = 3.0
 _NEUTRAL = float(student_cost(np.array(3.0), 3))
 _ANCHORS_PER_SITE = 6
@@ -27,11 +27,12 @@ Turn = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class SiteChoice:
-    """How one site's catheters are paired.
+    """The chosen pairing of one site.
 
     pairs : (s, 2) chain of view a and of view b in each slot of the catalogue, -1 where empty; over the study, one slot
-    of a group of look-alikes holds one catheter. alternative : the next best, or None. probability : (0 to 0.5) that it
-    is that instead.
+    of a group of look-alikes contains one catheter. alternative : the next best pairing, or None. probability : of the
+    alternative,
+    0 to 0.5.
     """
 
     pairs: IntArray
@@ -41,11 +42,14 @@ class SiteChoice:
 
 @dataclass(frozen=True, eq=False)
 class _Study:
-    """All hypotheses of all sites in one row, N of them; site : (N,) index of each one's site."""
+    """All hypotheses of all sites in one row, N of them.
+
+    resident_slots : the slots of the catheters that stay at their places. site : (N,) index of each hypothesis's site.
+    """
 
     sites: tuple[Hypotheses, ...]
     gantries: tuple[Hashable, ...]
-    placed: tuple[int, ...]
+    resident_slots: tuple[int, ...]
     orders: IntArray
     site: IntArray
     starts: IntArray
@@ -57,8 +61,12 @@ class _Study:
 
 @dataclass(frozen=True, eq=False)
 class _Configuration:
-    """One way to see the whole study: the row chosen at each site, in which order its slots stand in the places, how the
-    gantry is turned, where the places are and how wide; cost over all."""
+    """One explanation of the whole study.
+
+    chosen : the row chosen at each site. order : the order in which its slots fill the places. own_cost : (N,) cost of each
+    row,
+    given the gantry. centres_mm, variance_mm2 : of the places. cost : over all sites.
+    """
 
     chosen: IntArray
     order: IntArray
@@ -71,36 +79,37 @@ class _Configuration:
 def choose_pairings(
     sites: Sequence[Hypotheses], slots: Sequence[int], roving: int, gantries: Sequence[Hashable]
 ) -> tuple[SiteChoice, ...]:
-    """Choose each site's pairing so that the study as a whole is likeliest.
+    """Choose the pairings that make the study as a whole most likely.
 
-    All catheters but the roving one hardly move between the sites, and the gantry's angles are wrong by the same at all
-    sites that were taken at the same angles: a pairing that looks well at its own site alone can be ruled out by the others.
+    All catheters but the roving one hardly move between the sites. The gantry's angles have the same error at all sites
+    with the
+    same angles. So the other sites can rule out a pairing that fits well at its own site.
 
     Parameters
     ----------
     sites : sequence of Hypotheses
-        At least one hypothesis a site.
+        At least one hypothesis for each site.
     slots : sequence of int
         Group of each slot; slots of one group are look-alikes.
     roving : int
-        The slot of the mapping catheter; -1 where it looks like others and so cannot be told from those that stay.
+        The slot of the mapping catheter; -1 where it looks like others and cannot be distinguished from them.
     gantries : sequence
         Equal for sites taken at the same gantry angles.
     """
     if not sites:
         return ()
-    placed = tuple(slot for slot in range(len(slots)) if slot != roving)
-    members = [[k for k, slot in enumerate(placed) if slots[slot] == group] for group in dict.fromkeys(slots)]
+    resident_slots = tuple(slot for slot in range(len(slots)) if slot != roving)
+    members = [[k for k, slot in enumerate(resident_slots) if slots[slot] == group] for group in dict.fromkeys(slots)]
     orders = []
     for exchanged in itertools.product(*map(itertools.permutations, members)):
-        order = np.empty(len(placed), dtype=np.int64)
+        order = np.empty(len(resident_slots), dtype=np.int64)
         order[[k for own in members for k in own]] = [k for own in exchanged for k in own]
         orders.append(order)
     lengths = [len(one.pairs) for one in sites]
     study = _Study(
-        tuple(sites), tuple(gantries), placed, np.array(orders),
+        tuple(sites), tuple(gantries), resident_slots, np.array(orders),
         np.repeat(np.arange(len(sites)), lengths), np.cumsum([0, *lengths[:-1]]),
-        np.concatenate([one.position_mm[:, list(placed)] for one in sites]),
+        np.concatenate([one.position_mm[:, list(resident_slots)] for one in sites]),
     )  # fmt: skip
     found = _configurations(study)
     least = min(one.cost for one in found)
@@ -111,10 +120,13 @@ def choose_pairings(
 
 
 def _configurations(study: _Study) -> list[_Configuration]:
-    """The likeliest ways to see the study, found from each site's likeliest hypotheses."""
+    """Return the most likely explanations of the study.
+
+    The search starts from each site's most likely hypotheses.
+    """
     turns = dict.fromkeys(study.gantries, PRIOR_TURN)
     own_cost = _own_cost(study, turns)
-    wide = np.full(len(study.placed), PLACE_SD_MM**2)
+    wide = np.full(len(study.resident_slots), PLACE_SD_MM**2)
     anchors: list[int] = []
     for site in range(len(study.sites)):
         rows = study.rows(site)
@@ -143,16 +155,21 @@ def _own_cost(study: _Study, turns: dict[Hashable, Turn]) -> Array:
 
 
 def _place_cost(study: _Study, centres_mm: Array, variance_mm2: Array) -> Array:
-    """Cost (N, orders) of where the catheters are, with their places at ``centres_mm`` (p, 3)."""
+    """Return the cost (N, orders) of the catheters' positions.
+
+    The places are at ``centres_mm`` (p, 3).
+    """
     apart = ((study.position_mm[:, :, None] - centres_mm) ** 2).sum(axis=3) / variance_mm2
     cost = student_cost(apart, 3) + 1.5 * np.log(variance_mm2 / PLACE_SD_MM**2)
     cost = np.where(np.isfinite(cost), cost, _NEUTRAL)
-    each: Array = cost[:, np.arange(len(study.placed)), study.orders[:, None]].sum(axis=-1).reshape(len(cost), -1)
+    each: Array = (
+        cost[:, np.arange(len(study.resident_slots)), study.orders[:, None]].sum(axis=-1).reshape(len(cost), -1)
+    )
     return each
 
 
 def _choose(study: _Study, own_cost: Array, centres_mm: Array, variance_mm2: Array) -> _Configuration:
-    """Each site's best row, given the gantry and the places."""
+    """Choose each site's best row, given the gantry and the places."""
     each = own_cost[:, None] + _place_cost(study, centres_mm, variance_mm2)
     by_row = each.min(axis=1)
     chosen, cost = [], 0.0
@@ -167,11 +184,11 @@ def _choose(study: _Study, own_cost: Array, centres_mm: Array, variance_mm2: Arr
 
 
 def _refine(study: _Study, configuration: _Configuration) -> _Configuration:
-    """Places and gantry from the chosen rows, rows from places and gantry, a few times over."""
+    """Alternate between estimating places and gantry, and choosing rows."""
     for _ in range(_ROUNDS):
         turns = {gantry: _fit_turn(study, configuration, gantry) for gantry in dict.fromkeys(study.gantries)}
         prior = sum(float(turn @ np.linalg.solve(PRIOR_TURN[1], turn)) / 2 for turn, _ in turns.values())
-        positions = _in_places(study, configuration)
+        positions = _place_positions(study, configuration)
         centres, variance = _places(positions, configuration.centres_mm)
         again = _choose(study, _own_cost(study, turns), centres, variance)
         configuration = _Configuration(
@@ -180,29 +197,38 @@ def _refine(study: _Study, configuration: _Configuration) -> _Configuration:
     return configuration
 
 
-def _in_places(study: _Study, configuration: _Configuration) -> Array:
-    """Positions (sites, places, 3) of the chosen rows' catheters, NaN where missing."""
-    positions = np.full((len(study.sites), len(study.placed), 3), np.nan)
+def _place_positions(study: _Study, configuration: _Configuration) -> Array:
+    """Return the positions (sites, places, 3) of the chosen rows' catheters.
+
+    NaN where a catheter is missing.
+    """
+    positions = np.full((len(study.sites), len(study.resident_slots), 3), np.nan)
     for site, (row, order) in enumerate(zip(configuration.chosen, configuration.order, strict=True)):
         positions[site, study.orders[order]] = study.position_mm[row]
     return positions
 
 
 def _places(positions: Array, otherwise: Array) -> tuple[Array, Array]:
-    """Centre (p, 3) and variance an axis (p,) of each place; ``otherwise`` where no site shows it."""
+    """Return centre (p, 3) and variance an axis (p,) of each place.
+
+    ``otherwise`` is the centre of a place that no site shows.
+    """
     known = np.isfinite(positions[..., 0])
     count = known.sum(axis=0)
     centres = np.where(
         count[:, None] > 0, np.nansum(positions, axis=0) / np.maximum(count, 1)[:, None], otherwise
     )  # fmt: skip
-    # A site far off is one that is paired wrongly; it must not widen the place.
+    # A site far off is paired wrongly; it must not widen the place.
     squares = np.nansum(np.minimum((positions - centres) ** 2, (2 * PLACE_SD_MM) ** 2), axis=(0, 2))
     variance = (3 * _PLACE_PRIOR_SITES * PLACE_SD_MM**2 + squares) / (3 * (_PLACE_PRIOR_SITES + count))
     return centres, variance
 
 
 def _fit_turn(study: _Study, configuration: _Configuration, gantry: Hashable) -> Turn:
-    """How view b is turned against view a at these gantry angles, by ridge regression on the chosen pairs' distances."""
+    """Estimate the rotation of view b against view a at these gantry angles.
+
+    The estimate is a ridge regression on the chosen pairs' distances.
+    """
     normal, pull = np.linalg.inv(PRIOR_TURN[1]), np.zeros(3)
     for site, (one, at) in enumerate(zip(study.sites, study.gantries, strict=True)):
         if at != gantry:
@@ -221,8 +247,11 @@ def _fit_turn(study: _Study, configuration: _Configuration, gantry: Hashable) ->
 
 
 def _probabilities(study: _Study, configuration: _Configuration) -> Array:
-    """Probability (N,) of each row at its site, the places being told by the other sites."""
-    positions = _in_places(study, configuration)
+    """Return the probability (N,) of each row at its site.
+
+    The places are those of the other sites.
+    """
+    positions = _place_positions(study, configuration)
     probability = np.empty(len(study.site))
     for site in range(len(study.sites)):
         rows = study.rows(site)
@@ -230,7 +259,7 @@ def _probabilities(study: _Study, configuration: _Configuration) -> Array:
         nowhere = np.full_like(configuration.centres_mm, np.nan)
         centres, variance = _places(others, nowhere) if len(others) else (nowhere, configuration.variance_mm2)
         own = _Study(
-            (study.sites[site],), (), study.placed, study.orders, study.site[rows], np.zeros(1, dtype=np.int64),
+            (study.sites[site],), (), study.resident_slots, study.orders, study.site[rows], np.zeros(1, dtype=np.int64),
             study.position_mm[rows],
         )  # fmt: skip
         cost = configuration.own_cost[rows] + _place_cost(own, centres, variance).min(axis=1)
@@ -257,8 +286,8 @@ def _site_choice(study: _Study, site: int, probability: Array, best: _Configurat
 
 
 def _in_order(study: _Study, one: Hypotheses, row: int, order: int) -> IntArray:
-    """The pairs of a row with each look-alike in its place."""
+    """Return the pairs of a row with each look-alike at its place."""
     pairs: IntArray = one.pairs[row].copy()
-    placed = np.array(study.placed, dtype=np.int64)
-    pairs[placed[study.orders[order]]] = one.pairs[row][placed]
+    resident_slots = np.array(study.resident_slots, dtype=np.int64)
+    pairs[resident_slots[study.orders[order]]] = one.pairs[row][resident_slots]
     return pairs

@@ -1,4 +1,4 @@
-"""How well each chain of one view fits each chain of the other: costs in nats, the less the likelier."""
+"""Costs of pairing each chain of one view with each of the other, in nats."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from fluoromap.matching.run_catheters import RunCatheter, common_electrodes
 from fluoromap.matching.two_view import signed_epipolar_px, triangulate_linear
 
 LEAST_VOTE = 0.15
-"""A catheter is not given a name that fewer votes speak for."""
+"""A catheter does not get a name with a smaller vote."""
 GANTRY_SD_RAD = np.radians(np.sqrt(2.0))
-"""Of the rotation of one view against the other about each axis: 1 degree in each view."""
+"""Rotation of one view against the other about each axis: 1 degree in each view."""
 CATHETER_SD_MM = 0.6
-"""Of a catheter's place in one run against the other: beat to beat, and another moment of the cycle."""
+"""Difference of a catheter's place between the runs: beat to beat, and another moment of the cycle."""
 TAILS = 3.0
-"""Degrees of freedom of the Student distributions that stand for normal ones with a few gross errors."""
+"""Degrees of freedom of the Student distributions, which replace normal ones where a few gross errors occur."""
 _TURN_RAD = 1e-3
 _PIXEL_FLOOR_PX = 0.8
 _SPACING_SD_MM = 0.45
@@ -32,10 +32,11 @@ class PairTable:
     """Every chain of view a (n of them) against every chain of view b (m).
 
     possible : (n, m), whether the two can be one catheter at all. distance_px : (n, m) mean signed epipolar distance of
-    their electrodes. variance_px2 : (n, m) of that, were the gantry right and the heart in one place in both runs.
-    turn_px : (n, m, 3) how a rotation of view b about the world's axes by one radian changes it. shape_cost : (n, m), how
-    the distances differ along the catheter and whether it bends as a catheter can. group_cost : (groups, n, m), spacing and
-    votes; infinite where the name is out of the question. motion_cost : (n, m, shifts) over the cycle, for each shift of
+    their electrodes. variance_px2 : (n, m) of that, for a correct gantry and the heart at one place in both runs.
+    turn_px : (n, m, 3) its change for a rotation of view b about the world's axes by one radian. shape_cost : (n, m), for
+    differences of the distance along the catheter and for bends that a catheter does not have. group_cost : (groups, n, m),
+    spacing
+    and votes; infinite where the name is impossible. motion_cost : (n, m, shifts) over the cycle, for each shift of
     view b's phases. position_mm : (n, m, 3), mean of the electrodes in the world.
     """
 
@@ -50,13 +51,16 @@ class PairTable:
 
 
 def student_cost(chi2: Array, terms: int | Array = 1) -> Array:
-    """Negative logarithm of a Student density of ``terms`` numbers whose squares over their variances sum to ``chi2``."""
+    """Return the negative logarithm of a Student density of ``terms`` numbers.
+
+    chi2 : the sum of their squares over their variances.
+    """
     cost: Array = (TAILS + terms) / 2 * np.log1p(chi2 / TAILS)
     return cost
 
 
 def common_distance(distances: Array, variances: Array) -> float:
-    """Weighted mean of distances (m,) that a few gross errors do not draw away."""
+    """Return a weighted mean of distances (m,), robust against a few gross errors."""
     mean = float(np.median(distances))
     for _ in range(3):
         weights = (TAILS + 1) / (TAILS + (distances - mean) ** 2 / variances) / variances
@@ -65,9 +69,11 @@ def common_distance(distances: Array, variances: Array) -> float:
 
 
 def spacing_cost(points_world_mm: Array, electrodes: Sequence[int], catheter: Catheter) -> float:
-    """Cost of the differences between the distances of neighbouring electrodes and the catalogue's.
+    """Return the cost of the difference between measured and catalogue spacings.
 
-    points_world_mm : (m, 3) of the electrodes with these numbers, ascending. 0 for one, infinite for too many.
+    points_world_mm : (m, 3) of the electrodes with these numbers, ascending. The cost is 0 for one electrode, and infinite
+    for more
+    than the catheter has.
     """
     if electrodes[-1] > catheter.electrodes:
         return np.inf
@@ -77,7 +83,7 @@ def spacing_cost(points_world_mm: Array, electrodes: Sequence[int], catheter: Ca
 
 
 def bend_cost(points_world_mm: Array) -> float:
-    """Cost of the bends of the line through points (m, 3)."""
+    """Return the cost of the bends of the line through points (m, 3)."""
     steps = np.diff(points_world_mm, axis=0)
     steps = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
     cosine = np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1.0, 1.0)
@@ -92,7 +98,10 @@ def pair_table(
     catalogue: Catalogue,
     groups: Sequence[tuple[str, ...]],
 ) -> PairTable:
-    """Compare all chains of the two runs of a site at diastole; ``motion_cost`` tells how they compare over the cycle."""
+    """Compare all chains of a site's two runs at diastole.
+
+    ``motion_cost`` compares them over the cycle, see :func:`~fluoromap.matching.phase_matching.motion_misfit`.
+    """
     n, m = len(catheters_a), len(catheters_b)
     shared = {}
     for i, first in enumerate(catheters_a):
@@ -143,7 +152,7 @@ def pair_table(
 
 
 def _turned(camera: Camera, axis: int) -> Camera:
-    """The camera with the world turned a little about one of its axes."""
+    """Return the camera with the world rotated slightly about one of its axes."""
     c, s = np.cos(_TURN_RAD), np.sin(_TURN_RAD)
     first, second = [k for k in range(3) if k != axis] if axis != 1 else (2, 0)
     turn = np.eye(4)

@@ -1,4 +1,4 @@
-"""Cardiac phase of the frames of a run: from R waves where told, else from the catheters' own periodic motion."""
+"""Cardiac phase of a run's frames, from R waves or the catheters' motion."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from fluoromap.matching.steady_beats import steady_beats_ms
 SHORTEST_CYCLE_MS = 300.0
 LONGEST_CYCLE_MS = 1600.0
 MUST_SHOW = 0.7
-"""A catheter serves as a clock when it is seen in this share of the frames."""
+"""A catheter is used for timing when it is present in this share of the frames."""
 PERIODIC_BELOW = 0.5
-"""Mean squared change over one cycle, as a share of that over any time: above it, nothing repeats."""
+"""Limit of the mean squared change over one cycle, as a share of that over any time; a larger change is not periodic."""
 _SAME_CYCLE = 0.15
 _BINS = 60
 
@@ -27,24 +27,28 @@ _BINS = 60
 class Rhythm:
     """The cardiac cycle in one run.
 
-    phases : (n,) of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next. irregular : the beats
-    differ in length. unsure : how far from there phase 0 may lie at most, in cycles: R waves are told to the frame, and
-    without them it may be anywhere.
+    phases : (n,) of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next. irregular : whether
+    the beats
+    differ in length. phase_uncertainty : the largest possible error of phase 0, in cycles. R waves are known to the nearest
+    frame;
+    without them phase 0 may lie anywhere.
     """
 
     phases: Array
     irregular: bool
-    unsure: float = 0.5
+    phase_uncertainty: float = 0.5
 
 
 def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter]) -> Rhythm | None:
-    """Phase of each frame; None where unknown.
+    """Return the phase of each frame, or None where it is unknown.
 
-    With R waves told the time between two of them is one cycle; before the first and after the last the neighbouring
-    cycle's length goes on. Frames tell them to half a frame; a steady rhythm is known more finely. Without, the length of
-    the cycle is the time after which the catheters are back where they were, and systole begins where the longest quiet
-    stretch of the cycle ends. Where the catheters show beats that differ in length, each beat counts from its own start of
-    systole.
+    - With R waves, the time between two of them is one cycle. Before the first and after the last one the neighbouring
+    cycle's
+      length is used. The frames give them to half a frame; a steady rhythm gives them more precisely.
+    - Without R waves, the length of the cycle is the time after which the catheters are back at their places. Systole
+    begins where
+      the longest quiet stretch of the cycle ends.
+    - Where the catheters show beats that differ in length, each beat counts from its own start of systole.
     """
     times = segmentation.frame_times_ms
     beats = times[np.array(sorted(set(segmentation.r_wave_frames)), dtype=np.intp)]
@@ -55,15 +59,15 @@ def cardiac_phases(segmentation: Segmentation, catheters: Sequence[RunCatheter])
     places = _places(segmentation, catheters, grid)
     if len(beats) >= 2:
         finer = steady_beats_ms(beats, step_ms / 2, grid, places)
-        unsure = step_ms / 2 / float(np.diff(finer).mean())
-        return Rhythm(_phases_from_beats(times, finer), is_irregular(finer), min(unsure, 0.5))
+        uncertainty = step_ms / 2 / float(np.diff(finer).mean())
+        return Rhythm(_phases_from_beats(times, finer), is_irregular(finer), min(uncertainty, 0.5))
     marks = np.zeros(0) if places is None else times[0] + systole_starts_ms(places, step_ms)
     if is_irregular(marks):
         return Rhythm(_phases_from_beats(times, marks), True)
     signal = places if places is not None else np.interp(grid, times, segmentation.motion)[:, None]
     cycle_ms = cycle_length_ms(signal, step_ms)
     if len(marks) >= 2:
-        # Two beats repeat as well as one does: the marks tell how many there are.
+        # A lag of two beats repeats as well as a lag of one; the detected beats give their number.
         mean_ms = float(np.polyfit(np.arange(len(marks)), marks, 1)[0])
         if cycle_ms is None or abs(cycle_ms - mean_ms) > _SAME_CYCLE * mean_ms:
             cycle_ms = mean_ms
@@ -92,7 +96,10 @@ def _phases_from_beats(times: Array, beats: Array) -> Array:
 
 
 def _places(segmentation: Segmentation, catheters: Sequence[RunCatheter], grid_ms: Array) -> Array | None:
-    """Centroids of the catheters that are seen nearly throughout, on an even time grid, shape (g, 2 k); drift removed."""
+    """Return the centroids of the catheters present nearly throughout, shape (g, 2 k).
+
+    They are on an even time grid, and their drift is removed.
+    """
     columns: list[Array] = []
     for catheter in catheters:
         frames, centroids = catheter.centroids_uv
@@ -103,17 +110,18 @@ def _places(segmentation: Segmentation, catheters: Sequence[RunCatheter], grid_m
     if not columns:
         return None
     signal = np.stack(columns, axis=1)
-    # Breathing within a run is slow: a straight line takes most of it.
+    # Breathing within a run is slow: a straight line removes most of it.
     ramp = np.stack([np.ones(len(signal)), np.linspace(-1, 1, len(signal))], axis=1)
     places: Array = signal - ramp @ np.linalg.lstsq(ramp, signal, rcond=None)[0]
     return places
 
 
 def cycle_length_ms(signal: Array, step_ms: float) -> float | None:
-    """Length of the cycle of a signal (g, k) on an even time grid; None where it does not repeat.
+    """Return the length of a signal's cycle.
 
-    The first lag at which the signal comes back to itself nearly as well as it ever does, between 300 and 1600 ms and
-    at most 0.7 of the run.
+    The signal (g, k) is on an even time grid. The length is the first lag at which the signal returns to itself nearly as
+    well as
+    at its best lag, between 300 and 1600 ms and at most 0.7 of the run. None where the signal does not repeat.
     """
     n = len(signal)
     spread = 2.0 * float(signal.var(axis=0).sum())
@@ -135,14 +143,14 @@ def cycle_length_ms(signal: Array, step_ms: float) -> float | None:
 
 
 def start_of_systole(phases: Array, speed: Array) -> float:
-    """Phase at which the longest quiet stretch of the cycle ends.
+    """Return the phase at which the longest quiet stretch of the cycle ends.
 
-    End-systole stands still too, but for a shorter time than diastole.
+    The heart also rests at end-systole, but for a shorter time than in diastole.
 
     Parameters
     ----------
     phases, speed : ndarray, shape (g,)
-        Phase from any origin, and how fast the heart moves (any unit).
+        Phase from any origin, and the speed of the heart (any unit).
     """
     weights = np.bincount((phases * _BINS).astype(np.intp) % _BINS, minlength=_BINS).astype(np.float64)
     sums = np.bincount((phases * _BINS).astype(np.intp) % _BINS, weights=speed, minlength=_BINS)
@@ -150,7 +158,7 @@ def start_of_systole(phases: Array, speed: Array) -> float:
     folded = np.interp(np.arange(_BINS), known, sums[known] / weights[known], period=_BINS)
     folded = gaussian_filter1d(folded, 1.0, mode="wrap")
     threshold = folded.min() + 0.3 * (folded.max() - folded.min())
-    # Starting at the fastest moment, no quiet stretch is cut in two.
+    # The cycle is cut at its fastest moment, so that no quiet stretch is divided.
     origin = int(np.argmax(folded))
     quiet = np.append(np.roll(folded, -origin) < threshold, False)
     best_length, best_end, length = 0, 0, 0
@@ -165,7 +173,7 @@ def start_of_systole(phases: Array, speed: Array) -> float:
 
 
 def phase_distance(first: Array, second: Array) -> Array:
-    """Distance between phases round the cycle, 0 to 0.5."""
+    """Return the distance between phases round the cycle, 0 to 0.5."""
     apart = np.abs(np.asarray(first) - np.asarray(second)) % 1.0
     distance: Array = np.minimum(apart, 1.0 - apart)
     return distance

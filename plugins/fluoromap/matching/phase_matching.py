@@ -1,4 +1,4 @@
-"""Two runs of a site brought to the same cardiac phase, and whether catheters move alike in both."""
+"""Phase matching of a site's two runs, and comparison of their motion."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from fluoromap.matching.run_catheters import RunCatheter
 from fluoromap.matching.two_view import signed_epipolar_px
 
 NEAREST_PHASE = 0.03
-"""Frames of the two views are the same moment of the cycle when their phases differ by no more than this."""
+"""Frames of the two views show the same moment of the cycle when their phases differ by no more than this."""
 WIDEST_GAP = 0.15
-"""Between frames that are further apart in phase nothing is interpolated: systole would be cut short."""
+"""Frames with a larger difference in phase are not interpolated: that would cut systole short."""
 MOMENTS = 50
-"""Phases at which a run's motion is compared with the other's."""
+"""Number of phases at which the motion of two runs is compared."""
 _BLUR = 0.025
 _LEAST_MOTION_PX = 0.5
 _MOTION_SD_PX = 1.5
@@ -28,21 +28,24 @@ _INDEPENDENT_MOMENTS = 4.0
 
 @dataclass(frozen=True, eq=False)
 class FoldedRun:
-    """The motion of a run's catheters over one cycle, all beats taken together.
+    """The motion of a run's catheters over one cycle, from all beats together.
 
     paths : for each catheter electrode number -> pixels (MOMENTS, 2) at phases evenly from 0 on.
-    unsure : how far from the R wave phase 0 may lie at most, in cycles; 0.5 where nothing tells.
+    phase_uncertainty : the largest possible distance of phase 0 from the R wave, in cycles; 0.5 without R waves.
     """
 
     paths: tuple[dict[int, Array], ...]
-    unsure: float
+    phase_uncertainty: float
 
 
-def fold(catheters: Sequence[RunCatheter], phases: Array, unsure: float) -> FoldedRun:
-    """Take all beats of a run together; phases (n,) of its frames."""
+def fold(catheters: Sequence[RunCatheter], phases: Array, phase_uncertainty: float) -> FoldedRun:
+    """Combine all beats of a run into one cycle.
+
+    phases : (n,) of its frames.
+    """
     paths: list[dict[int, Array]] = []
     for catheter in catheters:
-        frames, electrodes, pixels = catheter.seen_throughout
+        frames, electrodes, pixels = catheter.electrode_paths
         if len(frames) < 4:
             paths.append({})
             continue
@@ -53,16 +56,22 @@ def fold(catheters: Sequence[RunCatheter], phases: Array, unsure: float) -> Fold
         weights /= weights.sum(axis=1, keepdims=True)
         smooth = np.einsum("kn,nei->kei", weights, pixels)
         paths.append({number: smooth[:, row] for row, number in enumerate(electrodes)})
-    return FoldedRun(tuple(paths), unsure)
+    return FoldedRun(tuple(paths), phase_uncertainty)
 
 
 def _variations(
     cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, FoldedRun], pairs: Sequence[tuple[int, int]]
 ) -> tuple[Array, Array]:
-    """How much the epipolar distance of each pair varies over the cycle, px^2: (p, MOMENTS) for each shift of view b's
-    phases by k / MOMENTS, and (p,) were the two not the same. NaN where no electrode is followed in both runs.
+    """Return the variation of each pair's epipolar distance over the cycle, px^2.
 
-    What moves across the epipolar lines is seen by both views: at equal phases the distance stays what it is.
+    Both views show the same motion across the epipolar lines: at equal phases the distance does not change.
+
+    Returns
+    -------
+    (p, MOMENTS)
+        For each shift of view b's phases by k / MOMENTS. NaN where no electrode is tracked in both runs.
+    (p,)
+        The variation if the two chains were different catheters.
     """
     known, first, second = [], [], []
     for row, (i, j) in enumerate(pairs):
@@ -76,7 +85,7 @@ def _variations(
     if known:
         distance = signed_epipolar_px(*cameras, np.array(first)[:, :, None], np.array(second)[:, None, :])
         moments = np.arange(MOMENTS)
-        # View b's phases shifted by s: what it shows at phase p it has recorded at p - s.
+        # With view b's phases shifted by s, its image at phase p was recorded at p - s.
         recorded = (moments[None, :] - moments[:, None]) % MOMENTS
         variation[known] = distance[:, moments[None, :], recorded].var(axis=2)
         unlike[known] = distance.var(axis=1).mean(axis=1) + distance.var(axis=2).mean(axis=1)
@@ -84,18 +93,18 @@ def _variations(
 
 
 def motion_misfit(cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, FoldedRun] | None, n: int, m: int) -> Array:
-    """What each pair of n and m catheters costs for moving otherwise in the two views, in nats.
+    """Return the cost of each pair's different motion in the two views, nats.
 
     Returns
     -------
     ndarray, shape (n, m, k)
-        For k shifts of view b's phases: as far as they may be apart, 0 always among them; none without phases.
+        For n and m catheters and k possible shifts of view b's phases, 0 among them; k is 0 without phases.
     """
     if folded is None:
         return np.zeros((n, m, 0))
     pairs = [(i, j) for i in range(n) for j in range(m)]
     variation, unlike = _variations(cameras, folded, pairs)
-    variation = variation[:, _within(folded)]
+    variation = variation[:, _allowed_shifts(folded)]
     usual = _MOTION_SD_PX**2 + _MOTION_SD_SHARE**2 * unlike[:, None]
     cost = _INDEPENDENT_MOMENTS / 2 * np.log1p(np.nan_to_num(variation / usual, nan=1.0))
     misfit: Array = cost.reshape(n, m, -1)
@@ -105,12 +114,13 @@ def motion_misfit(cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, Folde
 def phase_shift(
     cameras: tuple[Camera, Camera], folded: tuple[FoldedRun, FoldedRun], pairs: Sequence[tuple[int, int]]
 ) -> float:
-    """What to add to view b's phases so that both views count from the same moment of the cycle, -0.5 to 0.5.
+    """Return the shift of view b's phases for which both views count alike.
 
-    The shift that leaves the paired catheters' epipolar distances the least variation, no farther than R waves allow; 0
-    where hardly anything moves across the epipolar lines.
+    It lies between -0.5 and 0.5. It is the shift for which the paired catheters' epipolar distances vary least, within the
+    limits of
+    the R waves. It is 0 where hardly anything moves across the epipolar lines.
     """
-    allowed = _within(folded)
+    allowed = _allowed_shifts(folded)
     variation = np.nansum(_variations(cameras, folded, pairs)[0], axis=0) / max(len(pairs), 1)
     best = int(np.flatnonzero(allowed)[np.argmin(variation[allowed])])
     if np.sqrt(variation.max()) - np.sqrt(variation[best]) < _LEAST_MOTION_PX:
@@ -119,22 +129,25 @@ def phase_shift(
     bend = left - 2 * middle + right
     between = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend > 0 else 0.0
     shift = float(((best + between) / MOMENTS + 0.5) % 1.0 - 0.5)
-    farthest = folded[0].unsure + folded[1].unsure
+    farthest = folded[0].phase_uncertainty + folded[1].phase_uncertainty
     return float(np.clip(shift, -farthest, farthest))
 
 
-def _within(folded: tuple[FoldedRun, FoldedRun]) -> BoolArray:
-    """Which of MOMENTS shifts (MOMENTS,) of view b's phases the two runs allow."""
-    farthest = folded[0].unsure + folded[1].unsure
+def _allowed_shifts(folded: tuple[FoldedRun, FoldedRun]) -> BoolArray:
+    """Return which of the MOMENTS shifts (MOMENTS,) of view b's phases are possible."""
+    farthest = folded[0].phase_uncertainty + folded[1].phase_uncertainty
     within: BoolArray = phase_distance(np.arange(MOMENTS) / MOMENTS, np.array(0.0)) <= farthest
     return within
 
 
 def pair_by_phase(track_a: Sequence[Observation], track_b: Sequence[Observation]) -> tuple[PhasePair, ...]:
-    """Each frame of view a with what view b shows at that phase, by rising phase; only frames that show catheters.
+    """Pair each frame of view a with view b at the same phase.
 
-    View b's frame nearest in phase, of any beat. At low frame rates there may be none near enough: then what lies between
-    the frames next before and after in phase, on straight lines; where those are too far apart the moment is left out.
+    The pairs have rising phases, and only frames with catheters are used. The partner is view b's frame nearest in phase,
+    of any
+    beat. At low frame rates there may be none near enough. Then the positions are interpolated between the frames before
+    and after
+    in phase. A moment between frames that differ too much is left out.
     """
     shown_a = [seen for seen in track_a if seen.chains and seen.phase is not None]
     shown_b = sorted((seen for seen in track_b if seen.chains and seen.phase is not None), key=_phase_of)
@@ -148,7 +161,7 @@ def pair_by_phase(track_a: Sequence[Observation], track_b: Sequence[Observation]
         partner: Observation | None = shown_b[nearest]
         if apart[nearest] > NEAREST_PHASE:
             after = int(np.searchsorted(phases_b, _phase_of(seen))) % len(shown_b)
-            partner = _between(shown_b[after - 1], shown_b[after], _phase_of(seen))
+            partner = _interpolate(shown_b[after - 1], shown_b[after], _phase_of(seen))
         if partner is not None:
             pairs.append(PhasePair(seen.phase, seen, partner))
     return tuple(pairs)
@@ -159,8 +172,11 @@ def _phase_of(seen: Observation) -> float:
     return seen.phase
 
 
-def _between(before: Observation, after: Observation, phase: float) -> Observation | None:
-    """What is seen at ``phase``, between two moments of the cycle; None where they are too far apart or share nothing."""
+def _interpolate(before: Observation, after: Observation, phase: float) -> Observation | None:
+    """Return the interpolated observation at ``phase``.
+
+    None where the two moments are too far apart or have no electrode in common.
+    """
     gap = (_phase_of(after) - _phase_of(before)) % 1.0
     if not 0 < gap <= WIDEST_GAP:
         return None

@@ -1,4 +1,4 @@
-"""The chains of one run gathered into catheters, not yet named."""
+"""Catheters of one run, gathered from its chains and not yet named."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scipy.optimize import linear_sum_assignment
 from fluoromap.contracts import Array, Chain, IntArray, Segmentation
 
 LINK_GATE_MM = 3.0
-"""A chain without a track number continues the catheter that was this near in a neighbouring frame (at the isocentre)."""
+"""A chain without a track number continues the catheter within this distance in a neighbouring frame (at the isocentre)."""
 LINK_MEMORY_FRAMES = 10
-"""How many frames back a catheter's last place is still a guide."""
-SEEN_AT_LEAST = 0.2
-"""A track in fewer of the run's frames, absent from the diastolic mean and not set by hand, is taken for a false one."""
-SHOWN_IN_MOST = 0.7
-"""An electrode is followed when it is in this share of the frames that show its catheter's most constant electrode."""
+"""Number of frames for which a catheter's last place is used."""
+LEAST_SHARE = 0.2
+"""A track in a smaller share of the frames is false, unless it is in the diastolic mean or was set by hand."""
+CONSTANT_SHARE = 0.7
+"""An electrode is constant when it is in this share of the frames of its catheter's most frequent electrode."""
 _NEVER = 1e6
 
 
@@ -27,8 +27,8 @@ _NEVER = 1e6
 class RunCatheter:
     """One catheter through one run.
 
-    chains : frame -> chain. diastole : the chain that stands for diastole, valid in ``diastole_frame``.
-    votes : catheter name -> mean probability over the frames. manual_name : as set by hand, else None.
+    chains : frame -> chain. diastole : the chain at diastole, valid in ``diastole_frame``.
+    votes : catheter name -> mean probability over the frames. manual_name : the name set by hand, else None.
     """
 
     chains: dict[int, Chain]
@@ -38,12 +38,14 @@ class RunCatheter:
     manual_name: str | None
 
     @functools.cached_property
-    def seen_throughout(self) -> tuple[IntArray, tuple[int, ...], Array]:
-        """Frames (k,), electrodes (e of them) and pixels (k, e, 2): the electrodes that most of its frames show, in the
-        frames that show all of those."""
+    def electrode_paths(self) -> tuple[IntArray, tuple[int, ...], Array]:
+        """Frames (k,), numbers of the e constant electrodes, and pixels (k, e, 2).
+
+        The frames are those that show all constant electrodes.
+        """
         counts = collections.Counter(number for chain in self.chains.values() for number in chain.electrodes)
         most = max(counts.values(), default=0)
-        common = tuple(sorted(number for number, count in counts.items() if count >= SHOWN_IN_MOST * most))
+        common = tuple(sorted(number for number, count in counts.items() if count >= CONSTANT_SHARE * most))
         frames = [f for f in sorted(self.chains) if set(common) <= set(self.chains[f].electrodes)] if common else []
         pixels = np.zeros((len(frames), len(common), 2))
         for row, frame in enumerate(frames):
@@ -57,25 +59,28 @@ class RunCatheter:
 
     @functools.cached_property
     def centroids_uv(self) -> tuple[IntArray, Array]:
-        """Frames (k,) and the mean pixel (k, 2) of the electrodes of :attr:`seen_throughout`."""
-        frames, _, pixels = self.seen_throughout
+        """Frames (k,) and the mean pixel (k, 2) of the electrodes of :attr:`electrode_paths`."""
+        frames, _, pixels = self.electrode_paths
         return frames, pixels.mean(axis=1) if len(frames) else np.zeros((0, 2))
 
     @property
     def motion_px(self) -> float:
-        """How far it moves through the run: RMS distance of its centroid from its mean place."""
+        """RMS distance of the centroid from its mean place through the run."""
         _, centroids = self.centroids_uv
         return float(np.sqrt(centroids.var(axis=0).sum())) if len(centroids) else np.inf
 
     def vote(self, names: Sequence[str]) -> float:
-        """Probability that it is one of these, voted over the frames; certain where named by hand."""
+        """Return the probability of these names, averaged over the frames.
+
+        It is 0 or 1 where the catheter was named by hand.
+        """
         if self.manual_name is not None:
             return float(self.manual_name in names)
         return sum(self.votes.get(name, 0.0) for name in names)
 
 
 def common_electrodes(first: Chain, second: Chain) -> tuple[list[int], list[int]]:
-    """Places in each chain of the electrodes that both hold."""
+    """Return the indices in each chain of the electrodes that both have."""
     both = [number for number in first.electrodes if number in second.electrodes]
     return [first.electrodes.index(number) for number in both], [second.electrodes.index(number) for number in both]
 
@@ -88,7 +93,10 @@ def _distance_px(first: Chain, second: Chain) -> float:
 
 
 def _assign(last: list[Chain], chains: list[Chain], gate_px: float) -> dict[int, int]:
-    """Chain index -> catheter index of those that lie within the gate, at least total distance."""
+    """Assign chains to catheters within the gate at the least total distance.
+
+    Returns chain index -> catheter index.
+    """
     if not last or not chains:
         return {}
     cost = np.array([[_distance_px(known, chain) for chain in chains] for known in last])
@@ -97,14 +105,16 @@ def _assign(last: list[Chain], chains: list[Chain], gate_px: float) -> dict[int,
 
 
 def gather(segmentation: Segmentation, phases: Array | None, px_per_mm: float) -> tuple[RunCatheter, ...]:
-    """Gather a run's chains into catheters, by track number and, where that is missing, by nearness in time and place.
+    """Gather a run's chains into catheters.
+
+    Chains belong together by track number or, without one, by nearness in time and place.
 
     Parameters
     ----------
     segmentation : Segmentation
         Of one run.
     phases : ndarray or None
-        (n,) cardiac phase of each frame, where known: a catheter missing at diastole is taken from another beat's.
+        (n,) cardiac phase of each frame, where known: a catheter missing at diastole is taken from another beat.
     px_per_mm : float
         At the isocentre.
     """
@@ -132,7 +142,7 @@ def gather(segmentation: Segmentation, phases: Array | None, px_per_mm: float) -
         _catheter(chains, quiet.get(key), centre, averaged, segmentation, phases)
         for key, chains in groups.items()
         if key in quiet
-        or len(chains) >= SEEN_AT_LEAST * len(segmentation.frames)
+        or len(chains) >= LEAST_SHARE * len(segmentation.frames)
         or any(chain.manual for chain in chains.values())
     ]
     return tuple(catheters)
@@ -141,7 +151,7 @@ def gather(segmentation: Segmentation, phases: Array | None, px_per_mm: float) -
 def _diastolic_frame(segmentation: Segmentation) -> int:
     if segmentation.diastole is not None:
         return segmentation.diastole.frame
-    # Where nothing was averaged, the quietest of the frames that show most stands for diastole.
+    # Without averaged frames, the quietest of the frames with most chains is used.
     seen = np.array([len(entry.chains) for entry in segmentation.frames])
     return int(np.lexsort((segmentation.motion, -seen))[0])
 
@@ -156,9 +166,9 @@ def _catheter(
 ) -> RunCatheter:
     frames = sorted(chains)
     marked = [frame for frame in frames if chains[frame].manual]
-    at_hand = [frame for frame in marked if frame in averaged]
-    if at_hand:
-        frame = min(at_hand, key=lambda f: abs(f - centre))
+    quiet_marks = [frame for frame in marked if frame in averaged]
+    if quiet_marks:
+        frame = min(quiet_marks, key=lambda f: abs(f - centre))
         chosen = chains[frame]
     elif mean_chain is not None:
         frame, chosen = centre, mean_chain
@@ -181,7 +191,10 @@ def _catheter(
 
 
 def _from_diastole(frame: int, centre: int, averaged: set[int], phases: Array | None) -> tuple[float, float]:
-    """How far a frame is from diastole: first by phase, then by time; the averaged frames come first."""
+    """Return a frame's distance from diastole, by phase and then by time.
+
+    The averaged frames come first.
+    """
     if frame in averaged:
         return 0.0, abs(frame - centre)
     if phases is None:
@@ -191,9 +204,11 @@ def _from_diastole(frame: int, centre: int, averaged: set[int], phases: Array | 
 
 
 def link_chains(segmentation: Segmentation, px_per_mm: float) -> dict[int, dict[int, Chain]]:
-    """Key -> frame -> chain: track numbers as the segmenter gave them, chains without one joined to the nearest.
+    """Return key -> frame -> chain for all catheters of a run.
 
-    Runs from the diastolic frame outwards, so that a catheter is met first where it moves least.
+    The key is the segmenter's track number. Chains without one join the nearest catheter. Frames are visited from diastole
+    outwards,
+    so that a catheter begins where it moves least.
     """
     groups: dict[int, dict[int, Chain]] = {}
     for entry in segmentation.frames:

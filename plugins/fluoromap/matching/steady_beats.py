@@ -1,4 +1,4 @@
-"""R waves told to the nearest frame, made finer where the heart beats steadily."""
+"""Refinement of R waves of a steady rhythm, which files give to the nearest frame."""
 
 from __future__ import annotations
 
@@ -7,42 +7,47 @@ import numpy as np
 from fluoromap.contracts import Array
 
 _LENGTHS = 61
-"""Cycle lengths tried."""
+"""Number of cycle lengths to try."""
 _ORDERS = np.arange(1, 7)
 """Harmonics of the catheters' motion; their strength falls as a Gaussian of the order with this rate."""
 _FALLING = 0.35
+"""The strength of the harmonics of the catheters' motion is a Gaussian of the order with this rate."""
 _SCATTER = (0.003, 0.01, 0.03, 0.1)
-"""Variances tried of what does not repeat, against those of the motion that does."""
+"""Variances of the motion that does not repeat, over those of the repeating motion, to try."""
 _INDEPENDENT = 2.0
-"""Coordinates of catheters that count as independent witnesses of the cycle's length: all follow one heart."""
+"""Number of catheter coordinates that count as independent evidence: all follow one heart."""
 
 
-def steady_beats_ms(told_ms: Array, half_frame_ms: float, times_ms: Array, places: Array | None) -> Array:
-    """Times of the R waves of a steady rhythm; as told where no steady rhythm lies within half a frame of each.
+def steady_beats_ms(r_waves_ms: Array, half_frame_ms: float, times_ms: Array, places: Array | None) -> Array:
+    """Return the times of the R waves of a steady rhythm.
 
-    A frame that holds an R wave tells it to half a frame. All beats together tell the length of a steady cycle and where
-    it starts more finely, and so do the catheters, which come back to their places after one cycle: the answer is the
-    mean over all rhythms that both leave possible.
+    The times of the file are returned where no steady rhythm lies within half a frame of each. A frame gives its R wave to
+    half a
+    frame. All beats together give the length of a steady cycle and its start more precisely. So do the catheters, which
+    return to
+    their places after one cycle. The result is the mean over all rhythms that both permit.
 
     Parameters
     ----------
-    told_ms : ndarray, shape (b,)
-        Times of the frames that hold R waves, rising; two or more.
+    r_waves_ms : ndarray, shape (b,)
+        Times of the frames that contain R waves, rising; two or more.
+    half_frame_ms : float
+        Half the time between two frames.
     times_ms : ndarray, shape (g,)
         Of ``places``.
     places : ndarray, shape (g, k), or None
         Coordinates of the catheters, less their mean.
     """
-    number = np.arange(len(told_ms))
+    number = np.arange(len(r_waves_ms))
     apart = number[1:] - number[0]
-    shortest = float(((told_ms[1:] - told_ms[0] - 2 * half_frame_ms) / apart).max())
-    longest = float(((told_ms[1:] - told_ms[0] + 2 * half_frame_ms) / apart).min())
+    shortest = float(((r_waves_ms[1:] - r_waves_ms[0] - 2 * half_frame_ms) / apart).max())
+    longest = float(((r_waves_ms[1:] - r_waves_ms[0] + 2 * half_frame_ms) / apart).min())
     lengths = np.linspace(max(shortest, 1.0), longest, _LENGTHS)
-    starts = told_ms - number * lengths[:, None]
+    starts = r_waves_ms - number * lengths[:, None]
     earliest, latest = starts.max(axis=1) - half_frame_ms, starts.min(axis=1) + half_frame_ms
     weights = np.maximum(latest - earliest, 0.0)
     if longest <= shortest or not weights.any():
-        return told_ms
+        return r_waves_ms
     if places is not None:
         evidence = _evidence(times_ms / lengths[:, None], places)
         weights *= np.exp(evidence - evidence[weights > 0].max())
@@ -52,7 +57,10 @@ def steady_beats_ms(told_ms: Array, half_frame_ms: float, times_ms: Array, place
 
 
 def _evidence(cycles: Array, places: Array) -> Array:
-    """Log likelihoods (n,), but for a constant, that places (g, k) at times counted in cycles (n, g) repeat every cycle."""
+    """Return the log-likelihoods (n,) that the places repeat every cycle.
+
+    They lack a constant. cycles : (n, g), the times in cycles. places : (g, k).
+    """
     angle = 2 * np.pi * cycles[:, :, None] * _ORDERS
     strength = np.exp(-0.5 * (_FALLING * _ORDERS) ** 2)
     strength /= np.linalg.norm(strength)
@@ -63,7 +71,7 @@ def _evidence(cycles: Array, places: Array) -> Array:
     frames = len(places)
     found = []
     for scatter in _SCATTER:
-        # Eigenvalues of waves @ waves.T + scatter: these, and the scatter alone for as many as there are more frames.
+        # waves @ waves.T + scatter has these eigenvalues, and the scatter alone for each further frame.
         spread = np.maximum(sizes, 0.0) + scatter
         scale = ((places**2).sum() - (shares / spread).sum(axis=1)) / (scatter * places.size)
         log_det = np.log(spread).sum(axis=1) + (frames - sizes.shape[1]) * np.log(scatter)

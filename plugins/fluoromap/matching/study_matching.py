@@ -1,8 +1,7 @@
-"""Matching of a whole study: from the chains of every run to named, paired, phase-matched catheters."""
+"""Matching of a whole study: chains of all runs become named, paired, phase-matched catheters."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,85 +20,48 @@ from fluoromap.contracts import (
     RejectedSite,
     Segmentation,
 )
-from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.doubts import (
     gantry_angles,
     geometry_is_doubtful,
     groups_with_extra,
-    mirror,
-    mirrored_gain,
     mirrored_sites,
 )
-from fluoromap.matching.hypotheses import Hypotheses, enumerate_pairings
 from fluoromap.matching.identity import PairedCatheter, look_alike_groups, name_look_alikes
 from fluoromap.matching.joint_choice import SiteChoice, choose_pairings
-from fluoromap.matching.pairs import PairTable, pair_table
-from fluoromap.matching.phase import cardiac_phases
-from fluoromap.matching.phase_matching import FoldedRun, fold, motion_misfit, pair_by_phase, phase_shift
-from fluoromap.matching.run_catheters import RunCatheter, gather
-from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
+from fluoromap.matching.phase_matching import pair_by_phase, phase_shift
+from fluoromap.matching.run_catheters import RunCatheter
+from fluoromap.matching.site_comparison import ComparedSite, SiteComparisons, SiteRuns
 from fluoromap.reasons import Reason
 
 LEAST_PROBABILITY = 0.02
-"""Another pairing that is less probable counts as ruled out."""
-
-
-@dataclass(frozen=True)
-class SiteRuns:
-    """The two runs of one site as the segmenter left them; None where it failed."""
-
-    site: str
-    camera_a: Camera
-    camera_b: Camera
-    segmentation_a: Segmentation | None
-    segmentation_b: Segmentation | None
-
-
-@dataclass(frozen=True, eq=False)
-class _ViewOfSite:
-    """One run of a site on its way: its phases and its unnamed catheters."""
-
-    segmentation: Segmentation
-    phases: Array | None
-    irregular: bool
-    unsure: float
-    catheters: tuple[RunCatheter, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _ComparedSite:
-    """A site whose chains are compared across its views but not yet paired.
-
-    mirrored_gain : see :func:`~fluoromap.matching.doubts.mirrored_gain`. doubtful : one of its views might be mirrored.
-    """
-
-    runs: SiteRuns
-    a: _ViewOfSite
-    b: _ViewOfSite
-    folded: tuple[FoldedRun, FoldedRun] | None
-    table: PairTable
-    hypotheses: Hypotheses
-    mirrored_gain: float
-    doubtful: bool = False
+"""Another pairing with a lower probability counts as ruled out."""
 
 
 @dataclass(frozen=True, eq=False)
 class _NamedSite:
-    """A site on its way to its answer. pairs : name -> chain of view a, of view b. notes : in doubt, and why."""
+    """A site with named catheters.
 
-    compared: _ComparedSite
+    pairs, alternative : name -> chain of view a, of view b. probability : of the alternative. notes : (name, reason of
+    doubt).
+    """
+
+    compared: ComparedSite
     pairs: dict[str, tuple[int, int]]
     alternative: dict[str, tuple[int, int]] | None
     probability: float
     notes: tuple[tuple[str, Reason], ...]
 
 
-def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Context) -> Matching:
-    """Name the catheters of all sites, pair them across each site's views and match the views by cardiac phase.
+def match_study(
+    sites: Sequence[SiteRuns], catalogue: Catalogue, context: Context, comparisons: SiteComparisons | None = None
+) -> Matching:
+    """Name the catheters of all sites, pair them across views and match the phases.
 
-    The mapping catheter is told by its tip, look-alikes by hand or by motion over the whole study. A site needs its
-    mapping catheter in both views; one without the reference catheter is matched all the same. Pairs are chosen over the
-    whole study at once; where another pairing cannot be ruled out at a site it is kept as the site's alternative.
+    The mapping catheter is identified by its tip, look-alikes by hand or by their motion over the whole study. A site needs
+    its
+    mapping catheter in both views; it does not need the reference catheter. Pairs are chosen over the whole study at once.
+    Where
+    another pairing cannot be ruled out at a site, it becomes the site's alternative.
 
     Parameters
     ----------
@@ -109,6 +71,8 @@ def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Contex
         Of the study.
     context : Context
         For progress and cancellation.
+    comparisons : SiteComparisons, optional
+        Earlier comparisons, to compare only new or changed sites. The results are the same with and without it.
 
     Returns
     -------
@@ -116,15 +80,16 @@ def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Contex
         Every site is either in ``sites`` or, with its reasons, in ``rejected``.
     """
     groups = look_alike_groups(catalogue)
-    compared: list[_ComparedSite] = []
+    comparisons = comparisons or SiteComparisons()
+    compared: list[ComparedSite] = []
     rejected: list[RejectedSite] = []
     for index, runs in enumerate(sites):
         context.check()
-        answer = _compare(runs, catalogue, groups)
-        if isinstance(answer, _ComparedSite):
-            compared.append(answer)
+        comparison = comparisons.compare(runs, catalogue)
+        if isinstance(comparison, ComparedSite):
+            compared.append(comparison)
         else:
-            rejected.append(RejectedSite(runs.site, answer))
+            rejected.append(RejectedSite(runs.site, comparison))
         context.progress(0.7 * (index + 1) / len(sites))
     mirrored, maybe = mirrored_sites([site.mirrored_gain for site in compared])
     sound = []
@@ -145,62 +110,8 @@ def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Contex
     return Matching(tuple(matched), tuple(rejected))
 
 
-@functools.lru_cache(maxsize=64)
-def _compare(
-    runs: SiteRuns, catalogue: Catalogue, groups: tuple[tuple[str, ...], ...]
-) -> _ComparedSite | tuple[Reason, ...]:
-    """The site with its chains compared, or why they cannot be.
-
-    A correction changes one site: the same runs, the very objects, are compared once.
-    """
-    if runs.segmentation_a is None or runs.segmentation_b is None:
-        return (Reason.PLUGIN_FAILED,)
-    if ray_angle_deg(runs.camera_a, runs.camera_b) < PARALLEL_BELOW_DEG:
-        return (Reason.VIEWS_PARALLEL,)
-    a, b = _view(runs.segmentation_a, runs.camera_a), _view(runs.segmentation_b, runs.camera_b)
-    if not a.catheters or not b.catheters:
-        empty = [view.segmentation for view in (a, b) if not view.catheters]
-        told = [reason for segmentation in empty for reason in _told(segmentation)]
-        return tuple(dict.fromkeys(told or [Reason.NO_ELECTRODES]))
-    folded = None
-    if a.phases is not None and b.phases is not None:
-        folded = (
-            fold(a.catheters, a.phases, a.unsure),
-            fold(b.catheters, b.phases, b.unsure),
-        )
-
-    # A mirror hardly changes how catheters move across the epipolar lines.
-    motion_cost = motion_misfit((runs.camera_a, runs.camera_b), folded, len(a.catheters), len(b.catheters))
-    slots = [k for k, group in enumerate(groups) for _ in group]
-
-    def compare(camera_a: Camera, camera_b: Camera) -> tuple[PairTable, Hypotheses]:
-        table = pair_table((camera_a, camera_b), a.catheters, b.catheters, motion_cost, catalogue, groups)
-        return table, enumerate_pairings(table, slots, runs.camera_b.px_per_mm)
-
-    table, hypotheses = compare(runs.camera_a, runs.camera_b)
-    mirrored = [compare(mirror(runs.camera_a), runs.camera_b)[1], compare(runs.camera_a, mirror(runs.camera_b))[1]]
-    return _ComparedSite(runs, a, b, folded, table, hypotheses, mirrored_gain(hypotheses, mirrored))
-
-
-def _told(segmentation: Segmentation) -> list[Reason]:
-    """What the segmenter said about a run without electrodes; the diastolic mean's word counts most."""
-    entries = [segmentation.diastole] if segmentation.diastole is not None else []
-    reasons = [entry.manual_needed for entry in [*entries, *segmentation.frames] if entry.manual_needed is not None]
-    return reasons[:1]
-
-
-def _view(segmentation: Segmentation, camera: Camera) -> _ViewOfSite:
-    catheters = gather(segmentation, None, camera.px_per_mm)
-    beats = cardiac_phases(segmentation, catheters)
-    if beats is None:
-        return _ViewOfSite(segmentation, None, False, 0.5, catheters)
-    # Knowing the phase, a catheter that is missing at diastole can be taken from the same moment of another beat.
-    catheters = gather(segmentation, beats.phases, camera.px_per_mm)
-    return _ViewOfSite(segmentation, beats.phases, beats.irregular, beats.unsure, catheters)
-
-
 def _name_all(
-    sites: Sequence[_ComparedSite], groups: tuple[tuple[str, ...], ...], catalogue: Catalogue
+    sites: Sequence[ComparedSite], groups: tuple[tuple[str, ...], ...], catalogue: Catalogue
 ) -> list[_NamedSite]:
     """Pair and name the catheters of all sites."""
     slots = [k for k, group in enumerate(groups) for _ in group]
@@ -221,7 +132,7 @@ def _name_all(
         for at_site, ones, labels in zip(names, members, given, strict=True):
             for one, label in zip(ones, labels, strict=True):
                 at_site[first + one.place] = label
-            # Where a place is empty in the answer, what the alternative has there gets the name that is left.
+            # The alternative may fill a place that is empty in the result; it gets the remaining name.
             left = [name for name in group if name not in at_site]
             for slot in places:
                 at_site[slot] = at_site[slot] or left.pop(0)
@@ -233,20 +144,20 @@ def _name_all(
     ]
 
 
-def _paired(site: _ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
+def _paired(site: ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
     i, j = int(pair[0]), int(pair[1])
     return PairedCatheter(site.a.catheters[i], site.b.catheters[j], site.table.position_mm[i, j], place)
 
 
 def _named_site(
-    site: _ComparedSite,
+    site: ComparedSite,
     choice: SiteChoice,
     names: Sequence[str],
     doubts: dict[str, Reason],
     groups: tuple[tuple[str, ...], ...],
     slots: Sequence[int],
 ) -> _NamedSite:
-    # In the catalogue's order whichever way they were named: naming one by hand must not change the other sites' answers.
+    # The order is the catalogue's, so that naming a catheter by hand does not change the results of other sites.
     order = [name for group in groups for name in group]
 
     def by_name(pairs: IntArray) -> dict[str, tuple[int, int]]:
@@ -307,7 +218,7 @@ def _matched(named: _NamedSite, catalogue: Catalogue) -> MatchedSite:
 
 
 def _named(name: str, chain: Chain) -> NamedChain:
-    return NamedChain(name, chain.electrodes, chain.pixels_uv, chain.covariance_px2)
+    return NamedChain(name, chain.electrodes, chain.pixels_uv, chain.covariance_px2, chain.track)
 
 
 def _phase(phases: Array | None, frame: int) -> float | None:
@@ -315,7 +226,7 @@ def _phase(phases: Array | None, frame: int) -> float | None:
 
 
 def _track(named: dict[str, RunCatheter], segmentation: Segmentation, phases: Array | None) -> tuple[Observation, ...]:
-    """Every frame of a run with its named catheters."""
+    """Return every frame of a run with its named catheters."""
     return tuple(
         Observation(
             frame,
@@ -333,7 +244,10 @@ def _at_diastole(
     phases_a: Array | None,
     phases_b: Array | None,
 ) -> PhasePair:
-    """The diastolic chains; a view's frame is the mapping catheter's, should another's have come from another beat."""
+    """Return the diastolic chains of both views.
+
+    A view's frame is that of the mapping catheter; another catheter may come from another beat.
+    """
     views = []
     for named, phases in ((in_a, phases_a), (in_b, phases_b)):
         frame = named[catalogue.mapping].diastole_frame

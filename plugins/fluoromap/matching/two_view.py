@@ -9,11 +9,13 @@ from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 
 PARALLEL_BELOW_DEG = 20.0 - 1e-6
-"""Views whose central rays are closer than this cannot tell depth."""
+"""Views whose central rays are closer than this give no depth."""
 
 
 def fundamental_matrix(camera_a: Camera, camera_b: Camera) -> Array:
-    """The 3x3 matrix F with ``(u_b, v_b, 1) F (u_a, v_a, 1)' = 0`` for the same point in both views.
+    """Return the fundamental matrix F of two views, (3, 3).
+
+    For one point in both views ``(u_b, v_b, 1) F (u_a, v_a, 1)' = 0``.
 
     References
     ----------
@@ -26,10 +28,11 @@ def fundamental_matrix(camera_a: Camera, camera_b: Camera) -> Array:
 
 
 def signed_epipolar_px(camera_a: Camera, camera_b: Camera, pixels_a: ArrayLike, pixels_b: ArrayLike) -> Array:
-    """Signed distance in view b of each point from the epipolar line of its partner in view a.
+    """Return each point's signed distance in view b from its epipolar line.
 
     Parameters
     ----------
+    camera_a, camera_b : Camera
     pixels_a, pixels_b : array_like, shape (..., 2)
         The same electrodes (u, v) in the two views.
 
@@ -46,12 +49,13 @@ def signed_epipolar_px(camera_a: Camera, camera_b: Camera, pixels_a: ArrayLike, 
 
 
 def triangulate_linear(camera_a: Camera, camera_b: Camera, pixels_a: ArrayLike, pixels_b: ArrayLike) -> Array:
-    """Points from the paper's four projection equations (8) of two views, by linear least squares.
+    """Triangulate points by linear least squares of the paper's equations (8).
 
     Each view gives ``(u m_3 - m_1) X = m_14 - u m_34`` and the same for v: four equations, three unknowns.
 
     Parameters
     ----------
+    camera_a, camera_b : Camera
     pixels_a, pixels_b : array_like, shape (N, 2)
         The same N electrodes (u, v) in the two views.
 

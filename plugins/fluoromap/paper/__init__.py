@@ -1,1 +1,1 @@
-"""The paper's tables and figures, made again beside ours."""
+"""The paper's tables and figures, reproduced and compared with this project's methods."""

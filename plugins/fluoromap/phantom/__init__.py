@@ -1,4 +1,4 @@
-"""A beating heart with catheters, rendered as fluoroscopy, with its truth."""
+"""Phantom: a beating heart with catheters, rendered as fluoroscopy, with its truth."""
 
 from fluoromap.phantom.appearance import APPEARANCES, Appearance, Contrast
 from fluoromap.phantom.chamber import Chamber

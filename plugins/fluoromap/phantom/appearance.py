@@ -1,4 +1,4 @@
-"""How a view looks: photons, scatter, contrast of platinum and the bones behind it, apart from where the gantry stands."""
+"""Appearance of a view, independent of its angles: photons, scatter, contrast of platinum, and bones behind the heart."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Appearance:
     texture : float
         Standard deviation of the soft-tissue texture, in log units.
     spine : bool
-        Whether vertebrae lie behind the heart.
+        True where vertebrae lie behind the heart.
     """
 
     photons: float

@@ -1,4 +1,4 @@
-"""The left ventricle at diastole: an ellipsoid, the focus on its wall and how activation spreads along the wall."""
+"""The left ventricle at diastole: an ellipsoid, the focus on its wall, and the spread of activation along the wall."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Chamber:
     semi_axes_mm : ndarray, shape (3,)
         Lengths along the rows of ``axes``.
     focus_mm : ndarray, shape (3,)
-        Where activation starts, on the wall.
+        Start of activation, on the wall.
     conduction_mm_per_ms : float
         Speed along the wall, the same everywhere; 1 mm/ms is 1 m/s.
     reference_ms : float
-        When the reference catheter is activated, after the focus: the zero of activation times.
+        Activation of the reference catheter after the focus: the zero of activation times.
     """
 
     centre_mm: Array
@@ -41,29 +41,30 @@ class Chamber:
 
     @property
     def volume_ml(self) -> float:
+        """Volume of the ellipsoid, ml."""
         return float(4 / 3 * np.pi * np.prod(self.semi_axes_mm) / 1000)
 
     def level(self, points_mm: ArrayLike) -> Array:
-        """1 on the wall, less inside, for points ``(..., 3)``; shape (...)."""
+        """Return the level (...) of points ``(..., 3)``: 1 on the wall, less inside."""
         unit = self._to_sphere(points_mm)
         return np.asarray(np.linalg.norm(unit, axis=-1))
 
     def on_wall(self, points_mm: ArrayLike) -> Array:
-        """Points ``(..., 3)`` moved along the line through the chamber's centre onto the wall."""
+        """Move points ``(..., 3)`` along the line through the chamber's centre onto the wall."""
         unit = self._to_sphere(points_mm)
         return self._from_sphere(unit / np.linalg.norm(unit, axis=-1, keepdims=True))
 
     def inward(self, points_mm: ArrayLike) -> Array:
-        """Unit normals of the wall at points ``(..., 3)`` on it, into the blood."""
+        """Return the wall's unit normals at points ``(..., 3)`` on it, into the blood."""
         normal = -(self._to_sphere(points_mm) / self.semi_axes_mm) @ self.axes
         unit: Array = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         return unit
 
     def wall_distance_mm(self, points_mm: ArrayLike) -> Array:
-        """Length of the shortest way along the wall from the focus to points ``(..., 3)`` on the wall, shape (...).
+        """Return the length (...) of the shortest way along the wall from the focus to wall points ``(..., 3)``.
 
         The way starts as the arc of a great circle and is pulled tight: every point moves to the middle of its
-        neighbours and back to the wall, on ever finer polylines.
+        neighbours and back to the wall, on finer and finer polylines.
         """
         ends = self._to_sphere(points_mm)
         ends = ends / np.linalg.norm(ends, axis=-1, keepdims=True)
@@ -71,23 +72,26 @@ class Chamber:
         way = np.stack([start, ends])
         for _ in range(_LEVELS):
             finer = np.empty((2 * len(way) - 1, *way.shape[1:]))
-            # A point exactly opposite the focus has no middle; any direction will do.
+            # The middle to a point exactly opposite the focus is undefined; the small number chooses a direction.
             finer[::2], finer[1::2] = way, _unit(way[1:] + way[:-1] + 1e-9)
             way = finer
             for _ in range(_SWEEPS):
                 for first in (1, 2):
-                    way[first:-1:2] = self._pulled(way[first - 1 : -2 : 2], way[first:-1:2], way[first + 1 :: 2])
+                    way[first:-1:2] = self._pull_tight(way[first - 1 : -2 : 2], way[first:-1:2], way[first + 1 :: 2])
         steps = np.diff(way * self.semi_axes_mm, axis=0)
         length: Array = np.linalg.norm(steps, axis=-1).sum(axis=0)
         return length
 
     def activation_ms(self, points_mm: ArrayLike) -> Array:
-        """Activation time of wall points ``(..., 3)`` relative to the reference catheter, without noise; may be negative."""
+        """Return the activation times of wall points ``(..., 3)`` relative to the reference catheter.
+
+        They have no noise and may be negative.
+        """
         times: Array = self.wall_distance_mm(points_mm) / self.conduction_mm_per_ms - self.reference_ms
         return times
 
-    def _pulled(self, before: Array, points: Array, after: Array) -> Array:
-        """Points of the unit sphere that stands for the wall, moved along the wall to the middle of their neighbours."""
+    def _pull_tight(self, before: Array, points: Array, after: Array) -> Array:
+        """Move points of the unit sphere, as images of wall points, along the wall to the middle of their neighbours."""
         pull = ((before + after) / 2 - points) * self.semi_axes_mm
         normal = _unit(points / self.semi_axes_mm)
         pull -= (pull * normal).sum(axis=-1, keepdims=True) * normal
@@ -109,10 +113,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def spread_over_wall(chamber: Chamber, count: int, rng: np.random.Generator) -> Array:
-    """``count`` wall points far from each other, apex and basal ring included, in random order; shape (count, 3).
+    """Return wall points (count, 3) far from each other, apex and basal ring included, in random order.
 
-    The valve plane leaves the basal quarter of the ellipsoid without wall. Each next point is the one of 1500 random
-    candidates that lies farthest from those chosen.
+    The valve plane leaves the basal quarter of the ellipsoid without wall. Each next point is, of 1500 random candidates,
+    the farthest from the points chosen so far.
     """
     candidates = chamber._from_sphere(_unit(rng.normal(size=(6000, 3))))
     height = (candidates - chamber.centre_mm) @ chamber.axes[2] / chamber.semi_axes_mm[2]

@@ -21,16 +21,16 @@ BITS_STORED = 12
 MEAN_GREY = 1400.0
 DETECTOR_BLUR_PX = 0.75
 ELECTRONIC_NOISE = 1.5
-# Where the shaft points nearly along the ray its line integral is cut: no real catheter runs straight at the detector.
+# The line integral of a shaft nearly along the ray is limited: no real catheter runs straight at the detector.
 _LEAST_SIN2 = 0.12
-# Of the points that keep arc lengths exact, every second is enough to draw.
+# Exact arc lengths need all points of a centre line; drawing needs only every second.
 _EVERY = 2
 
 
 class RenderedFrames:
-    """Frames of one run, rendered when asked for; frame ``i`` is the same in whatever order frames are asked for.
+    """Frames of one run, rendered on access; the order of access does not change a frame.
 
-    Holds a way to make images and nothing about what is in them.
+    The object holds only the function that renders a frame. It gives no access to the truth.
     """
 
     def __init__(self, shape: tuple[int, int], count: int, render: Callable[[int], NDArray[np.uint16]]) -> None:
@@ -47,15 +47,17 @@ class RenderedFrames:
         return self._count
 
     def __getitem__(self, index: int) -> NDArray[np.uint16]:
-        """Stored pixels of frame ``index`` (from 0; negative from the end), shape (rows, columns), 12 bits in 16.
+        """Render the stored pixels (rows, columns) of frame ``index``, 12 bits in 16.
+
+        Frames are counted from 0, negative ones from the end.
 
         Raises
         ------
         IndexError
-            When the run has no such frame.
+            Where the run has no such frame.
         """
         if not -self._count <= index < self._count:
-            raise IndexError(f"the run has {self._count} frames, not a frame {index}")
+            raise IndexError(f"no frame {index}: the run has {self._count} frames, counted from 0")
         return self._render(index % self._count)
 
     def __iter__(self) -> Iterator[NDArray[np.uint16]]:
@@ -64,12 +66,12 @@ class RenderedFrames:
 
 
 def transmission(camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Array], appearance: Appearance) -> Image:
-    """Share of primary photons the catheters let through, shape (rows, columns).
+    """Return the share (rows, columns) of primary photons that pass the catheters.
 
     Parameters
     ----------
     camera : Camera
-        The view as it truly is.
+        The true view, gantry errors included.
     shafts : sequence of Shaft
     lines_mm : sequence of ndarray, shape (t, k, 3)
         Each catheter's centre line at the ``t`` instants of one exposure, which are averaged.
@@ -81,9 +83,9 @@ def transmission(camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Arr
     touched = np.zeros((rows, columns), np.uint8)
     absorbed = np.zeros((rows, columns), np.float32)
     instants = len(lines_mm[0])
-    drawn = [_drawn(camera, lines) for lines in lines_mm]
+    samples = [_line_samples(camera, lines) for lines in lines_mm]
     for instant in range(instants):
-        for shaft, lines in zip(shafts, drawn, strict=True):
+        for shaft, lines in zip(shafts, samples, strict=True):
             kernels.add_tube(
                 thickness,
                 touched,
@@ -98,8 +100,8 @@ def transmission(camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Arr
     return 1 - absorbed
 
 
-def _drawn(camera: Camera, lines_mm: Array) -> Image:
-    """Centre lines (t, k, 3) as the kernel takes them: u, v, arc length, px per mm, 1/sin to the ray; (t, k, 5)."""
+def _line_samples(camera: Camera, lines_mm: Array) -> Image:
+    """Return the kernel's input (t, k, 5) for centre lines (t, k, 3): u, v, arc length, px per mm, 1/sin to the ray."""
     along = arc_lengths_mm(lines_mm)[:, ::_EVERY]
     lines_mm = lines_mm[:, ::_EVERY]
     pixels = camera.project(lines_mm)
@@ -114,16 +116,17 @@ def _drawn(camera: Camera, lines_mm: Array) -> Image:
 
 
 def expected_photons(torso: Torso, passed: Image, appearance: Appearance, dose: float) -> Image:
-    """Mean photon count of each pixel, shape (rows, columns), for the share ``passed`` the catheters let through."""
+    """Return the mean photon count (rows, columns) for the share ``passed`` that the catheters let through."""
     photons: Image = (torso.primary * passed + torso.scatter) * np.float32(appearance.photons * dose)
     return photons
 
 
 def detect(expected: Image, photons_at_mean: float, key: int) -> NDArray[np.uint16]:
-    """The stored image of an exposure: photons are counted, blurred by the detector, read out with noise and rounded.
+    """Return the stored image of an exposure.
 
-    The gain brings ``photons_at_mean`` to the same grey level at any dose, as a system's exposure control does.
-    ``key`` : 64 bits that name the exposure; the same key gives the same noise.
+    Photons are counted, blurred by the detector, read out with noise and rounded. The gain maps ``photons_at_mean`` to the
+    same grey level at any dose, as a system's exposure control does. ``key`` : 64 bits that identify the exposure; the same
+    key gives the same noise.
     """
     photons, electronic = np.empty_like(expected), np.empty_like(expected)
     middle, tail = _normal_quantiles()

@@ -36,9 +36,9 @@ def add_tube(
     """Add a catheter's attenuation to ``thickness`` (rows x columns, each pixel SUPERSAMPLING squared samples).
 
     ``line`` : (k, 5) points of the centre line from the tip on: u, v (pixels), arc length (mm), pixels per mm and 1/sin of
-    the angle between shaft and ray. ``bands`` : (electrodes, 2) arc lengths. ``touched`` (rows, columns) is set where
-    something was added. Between two points the line owns the samples ahead of the bisector at the one and behind the
-    bisector at the other, so that none is counted twice in a bend. Bands are cut square to the shaft in the image.
+    the angle between shaft and ray. ``bands`` : (electrodes, 2) arc lengths. ``touched`` (rows, columns) is set to 1 where
+    attenuation is added. A segment of the line owns the samples between the bisectors at its two ends, so that no sample
+    is counted twice in a bend. Bands end perpendicular to the shaft in the image.
     """
     rows, columns = touched.shape
     ss = SUPERSAMPLING
@@ -117,8 +117,8 @@ def absorb(thickness: Image, touched: NDArray[np.uint8], absorbed: Image, weight
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _mixed(state: np.uint64) -> np.uint64:
-    """64 random bits from a counter (SplitMix64: Steele, Lea and Flood, OOPSLA 2014)."""
+def _mix_bits(state: np.uint64) -> np.uint64:
+    """Return 64 random bits from a counter (SplitMix64: Steele, Lea and Flood, OOPSLA 2014)."""
     z = state * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -127,7 +127,7 @@ def _mixed(state: np.uint64) -> np.uint64:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
 def _normal(bits: np.int64, middle: Image, tail: Image) -> Any:
-    """A standard normal number from 32 random bits, by the two tables of :func:`normal_quantiles`."""
+    """Return a standard normal number from 32 random bits, by the two tables of :func:`normal_quantiles`."""
     cell = bits >> 20
     if cell == 0 or cell == _CELLS - 1:
         within = (bits >> 8) & (_CELLS - 1)
@@ -138,9 +138,9 @@ def _normal(bits: np.int64, middle: Image, tail: Image) -> Any:
 
 
 def normal_quantiles() -> tuple[Image, Image]:
-    """Quantiles of the normal distribution at 4096 equal steps, and at 4096 equal steps of the lowest of these.
+    """Return the normal quantiles at 4096 equal steps, and at 4096 equal steps of the lowest of these.
 
-    Between them numbers are taken as evenly spread: the variance is right to 1 part in 10 000, the tail to 5 sigma.
+    Numbers between two quantiles are uniform. The variance is correct to 1 part in 10 000, the tail to 5 sigma.
     """
     steps = np.arange(_CELLS + 1) / _CELLS
     tail = ndtri(np.maximum(steps, 0.25 / _CELLS) / _CELLS)
@@ -152,10 +152,10 @@ def normal_quantiles() -> tuple[Image, Image]:
 def count_photons(
     expected: Image, key: np.uint64, noise: float, middle: Image, tail: Image, photons: Image, electronic: Image
 ) -> None:
-    """Poisson counts of mean ``expected`` and normal noise of standard deviation ``noise``, pixel by pixel.
+    """Draw Poisson counts of mean ``expected`` and normal noise of standard deviation ``noise``, pixel by pixel.
 
-    Below a mean of 30 by inversion, exactly; above by the Cornish-Fisher expansion of the Poisson quantile, which has
-    its mean, variance and skewness. A pixel's numbers depend on ``key`` and its place alone.
+    Counts below a mean of 30 come from inversion and are exact. Others come from the Cornish-Fisher expansion of the
+    Poisson quantile, which has its mean, variance and skewness. A pixel's numbers depend only on ``key`` and its place.
     """
     rows, columns = expected.shape
     one, twelfth, sixth = np.float32(1.0), np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
@@ -163,11 +163,11 @@ def count_photons(
     for i in range(rows):
         for j in range(columns):
             place = np.uint64(2 * (i * columns + j))
-            bits = _mixed(key + place)
+            bits = _mix_bits(key + place)
             electronic[i, j] = sigma * _normal(np.int64(bits & np.uint64(0xFFFFFFFF)), middle, tail)
             mean = expected[i, j]
             if mean < np.float32(_EXACT_BELOW):
-                left = np.float64(_mixed(key + place + np.uint64(1)) >> np.uint64(11)) * 2.0**-53
+                left = np.float64(_mix_bits(key + place + np.uint64(1)) >> np.uint64(11)) * 2.0**-53
                 probability = math.exp(-np.float64(mean))
                 n = 0
                 while left > probability and n < 200:
@@ -185,7 +185,10 @@ def count_photons(
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def read_out(photons: Image, electronic: Image, taps: Image, gain: float, top: int, image: NDArray[np.uint16]) -> None:
-    """Blur ``photons`` by ``taps`` (centre first) in both directions, edges reflected, add ``electronic``, scale, round."""
+    """Blur ``photons`` by ``taps`` in both directions, add ``electronic``, scale and round.
+
+    ``taps`` start at the centre; edges are reflected.
+    """
     rows, columns = photons.shape
     reach = taps.shape[0] - 1
     across = np.empty((rows, columns), np.float32)

@@ -1,7 +1,7 @@
-"""How the heart moves: the beat's pulses, the field of the ventricular wall, beats that differ, breathing.
+"""Motion of the heart: pulses of the beat, field of the ventricular wall, beat-to-beat variation, breathing.
 
 A catheter's tip is displaced by a few fixed vectors (mm), each times a pulse of the beat: ``pulses(t) @ vectors``.
-Between the pulses of successive beats the heart stands still: that is diastole.
+Between the pulses of successive beats the heart rests: that is diastole.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DIASTOLIC_PHASE = 0.8
 """Cardiac phase, counted from the R wave, farthest from systole."""
 
 # Phase of the peak and width (standard deviation) of each pulse, in parts of the cycle: contraction with twist,
-# shortening a little later, and an early and a late one for what is not the ventricle's common motion.
+# shortening a little later, and an early and a late pulse for each catheter's own motion.
 _PEAK = np.array([0.30, 0.32, 0.24, 0.38])
 _WIDTH = np.array([0.11, 0.11, 0.11, 0.11])
 MODES = len(_PEAK)
@@ -40,10 +40,12 @@ BREATHING_HZ = 0.25
 
 
 def wall_vectors(chamber: Chamber, points_mm: Array, rocking_mm: Array) -> Array:
-    """Displacement of points ``(n, 3)`` of the ventricle by each pulse at its peak, shape (n, MODES, 3).
+    """Return the displacement (n, MODES, 3) of points ``(n, 3)`` of the ventricle by each pulse at its peak.
 
-    The base comes down to the apex by 14 %, the wall moves in by 18 %, the apex turns against the base by 8 degrees
-    over the ventricle's half length and the whole heart rocks by ``rocking_mm`` (3,), forth early and back late.
+    - The base moves to the apex by 14 %.
+    - The wall moves inwards by 18 %.
+    - The apex turns against the base by 8 degrees over the ventricle's half length.
+    - The whole heart rocks by ``rocking_mm`` (3,), forth early and back late.
     """
     along = chamber.axes[2]
     from_centre = points_mm - chamber.centre_mm
@@ -59,7 +61,7 @@ def wall_vectors(chamber: Chamber, points_mm: Array, rocking_mm: Array) -> Array
 
 
 def non_affine_vectors(rng: np.random.Generator) -> Array:
-    """A random motion of its own for one catheter, 0.6 mm standard deviation an axis over the cycle; shape (MODES, 3)."""
+    """Draw a motion (MODES, 3) of one catheter's own, 0.6 mm standard deviation an axis over the cycle."""
     vectors = np.zeros((MODES, 3))
     vectors[2:] = rng.normal(size=(2, 3))
     scaled: Array = vectors * (NON_AFFINE_MM / (_cycle_pulses() @ vectors).std(axis=0))
@@ -75,8 +77,8 @@ class Beats:
     """The heart beats of one run.
 
     period_s : R wave to R wave. r_waves_s : (b,) times of the R waves, from before the first frame to after the last.
-    amplitude : (b,) strength of each beat round 1. delay : (b,) of its contraction, in parts of the cycle.
-    offsets_mm : (b, catheters, 3) where each catheter comes to rest before the beat.
+    amplitude : (b,) strength of each beat, about 1. delay : (b,) of its contraction, in parts of the cycle.
+    offsets_mm : (b, catheters, 3) displacement of each catheter's resting place before the beat.
     """
 
     period_s: float
@@ -87,7 +89,10 @@ class Beats:
 
     @classmethod
     def draw(cls, rate_hz: float, duration_s: float, catheters: int, rng: np.random.Generator) -> Beats:
-        """Beats at a random place of the cycle: strength differs by 4 %, timing by 0.25 of 1/15 cycle, rest by 0.25 mm."""
+        """Draw beats from a random phase on.
+
+        Strength varies by 4 %, timing by 0.25 of 1/15 cycle, the resting place by 0.25 mm.
+        """
         period = 1 / rate_hz
         count = int(np.ceil(duration_s / period)) + 5
         return cls(
@@ -100,7 +105,7 @@ class Beats:
 
     @classmethod
     def even(cls, rate_hz: float, duration_s: float, catheters: int = 1) -> Beats:
-        """Beats that are all alike, the first R wave at 0: the average over beats."""
+        """Return equal beats with the first R wave at 0: the average over beats."""
         period = 1 / rate_hz
         count = int(np.ceil(duration_s / period)) + 5
         zeros = np.zeros(count)
@@ -113,7 +118,7 @@ class Beats:
         )
 
     def pulses(self, times_s: Array) -> Array:
-        """Strength of each pulse at times ``(t,)``, shape (t, MODES)."""
+        """Return the strength (t, MODES) of each pulse at times ``(t,)``."""
         phase = (times_s[:, None] - self.r_waves_s) / self.period_s - self.delay
         # At high rates diastole shortens more than systole.
         width = _WIDTH * max(1.0, float(np.sqrt(_SLOW_PERIOD_S / self.period_s)))
@@ -122,9 +127,9 @@ class Beats:
         return strength
 
     def rest_mm(self, times_s: Array) -> Array:
-        """Shift of the resting place of each catheter at times ``(t,)``, shape (t, catheters, 3).
+        """Return the displacement (t, catheters, 3) of each catheter's resting place at times ``(t,)``.
 
-        It changes from one beat's to the next's during systole, so that diastole stays quiet.
+        It changes from beat to beat during systole, so that diastole stays quiet.
         """
         phase = (times_s[:, None] - self.r_waves_s) / self.period_s - self.delay
         reached = 1 / (1 + np.exp(-np.clip((phase - _PEAK[0]) / 0.06, -40, 40)))
@@ -133,14 +138,14 @@ class Beats:
         return shift
 
     def phases(self, times_s: Array) -> Array:
-        """Cardiac phase at times ``(t,)``: 0 at an R wave, rising to 1 at the next."""
+        """Return the cardiac phase (t,) at times ``(t,)``: 0 at an R wave, rising to 1 at the next."""
         phase: Array = ((times_s - self.r_waves_s[0]) / self.period_s) % 1.0
         return phase
 
 
 @dataclass(frozen=True, eq=False)
 class Breathing:
-    """Where breathing holds the heart during one run: a shift of its own and a slow drift within the run."""
+    """Breathing position of the heart in one run: a shift of the run and a slow drift within it."""
 
     shift_mm: Array
     drift_mm: Array
@@ -148,12 +153,12 @@ class Breathing:
 
     @classmethod
     def draw(cls, head_feet_mm: float, rng: np.random.Generator) -> Breathing:
-        """Anywhere within ``head_feet_mm`` of the middle along the body, a quarter of it (standard deviation) across."""
+        """Draw a shift: uniform within ``head_feet_mm`` along the body, a quarter of it (standard deviation) across."""
         shift = np.array([*(head_feet_mm / 4 * rng.normal(size=2)), head_feet_mm * rng.uniform(-1, 1)])
         return cls(shift, head_feet_mm / 10 * np.array([0.0, 0.3, 1.0]), rng.uniform(0, 2 * np.pi))
 
     def at(self, times_s: Array) -> Array:
-        """Shift of the whole heart at times ``(t,)``, shape (t, 3)."""
+        """Return the shift (t, 3) of the whole heart at times ``(t,)``."""
         drift = np.sin(2 * np.pi * BREATHING_HZ * times_s + self.phase)
         shift: Array = self.shift_mm + drift[:, None] * self.drift_mm
         return shift

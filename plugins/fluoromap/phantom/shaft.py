@@ -1,4 +1,4 @@
-"""A catheter in the heart: its centre line at rest, and the same line bent by the moving tip without being stretched."""
+"""A catheter's shaft: its centre line at rest, and the line bent by the moving tip without stretching."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _BEND_MM = 25.0
 class Shaft:
     """One catheter's centre line at rest.
 
-    catheter : its electrodes. radius_mm : of shaft and rings. solid_tip : the tip electrode is nearly solid metal.
-    rest_mm : (k, 3) points of the centre line, from the tip's end until well outside the field.
+    catheter : its electrodes. radius_mm : of shaft and rings. solid_tip : True for a tip electrode of nearly solid metal.
+    rest_mm : (k, 3) points of the centre line, from the tip's end to well outside the field.
     """
 
     catheter: Catheter
@@ -32,7 +32,10 @@ class Shaft:
     def through(
         cls, catheter: Catheter, radius_mm: float, solid_tip: bool, tip: Array, behind: Array, bow: Array, entry: Array
     ) -> Shaft:
-        """Along the Bezier curve from ``tip``, leaving it towards ``behind``, bowed towards ``bow``, to ``entry``; (3,) mm."""
+        """Make a shaft along a Bezier curve.
+
+        The curve starts at ``tip`` towards ``behind``, bends towards ``bow`` and ends at ``entry``; each (3,) mm.
+        """
         t = np.linspace(0, 1, 1200)[:, None]
         curve = (1 - t) ** 3 * tip + 3 * (1 - t) ** 2 * t * behind + 3 * (1 - t) * t**2 * bow + t**3 * entry
         length = arc_lengths_mm(curve[None])[0]
@@ -40,22 +43,22 @@ class Shaft:
         rest = np.stack([np.interp(wanted, length, curve[:, axis]) for axis in range(3)], axis=1)
         return cls(catheter, radius_mm, solid_tip, rest)
 
-    def slipped(self, displacement_mm: Array) -> Shaft:
-        """The same catheter with its tip at rest elsewhere, displaced by ``(3,)`` mm."""
-        return replace(self, rest_mm=self.moved(displacement_mm[None])[0])
+    def with_tip_displaced(self, displacement_mm: Array) -> Shaft:
+        """Return the catheter with the resting place of its tip displaced by ``(3,)`` mm."""
+        return replace(self, rest_mm=self.lines_mm(displacement_mm[None])[0])
 
-    def moved(self, displacements_mm: Array) -> Array:
-        """Centre lines for tip displacements ``(t, 3)``, shape (t, k, 3).
+    def lines_mm(self, displacements_mm: Array) -> Array:
+        """Return the centre lines (t, k, 3) for tip displacements ``(t, 3)``.
 
-        Far from the tip the shaft moves half as much. Arc length counts from the moved tip, so electrodes keep
-        their distances and the shaft slides in its vessel.
+        Far from the tip the shaft moves half as much. Arc length is counted from the displaced tip, so that electrodes
+        keep their distances and the shaft slides in its vessel.
         """
         depth = _STEP_MM * np.arange(len(self.rest_mm))
         share = 0.5 + 0.5 * np.exp(-depth / _BEND_MM)
         return np.asarray(self.rest_mm + share[:, None] * displacements_mm[:, None, :])
 
     def electrodes_mm(self, lines_mm: Array) -> Array:
-        """Centres of the electrodes on centre lines ``(t, k, 3)``, tip first, shape (t, electrodes, 3)."""
+        """Return the centres (t, electrodes, 3) of the electrodes on centre lines ``(t, k, 3)``, tip first."""
         wanted = self.catheter.tip_mm / 2 + self.catheter.arc_lengths_mm
         length = arc_lengths_mm(lines_mm)
         centres = np.empty((len(lines_mm), len(wanted), 3))
@@ -66,7 +69,7 @@ class Shaft:
 
     @property
     def bands_mm(self) -> Array:
-        """Arc lengths from the tip's end where each electrode begins and ends, shape (electrodes, 2)."""
+        """Arc lengths (electrodes, 2) from the tip's end to the start and end of each electrode, mm."""
         centres = self.catheter.tip_mm / 2 + self.catheter.arc_lengths_mm
         half = np.full(len(centres), self.catheter.ring_mm / 2)
         half[0] = self.catheter.tip_mm / 2
@@ -74,6 +77,6 @@ class Shaft:
 
 
 def arc_lengths_mm(lines_mm: Array) -> Array:
-    """Distance along centre lines ``(t, k, 3)`` from their first point, shape (t, k)."""
+    """Return the distance (t, k) along centre lines ``(t, k, 3)`` from their first point."""
     steps = np.linalg.norm(np.diff(lines_mm, axis=1), axis=2)
     return np.concatenate([np.zeros((len(lines_mm), 1)), np.cumsum(steps, axis=1)], axis=1)

@@ -1,4 +1,4 @@
-"""A whole mapping study, simulated: what goes into the pipeline, and beside it the truth."""
+"""A simulated mapping study: the input of the pipeline and its truth."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
+from fluoromap.phantom.anatomy import Anatomy, Resident, draw_anatomy, electrodes_over_cycle_mm
 from fluoromap.phantom.appearance import APPEARANCES, Appearance, Contrast
 from fluoromap.phantom.chamber import Chamber
 from fluoromap.phantom.fluoroscopy import RenderedFrames, detect, expected_photons, transmission
 from fluoromap.phantom.motion import DIASTOLIC_PHASE, HEART_RATE_HZ, Beats, Breathing, HeartKind
-from fluoromap.phantom.placement import Anatomy, Resident, draw_anatomy, electrodes_over_cycle_mm
 from fluoromap.phantom.torso import Torso, torso
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ ACTIVATION_NOISE_MS = 1.0
 _INSTANTS = 3
 _MARGIN_PX = 20.0
 _ATTEMPTS = 12
-# What each independent stream of random numbers is for.
+# Each purpose has an independent stream of random numbers.
 _ANATOMY, _GANTRY, _TIMES, _RUN, _BONES, _TISSUE, _PHOTONS = range(7)
 
 
@@ -46,35 +46,35 @@ FRONTAL = _standard(0.0)
 
 @dataclass(frozen=True, slots=True)
 class StudySpec:
-    """What to simulate; the same spec gives the same study, to the last pixel.
+    """Specification of a simulated study; the same specification gives the same study, to the last pixel.
 
     Parameters
     ----------
     seed : int
-        Any number from 0 on.
+        0 or more.
     sites : int
-        Mapping sites, 1 to 200.
+        Number of mapping sites, 1 to 200.
     frames : int
-        Frames a run.
+        Frames in each run.
     frame_rate_hz : float
     heart : {"human", "dog"}
         1.0-1.6 or 1.6-2.2 beats a second.
     contrast : pair of {"LAT", "PA"}
-        Appearance of view a and b (:data:`~fluoromap.phantom.appearance.APPEARANCES`), whatever their angles.
+        Appearance of view a and b (:data:`~fluoromap.phantom.appearance.APPEARANCES`), independent of their angles.
     gantries : pair of Gantry
-        View a and b as the files tell them.
+        View a and b as stated in the files.
     gantry_error_deg, isocentre_error_mm : float
-        Standard deviation, an axis, of a view's true rotation about the isocentre and offset against what the files
-        tell; one draw a view for the whole study.
+        Standard deviation, an axis, of a view's true rotation about the isocentre and true offset against the files. There
+        is one draw for each view of the study.
     breathing_mm : float
-        Furthest shift of the heart to head or feet between runs; 0 is a breath held all through.
+        Largest shift of the heart to head or feet between runs; 0 means that the breath is held all the time.
     dose : float
-        Photons a pixel over those of the appearance.
+        Photons a pixel, as a multiple of the appearance's.
 
     Raises
     ------
     ValueError
-        When a number is out of range.
+        Where a number is out of range.
     """
 
     seed: int
@@ -114,7 +114,7 @@ class StudySpec:
 
 @dataclass(frozen=True, eq=False)
 class RunTruth:
-    """What one run really showed, at the middle of each of its n exposures.
+    """Truth of one run, at the middle of each of its n exposures.
 
     camera : the view with its gantry error. phases : (n,) of the cardiac cycle, 0 at an R wave. points_mm : catheter ->
     (n, electrodes, 3), LPS from the isocentre. pixels_uv : catheter -> (n, electrodes, 2), (u, v) of electrode centres.
@@ -128,9 +128,9 @@ class RunTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """One cine as a stranger would get it, and its truth.
+    """One cine as in a file, and its truth.
 
-    view : "a" or "b". gantry : as the file tells it. frame_times_ms : (n,) from the first frame on. start_seconds :
+    view : "a" or "b". gantry : as stated in the file. frame_times_ms : (n,) from the first frame on. start_seconds :
     acquisition of the first frame after the study's start. r_wave_frames : frames nearest to the R waves.
     """
 
@@ -145,11 +145,11 @@ class SimulatedRun:
 
 @dataclass(frozen=True, eq=False)
 class SiteTruth:
-    """Where the electrodes of a site are at diastole, averaged over the beats of its two runs.
+    """Truth of one site at diastole, averaged over the beats of its two runs.
 
     diastole_mm : catheter -> (electrodes, 3), LPS from the isocentre, breathing averaged over both runs.
-    relative_mm : the same less the reference catheter's mean; free of breathing. contact_mm : (3,) where the mapping
-    tip's end touches the wall between breaths. lat_ms : activation time there without annotation noise.
+    relative_mm : the same minus the reference catheter's mean, free of breathing. contact_mm : (3,) point where the
+    mapping tip's end touches the wall, without breathing. lat_ms : activation time there without annotation noise.
     """
 
     diastole_mm: Mapping[str, Array]
@@ -160,7 +160,7 @@ class SiteTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSite:
-    """One place of the mapping tip: ``lat_ms`` as annotated, and its runs in view a and b."""
+    """One place of the mapping tip: annotated activation time ``lat_ms``, runs in view a and b, and truth."""
 
     name: str
     lat_ms: float
@@ -172,8 +172,8 @@ class SimulatedSite:
 class SimulatedStudy:
     """All sites of one heart.
 
-    chamber : the wall between breaths, with its focus. reference_mm : (3,) mean of the reference catheter at diastole
-    between breaths: subtract it to have the chamber in the map's coordinates.
+    chamber : the wall without breathing, with its focus. reference_mm : (3,) mean of the reference catheter at diastole
+    without breathing; the chamber minus it is in the map's coordinates.
     """
 
     spec: StudySpec
@@ -185,12 +185,12 @@ class SimulatedStudy:
 
 
 def simulate_study(spec: StudySpec) -> SimulatedStudy:
-    """Simulate a mapping study. Takes a fraction of a second; frames are rendered when asked for.
+    """Simulate a mapping study in a fraction of a second; frames are rendered on access.
 
     Raises
     ------
     ValueError
-        When the heart does not fit into the views' fields.
+        Where the heart does not fit into the views' fields.
     """
     cameras = (_true_camera(spec, 0), _true_camera(spec, 1))
     anatomy = _anatomy_in_field(spec, cameras)
@@ -210,14 +210,14 @@ def simulate_study(spec: StudySpec) -> SimulatedStudy:
 def _true_camera(spec: StudySpec, view: int) -> Camera:
     rng = np.random.default_rng([spec.seed, _GANTRY, view])
     camera = camera_from_gantry(spec.gantries[view])
-    turned = np.eye(4)
-    turned[:3, :3] = Rotation.from_rotvec(rng.normal(0, spec.gantry_error_deg, 3), degrees=True).as_matrix()
-    turned[:3, 3] = rng.normal(0, spec.isocentre_error_mm, 3)
-    return Camera(camera.matrix @ turned, camera.rows, camera.columns)
+    error = np.eye(4)
+    error[:3, :3] = Rotation.from_rotvec(rng.normal(0, spec.gantry_error_deg, 3), degrees=True).as_matrix()
+    error[:3, 3] = rng.normal(0, spec.isocentre_error_mm, 3)
+    return Camera(camera.matrix @ error, camera.rows, camera.columns)
 
 
 def _anatomy_in_field(spec: StudySpec, cameras: tuple[Camera, Camera]) -> Anatomy:
-    """The first heart whose electrodes stay in both fields over the cycle and all breaths."""
+    """Draw hearts until the electrodes of one stay in both fields over the cycle and all breathing positions."""
     rng = np.random.default_rng([spec.seed, _ANATOMY])
     breaths = np.array([[0.0, 0.0, -1.2], [0.0, 0.0, 1.2]]) * spec.breathing_mm
     for _ in range(_ATTEMPTS):
@@ -231,7 +231,9 @@ def _anatomy_in_field(spec: StudySpec, cameras: tuple[Camera, Camera]) -> Anatom
             inside &= bool((pixels >= _MARGIN_PX).all() and (pixels <= limit).all())
         if inside:
             return anatomy
-    raise ValueError("the heart does not fit into the views' fields; a field of about 75 mm at the isocentre is needed")
+    raise ValueError(
+        "the heart does not fit into the views' fields; choose gantries with a field of at least 75 mm at the isocentre"
+    )
 
 
 def _site(
@@ -250,35 +252,35 @@ def _site(
     diastole = _diastole_mm(residents)
     origin = diastole[DEFAULT_CATALOGUE.reference].mean(axis=0)
     truth = SiteTruth(
-        MappingProxyType({name: _fixed(points + breathing) for name, points in diastole.items()}),
-        MappingProxyType({name: _fixed(points - origin) for name, points in diastole.items()}),
-        _fixed(anatomy.contacts_mm[index]),
+        MappingProxyType({name: _read_only(points + breathing) for name, points in diastole.items()}),
+        MappingProxyType({name: _read_only(points - origin) for name, points in diastole.items()}),
+        _read_only(anatomy.contacts_mm[index]),
         lat_ms[0],
     )
     return SimulatedSite(f"S{index + 1:02d}", lat_ms[1], (runs[0], runs[1]), truth)
 
 
 def _diastole_mm(residents: tuple[Resident, ...]) -> dict[str, Array]:
-    """Electrodes at diastole of the average beat between breaths, catheter -> (electrodes, 3)."""
+    """Return the electrodes at diastole of the average beat without breathing, catheter -> (electrodes, 3)."""
     pulses = Beats.even(1.0, 1.0).pulses(np.array([DIASTOLIC_PHASE]))
-    return {r.shaft.catheter.name: r.shaft.electrodes_mm(r.shaft.moved(pulses @ r.vectors_mm))[0] for r in residents}
+    return {r.shaft.catheter.name: r.shaft.electrodes_mm(r.shaft.lines_mm(pulses @ r.vectors_mm))[0] for r in residents}
 
 
 @dataclass(frozen=True, eq=False)
 class _Exposures:
-    """The catheters of one run at any time of it."""
+    """The catheters of one run at any time."""
 
     residents: tuple[Resident, ...]
     beats: Beats
     breathing: Breathing
 
     def lines_mm(self, times_s: Array) -> list[Array]:
-        """Centre line of each catheter at times ``(t,)``, each (t, k, 3)."""
+        """Return the centre line of each catheter at times ``(t,)``, each (t, k, 3)."""
         pulses = self.beats.pulses(times_s)
         rest = self.beats.rest_mm(times_s)
         breath = self.breathing.at(times_s)[:, None, :]
         return [
-            resident.shaft.moved(pulses @ resident.vectors_mm + rest[:, number]) + breath
+            resident.shaft.lines_mm(pulses @ resident.vectors_mm + rest[:, number]) + breath
             for number, resident in enumerate(self.residents)
         ]
 
@@ -296,15 +298,15 @@ def _run(
     gantry = spec.gantries[view]
     names = [resident.shaft.catheter.name for resident in exposures.residents]
     points = {
-        name: _fixed(resident.shaft.electrodes_mm(line))
+        name: _read_only(resident.shaft.electrodes_mm(line))
         for name, resident, line in zip(names, exposures.residents, exposures.lines_mm(times_s), strict=True)
     }
-    pixels = {name: _fixed(camera.project(points[name])) for name in names}
+    pixels = {name: _read_only(camera.project(points[name])) for name in names}
     truth = RunTruth(
-        camera, _fixed(exposures.beats.phases(times_s)), MappingProxyType(points), MappingProxyType(pixels)
+        camera, _read_only(exposures.beats.phases(times_s)), MappingProxyType(points), MappingProxyType(pixels)
     )
     r_waves = np.rint(exposures.beats.r_waves_s * spec.frame_rate_hz).astype(int)
-    seen = tuple(int(frame) for frame in r_waves if 0 <= frame < spec.frames)
+    r_wave_frames = tuple(int(frame) for frame in r_waves if 0 <= frame < spec.frames)
     appearance = APPEARANCES[spec.contrast[view]]
     breath_mm = float(exposures.breathing.shift_mm[2])
 
@@ -319,7 +321,7 @@ def _run(
 
     frames = RenderedFrames((gantry.rows, gantry.columns), spec.frames, render)
     name: View = get_args(View)[view]
-    return SimulatedRun(name, gantry, frames, _fixed(times_s * 1000), start_s, seen, truth)
+    return SimulatedRun(name, gantry, frames, _read_only(times_s * 1000), start_s, r_wave_frames, truth)
 
 
 @functools.lru_cache(maxsize=4)
@@ -329,7 +331,7 @@ def _torso(gantry: Gantry, appearance: Appearance, seed: int, site: int, view: i
     return torso(gantry, appearance, bones, tissue, breathing_mm)
 
 
-def _fixed(array: Array) -> Array:
+def _read_only(array: Array) -> Array:
     array = np.array(array, dtype=np.float64)
     array.setflags(write=False)
     return array

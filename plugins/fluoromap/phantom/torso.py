@@ -1,4 +1,4 @@
-"""What lies behind the catheters: heart shadow, diaphragm, ribs, spine, ECG wires and soft tissue, in one image.
+"""The torso behind the catheters as one image: heart shadow, diaphragm, ribs, spine, ECG wires and soft tissue.
 
 Sizes are millimetres at the isocentre; attenuation is in log units.
 """
@@ -25,9 +25,9 @@ _WIRES = 2
 
 @dataclass(frozen=True, eq=False)
 class Torso:
-    """Photons that reach each pixel while no catheter is there, the image's mean being 1.
+    """Photons at each pixel without catheters; the image's mean is 1.
 
-    primary : (rows, columns) unscattered share, which catheters attenuate. scatter : (rows, columns) the rest.
+    primary : (rows, columns) unscattered share, which catheters attenuate. scatter : (rows, columns) scattered share.
     """
 
     primary: Image
@@ -41,23 +41,23 @@ def torso(
     tissue: np.random.Generator,
     breathing_mm: float,
 ) -> Torso:
-    """The torso in one run.
+    """Draw the torso of one run.
 
     Parameters
     ----------
     gantry, appearance
-        The view; the spine is drawn upright in the image.
+        The view; the spine is upright in the image.
     anatomy, tissue : Generator
-        Bones and wires are the patient's and the same in all runs of a view; soft tissue differs from run to run.
+        ``anatomy`` draws bones and wires, the same in all runs of a view. ``tissue`` draws soft tissue, new in each run.
     breathing_mm : float
-        How far breathing has moved heart and diaphragm towards the head.
+        Displacement of heart and diaphragm towards the head by breathing.
     """
     attenuation = _attenuation(gantry, appearance, anatomy, tissue, breathing_mm)
     px_per_mm = camera_from_gantry(gantry).px_per_mm
     primary = np.exp(-attenuation)
     primary /= primary.mean()
     scatter = primary
-    # Three running means make a Gaussian of standard deviation width / 2, at a cost that does not depend on the width.
+    # Three running means approximate a Gaussian of standard deviation width / 2; their cost does not depend on the width.
     for _ in range(3):
         scatter = uniform_filter(scatter, round(2 * _SCATTER_MM * px_per_mm), mode="nearest")
     scatter = scatter * (appearance.scatter_to_primary / scatter.mean())
@@ -91,7 +91,7 @@ def _attenuation(
 
 
 def _tissue(rows: int, columns: int, rng: np.random.Generator) -> Image:
-    """Noise whose amplitude falls as frequency to the power -1.4, mean 0, standard deviation 1."""
+    """Draw noise whose amplitude falls as frequency to the power -1.4, with mean 0 and standard deviation 1."""
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None, :])
     amplitude = np.maximum(frequency, 2 / max(rows, columns)) ** -1.4
     amplitude[0, 0] = 0
@@ -119,7 +119,7 @@ def _rib(x: Image, y: Image, rng: np.random.Generator) -> Image:
 
 
 def _spine(x: Image, y: Image, rng: np.random.Generator) -> Image:
-    """Vertebral bodies and discs with a pair of pedicles each: dark ovals of about an electrode's contrast."""
+    """Draw vertebral bodies and discs; each body has two pedicles, dark ovals of about an electrode's contrast."""
     middle, pitch = rng.normal(0, 4.3), rng.uniform(16.5, 20)
     first = rng.uniform(0, pitch)
     from_middle = np.abs(x - middle)
@@ -141,5 +141,5 @@ def _wire(x: Image, y: Image, rng: np.random.Generator) -> Image:
 
 
 def _step(value: NDArray[np.floating[Any]], width: float) -> Image:
-    """From 0 where ``value`` is negative to 1, over about ``width``."""
+    """Return a smooth step from 0 where ``value`` is negative to 1, over about ``width``."""
     return np.asarray(expit(value / np.float32(width)), dtype=np.float32)

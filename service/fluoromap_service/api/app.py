@@ -1,4 +1,4 @@
-"""The service as an ASGI application."""
+"""The HTTP service as an ASGI application."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
 import structlog
-from fastapi import FastAPI, Request
+from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap_service.api.http import drawing_pool, problems
-from fluoromap_service.api.http.body_limit import BodyLimit, TooLarge
+from fluoromap_service.api.http import file_pool, problems
+from fluoromap_service.api.http.body_limit import BodyLimit
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
@@ -48,8 +48,8 @@ log = structlog.get_logger(__name__)
 
 
 def create_app() -> FastAPI:
-    """The application for the process's settings."""
-    # The usual documentation pages fetch their scripts from elsewhere; hospital networks are closed.
+    """Make the application."""
+    # FastAPI's documentation pages fetch scripts from the internet; hospital networks are closed.
     app = FastAPI(
         title="fluoromap",
         summary="Activation maps of a heart chamber from ordinary C-arm fluoroscopy",
@@ -61,7 +61,6 @@ def create_app() -> FastAPI:
         lifespan=_lifespan,
     )
     problems.install(app)
-    _install_body_limit(app)
     for router in ROUTERS:
         app.include_router(router)
 
@@ -74,12 +73,6 @@ def create_app() -> FastAPI:
     return app
 
 
-def _install_body_limit(app: FastAPI) -> None:
-    @app.exception_handler(TooLarge)
-    async def too_large(request: Request, error: TooLarge) -> JSONResponse:
-        return problems.answer(error.problem)
-
-
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     tasks = [] if settings().eager else [asyncio.create_task(_sweep()), asyncio.create_task(_warm_up())]
@@ -90,22 +83,22 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
-        drawing_pool.close()
+        file_pool.close()
 
 
 async def _warm_up() -> None:
-    await run_in_threadpool(drawing_pool.start)
+    await run_in_threadpool(file_pool.start)
 
 
 async def _sweep() -> None:
-    """Free dead workers' stages and announce what is due, for as long as the service runs."""
+    """Free the stages of dead workers and announce ready stages, as long as the service runs."""
     failing = False
     while True:
         try:
             await run_in_threadpool(queue.sweep)
             failing = False
         except Exception as error:
-            # The database may come back; one line when it goes is enough.
+            # The database may come back: log the first failure only.
             if not failing:
                 log.warning("sweep_failed", error=type(error).__name__)
             failing = True

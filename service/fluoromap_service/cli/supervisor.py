@@ -1,4 +1,4 @@
-"""The API and a worker as child processes of one command, for the embedded default: no server needed."""
+"""The API and a worker as child processes of one command."""
 
 from __future__ import annotations
 
@@ -17,27 +17,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+import httpx
+
+from fluoromap_service.cli.failures import CommandFailed
+
 STOP_SECONDS = 30.0
+"""Longest time that the children get to stop."""
 READY_SECONDS = 180.0
+"""Longest time until the service must be ready. The first start compiles kernels."""
 LONGEST_BACKOFF_SECONDS = 30.0
+"""Longest wait before a worker that dies again and again is restarted."""
 STEADY_SECONDS = 60.0
-"""A worker that lived this long is restarted at once when it dies."""
-
-
-class CommandFailed(Exception):
-    """A command could not do its work; the message is one sentence for the user that says what to do."""
+"""A worker that dies after this time is restarted at once."""
 
 
 def program() -> str:
-    """The installed ``fluoromap`` program of this Python."""
+    """Return the path of the ``fluoromap`` program that belongs to this Python."""
     found = shutil.which("fluoromap", path=sysconfig.get_path("scripts")) or shutil.which("fluoromap")
     if found is None:
-        raise CommandFailed("The program fluoromap is not installed beside this Python; install the package again.")
+        raise CommandFailed(
+            "The program fluoromap is missing in this Python's environment; install the package fluoromap again."
+        )
     return found
 
 
 def free_port() -> int:
-    """A port of the loopback address that nobody listens on."""
+    """Return a port of the loopback address that is not in use."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -45,12 +50,12 @@ def free_port() -> int:
 
 
 def check_port(host: str, port: int) -> None:
-    """Refuse an address that cannot be listened on, before anything is started.
+    """Check that the API can listen on an address.
 
     Raises
     ------
     CommandFailed
-        Saying why.
+        When it cannot; the message says why.
     """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
@@ -59,7 +64,7 @@ def check_port(host: str, port: int) -> None:
             probe.bind((host, port))
     except OSError as error:
         raise CommandFailed(
-            f"Cannot listen on {host} port {port} ({error.strerror}); choose another with --host or --port."
+            f"Cannot listen on {host} port {port} ({error.strerror}); choose another address with --host or --port."
         ) from error
 
 
@@ -69,13 +74,13 @@ class _Child:
     log: Path | None
     environment: dict[str, str]
     process: subprocess.Popen[bytes] = field(init=False)
-    started: float = field(init=False)
+    start_time: float = field(init=False)
     deaths: int = 0
     restart_at: float | None = None
 
     def start(self) -> None:
         output: IO[bytes] | None = self.log.open("ab") if self.log else None
-        # A group of its own: Ctrl-C in a terminal reaches the supervisor alone, which then stops its children in order.
+        # In a session of its own the child does not receive Ctrl-C. The supervisor receives it and stops the children in order.
         self.process = subprocess.Popen(
             [program(), *self.arguments],
             stdin=subprocess.DEVNULL,
@@ -86,7 +91,7 @@ class _Child:
         )
         if output is not None:
             output.close()
-        self.started = time.monotonic()
+        self.start_time = time.monotonic()
         self.restart_at = None
 
     @property
@@ -100,16 +105,16 @@ class _Child:
 
 
 class Supervisor:
-    """Starts the worker and the API, restarts a worker that died, stops both.
+    """The parent of the API and the worker: it starts both, restarts a dead worker and stops both.
 
     Parameters
     ----------
     host, port
-        Where the API listens.
+        Address of the API.
     environment : mapping
-        The children's environment; holds the FLUOROMAP_* settings.
+        Environment of the children, with the FLUOROMAP_* settings.
     log_folder : Path, optional
-        Where the children's output goes, ``worker.log`` and ``api.log``; by default to this process's own.
+        Folder of ``worker.log`` and ``api.log``, the output of the children. By default they use this process's output.
     """
 
     def __init__(self, host: str, port: int, environment: Mapping[str, str], log_folder: Path | None = None) -> None:
@@ -117,39 +122,43 @@ class Supervisor:
         self._worker = _Child(["worker"], log_folder and log_folder / "worker.log", settings)
         self._api = _Child(["api"], log_folder and log_folder / "api.log", settings)
         self._log_folder = log_folder
-        shown = f"[{host}]" if ":" in host else host
-        self.url = f"http://{shown}:{port}"
+        # An IPv6 address has brackets in a URL.
+        address = f"[{host}]" if ":" in host else host
+        self.url = f"http://{address}:{port}"
 
     def start(self) -> None:
+        """Start the worker and the API."""
         self._worker.start()
         self._api.start()
 
     def wait_until_ready(self, stop: threading.Event | None = None) -> None:
-        """Return when the API answers and a worker has been seen, or when ``stop`` is set before.
+        """Wait until the API reports that it and a worker are ready.
+
+        Parameters
+        ----------
+        stop : Event, optional
+            Ends the waiting without an error when it is set.
 
         Raises
         ------
         CommandFailed
-            When that does not happen.
+            When the service is not ready within READY_SECONDS.
         """
-        import httpx
-
         end = time.monotonic() + READY_SECONDS
         with httpx.Client(trust_env=False, timeout=5) as client:
             while time.monotonic() < end and not (stop and stop.is_set()):
-                self.tend()
+                self.check_children()
                 with suppress(httpx.HTTPError):
                     if client.get(f"{self.url}/v1/ready").status_code == 200:
                         return
                 time.sleep(0.1)
         if not (stop and stop.is_set()):
-            raise CommandFailed(self._not_ready())
+            raise CommandFailed(f"The service was not ready within {READY_SECONDS:.0f} s; {self._where_to_look()}.")
 
-    def _not_ready(self) -> str:
-        return f"The service did not get ready within {READY_SECONDS:.0f} s; {self._where_to_look()}."
+    def check_children(self) -> None:
+        """Check the children once and restart a dead worker.
 
-    def tend(self) -> None:
-        """Look after the children once: restart a worker that died, later each time it dies young.
+        A worker that dies again and again is restarted after a longer and longer time.
 
         Raises
         ------
@@ -163,9 +172,9 @@ class Supervisor:
             return
         now = time.monotonic()
         if worker.restart_at is None:
-            # What the dead worker left running would compute beside its successor.
+            # The pool processes of a dead worker would compute beside the new worker.
             worker.kill_group()
-            steady = now - worker.started > STEADY_SECONDS
+            steady = now - worker.start_time > STEADY_SECONDS
             worker.deaths = 1 if steady else worker.deaths + 1
             delay = 0.0 if worker.deaths == 1 else min(2.0 ** (worker.deaths - 2), LONGEST_BACKOFF_SECONDS)
             worker.restart_at = now + delay
@@ -174,7 +183,7 @@ class Supervisor:
             worker.start()
 
     def stop(self) -> None:
-        """Ask both to stop, let running stages end for a while, then make sure."""
+        """Ask both children to stop, wait up to STOP_SECONDS, then kill them."""
         children = [child for child in (self._api, self._worker) if hasattr(child, "process")]
         for child in children:
             if child.alive:
@@ -185,29 +194,39 @@ class Supervisor:
                 with suppress(subprocess.TimeoutExpired):
                     child.process.wait(max(end - time.monotonic(), 0.1))
         finally:
-            # Also when the user would not wait and pressed Ctrl-C again.
+            # A second Ctrl-C interrupts the waiting; the children must end in that case too.
             for child in children:
                 child.kill_group()
 
     def _where_to_look(self) -> str:
-        return f"see the logs in {self._log_folder}" if self._log_folder else "its own message stands above"
+        return f"read the logs in {self._log_folder}" if self._log_folder else "read its message above"
 
 
 def run_until_stopped(supervisor: Supervisor, stop: threading.Event, on_ready: Callable[[], None]) -> None:
-    """Start the children, tend them until ``stop`` is set, then stop them; ``on_ready`` is called when they can be used."""
+    """Run the children until ``stop`` is set.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+        Parent of the children.
+    stop : Event
+        Ends the run.
+    on_ready : callable
+        Called once, when the service is ready.
+    """
     try:
         supervisor.start()
         supervisor.wait_until_ready(stop)
         if not stop.is_set():
             on_ready()
         while not stop.wait(0.2):
-            supervisor.tend()
+            supervisor.check_children()
     finally:
         supervisor.stop()
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that the first SIGINT or SIGTERM sets; a second one interrupts the process."""
+    """Return an event that the first SIGINT or SIGTERM sets; a second signal ends the process."""
     event = threading.Event()
 
     def stop(number: int, frame: object) -> None:
@@ -226,21 +245,29 @@ def _exit(number: int, frame: object) -> None:
 
 @contextmanager
 def private_service(data_dir: Path) -> Iterator[str]:
-    """The whole service on a free port of the loopback address and on that data folder alone; gives its address.
+    """Run the whole service on one data folder and yield its address.
 
-    A database or broker configured for this user's own service is left alone.
+    It listens on a free port of the loopback address. It ignores the FLUOROMAP_* variables of this user, so that it cannot
+    touch the database or broker of another service.
+
+    Raises
+    ------
+    CommandFailed
+        When the database cannot be made or the service is not ready in time.
     """
     data_dir.mkdir(parents=True, exist_ok=True)
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
     environment["FLUOROMAP_DATA_DIR"] = str(data_dir.resolve())
-    migrated = subprocess.run(
+    migration = subprocess.run(
         [program(), "db", "upgrade"], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
     )
-    if migrated.returncode != 0:
-        raise CommandFailed(migrated.stderr.strip() or "The database could not be made.")
+    if migration.returncode != 0:
+        raise CommandFailed(
+            migration.stderr.strip().removeprefix("fluoromap: ") or f"The database in {data_dir} cannot be made."
+        )
     supervisor = Supervisor("127.0.0.1", free_port(), environment, log_folder=data_dir)
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-        # The default would end this process at once and leave its children running.
+        # The default action ends this process at once and leaves its children running.
         signal.signal(signal.SIGTERM, _exit)
     stop = threading.Event()
     watcher = threading.Thread(target=_watch, args=(supervisor, stop), daemon=True)
@@ -257,7 +284,7 @@ def private_service(data_dir: Path) -> Iterator[str]:
 
 
 def _watch(supervisor: Supervisor, stop: threading.Event) -> None:
-    # When the API has ended the client that talks to it is told by the connection.
+    # A client of a dead API fails by its own connection error.
     with suppress(CommandFailed):
         while not stop.wait(0.2):
-            supervisor.tend()
+            supervisor.check_children()

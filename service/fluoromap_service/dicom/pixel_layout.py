@@ -207,7 +207,8 @@ def _group(
     file: BufferedReader, fragments: _Fragments, frames: int, syntax: str, warnings: list[HeaderWarning]
 ) -> tuple[tuple[Extent, ...], ...]:
     """Which fragments belong to which frame: one each; else as the offset table tells; else a frame begins where a
-    compressed image does (PS3.5 A.4: a fragment never holds parts of two frames)."""
+    compressed image does (PS3.5 A.4: a fragment never holds parts of two frames).
+    """
     extents = fragments.extents
     if len(extents) < frames:
         raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData holds {len(extents)} fragments.")

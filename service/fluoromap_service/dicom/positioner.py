@@ -74,7 +74,8 @@ def _source_isocentre_mm(header: Header, detector_mm: float | None, warnings: li
 
 def _pixel_spacing_mm(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> Pair | None:
     """Row and column spacing at the detector. PixelSpacing (0028,0030) is never used: it may be divided by the
-    magnification already."""
+    magnification already.
+    """
     told = header.numbers("ImagerPixelSpacing")
     if len(told) == 2 and any(told):
         if all(0.01 <= value <= 5 for value in told):
@@ -148,7 +149,8 @@ def table_mm(header: Header) -> tuple[float, float, float] | None:
 
 def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
     """Warn when gantry or table moved during the run: increments of legacy XA (0018,1520), (0018,1521), (0018,1135) to
-    (0018,1137), or differing functional groups."""
+    (0018,1137), or differing functional groups.
+    """
     gantry_moved = any(
         _spread(header, f"{axis}Increment", axis) > _STILL_DEG
         for axis in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")

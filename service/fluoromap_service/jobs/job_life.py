@@ -57,7 +57,7 @@ class StoredResult:
 
 
 def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
-    """Add a job with all its stages; the first ones are ready, which announces them."""
+    """Add a job with all its stages. The first ones are ready."""
     job = Job(
         id=uuid.uuid4().hex,
         study_id=study_id,
@@ -108,14 +108,14 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
 
 
 def ready(session: Session, job_id: str) -> list[Claim]:
-    """Return the claims that a job's ready stages would give, in the order in which they were made."""
+    """Return the claims that a job's ready stages would give."""
     columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
     query = select(*columns).where(StageRow.job_id == job_id, StageRow.state == StageState.READY)
     return [Claim(*row) for row in session.execute(query.order_by(StageRow.id))]
 
 
 def finish_ready(session: Session, job_id: str, results: Sequence[tuple[Claim, StoredResult]]) -> None:
-    """End stages whose results are stored already, unless another worker has claimed them."""
+    """End ready stages whose results are stored already."""
     job = _lock(session, job_id)
     for claimable, result in results:
         ended = session.execute(
@@ -176,7 +176,10 @@ def beat(session: Session, held: Claim, progress: float) -> Literal["alive", "ca
 
 
 def finish(session: Session, held: Claim, result: StoredResult, *, reused: bool) -> bool:
-    """Store a stage's end. Return False when the claim was lost: then the result is dropped."""
+    """Store a stage's end.
+
+    Return False when the claim was lost: then the result is dropped.
+    """
     job = _lock(session, held.job_id)
     if not _end(session, held, StageState.DONE, result=result.sha256, reused=reused, progress=1.0):
         return False
@@ -216,7 +219,10 @@ def cancel(session: Session, job_id: str) -> bool:
 
 
 def reap(session: Session) -> int:
-    """Free the stages whose workers fell silent and return how many. After its last attempt a stage fails."""
+    """Free the stages whose workers fell silent and return how many.
+
+    After its last attempt a stage fails.
+    """
     expired = session.execute(
         select(StageRow.id, StageRow.job_id)
         .where(StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now())
@@ -300,7 +306,10 @@ def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState],
 
 
 def _settle(session: Session, job: Job) -> None:
-    """Make stages ready whose inputs have ended, and end the job after its last stage. The job's row is locked."""
+    """Make stages ready whose inputs have ended, and end a finished job.
+
+    The caller holds the lock of the job's row.
+    """
     rows = _stages(session, job.id)
     broken = [row for row in rows if row.state == StageState.FAILED and STAGES[row.name].fails == "job"]
     if broken:
@@ -332,6 +341,9 @@ def _report_job(session: Session, job: Job) -> None:
 
 
 def _report_stage(session: Session, job_id: str, stage: StageRow | Row[*tuple[Any, ...]]) -> None:
-    """Add the event of a stage's new state. ``stage`` is its row, or a result with the columns of ``_REPORTED``."""
+    """Add the event of a stage's new state.
+
+    ``stage`` is its row, or a result with the columns of ``_REPORTED``.
+    """
     data = {column.key: getattr(stage, column.key) for column in _REPORTED}
     session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": round(float(stage.progress), 3)}))

@@ -68,9 +68,10 @@ def plugin_of(stage: Stage, snapshot: Snapshot) -> PluginSnapshot:
 
 
 def subjects_of(stage: Stage, snapshot: Snapshot) -> list[str]:
-    """Return what a job's stages of this row are about, in the order in which they begin.
+    """Return the runs, sites or study that a job has such stages for.
 
-    Runs with corrections come first: after a correction only they are computed again, and everything waits for them.
+    They come in the order in which they begin. Runs with corrections come first: after a correction only they are
+    computed again, and everything waits for them.
     """
     if stage.subject == "run":
         used = {uid for site in snapshot.sites for uid in (site.view_a, site.view_b)}

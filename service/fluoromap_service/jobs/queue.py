@@ -70,7 +70,10 @@ def celery_app() -> Celery:
 
 
 def publish(stage_ids: list[int]) -> None:
-    """Announce ready stages. A failure is only logged: the committed rows are announced again until a worker claims them."""
+    """Announce ready stages.
+
+    A failure is only logged: the committed rows are announced again until a worker claims them.
+    """
     app = celery_app()
     if app.conf.task_always_eager:
         app.loader.import_default_modules()
@@ -85,7 +88,10 @@ def publish(stage_ids: list[int]) -> None:
 
 
 def publish_due() -> int:
-    """Announce all stages that are due and return how many. Call it after each commit that made stages ready."""
+    """Announce all stages that are due and return how many.
+
+    Call it after each commit that made stages ready.
+    """
     with writing() as session:
         ids = job_life.take_due(session)
     publish(ids)
@@ -93,7 +99,10 @@ def publish_due() -> int:
 
 
 def sweep() -> None:
-    """Free the stages of dead workers and announce the stages that are due. Any process may call it at any time."""
+    """Free the stages of dead workers and announce stages that are due.
+
+    Any process may call it at any time.
+    """
     publish_due()
     with writing() as session:
         freed = job_life.reap(session)

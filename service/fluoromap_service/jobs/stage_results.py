@@ -60,7 +60,7 @@ _lock = threading.Lock()
 
 
 def stages_of(session: Session, job_id: str, name: str | None = None) -> Sequence[StageRow]:
-    """Return all stages of a job, or those of one name, in the order in which they were made."""
+    """Return a job's stages, or those of one name, oldest first."""
     query = select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)
     return session.scalars(query if name is None else query.where(StageRow.name == name)).all()
 

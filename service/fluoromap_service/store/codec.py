@@ -123,7 +123,10 @@ def decode(kind: type[T], content: bytes) -> T:
 
 
 def form_of(kind: type[Any]) -> str:
-    """Return the hash of a type's fields and of the fields of all types in it: it changes when a contract does."""
+    """Return the hash of a type's form, which changes when a contract does.
+
+    The form is the names and types of its fields, and those of all dataclasses in it.
+    """
     return _form_of(cast(Hashable, kind))
 
 
@@ -155,7 +158,10 @@ def _padded(content: bytes) -> bytes:
 
 @contextmanager
 def _without_collector() -> Iterator[None]:
-    """Keep the cyclic garbage collector still: it would walk through thousands of fresh small objects in vain."""
+    """Pause the cyclic garbage collector.
+
+    It would walk through thousands of fresh small objects in vain.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:

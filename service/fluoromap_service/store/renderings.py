@@ -1,13 +1,11 @@
-"""Pictures and meshes made of a job's results on request, made once and kept."""
+"""Kept renderings: pictures, meshes and pages that the service makes of a job's results once."""
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +19,25 @@ from fluoromap_service.store.models import Rendering
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
-    """A kept rendering: its hash, and the file that holds it."""
+    """A kept rendering: the hash of its content, and its file."""
 
     sha256: str
     path: Path
 
 
-def rendered(job_id: str, asked: dict[str, Any], media_type: str, make: Callable[[], bytes]) -> Rendered:
-    """The kept rendering of a job for everything that was asked for, made by ``make`` when there is none yet.
+def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Callable[[], bytes]) -> Rendered:
+    """Return the kept rendering of a job; make it when there is none.
 
     Parameters
     ----------
     job_id : str
-    asked : dict
-        JSON values; whatever changes the picture must be in it.
+    depends_on : dict
+        JSON values: everything that changes the rendering.
     media_type : str
     make : callable
-        Called outside any transaction.
+        Makes the content. It is called outside any transaction.
     """
-    key = hashlib.sha256(json.dumps([job_id, _version(), asked], sort_keys=True).encode()).hexdigest()
+    key = hashlib.sha256(json.dumps([job_id, depends_on], sort_keys=True).encode()).hexdigest()
     kept = _kept(key)
     if kept is not None:
         return kept
@@ -53,7 +51,7 @@ def rendered(job_id: str, asked: dict[str, Any], media_type: str, make: Callable
             else:
                 row.sha256 = sha256
     except IntegrityError:
-        # Someone else made the same picture meanwhile; theirs is as good.
+        # Another request made the same rendering meanwhile: take that one.
         kept = _kept(key)
         if kept is None:
             raise
@@ -67,8 +65,3 @@ def _kept(key: str) -> Rendered | None:
     if sha256 is None or not files.path_of(sha256).exists():
         return None
     return Rendered(sha256, files.path_of(sha256))
-
-
-@functools.cache
-def _version() -> str:
-    return version("fluoromap")

@@ -1,4 +1,4 @@
-"""From a study as it stands now to a job's frozen input."""
+"""Freeze a study into the input of a job."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from fluoromap.registry import DEFAULTS, Kind, UnknownPlugin, plugin
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Study
 from fluoromap_service.study import corrections, sites
+from fluoromap_service.study.catheters import catheters_of
 from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
 from fluoromap_service.study.sites import BoundSite
 from fluoromap_service.study.snapshot import (
-    CatheterSnapshot,
     CorrectedElectrode,
     PluginSnapshot,
     RejectedSiteSnapshot,
@@ -22,22 +22,22 @@ from fluoromap_service.study.snapshot import (
     SiteSnapshot,
     Snapshot,
 )
-from fluoromap_service.study.studies import catalogue_of, catheter_rows, lock
+from fluoromap_service.study.studies import lock
 
 LAT_SD_MS = 2.0
-"""Standard deviation of an activation time whose source tells none: two readers of one electrogram differ by about this."""
+"""Standard deviation of an activation time whose source gives none: about the difference of two readers."""
 
 
 class StageRequest(BaseModel):
-    """A plugin for one stage."""
+    """The plugin for one stage."""
 
     model_config = ConfigDict(extra="forbid")
-    name: str | None = Field(None, description="Name as in /v1/plugins; the default plugin when left out.")
-    params: dict[str, Any] = Field(default_factory=dict, description="Its parameters; defaults for those left out.")
+    name: str | None = Field(None, description="Name as in /v1/plugins; by default the default plugin.")
+    params: dict[str, Any] = Field(default_factory=dict, description="Its parameters; each has a default.")
 
 
 class PipelineRequest(BaseModel):
-    """The plugins a job shall use; stages left out take their defaults."""
+    """The plugins of a job; every stage has a default plugin."""
 
     model_config = ConfigDict(
         extra="forbid", json_schema_extra={"examples": [{"fuser": {"name": "convex-hull", "params": {}}}]}
@@ -51,14 +51,16 @@ class PipelineRequest(BaseModel):
 def freeze(
     session: Session, study: Study, pipeline: PipelineRequest, view: Literal["a", "b", "both"] = "both"
 ) -> Snapshot:
-    """Freeze everything a job will read; needs a writing transaction, as pairs by time get their names here.
+    """Freeze everything that a job reads.
+
+    It needs a writing transaction, because pairs by time get their names here.
 
     Raises
     ------
     Problem
-        422 ``unknown_plugin`` or ``invalid_parameter`` naming the field, ``no_ready_site`` with what each site misses.
+        422 ``unknown_plugin`` or ``invalid_parameter`` with the field; ``no_ready_site`` with the needs of each site.
     """
-    plans = _plugin_snapshots(pipeline)
+    plugins = _plugin_snapshots(pipeline)
     study = lock(session, study.id)
     sites.settle(session, study)
     bound = sites.resolve(session, study)
@@ -70,10 +72,10 @@ def freeze(
     used = sorted({uid for site in ready for uid in (site.view_a, site.view_b) if uid is not None})
     return Snapshot(
         study=study.id,
-        catheters=tuple(CatheterSnapshot(**row) for row in catheter_rows(catalogue_of(study))),
+        catheters=catheters_of(study),
         reference=study.reference,
         mapping=study.mapping,
-        **plans,
+        **plugins,
         view=view,
         runs={uid: _run_snapshot(runs[uid], by_hand.get(uid, {})) for uid in used},
         sites=tuple(_site_snapshot(site) for site in ready),
@@ -88,21 +90,21 @@ def freeze(
 
 
 def _plugin_snapshots(pipeline: PipelineRequest) -> dict[Any, PluginSnapshot]:
-    plans: dict[Any, PluginSnapshot] = {}
+    chosen: dict[Any, PluginSnapshot] = {}
     errors: list[tuple[str, str]] = []
     for kind, default in DEFAULTS.items():
         asked: StageRequest = getattr(pipeline, kind)
-        plan = _plugin_snapshot(kind, asked.name or default, asked.params, errors)
-        if plan is not None:
-            plans[kind] = plan
+        snapshot = _plugin_snapshot(kind, asked.name or default, asked.params, errors)
+        if snapshot is not None:
+            chosen[kind] = snapshot
     if errors:
         raise Problem(
             422,
             "invalid_parameter",
-            "Some parameters of the pipeline are wrong; /v1/plugins tells which there are.",
+            "Some parameters of the pipeline are wrong; /v1/plugins lists the parameters of each plugin.",
             errors,
         )
-    return plans
+    return chosen
 
 
 def _plugin_snapshot(
@@ -112,7 +114,7 @@ def _plugin_snapshot(
         found = plugin(kind, name)
     except UnknownPlugin as error:
         raise Problem(
-            422, "unknown_plugin", "There is no such plugin; /v1/plugins tells which there are.",
+            422, "unknown_plugin", "There is no such plugin; /v1/plugins lists all plugins.",
             [(f"pipeline.{kind}.name", str(error))],
         ) from None  # fmt: skip
     assert found.stage is not None
@@ -133,13 +135,13 @@ def _no_ready_site(bound: list[BoundSite]) -> Problem:
         for site in bound
     ]
     errors = [
-        (f"sites.{site.site}", ", ".join([*site.missing, *([site.refused.sentence] if site.refused else [])]))
+        (f"sites.{site.site}", ", ".join([*site.missing, *([site.unusable.sentence] if site.unusable else [])]))
         for site in bound
     ]
     detail = (
-        "No site is ready: one needs an activation time and two runs with known geometry, 20 degrees or more apart."
+        "No site is ready: a site needs an activation time and two runs with known geometry, 20 degrees or more apart."
         if bound
-        else "The study has no site yet: send its runs and its activation times first."
+        else "The study has no site yet; send its runs and its activation times first."
     )
     return Problem(422, "no_ready_site", detail, errors, extra={"sites": rows})
 

@@ -1,8 +1,7 @@
-"""Runs: DICOM instances, kept once by SOP Instance UID, and what each study says of them."""
+"""Runs: DICOM instances, stored once by SOP Instance UID, and each study's own facts about them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from fluoromap.geometry.gantry import UPRIGHT, ImageAxes, view_axes
+from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom.facts import InstanceFacts
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
-from fluoromap_service.problem import Problem
+from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import ENDED_JOB, Correction, File, Instance, Job, Rendering, Site, StudyInstance
@@ -27,12 +26,12 @@ GANTRY_KEYWORDS = {
     "source_isocentre_mm": "DistanceSourceToPatient",
     "pixel_spacing_mm": "ImagerPixelSpacing",
 }
-"""Gantry fields and the DICOM keywords that tell them."""
+"""Gantry fields and their DICOM keywords."""
 
 
 @dataclass(frozen=True, eq=False)
 class StudyRun:
-    """One run as a study sees it."""
+    """One run of a study: the study's reference to it, the instance and its facts."""
 
     link: StudyInstance
     instance: Instance
@@ -40,19 +39,25 @@ class StudyRun:
 
     @property
     def uid(self) -> str:
+        """The SOP Instance UID."""
         return self.facts.sop_instance_uid
 
     @property
     def gantry(self) -> dict[str, Any]:
+        """Effective gantry values; None where unknown."""
         return gantry_values(self.facts, self.link.gantry)[0]
 
     @property
     def missing(self) -> list[str]:
+        """DICOM keywords of the gantry values that are unknown."""
         return gantry_values(self.facts, self.link.gantry)[1]
 
 
 def gantry_values(facts: InstanceFacts, override: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The header's gantry values, completed and overridden by the study's, and the DICOM keywords still missing."""
+    """Return the effective gantry values and the DICOM keywords of the missing ones.
+
+    The study's values complete and override the header's.
+    """
     values = {
         field: override[field] if override.get(field) is not None else getattr(facts, field)
         for field in GANTRY_KEYWORDS
@@ -61,7 +66,7 @@ def gantry_values(facts: InstanceFacts, override: dict[str, Any]) -> tuple[dict[
 
 
 def effective_gantry(facts: InstanceFacts, override: dict[str, Any]) -> GantrySnapshot | None:
-    """The run's whole geometry, or None while something is missing."""
+    """Return the run's whole geometry; None while a value is missing."""
     values, missing = gantry_values(facts, override)
     if missing:
         return None
@@ -72,30 +77,12 @@ def _image_axes(facts: InstanceFacts, values: dict[str, Any]) -> ImageAxes:
     angles_came_later = facts.primary_deg is None or facts.secondary_deg is None
     if not angles_came_later or facts.patient_orientation is None or facts.image_axes != UPRIGHT:
         return facts.image_axes
-    told = image_axes_from_orientation(facts.patient_orientation, values["primary_deg"], values["secondary_deg"])
-    return told or facts.image_axes
-
-
-def ray_angle_deg(first: StudyRun, second: StudyRun) -> float | None:
-    """Angle between two runs' central rays, folded to 0..90 degrees; None while gantry angles are missing."""
-    axes = [central_ray(run) for run in (first, second)]
-    if axes[0] is None or axes[1] is None:
-        return None
-    cosine = abs(sum(a * b for a, b in zip(axes[0], axes[1], strict=True)))
-    return math.degrees(math.acos(min(cosine, 1.0)))
-
-
-def central_ray(run: StudyRun) -> tuple[float, float, float] | None:
-    """Unit vector from the isocentre to the detector in patient axes (LPS); None while gantry angles are missing."""
-    primary, secondary = run.gantry["primary_deg"], run.gantry["secondary_deg"]
-    if primary is None or secondary is None:
-        return None
-    x, y, z = view_axes(primary, secondary)[2].tolist()
-    return x, y, z
+    axes = image_axes_from_orientation(facts.patient_orientation, values["primary_deg"], values["secondary_deg"])
+    return axes or facts.image_axes
 
 
 def runs_of(session: Session, study_id: str) -> list[StudyRun]:
-    """All runs of a study in the order of arrival."""
+    """Return all runs of a study in the order of arrival."""
     query = (
         select(StudyInstance, Instance)
         .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
@@ -108,7 +95,7 @@ def runs_of(session: Session, study_id: str) -> list[StudyRun]:
 
 
 def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
-    """One run of a study.
+    """Return one run of a study.
 
     Raises
     ------
@@ -121,7 +108,7 @@ def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
         .where(StudyInstance.study_id == study_id, StudyInstance.sop_instance_uid == uid)
     ).first()
     if row is None:
-        raise Problem(404, "not_found", "There is no such instance in this study.")
+        raise not_found("instance in this study")
     return StudyRun(row[0], row[1], InstanceFacts.from_json(row[1].facts))
 
 
@@ -135,12 +122,12 @@ def add(
     file_name: str | None,
     site: str | None,
 ) -> bool:
-    """Store an incoming file and refer to it from the study. False when both were there already.
+    """Store an incoming file and refer to it from the study; return False when both exist already.
 
     Raises
     ------
     Problem
-        409 when other bytes are stored under the same SOP Instance UID.
+        409 when the store has other bytes under the same SOP Instance UID.
     """
     files.lock(session)
     known = session.get(Instance, facts.sop_instance_uid)
@@ -148,7 +135,7 @@ def add(
         raise Problem(
             409,
             "sop_instance_uid_taken",
-            "Another file with the same SOP Instance UID is stored already; the sender must mint a new UID for changed files.",
+            "The store has another file with the same SOP Instance UID; the sender must make a new UID for a changed file.",
             [("SOPInstanceUID", "already stored with other content")],
         )
     if known is None:
@@ -189,12 +176,12 @@ def add(
 
 
 def remove(session: Session, study_id: str, uid: str) -> list[str]:
-    """Take a run out of a study; the instance goes too when no other study refers to it.
+    """Take a run out of a study; delete the instance when no other study refers to it.
 
     Returns
     -------
     list of str
-        Hashes of files to hand to :func:`unlink_unreferenced` after the commit.
+        Hashes of files; give them to :func:`unlink_unreferenced` after the commit.
 
     Raises
     ------
@@ -212,7 +199,7 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
         site.explicit_b = None if site.explicit_b == uid else site.explicit_b
         if uid in (site.paired_a, site.paired_b):
             site.paired_a = site.paired_b = None
-    # Pictures show the run itself: those that were kept go with it.
+    # Kept pictures show the run itself: delete them with it.
     ended = select(Job.id).where(Job.study_id == study_id)
     kept = list(session.scalars(select(Rendering.sha256).where(Rendering.job_id.in_(ended))))
     session.execute(delete(Rendering).where(Rendering.job_id.in_(ended)))
@@ -221,9 +208,20 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
 
 
 def forget_instances(session: Session, uids: Iterable[str], also: Iterable[str] = ()) -> list[str]:
-    """Delete those instances no study refers to, and the rows of their files and of the files ``also``, where unused.
+    """Delete the instances that no study refers to, and the rows of unused files.
 
-    Returns the hashes of the files whose rows went, for :func:`unlink_unreferenced` after the commit.
+    Parameters
+    ----------
+    session : Session
+    uids : iterable of str
+        SOP Instance UIDs of the instances; their files are candidates.
+    also : iterable of str
+        Hashes of further candidates.
+
+    Returns
+    -------
+    list of str
+        Hashes of files without a row; give them to :func:`unlink_unreferenced` after the commit.
     """
     files.lock(session)
     candidates = list(also)
@@ -238,7 +236,7 @@ def forget_instances(session: Session, uids: Iterable[str], also: Iterable[str] 
 
 
 def unlink_unreferenced(hashes: Iterable[str]) -> None:
-    """Remove files from the disk whose rows are gone, unless the same content has arrived again since."""
+    """Remove files without a row from the disk, unless the same content arrived again meanwhile."""
     for sha256 in hashes:
         with writing() as session:
             files.lock(session)

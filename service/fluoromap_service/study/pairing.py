@@ -1,131 +1,240 @@
-"""Which two runs belong to which mapping site.
+"""The rules that join two runs to a mapping site, as pure functions on plain values.
 
-What the user said comes first: runs set by PUT or PATCH, then those the activation-time table names, then the site given at
-upload, then the table's row order. Runs that nobody spoke for are paired when they follow each other in acquisition time and
-look from directions 30 degrees or more apart.
+The rules apply in this order: runs set by PUT or PATCH, runs that the activation-time table names, the site given at upload,
+the row order of the table. Runs without any of these are paired when they follow each other in acquisition time and their
+views are 30 degrees or more apart.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Literal
 
-from fluoromap_service.store.models import Site
-from fluoromap_service.study.instances import StudyRun, central_ray, ray_angle_deg
+from fluoromap.geometry import view_axes
 
 PAIRING_ANGLE_DEG = 30.0
-"""Runs nearer to each other in direction are not paired by time."""
+"""Smallest angle between the views of two runs that acquisition time pairs."""
 PARALLEL_ANGLE_DEG = 20.0
-"""Below this even an explicit pair is refused."""
+"""Smallest angle between the views of a usable site."""
 ROUNDING_DEG = 1e-6
-"""Angles are compared with this much tolerance, so that 30 degrees are 30 degrees."""
+"""Tolerance of the comparison of angles, so that 30 degrees count as 30 degrees."""
 TABLE_STILL_MM = 1.0
-"""A table that moved farther between two runs moved the patient off the isocentre."""
+"""Largest distance between two positions of a table that did not move."""
 
-_STRENGTH = ("explicit", "csv", "upload", "order", "time")
+Direction = tuple[float, float, float]
+"""Unit vector from the isocentre to the detector in patient axes (LPS)."""
+Rule = Literal["explicit", "csv", "upload", "order", "time"]
+_STRENGTH: tuple[Rule, ...] = ("explicit", "csv", "upload", "order", "time")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run, with everything that the rules read.
+
+    Parameters
+    ----------
+    uid : str
+        SOP Instance UID.
+    arrival : int
+        Rises in the order of arrival.
+    direction : Direction or None
+        None while gantry angles are missing.
+    acquired : datetime or None
+    table_mm : tuple of float or None
+        Table top in the machine's own frame.
+    series_number : int or None
+    file_name : str or None
+        Name of the uploaded file.
+    site, site_by : str or None
+        Site that the upload ("upload") or a PATCH ("explicit") gave.
+    """
+
+    uid: str
+    arrival: int
+    direction: Direction | None
+    acquired: datetime | None
+    table_mm: tuple[float, float, float] | None = None
+    series_number: int | None = None
+    file_name: str | None = None
+    site: str | None = None
+    site_by: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One site, with everything that the rules read.
+
+    Parameters
+    ----------
+    name : str
+    has_time : bool
+        Whether the site has an activation time.
+    csv_row : int or None
+        Row of the last activation-time table that named the site.
+    explicit_a, explicit_b : str or None
+        SOP Instance UIDs set by PUT.
+    csv_a, csv_b : str or None
+        Run that the table names: UID, series number or file name.
+    paired_a, paired_b : str or None
+        SOP Instance UIDs of an earlier pairing by acquisition time.
+    """
+
+    name: str
+    has_time: bool = False
+    csv_row: int | None = None
+    explicit_a: str | None = None
+    explicit_b: str | None = None
+    csv_a: str | None = None
+    csv_b: str | None = None
+    paired_a: str | None = None
+    paired_b: str | None = None
+
+
+Pair = tuple[Run, Run]
+
+
+@dataclass(frozen=True, slots=True)
+class SiteRuns:
+    """The runs of one site; ``bound_by`` is the strongest rule that gave a run, None without runs."""
+
+    a: Run | None = None
+    b: Run | None = None
+    bound_by: Rule | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pairing:
+    """The runs of all sites by the site's name, and the pairs by time that have no name yet."""
+
+    sites: Mapping[str, SiteRuns]
+    unnamed: tuple[Pair, ...]
+
+
+def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
+    """Apply the rules to a study's sites (in order of first mention) and runs (in order of arrival)."""
+    draft = _Draft(sites, runs)
+    draft.take_explicit_views()
+    draft.take_members("explicit")
+    draft.take_table_views()
+    draft.take_members("upload")
+    earlier = draft.take_earlier_pairs()
+    unnamed = pairs_by_time(list(draft.free.values()))
+    # A pair of an anonymous site has a name that the service invented: a row of the table may take it over.
+    anonymous = [(site, pair) for site, pair in earlier if site.csv_row is None and not site.has_time]
+    pairs = sorted([*(pair for _, pair in anonymous), *unnamed], key=lambda pair: _moment(pair[0]))
+    rows = draft.rows_without_runs([site for site, _ in earlier])
+    if rows and len(rows) == len(pairs):
+        for site, pair in zip(rows, pairs, strict=True):
+            draft.slots[site.name] = _Slots(*pair, "order")
+        earlier = [entry for entry in earlier if entry not in anonymous]
+        unnamed = []
+    for site, pair in earlier:
+        draft.slots[site.name] = _Slots(*pair, "time")
+    return Pairing({name: slots.result() for name, slots in draft.slots.items()}, tuple(unnamed))
 
 
 @dataclass(eq=False)
-class Slots:
-    """The two runs of one site while the rules are applied; ``named`` once someone said which of them is a or b."""
+class _Slots:
+    """The two runs of one site while the rules apply; ``named``: a person or table said which run is a or b."""
 
-    a: StudyRun | None = None
-    b: StudyRun | None = None
-    by: str | None = None
+    a: Run | None = None
+    b: Run | None = None
+    by: Rule | None = None
     named: bool = False
 
     @property
-    def runs(self) -> list[StudyRun]:
+    def runs(self) -> list[Run]:
         return [run for run in (self.a, self.b) if run is not None]
 
-    def rule(self, by: str) -> None:
+    def put(self, view: str, run: Run, by: Rule) -> None:
+        setattr(self, view, run)
         if self.by is None or _STRENGTH.index(by) < _STRENGTH.index(self.by):
             self.by = by
 
-
-@dataclass(eq=False)
-class Binding:
-    """All sites' runs. ``slots``: site name -> its runs; ``fresh``: pairs by time that have no name yet."""
-
-    slots: dict[str, Slots]
-    fresh: list[tuple[StudyRun, StudyRun]]
-
-
-def bind(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Binding:
-    """Apply the rules to a study's sites (in order of first mention) and runs (in order of arrival)."""
-    slots = {row.name: Slots() for row in rows}
-    by_uid = {run.uid: run for run in runs}
-    free = dict(by_uid)
-
-    def take(site: str, view: str, run: StudyRun | None, by: str) -> None:
-        slot = slots[site]
-        if run is None or run.uid not in free or getattr(slot, view) is not None:
-            return
-        setattr(slot, view, free.pop(run.uid))
-        slot.rule(by)
-
-    for row in rows:
-        for view, uid in (("a", row.explicit_a), ("b", row.explicit_b)):
-            if uid is not None:
-                take(row.name, view, by_uid.get(uid), "explicit")
-                slots[row.name].named = True
-    _take_members(slots, free, runs, "explicit")
-    for row in rows:
-        for view, text in (("a", row.csv_a), ("b", row.csv_b)):
-            if text is not None:
-                take(row.name, view, told_run(text, runs), "csv")
-                slots[row.name].named = True
-    _take_members(slots, free, runs, "upload")
-
-    kept: list[tuple[Site, StudyRun, StudyRun]] = []
-    for row in rows:
-        first, second = free.get(row.paired_a or ""), free.get(row.paired_b or "")
-        if first is not None and second is not None and not slots[row.name].runs:
-            kept.append((row, free.pop(first.uid), free.pop(second.uid)))
-    fresh = pairs_by_time(list(free.values()))
-    unbound = [row for row in rows if row.csv_row is not None and slots[row.name].by is None]
-    unbound = [row for row in unbound if not any(row is owner for owner, _, _ in kept)]
-    unbound = sorted(
-        (row for row in unbound if row.csv_a is None and row.csv_b is None), key=lambda row: row.csv_row or 0
-    )
-    anonymous = [(row, a, b) for row, a, b in kept if row.csv_row is None and row.lat_ms is None]
-    pairs = sorted([*((a, b) for _, a, b in anonymous), *fresh], key=lambda pair: _moment(pair[0]))
-    if unbound and len(unbound) == len(pairs):
-        for row, (first, second) in zip(unbound, pairs, strict=True):
-            slots[row.name] = Slots(first, second, "order")
-        kept = [entry for entry in kept if entry not in anonymous]
-        fresh = []
-    for row, first, second in kept:
-        slots[row.name] = Slots(first, second, "time")
-    for slot in slots.values():
-        _lateral_first(slot)
-    return Binding(slots, fresh)
+    def result(self) -> SiteRuns:
+        """Return the runs; view a is the one nearer to lateral unless somebody named the views."""
+        if self.a is None or self.b is None or self.named:
+            return SiteRuns(self.a, self.b, self.by)
+        share_a, share_b = _lateral_share(self.a), _lateral_share(self.b)
+        if min(share_a, share_b) >= 0 and share_b > share_a + 1e-9:
+            return SiteRuns(self.b, self.a, self.by)
+        return SiteRuns(self.a, self.b, self.by)
 
 
-def _take_members(slots: dict[str, Slots], free: dict[str, StudyRun], runs: Sequence[StudyRun], by: str) -> None:
-    """Fill what is free of each site with the runs that were put there, as they arrived; a third one stays unbound."""
-    for site, slot in slots.items():
-        members = [run for run in runs if run.uid in free and run.link.site == site and run.link.site_by == by]
-        while members and len(slot.runs) < 2:
-            present = slot.runs
-            chosen = next((run for run in members if present and _apart(present[0], run)), members[0])
-            members.remove(chosen)
-            wanted = "a" if _is_lateral(chosen) else "b"
-            other = {"a": "b", "b": "a"}[wanted]
-            setattr(slot, wanted if getattr(slot, wanted) is None else other, free.pop(chosen.uid))
-            slot.rule(by)
+class _Draft:
+    """The state between two rules: the runs of each site, and the runs that no site has yet."""
+
+    def __init__(self, sites: Sequence[Site], runs: Sequence[Run]) -> None:
+        self._sites = sites
+        self._runs = runs
+        self.slots = {site.name: _Slots() for site in sites}
+        self.free = {run.uid: run for run in runs}
+
+    def take_explicit_views(self) -> None:
+        by_uid = {run.uid: run for run in self._runs}
+        for site in self._sites:
+            for view, uid in (("a", site.explicit_a), ("b", site.explicit_b)):
+                if uid is not None:
+                    self._take_view(site, view, by_uid.get(uid), "explicit")
+
+    def take_table_views(self) -> None:
+        for site in self._sites:
+            for view, text in (("a", site.csv_a), ("b", site.csv_b)):
+                if text is not None:
+                    self._take_view(site, view, named_run(text, self._runs), "csv")
+
+    def _take_view(self, site: Site, view: str, run: Run | None, by: Rule) -> None:
+        slots = self.slots[site.name]
+        slots.named = True
+        if run is not None and run.uid in self.free and getattr(slots, view) is None:
+            slots.put(view, self.free.pop(run.uid), by)
+
+    def take_members(self, by: Rule) -> None:
+        """Fill the free views of each site with the runs put there, in order of arrival; a third run stays free."""
+        for name, slots in self.slots.items():
+            members = [run for run in self._runs if run.uid in self.free and run.site == name and run.site_by == by]
+            while members and len(slots.runs) < 2:
+                present = slots.runs
+                chosen = next((run for run in members if present and _apart(present[0], run)), members[0])
+                members.remove(chosen)
+                wanted, other = ("a", "b") if _lateral_share(chosen) > math.sqrt(0.5) else ("b", "a")
+                view = wanted if getattr(slots, wanted) is None else other
+                slots.put(view, self.free.pop(chosen.uid), by)
+
+    def take_earlier_pairs(self) -> list[tuple[Site, Pair]]:
+        """Take the pairs that acquisition time joined before, where both runs and the site are still free."""
+        earlier: list[tuple[Site, Pair]] = []
+        for site in self._sites:
+            first, second = self.free.get(site.paired_a or ""), self.free.get(site.paired_b or "")
+            if first is not None and second is not None and not self.slots[site.name].runs:
+                earlier.append((site, (self.free.pop(first.uid), self.free.pop(second.uid))))
+        return earlier
+
+    def rows_without_runs(self, paired: Sequence[Site]) -> list[Site]:
+        """Return the table's sites that have no run, name no run and have no earlier pair, in row order."""
+        rows = [
+            site
+            for site in self._sites
+            if site.csv_row is not None
+            and self.slots[site.name].by is None
+            and site not in paired
+            and site.csv_a is None
+            and site.csv_b is None
+        ]
+        return sorted(rows, key=lambda site: site.csv_row or 0)
 
 
-def told_run(text: str, runs: Sequence[StudyRun]) -> StudyRun | None:
-    """The run that a table names by SOP Instance UID, series number or uploaded file name; None unless it is just one."""
+def named_run(text: str, runs: Sequence[Run]) -> Run | None:
+    """Return the run that a table names by SOP Instance UID, series number or file name; None unless it is just one."""
     text = text.strip()
-    tests: tuple[Callable[[StudyRun], bool], ...] = (
+    tests: tuple[Callable[[Run], bool], ...] = (
         lambda run: run.uid == text,
-        lambda run: run.facts.series_number is not None and str(run.facts.series_number) == text,
-        lambda run: run.link.file_name == text,
-        lambda run: run.link.file_name is not None and _base_name(run.link.file_name) == _base_name(text),
+        lambda run: run.series_number is not None and str(run.series_number) == text,
+        lambda run: run.file_name == text,
+        lambda run: run.file_name is not None and _base_name(run.file_name) == _base_name(text),
     )
     for test in tests:
         found = [run for run in runs if test(run)]
@@ -138,14 +247,14 @@ def _base_name(path: str) -> str:
     return path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
-def pairs_by_time(runs: Sequence[StudyRun]) -> list[tuple[StudyRun, StudyRun]]:
-    """Pair runs next in acquisition time, 30 degrees or more apart and with the table where it was.
+def pairs_by_time(runs: Sequence[Run]) -> list[Pair]:
+    """Pair runs next in acquisition time, 30 degrees or more apart and with the table at rest.
 
-    A run repeated in the same direction leaves an odd one out. Of all ways to pair neighbours the one with most pairs is
-    taken, then the one with the least time between the runs of a pair, then the earliest.
+    A run that repeats a direction stays alone. Of all ways to pair neighbours, the one with most pairs wins; then the one
+    with the least time between the runs of a pair; then the earliest.
     """
-    timed = sorted((run for run in runs if run.facts.acquired is not None), key=_moment)
-    Best = tuple[int, float, list[tuple[StudyRun, StudyRun]]]
+    timed = sorted((run for run in runs if run.acquired is not None), key=_moment)
+    Best = tuple[int, float, list[Pair]]
     best: list[Best] = [(0, 0.0, [])] * (len(timed) + 2)
     for index in range(len(timed) - 2, -1, -1):
         skipped = best[index + 1]
@@ -160,41 +269,41 @@ def pairs_by_time(runs: Sequence[StudyRun]) -> list[tuple[StudyRun, StudyRun]]:
     return best[0][2]
 
 
-def _acquired(run: StudyRun) -> datetime:
-    assert run.facts.acquired is not None
-    return run.facts.acquired
+def _acquired(run: Run) -> datetime:
+    assert run.acquired is not None
+    return run.acquired
 
 
-def _moment(run: StudyRun) -> tuple[float, int]:
-    acquired = run.facts.acquired
-    return (acquired.timestamp() if acquired is not None else math.inf, run.link.id)
+def _moment(run: Run) -> tuple[float, int]:
+    return (run.acquired.timestamp() if run.acquired is not None else math.inf, run.arrival)
 
 
-def _apart(first: StudyRun, second: StudyRun) -> bool:
+def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
+    """Return the direction from the isocentre to the detector of a gantry position."""
+    x, y, z = view_axes(primary_deg, secondary_deg)[2].tolist()
+    return x, y, z
+
+
+def ray_angle_deg(first: Run, second: Run) -> float | None:
+    """Return the angle between two runs' central rays, folded to 0..90 degrees; None while angles are missing."""
+    if first.direction is None or second.direction is None:
+        return None
+    cosine = abs(sum(a * b for a, b in zip(first.direction, second.direction, strict=True)))
+    return math.degrees(math.acos(min(cosine, 1.0)))
+
+
+def _apart(first: Run, second: Run) -> bool:
     angle = ray_angle_deg(first, second)
     return angle is not None and angle >= PAIRING_ANGLE_DEG - ROUNDING_DEG
 
 
-def table_moved(first: StudyRun, second: StudyRun) -> bool:
-    """Whether both headers tell the table's place and it moved between the runs."""
-    if first.facts.table_mm is None or second.facts.table_mm is None:
+def table_moved(first: Run, second: Run) -> bool:
+    """Return whether both headers give the table's position and it differs between the runs."""
+    if first.table_mm is None or second.table_mm is None:
         return False
-    return math.dist(first.facts.table_mm, second.facts.table_mm) > TABLE_STILL_MM
+    return math.dist(first.table_mm, second.table_mm) > TABLE_STILL_MM
 
 
-def _lateral_share(run: StudyRun) -> float:
-    """1 for a lateral view, 0 for a frontal one, -1 where the angles are missing."""
-    ray = central_ray(run)
-    return -1.0 if ray is None else abs(ray[0])
-
-
-def _is_lateral(run: StudyRun) -> bool:
-    return _lateral_share(run) > math.sqrt(0.5)
-
-
-def _lateral_first(slot: Slots) -> None:
-    if slot.a is None or slot.b is None or slot.named:
-        return
-    share_a, share_b = _lateral_share(slot.a), _lateral_share(slot.b)
-    if min(share_a, share_b) >= 0 and share_b > share_a + 1e-9:
-        slot.a, slot.b = slot.b, slot.a
+def _lateral_share(run: Run) -> float:
+    """Return 1 for a lateral view, 0 for a frontal one, -1 where angles are missing."""
+    return -1.0 if run.direction is None else abs(run.direction[0])

@@ -1,4 +1,4 @@
-"""Mapping sites: activation times, and the runs bound to them."""
+"""Mapping sites: their activation times and their runs, as the store holds them and as a job takes them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from fluoromap.reasons import Reason
-from fluoromap_service.problem import Problem
+from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.models import Job, Site, Study
-from fluoromap_service.study.instances import StudyRun, effective_gantry, ray_angle_deg, runs_of
-from fluoromap_service.study.pairing import PARALLEL_ANGLE_DEG, ROUNDING_DEG, Slots, bind, table_moved
+from fluoromap_service.study import pairing
+from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
+from fluoromap_service.study.pairing import PARALLEL_ANGLE_DEG, ROUNDING_DEG, Pairing, SiteRuns
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,16 +26,16 @@ class BoundSite:
     ----------
     site : str
     lat_ms, lat_sd_ms : float or None
-        Activation time and its standard deviation where one was told.
+        Activation time and its standard deviation, where known.
     view_a, view_b : str or None
-        SOP Instance UIDs; a is the run nearer to lateral unless someone said otherwise.
+        SOP Instance UIDs; a is the run nearer to lateral unless somebody named the views.
     bound_by : str or None
         "explicit", "csv", "upload", "order" or "time"; None without runs.
     missing : tuple of str
         Of "lat_ms", "view_a", "view_b", "gantry:view_a", "gantry:view_b".
     warnings : tuple of str
-    refused : Reason or None
-        Why the pair cannot be used although nothing is missing.
+    unusable : Reason or None
+        Why a job cannot use the pair although nothing is missing.
     angle_deg : float or None
         Between the two views' rays, folded to 0..90.
     """
@@ -47,23 +48,24 @@ class BoundSite:
     bound_by: str | None
     missing: tuple[str, ...]
     warnings: tuple[str, ...] = ()
-    refused: Reason | None = None
+    unusable: Reason | None = None
     angle_deg: float | None = None
 
     @property
     def ready(self) -> bool:
-        return not self.missing and self.refused is None
+        """Whether a job can use the site."""
+        return not self.missing and self.unusable is None
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why a job will reject this site; empty when it is ready."""
+        """The reasons why a job rejects this site; empty when it is ready."""
         found = [Reason.ONE_VIEW_ONLY] if {"view_a", "view_b"} & set(self.missing) else []
         if any(item.startswith("gantry:") for item in self.missing):
             found.append(Reason.NO_GEOMETRY)
         if "lat_ms" in self.missing:
             found.append(Reason.NO_ACTIVATION_TIME)
-        if self.refused is not None:
-            found.append(self.refused)
+        if self.unusable is not None:
+            found.append(self.unusable)
         return tuple(found)
 
 
@@ -79,22 +81,25 @@ class ActivationTime:
 
 
 def rows_of(session: Session, study_id: str) -> list[Site]:
-    """All rows of a study's sites in the order of first mention."""
+    """Return all rows of a study's sites in the order of first mention."""
     return list(session.scalars(select(Site).where(Site.study_id == study_id).order_by(Site.id)))
 
 
 def resolve(session: Session, study: Study) -> list[BoundSite]:
-    """The study's sites with their runs, in the order of first mention; pairs without a name yet are left out."""
-    rows = rows_of(session, study.id)
-    binding = bind(rows, runs_of(session, study.id))
-    return [_bound(row, binding.slots[row.name]) for row in rows if _stands(row, binding.slots[row.name])]
+    """Return the study's sites with their runs, in the order of first mention.
+
+    Pairs without a name yet, and empty rows, are left out.
+    """
+    rows, runs = rows_of(session, study.id), runs_of(session, study.id)
+    return _bound_sites(rows, runs)
 
 
 def settle(session: Session, study: Study) -> None:
-    """Pair runs by acquisition time and name the pairs; call it in every transaction that changes the study's runs.
+    """Pair runs by acquisition time and name the pairs.
 
-    A name is given at the first pairing and stays with its run. Which run is the other one may still change while runs
-    arrive out of order, until the site has an activation time or a job was made: from then on the pair is for good.
+    Call it in every transaction that changes the study's runs. The first pairing of a run gives a name, which stays with this
+    run. The other run of the pair may still change while runs arrive out of order. The pair is final when the site has an
+    activation time, or when the study has a job.
     """
     rows, runs = rows_of(session, study.id), runs_of(session, study.id)
     has_job = session.scalar(select(Job.id).where(Job.study_id == study.id).limit(1)) is not None
@@ -102,13 +107,13 @@ def settle(session: Session, study: Study) -> None:
     before = {row: {row.paired_a, row.paired_b} for row in loose}
     for row in loose:
         row.paired_a = row.paired_b = None
-    known = {row.name for row in rows} | {run.link.site for run in runs}
+    used_names = {row.name for row in rows} | {run.link.site for run in runs}
     numbers = itertools.count(1)
-    for first, second in bind(rows, runs).fresh:
+    for first, second in _pairing(rows, runs).unnamed:
         pair = {first.uid, second.uid}
         owner = max(before, key=lambda row: len(before[row] & pair), default=None)
         if owner is None or not before[owner] & pair:
-            name = next(name for number in numbers if (name := f"S{number:02d}") not in known)
+            name = next(name for number in numbers if (name := f"S{number:02d}") not in used_names)
             owner = Site(study_id=study.id, name=name)
             session.add(owner)
         else:
@@ -120,46 +125,85 @@ def settle(session: Session, study: Study) -> None:
     session.flush()
 
 
-def _bound(row: Site, slot: Slots) -> BoundSite:
+def _pairing(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Pairing:
+    """Apply the pairing rules to the rows of the store."""
+    return pairing.pair_runs([_site_value(row) for row in rows], [_run_value(run) for run in runs])
+
+
+def _site_value(row: Site) -> pairing.Site:
+    return pairing.Site(
+        name=row.name,
+        has_time=row.lat_ms is not None,
+        csv_row=row.csv_row,
+        explicit_a=row.explicit_a,
+        explicit_b=row.explicit_b,
+        csv_a=row.csv_a,
+        csv_b=row.csv_b,
+        paired_a=row.paired_a,
+        paired_b=row.paired_b,
+    )
+
+
+def _run_value(run: StudyRun) -> pairing.Run:
+    primary, secondary = run.gantry["primary_deg"], run.gantry["secondary_deg"]
+    return pairing.Run(
+        uid=run.uid,
+        arrival=run.link.id,
+        direction=None if primary is None or secondary is None else pairing.central_ray(primary, secondary),
+        acquired=run.facts.acquired,
+        table_mm=run.facts.table_mm,
+        series_number=run.facts.series_number,
+        file_name=run.link.file_name,
+        site=run.link.site,
+        site_by=run.link.site_by,
+    )
+
+
+def _bound_sites(rows: Sequence[Site], runs: Sequence[StudyRun]) -> list[BoundSite]:
+    paired = _pairing(rows, runs).sites
+    with_geometry = _with_geometry(runs)
+    return [_bound(row, paired[row.name], with_geometry) for row in rows if not _is_empty(row, paired[row.name])]
+
+
+def _with_geometry(runs: Sequence[StudyRun]) -> set[str]:
+    return {run.uid for run in runs if effective_gantry(run.facts, run.link.gantry) is not None}
+
+
+def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
+    views = (("view_a", runs.a), ("view_b", runs.b))
     missing = [] if row.lat_ms is not None else ["lat_ms"]
-    missing += [view for view, run in (("view_a", slot.a), ("view_b", slot.b)) if run is None]
-    for view, run in (("view_a", slot.a), ("view_b", slot.b)):
-        if run is not None and effective_gantry(run.facts, run.link.gantry) is None:
-            missing.append(f"gantry:{view}")
-    warnings: list[str] = []
-    refused: Reason | None = None
+    missing += [view for view, run in views if run is None]
+    missing += [f"gantry:{view}" for view, run in views if run is not None and run.uid not in with_geometry]
+    unusable: Reason | None = None
     angle: float | None = None
-    if slot.a is not None and slot.b is not None:
-        angle = ray_angle_deg(slot.a, slot.b)
-        if angle is not None and angle < PARALLEL_ANGLE_DEG - ROUNDING_DEG:
-            refused = Reason.VIEWS_PARALLEL
-        if table_moved(slot.a, slot.b):
-            warnings.append("table_moved")
-            refused = Reason.TABLE_MOVED
-    if refused is not None and str(refused) not in warnings:
-        warnings.append(str(refused))
+    if runs.a is not None and runs.b is not None:
+        angle = pairing.ray_angle_deg(runs.a, runs.b)
+        if pairing.table_moved(runs.a, runs.b):
+            unusable = Reason.TABLE_MOVED
+        elif angle is not None and angle < PARALLEL_ANGLE_DEG - ROUNDING_DEG:
+            unusable = Reason.VIEWS_PARALLEL
     return BoundSite(
         site=row.name,
         lat_ms=row.lat_ms,
         lat_sd_ms=row.lat_sd_ms,
-        view_a=slot.a.uid if slot.a else None,
-        view_b=slot.b.uid if slot.b else None,
-        bound_by=slot.by,
+        view_a=runs.a.uid if runs.a else None,
+        view_b=runs.b.uid if runs.b else None,
+        bound_by=runs.bound_by,
         missing=tuple(missing),
-        warnings=tuple(warnings),
-        refused=refused,
+        warnings=() if unusable is None else (str(unusable),),
+        unusable=unusable,
         angle_deg=angle,
     )
 
 
-def _stands(row: Site, slot: Slots) -> bool:
-    """Whether there is anything to tell of a site; a pair that others took over leaves an empty row behind."""
-    told = (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b)
-    return bool(slot.runs) or any(value is not None for value in told)
+def _is_empty(row: Site, runs: SiteRuns) -> bool:
+    """Return whether a site has neither runs nor facts: another site took over the pair that gave it its name."""
+    facts = (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b)
+    return runs.a is None and runs.b is None and all(fact is None for fact in facts)
 
 
 def one(session: Session, study: Study, name: str) -> BoundSite:
-    """One site of a study.
+    """Return one site of a study.
 
     Raises
     ------
@@ -169,22 +213,23 @@ def one(session: Session, study: Study, name: str) -> BoundSite:
     for site in resolve(session, study):
         if site.site == name:
             return site
-    raise Problem(404, "not_found", "There is no such site in this study.")
+    raise not_found("site in this study")
 
 
-def as_it_stands(session: Session, study: Study, name: str) -> BoundSite:
-    """As :func:`one` for a site that may have been emptied just now."""
+def one_or_empty(session: Session, study: Study, name: str) -> BoundSite:
+    """Return one site as :func:`one` does, also when a change has just emptied it."""
     row = mention(session, study.id, name)
-    return _bound(row, bind(rows_of(session, study.id), runs_of(session, study.id)).slots[name])
+    runs = runs_of(session, study.id)
+    return _bound(row, _pairing(rows_of(session, study.id), runs).sites[name], _with_geometry(runs))
 
 
 def mention(session: Session, study_id: str, name: str) -> Site:
-    """The row of a site, made when it is mentioned for the first time.
+    """Return the row of a site; add it at the first mention.
 
     Raises
     ------
     Problem
-        422 when the name cannot be one.
+        422 when the text cannot be a name.
     """
     if not is_site_name(name):
         raise Problem(
@@ -202,7 +247,7 @@ def mention(session: Session, study_id: str, name: str) -> Site:
 
 
 def is_site_name(name: str) -> bool:
-    """Whether a text can name a site: it stands in addresses and file names."""
+    """Return whether a text can name a site in addresses and file names."""
     return (
         re.fullmatch(r"[^\x00-\x1f\x7f/\\]{1,64}", name) is not None
         and name == name.strip()
@@ -211,12 +256,14 @@ def is_site_name(name: str) -> bool:
 
 
 def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -> list[str]:
-    """Replace the study's activation-time table; times told by PUT or electrogram stay unless the table names their site.
+    """Replace the study's activation-time table.
+
+    Times from PUT or from an electrogram stay, unless the table names their site.
 
     Returns
     -------
     list of str
-        Sites of the table that no run is bound to, or not the run that the table names.
+        Sites of the table that have no run, or not the run that the table names.
     """
     for row in rows_of(session, study.id):
         row.csv_row = row.csv_a = row.csv_b = None
@@ -228,34 +275,42 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
         row.lat_ms, row.lat_sd_ms, row.lat_by = entry.lat_ms, None, "csv"
     session.flush()
     bound = {site.site: site for site in resolve(session, study)}
-    return [entry.site for entry in table if not _kept(entry, bound[entry.site])]
+    return [entry.site for entry in table if not _has_its_runs(entry, bound[entry.site])]
 
 
-def _kept(entry: ActivationTime, site: BoundSite) -> bool:
-    """Whether a row of the table found its runs: those it names, or else any."""
+def _has_its_runs(entry: ActivationTime, site: BoundSite) -> bool:
+    """Return whether a row of the table has the runs that it names, or any run when it names none."""
     if entry.view_a is None and entry.view_b is None:
         return site.view_a is not None or site.view_b is not None
     return (entry.view_a is None or site.view_a is not None) and (entry.view_b is None or site.view_b is not None)
 
 
 def put_views(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
-    """Bind runs to a site by hand; keys "view_a", "view_b", None sets a view free. A run leaves the site it was in.
+    """Bind runs to a site by hand; a run leaves the site that it was in.
+
+    Parameters
+    ----------
+    session : Session
+    study : Study
+    name : str
+    views : dict
+        SOP Instance UIDs under "view_a" and "view_b"; None frees a view.
 
     Raises
     ------
     Problem
         422 when a run is not in the study or would be both views.
     """
-    known = {run.uid: run for run in runs_of(session, study.id)}
+    uids = {run.uid for run in runs_of(session, study.id)}
     row = mention(session, study.id, name)
     after = {"view_a": row.explicit_a, "view_b": row.explicit_b, **views}
     errors = [
-        (view, "there is no such instance in this study") for view, uid in views.items() if uid and uid not in known
+        (view, "there is no such instance in this study") for view, uid in views.items() if uid and uid not in uids
     ]
     if after["view_a"] is not None and after["view_a"] == after["view_b"]:
         errors.append(("view_b", "the two views must be two different runs"))
     if errors:
-        raise Problem(422, "invalid_binding", "These runs cannot be bound to the site.", errors)
+        raise Problem(422, "invalid_binding", "The site cannot have these runs; see 'errors' for each view.", errors)
     for other in rows_of(session, study.id):
         if other is not row:
             other.explicit_a = None if other.explicit_a in views.values() else other.explicit_a
@@ -265,7 +320,7 @@ def put_views(session: Session, study: Study, name: str, views: dict[str, str | 
 
 
 def move_run(session: Session, study: Study, run: StudyRun, site: str | None) -> None:
-    """Put a run into a site by hand, or take it out of every one it was put into (then the rules apply again)."""
+    """Put a run into a site by hand; None takes it out of every site, and the rules apply again."""
     for row in rows_of(session, study.id):
         row.explicit_a = None if row.explicit_a == run.uid else row.explicit_a
         row.explicit_b = None if row.explicit_b == run.uid else row.explicit_b
@@ -276,7 +331,7 @@ def move_run(session: Session, study: Study, run: StudyRun, site: str | None) ->
 
 
 def views_of(bound: Sequence[BoundSite]) -> dict[str, tuple[BoundSite, str]]:
-    """SOP Instance UID -> the site it is bound to and the view it is there."""
+    """Return site and view ("a" or "b") of each bound run, by SOP Instance UID."""
     found: dict[str, tuple[BoundSite, str]] = {}
     for site in bound:
         for view, uid in (("a", site.view_a), ("b", site.view_b)):

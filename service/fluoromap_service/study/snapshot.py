@@ -1,4 +1,4 @@
-"""A job's frozen input: everything its stages will read, so that later edits never touch a running job."""
+"""A job's frozen input: everything that its stages read, so that later edits never touch a running job."""
 
 from __future__ import annotations
 
@@ -6,22 +6,15 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from fluoromap.catheters import Catalogue, Catheter
+from fluoromap.catheters import Catalogue
 from fluoromap.contracts import View
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
+from fluoromap_service.study.catheters import StudyCatheter
 
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class CatheterSnapshot(_Frozen):
-    name: str
-    electrodes: int
-    spacing_mm: tuple[float, ...]
-    tip_mm: float
-    ring_mm: float
 
 
 class PluginSnapshot(_Frozen):
@@ -45,6 +38,7 @@ class GantrySnapshot(_Frozen):
     image_axes: tuple[tuple[int, int], tuple[int, int]]
 
     def camera(self) -> Camera:
+        """Return the camera of this gantry position."""
         return camera_from_gantry(Gantry(**self.model_dump()))
 
 
@@ -59,7 +53,7 @@ class CorrectedElectrode(_Frozen):
 
 
 class RunSnapshot(_Frozen):
-    """One run: the stored file, what is known of it, and the frames marked by hand (counted from 1)."""
+    """One run: hash of the stored file, its facts, its geometry, and the corrected frames (counted from 1)."""
 
     sha256: str
     facts: dict[str, Any]
@@ -68,7 +62,7 @@ class RunSnapshot(_Frozen):
 
 
 class SiteSnapshot(_Frozen):
-    """A site that is ready: two runs and a time."""
+    """A ready site: two runs and an activation time."""
 
     site: str
     lat_ms: float
@@ -77,6 +71,7 @@ class SiteSnapshot(_Frozen):
     view_b: str
 
     def run(self, view: View) -> str:
+        """Return the SOP Instance UID of a view."""
         return self.view_a if view == "a" else self.view_b
 
 
@@ -94,7 +89,7 @@ class Snapshot(_Frozen):
     """The whole input of a job."""
 
     study: str
-    catheters: tuple[CatheterSnapshot, ...]
+    catheters: tuple[StudyCatheter, ...]
     reference: str
     mapping: str
     segmenter: PluginSnapshot
@@ -107,14 +102,14 @@ class Snapshot(_Frozen):
     rejected: tuple[RejectedSiteSnapshot, ...]
 
     def catalogue(self) -> Catalogue:
-        return Catalogue(
-            tuple(Catheter(**catheter.model_dump()) for catheter in self.catheters), self.reference, self.mapping
-        )
+        """Return the catheters with their roles."""
+        return Catalogue(tuple(each.catheter() for each in self.catheters), self.reference, self.mapping)
 
     @property
     def views(self) -> tuple[View, ...]:
-        """The views that are followed."""
+        """The views that the job tracks frame by frame."""
         return ("a", "b") if self.view == "both" else (self.view,)
 
     def site(self, name: str) -> SiteSnapshot:
+        """Return the ready site of a name."""
         return next(site for site in self.sites if site.site == name)

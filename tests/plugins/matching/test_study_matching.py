@@ -1,14 +1,14 @@
-"""A whole study matched: names, pairs, phases, and what is told where they fail."""
+"""A whole study matched: names, pairs, phases, and the reasons where they fail."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap.contracts import FrameChains, MatchedSite, Segmentation, Silent
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
-from fluoromap.matching import SiteRuns, match_study
+from fluoromap.matching import SiteComparisons, SiteRuns, match_study, site_comparison
 from fluoromap.matching.two_view import triangulate_linear
 from fluoromap.reasons import Reason
 
@@ -281,3 +281,37 @@ def test_a_mark_that_contradicts_everything_else_is_told_not_dropped_silently(he
     matching = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent())
     told = {site.site for site in matching.sites if ("mapping", Reason.MARK_NOT_USED) in site.notes}
     assert told == {"S01"}
+
+
+def test_named_chains_carry_the_track_of_the_segmenter(heart) -> None:  # type: ignore[no-untyped-def]
+    runs = heart(seed=2).site("S01")
+    (site,) = match_study((runs,), DEFAULT_CATALOGUE, Silent()).sites
+    for segmentation, track in ((runs.segmentation_a, site.track_a), (runs.segmentation_b, site.track_b)):
+        assert segmentation is not None
+        for entry, observation in zip(segmentation.frames, track, strict=True):
+            by_track = {chain.track: chain for chain in entry.chains}
+            assert observation.chains
+            for chain in observation.chains:
+                np.testing.assert_array_equal(chain.pixels_uv, by_track[chain.track].pixels_uv)
+
+
+def test_stored_comparisons_change_nothing_but_the_work(heart, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    study = heart(seed=4)
+    sites = [replace(study.site(f"S{i:02d}"), content=i) for i in range(3)]
+    comparisons, compared = SiteComparisons(most=3), []
+
+    def counting(runs: SiteRuns, catalogue: Catalogue) -> object:
+        compared.append(runs.site)
+        return compare_views(runs, catalogue)
+
+    compare_views = site_comparison.compare_views
+    monkeypatch.setattr(site_comparison, "compare_views", counting)
+    first = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent(), comparisons)
+    sites[1] = replace(sites[1], content="corrected")
+    again = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent(), comparisons)
+    assert compared == ["S00", "S01", "S02", "S01"]
+    unstored = match_study(
+        tuple(replace(site, content=None) for site in sites), DEFAULT_CATALOGUE, Silent(), comparisons
+    )
+    assert len(compared) == 7
+    assert repr(first) == repr(again) == repr(unstored)

@@ -24,7 +24,7 @@ from fluoromap.monoplane.motion_covariance import FIXED, MotionCovariance, Motio
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.monoplane.view_electrodes import gather_electrodes
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
 from fluoromap.triangulator.uncertainty import UncertaintyParams

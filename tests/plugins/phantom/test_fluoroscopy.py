@@ -1,4 +1,4 @@
-"""Fairness of the rendered frames: what a segmenter meets is no kinder than it should be."""
+"""Fairness of the rendered frames: they are not easier to segment than they should be."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LAT, PA = APPEARANCES["LAT"], APPEARANCES["PA"]
 
 
 def _straight(name: str, tilt_deg: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)) -> tuple[Shaft, np.ndarray]:  # type: ignore[type-arg]
-    """A straight catheter through the isocentre plane of the frontal view, tip to the patient's feet."""
+    """Return a straight catheter in the isocentre plane of the frontal view, tip to the patient's feet."""
     tilt = np.radians(tilt_deg)
     heading = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     tip = np.array([centre[0], 0.0, centre[1]])
     radius, solid = (1.17, True) if name == "mapping" else (1.0, False)
     ends = (tip, tip + 30 * heading, tip + 60 * heading, tip + 90 * heading)
     shaft = Shaft.through(DEFAULT_CATALOGUE[name], radius, solid, *ends)
-    return shaft, shaft.moved(np.zeros((1, 3)))
+    return shaft, shaft.lines_mm(np.zeros((1, 3)))
 
 
 def _camera() -> Camera:
@@ -57,7 +57,7 @@ def test_no_seams_in_a_bent_shaft() -> None:
         DEFAULT_CATALOGUE["reference"], 1.0, False, tip, tip + np.array([0.0, 0.0, 25.0]), np.array([25.0, 0.0, 25.0]),
         np.array([30.0, 0.0, -60.0]),
     )  # fmt: skip
-    line = shaft.moved(np.zeros((1, 3)))
+    line = shaft.lines_mm(np.zeros((1, 3)))
     thickness = -np.log(transmission(_camera(), [shaft], [line], LAT))
     bare = line[0, 50:140]
     u, v = _camera().project(bare).T
@@ -124,7 +124,7 @@ def test_mean_counts_and_grey_level(contrast: str, photons: float) -> None:
 
 @pytest.mark.parametrize(("contrast", "low", "high"), [("LAT", 7.0, 30.0), ("PA", 1.0, 4.0)])
 def test_contrast_to_noise_of_a_ring(contrast: str, low: float, high: float) -> None:
-    """A 6F ring against the shadow beside it, on single pixels of rendered frames."""
+    """Compare a 6F ring with the shadow beside it, on single pixels of rendered frames."""
     ratios = []
     for seed in range(3):
         spec = StudySpec(seed, sites=2, frames=1, contrast=(contrast, contrast))  # type: ignore[arg-type]
@@ -183,7 +183,7 @@ def test_photon_counts_are_poisson(mean: float) -> None:
     assert abs(np.corrcoef(counts[1:], counts[:-1])[0, 1]) < 0.01
 
 
-def test_a_frame_is_the_same_in_whatever_order_it_is_asked_for() -> None:
+def test_a_frame_is_the_same_in_any_order_of_access() -> None:
     spec = StudySpec(8, sites=2, frames=6)
     once, again = simulate_study(spec), simulate_study(spec)
     wanted = once.sites[1].runs[0].frames[4]

@@ -1,4 +1,4 @@
-"""What a simulated study holds, and how its heart moves."""
+"""Content of a simulated study, and motion of its heart."""
 
 from __future__ import annotations
 
@@ -202,9 +202,9 @@ def test_gantry_error_moves_the_true_camera_but_not_the_header() -> None:
     for view in (0, 1):
         runs = [site.runs[view] for site in study.sites]
         assert all(run.gantry == spec.gantries[view] for run in runs)
-        told = camera_from_gantry(runs[0].gantry)
+        header = camera_from_gantry(runs[0].gantry)
         points = runs[0].truth.points_mm["mapping"][0]
-        error = np.linalg.norm(told.project(points) - runs[0].truth.camera.project(points), axis=1)
+        error = np.linalg.norm(header.project(points) - runs[0].truth.camera.project(points), axis=1)
         assert 0.5 < error.mean() < 60
         assert np.allclose(runs[0].truth.camera.matrix, runs[1].truth.camera.matrix)
 

@@ -41,7 +41,7 @@ def beating(request):
 
 
 def located(chains, truth_uv, within_px=5.0):
-    """catheter -> the chain whose electrodes all lie on its true ones."""
+    """Catheter -> the chain whose electrodes all lie on its true ones."""
     return {
         name: chain
         for name, points in truth_uv.items()

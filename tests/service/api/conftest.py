@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from finished_study import FinishedStudy, make_study
 
 from fluoromap_service.api.app import create_app
-from fluoromap_service.api.http import drawing_pool
+from fluoromap_service.api.http import file_pool
 
 
 @pytest.fixture(scope="session")
@@ -33,7 +33,7 @@ def study(client: TestClient) -> FinishedStudy:
 
 
 @pytest.fixture(scope="session")
-def drawing_processes() -> Iterator[None]:
-    """Ends the drawing processes with the session."""
+def file_processes() -> Iterator[None]:
+    """End the processes of the file pool with the session."""
     yield
-    drawing_pool.close()
+    file_pool.close()

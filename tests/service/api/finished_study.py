@@ -38,8 +38,8 @@ from fluoromap_service.store import files
 from fluoromap_service.store.codec import MEDIA_TYPE, encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
+from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
-    CatheterSnapshot,
     GantrySnapshot,
     PluginSnapshot,
     RejectedSiteSnapshot,
@@ -172,7 +172,7 @@ def make_study() -> FinishedStudy:
         snapshot = Snapshot(
             study=study.id,
             catheters=tuple(
-                CatheterSnapshot(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
+                StudyCatheter(name=name, electrodes=2, spacing_mm=(4.0,), tip_mm=2.0, ring_mm=1.0)
                 for name in ("reference", "mapping")
             ),
             reference="reference",
@@ -282,7 +282,8 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
 
 def followed_site(relative: bool = False) -> SiteTracks:
     """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
-    is not seen in frame 2."""
+    is not seen in frame 2.
+    """
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
     half = np.array([0.0, 0.0, 2.0])
     positions = np.zeros((FRAMES, 3, 3))

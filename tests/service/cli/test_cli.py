@@ -1,4 +1,4 @@
-"""The command line: what it answers, and with which exit code."""
+"""The command line: its answers and its exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Program = Callable[..., Answer]
 
 @pytest.fixture
 def fluoromap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Program]:
-    """Calls the program's entry point on an empty data folder."""
+    """Yield a function that calls the program's entry point on an empty data folder."""
     for name in [name for name in os.environ if name.startswith("FLUOROMAP_") and "BROKER" not in name]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(tmp_path / "data"))
@@ -50,7 +50,7 @@ def fluoromap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
     before = dict(os.environ)
     yield run
-    # Options of commands go into the environment; put back what was there.
+    # Commands store their options in the environment.
     os.environ.clear()
     os.environ.update(before)
     settings.cache_clear()

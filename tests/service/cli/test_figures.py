@@ -1,4 +1,4 @@
-"""The command ``fluoromap figures``: the files it writes and its exit codes; the figures themselves are tested elsewhere."""
+"""The command ``fluoromap figures``: its files and exit codes; tests of the science cover the figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _made(seed: int, context: Context) -> PaperFigures:
 
 @pytest.fixture
 def call(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int | str | None]:
-    monkeypatch.setattr("fluoromap.paper.figures.paper_figures", _made)
+    monkeypatch.setattr("fluoromap_service.cli.figures.paper_figures", _made)
 
     def run(*arguments: str) -> int | str | None:
         monkeypatch.setattr(sys, "argv", ["fluoromap", "figures", *arguments])
@@ -53,20 +53,20 @@ def test_files_are_written_replaced_and_named(
     assert (folder / "figures.json").read_bytes() != before
 
 
-def test_a_folder_that_cannot_be_written_is_told_in_one_sentence(
+def test_a_folder_that_cannot_be_written_is_reported_in_one_sentence(
     call: Callable[..., int | str | None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "file"
     file.write_text("")
     for folder in (file, file / "below"):
         assert call(str(folder)) == 1
-        told = capsys.readouterr().err
-        assert told.startswith("fluoromap: ")
-        assert told.count("\n") == 1
-        assert str(file) in told
+        shown = capsys.readouterr().err
+        assert shown.startswith("fluoromap: ")
+        assert shown.count("\n") == 1
+        assert str(file) in shown
 
 
-def test_a_refusal_is_told_in_a_sentence(
+def test_a_refusal_is_reported_in_a_sentence(
     call: Callable[..., int | str | None],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -75,11 +75,11 @@ def test_a_refusal_is_told_in_a_sentence(
     def refuse(seed: int, context: Context) -> PaperFigures:
         raise Refusal(Reason.TOO_FEW_SITES)
 
-    monkeypatch.setattr("fluoromap.paper.figures.paper_figures", refuse)
+    monkeypatch.setattr("fluoromap_service.cli.figures.paper_figures", refuse)
     assert call(str(tmp_path), "--seed", "8") == 1
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told.startswith("fluoromap: ")
-    assert "8" in told
+    shown = capsys.readouterr().err.splitlines()[-1]
+    assert shown.startswith("fluoromap: ")
+    assert "8" in shown
     assert not list(tmp_path.iterdir())
 
 

@@ -1,4 +1,4 @@
-"""The supervisor, with small programs in the place of API and worker."""
+"""The supervisor, with small programs instead of the API and the worker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import psutil
 import pytest
 
 from fluoromap_service.cli import supervisor
-from fluoromap_service.cli.supervisor import CommandFailed, Supervisor, check_port, free_port
+from fluoromap_service.cli.failures import CommandFailed
+from fluoromap_service.cli.supervisor import Supervisor, check_port, free_port
 
 PROGRAM = """#!/bin/sh
 echo $$ >> "$FLUOROMAP_DATA_DIR/$1.pids"
@@ -61,7 +62,7 @@ def test_dead_worker_is_replaced_and_its_children_are_not_left(running: Supervis
     os.kill(first, signal.SIGKILL)
 
     def replaced() -> bool:
-        running.tend()
+        running.check_children()
         return len(_pids(tmp_path, "worker")) == 2
 
     _eventually(replaced)
@@ -75,7 +76,7 @@ def test_worker_that_keeps_dying_is_restarted_ever_later(running: Supervisor, tm
     waits = set()
 
     def thrice() -> bool:
-        running.tend()
+        running.check_children()
         child = running._worker
         if child.restart_at is not None:
             waits.add(child.deaths)
@@ -89,14 +90,14 @@ def test_dead_api_is_an_error_that_says_where_to_look(running: Supervisor, tmp_p
     _eventually(lambda: bool(_pids(tmp_path, "api")))
     os.killpg(_pids(tmp_path, "api")[0], signal.SIGKILL)
 
-    def told() -> bool:
+    def reported() -> bool:
         try:
-            running.tend()
+            running.check_children()
         except CommandFailed as error:
             return str(tmp_path) in str(error)
         return False
 
-    _eventually(told)
+    _eventually(reported)
 
 
 def test_stop_leaves_nothing_running(running: Supervisor, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The command ``fluoromap tables``: its shapes and exit codes, on made-up rows."""
+"""The command ``fluoromap tables``: its formats and exit codes, on invented rows."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from fluoromap.paper.tables.rigid_helix import RigidPoseRow
 from fluoromap.paper.tables.table2 import RigidPhantomRow
 from fluoromap.paper.tables.whole_cycle import WholeCycleRow
 from fluoromap_service.cli import app, one_view_report
+from fluoromap_service.cli.progress import BarContext
 
 PAPER, OURS, FITTED = (DepthFigures(*(k + x for x in (0.1, 0.0, 0.2, 0.3))) for k in (1, 2, 3))
 TABLES = OneViewTables(
@@ -83,7 +84,9 @@ def _call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
 def test_figures_go_to_output_and_progress_to_the_other_stream(
     option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("fluoromap.paper.tables.one_view_tables", lambda context: (context.progress(1.0), TABLES)[1])
+    monkeypatch.setattr(
+        "fluoromap_service.cli.tables.one_view_tables", lambda context: (context.progress(1.0), TABLES)[1]
+    )
     assert _call(monkeypatch, *([option] if option else [])) in (None, 0)
     written = capsys.readouterr()
     assert "simulate, follow" in written.err
@@ -98,13 +101,13 @@ def test_wrong_usage_ends_with_2(arguments: tuple[str, ...], monkeypatch: pytest
 
 
 def test_all_tables_come_about(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The real thing, small; the solver that is tested elsewhere is left out."""
+    """The real computation, on few hearts and without the slowest solver, which has tests of its own."""
     monkeypatch.setattr(made, "whole_cycle_rows", lambda scenario, runs: iter(()))
     monkeypatch.setattr(made, "rigid_pose_rows", lambda: iter(()))
-    told: list[float] = []
-    tables = made.one_view_tables(one_view_report.Bar(told.append), hearts=(7,), sites=2, followed_sites=1)
+    reported: list[float] = []
+    tables = made.one_view_tables(BarContext(reported.append), hearts=(7,), sites=2, tracked_sites=1)
     assert len(tables.table1) == 96
     assert len(tables.table2) == 48
     assert {row.runs for row in tables.rigid_pose_phantom} == {1}
-    assert told == sorted(told)
+    assert reported == sorted(reported)
     json.loads(one_view_report.as_json(tables))

@@ -13,7 +13,7 @@ import pytest
 
 from fluoromap.geometry import Gantry
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap_service.cli.demonstration import accuracy, rms_mm
+from fluoromap_service.cli.accuracy import accuracy, rms_mm
 from fluoromap_service.dicom import open_frames, read_instance
 from fluoromap_service.dicom.simulation import STARTED, SimulatedFiles, simulate
 

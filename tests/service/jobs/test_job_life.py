@@ -16,8 +16,8 @@ from fluoromap_service.store import files
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import engine, reading, writing
 from fluoromap_service.store.models import Base, Event, Job, JobState, StageRow, StageState, Study
+from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
-    CatheterSnapshot,
     GantrySnapshot,
     PluginSnapshot,
     RunSnapshot,
@@ -35,7 +35,7 @@ def _snapshot(study: str, sites: int = 2) -> Snapshot:
     plan = PluginSnapshot(name="p", version="1", params={})
     run = RunSnapshot(sha256="0" * 64, facts={}, gantry=GANTRY, corrections={})
     catheters = tuple(
-        CatheterSnapshot(name=name, electrodes=4, spacing_mm=(3.5, 6, 3), tip_mm=2, ring_mm=1)
+        StudyCatheter(name=name, electrodes=4, spacing_mm=(3.5, 6, 3), tip_mm=2, ring_mm=1)
         for name in ("reference", "mapping")
     )
     plans = tuple(

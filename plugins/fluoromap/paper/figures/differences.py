@@ -1,4 +1,4 @@
-"""How far two maps of the same sites differ, in mm and in ms."""
+"""Differences between two maps of the same sites, in mm and in ms."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Vector = tuple[float, float, float]
 class SiteDifference:
     """One site in both maps.
 
-    frame : of the run, from 1. exact_mm, single_view_mm : the tip less the reference catheter's mean, LPS axes.
-    other_cycles_mm : single view as well, were only the cycles of other sites known. ray : unit vector from the source to
-    the true tip. distance_mm : single view from exact. along_ray_mm : the part of that difference along the ray, positive
-    away from the source. lateral_mm : its length across the ray.
+    frame : of the run, from 1. exact_mm, single_view_mm : the tip minus the reference catheter's mean, LPS axes.
+    other_cycles_mm : from the single view with only the cycles of other sites. ray : unit vector from the source to the
+    true tip. distance_mm : between single view and exact. along_ray_mm : the part of that difference along the ray,
+    positive away from the source. lateral_mm : its length across the ray.
     """
 
     site: str
@@ -40,10 +40,10 @@ class SiteDifference:
 class MapDifference:
     """Two maps of the same sites.
 
-    rms_mm, rms_along_ray_mm, rms_lateral_mm : over the sites. farthest_site : whose distance is the largest. median_ms,
-    largest_ms : of the absolute differences of time, see :func:`time_differences_ms`. covered_points, compared_points :
-    vertices of the exact map's covered wall, and how many of them the other map covers as well. other_cycles_rms_mm,
-    other_cycles_largest_mm : distances from exact, were only the cycles of other sites known.
+    rms_mm, rms_along_ray_mm, rms_lateral_mm : over the sites. farthest_site : the site with the largest distance.
+    median_ms, largest_ms : of the absolute differences of time, see :func:`time_differences_ms`. covered_points : vertices
+    of the exact map's covered wall. compared_points : those of them that the other map covers too. other_cycles_rms_mm,
+    other_cycles_largest_mm : distances from exact with only the cycles of other sites.
     """
 
     rms_mm: float
@@ -60,7 +60,7 @@ class MapDifference:
 
 
 def site_differences(sites: Sequence[SiteAtMoment]) -> tuple[SiteDifference, ...]:
-    """Each site's two positions and their difference along and across the ray."""
+    """Return each site's two positions and their difference along and across the ray."""
     differences = []
     for site in sites:
         apart = site.single_view.tip_mm - site.exact.tip_mm
@@ -83,7 +83,7 @@ def site_differences(sites: Sequence[SiteAtMoment]) -> tuple[SiteDifference, ...
 
 
 def map_difference(moment: MomentInView, sites: Sequence[SiteDifference]) -> MapDifference:
-    """Figures over the sites and the covered wall."""
+    """Return the difference of a moment's two maps over the sites and the covered wall."""
     farthest = max(sites, key=lambda site: site.distance_mm)
     times = time_differences_ms(moment.exact, moment.single_view)
     other_cycles = [float(np.linalg.norm(np.subtract(site.other_cycles_mm, site.exact_mm))) for site in sites]
@@ -103,8 +103,11 @@ def map_difference(moment: MomentInView, sites: Sequence[SiteDifference]) -> Map
 
 
 def time_differences_ms(first: ChamberMap, second: ChamberMap) -> Array:
-    """Absolute differences of time (k,) between covered vertices of the first map and the nearest points of the second
-    map's wall, where that is covered too."""
+    """Return the absolute differences of time (k,) between two maps.
+
+    Covered vertices of the first map are compared with the nearest points of the second map's wall, where it is covered
+    too.
+    """
     near = nearest_on_surface(second.vertices_mm, second.faces, first.vertices_mm[first.covered])
     interpolated = near.rows(second.faces, len(second.vertices_mm))
     both = interpolated @ (~second.covered).astype(np.float64) < 1e-9

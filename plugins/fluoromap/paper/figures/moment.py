@@ -1,8 +1,8 @@
-"""One moment of the cardiac cycle in one view of a simulated study: the sites as they are, and as that view tells them.
+"""One moment of the cardiac cycle in one view of a simulated study: exact and single-view positions of the sites.
 
-The electrodes' pixels are the true ones with noise, so that the figures show depth alone; names and the gantry are right.
-Everything else comes about as in a study: two runs of a site one after the other, their frames matched by cardiac phase,
-positions at diastole and the site's cycle from two views by the triangulator.
+The electrodes' pixels are the true ones with noise, so that the figures show depth alone. Names and the gantry are correct.
+Everything else is as in a study: the two runs of a site are taken one after the other, frames are matched by cardiac phase,
+and the triangulator computes positions at diastole and the site's cycle from two views.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from fluoromap.contracts import (
 )
 from fluoromap.geometry import Camera
 from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy
-from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.phantom.simulated_study import ACTIVATION_NOISE_MS
 from fluoromap.registry import DEFAULTS, build_fuser, build_monoplane, build_triangulator
 
@@ -41,11 +41,11 @@ _PHASES = 15
 class SiteAtMoment:
     """A site in the frame of one run that is nearest to the moment.
 
-    frame : from 0. exact, single_view : the mapping tip less the reference catheter's mean in that frame, as it truly is
-    and as the view tells it. other_cycles_mm : (3,) the same as the view would tell it, were only the cycles of other
-    sites known: as at a site with one usable view. exact_origin_mm, single_view_origin_mm : (3,) the reference's mean,
-    from the isocentre. ray : (3,) unit vector from the source to the true tip. tip_uv : (2,) the tip as seen. moved_mm :
-    distance of the true tip from its place at diastole, both less the reference.
+    frame : from 0. exact, single_view : true and single-view position of the mapping tip minus the reference catheter's
+    mean in that frame. other_cycles_mm : (3,) single-view position with only the cycles of other sites, as at a site with
+    one usable view. exact_origin_mm, single_view_origin_mm : (3,) the reference's mean, from the isocentre. ray : (3,)
+    unit vector from the source to the true tip. tip_uv : (2,) pixel of the tip. moved_mm : distance of the true tip from
+    its place at diastole, both minus the reference.
     """
 
     frame: int
@@ -70,11 +70,12 @@ class MomentInView:
     single_view: ChamberMap
 
     def site(self, name: str) -> SiteAtMoment:
+        """Return the site of this name."""
         return next(site for site in self.sites if site.exact.site == name)
 
 
 def farthest_phase(study: SimulatedStudy) -> float:
-    """The phase of the cycle at which the tips are, on average over sites and runs, farthest from their diastolic places."""
+    """Return the phase at which the tips are farthest from their diastolic places, averaged over sites and runs."""
     phases = np.concatenate([run.truth.phases for site in study.sites for run in site.runs])
     moved = np.concatenate([_moved_mm(study.catalogue, site, run) for site in study.sites for run in site.runs])
     part = np.minimum((phases * _PHASES).astype(np.int64), _PHASES - 1)
@@ -84,12 +85,12 @@ def farthest_phase(study: SimulatedStudy) -> float:
 
 
 def moment_in_views(study: SimulatedStudy, phase: float, context: Context) -> dict[PhantomView, MomentInView]:
-    """Both views at a phase of the cycle, every site followed in one view at a time by the default solver.
+    """Return both views at a phase of the cycle; the default solver tracks every site in one view at a time.
 
     Raises
     ------
     Refusal
-        Where a view cannot be followed or the sites make no map.
+        Where a view cannot be tracked or the sites make no map.
     """
     matched = {site.site: site for site in matched_sites(study, NOISE_PX, study.spec.seed)}
     triangulator = build_triangulator(DEFAULTS["triangulator"], {})
@@ -120,7 +121,7 @@ def _site_at(
     others: tuple[SiteCycle, ...], phase: float,
 ) -> SiteAtMoment:  # fmt: skip
     run = site.runs[view]
-    seen = MonoplaneView(
+    monoplane_view = MonoplaneView(
         site=site.name,
         view=run.view,
         camera=(located.camera_a, located.camera_b)[view],
@@ -133,22 +134,22 @@ def _site_at(
         others=() if located.cycle is not None else others,
     )
     solver = build_monoplane(DEFAULTS["monoplane"], {})
-    track = solver.track(seen, Silent())
+    track = solver.track(monoplane_view, Silent())
     frame = int(np.argmin(np.abs((run.truth.phases - phase + 0.5) % 1.0 - 0.5)))
     truth = {name: points[frame] for name, points in run.truth.points_mm.items()}
-    told = _electrodes_mm(catalogue, track, frame)
-    without_own = _electrodes_mm(catalogue, solver.track(replace(seen, cycle=None, others=others), Silent()), frame)
+    single_view = _electrodes_mm(catalogue, track, frame)
+    without_own_cycle = solver.track(replace(monoplane_view, cycle=None, others=others), Silent())
     tip = track.labels.index((catalogue.mapping, 1))
     covariance = track.covariance_mm2 if track.relative_covariance_mm2 is None else track.relative_covariance_mm2
-    ray = truth[catalogue.mapping][0] - seen.camera.source_world_mm
+    ray = truth[catalogue.mapping][0] - monoplane_view.camera.source_world_mm
     return SiteAtMoment(
         frame=frame,
-        exact=_mapped(catalogue, site, truth, np.zeros((3, 3))),
-        single_view=_mapped(catalogue, site, told, covariance[frame, tip]),
-        other_cycles_mm=_tip_mm(catalogue, without_own),
+        exact=_mapped_site(catalogue, site, truth, np.zeros((3, 3))),
+        single_view=_mapped_site(catalogue, site, single_view, covariance[frame, tip]),
+        other_cycles_mm=_tip_mm(catalogue, _electrodes_mm(catalogue, without_own_cycle, frame)),
         exact_origin_mm=truth[catalogue.reference].mean(axis=0),
-        single_view_origin_mm=told[catalogue.reference].mean(axis=0),
-        camera=seen.camera,
+        single_view_origin_mm=single_view[catalogue.reference].mean(axis=0),
+        camera=monoplane_view.camera,
         ray=ray / np.linalg.norm(ray),
         tip_uv=track.pixels_uv[frame, tip],
         moved_mm=float(_moved_mm(catalogue, site, run)[frame]),
@@ -156,18 +157,18 @@ def _site_at(
 
 
 def _electrodes_mm(catalogue: Catalogue, track: Track, frame: int) -> dict[str, Array]:
-    """Positions in one frame, catheter -> (electrodes, 3), tip first."""
+    """Return the positions in one frame, catheter -> (electrodes, 3), tip first."""
     at = dict(zip(track.labels, track.positions_mm[frame], strict=True))
     return {name: np.array([at[label] for label in sorted(at) if label[0] == name]) for name in catalogue.names}
 
 
 def _tip_mm(catalogue: Catalogue, electrodes_mm: dict[str, Array]) -> Array:
-    """The mapping tip (3,) less the reference catheter's mean."""
+    """Return the mapping tip (3,) minus the reference catheter's mean."""
     tip: Array = electrodes_mm[catalogue.mapping][0] - electrodes_mm[catalogue.reference].mean(axis=0)
     return tip
 
 
-def _mapped(
+def _mapped_site(
     catalogue: Catalogue, site: SimulatedSite, electrodes_mm: dict[str, Array], covariance_mm2: Array
 ) -> MappedSite:
     mapping = electrodes_mm[catalogue.mapping]
@@ -184,7 +185,7 @@ def _mapped(
 
 
 def _moved_mm(catalogue: Catalogue, site: SimulatedSite, run: SimulatedRun) -> Array:
-    """How far the true tip is from its place at diastole in each frame (n,), both less the reference catheter's mean."""
+    """Return the distance (n,) of the true tip from its place at diastole, both minus the reference catheter's mean."""
     points = run.truth.points_mm
     tip = points[catalogue.mapping][:, 0] - points[catalogue.reference].mean(axis=1)
     moved: Array = np.linalg.norm(tip - site.truth.relative_mm[catalogue.mapping][0], axis=1)

@@ -1,4 +1,4 @@
-"""Figures 3, 4 and 5 of the paper, made in one go."""
+"""Figures 3, 4 and 5 of the paper with their numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FRAMES, _FRAME_RATE_HZ = 60, 30.0
 
 @dataclass(frozen=True, slots=True)
 class ViewNumbers:
-    """What the figures of one view say. figures : their numbers in the paper."""
+    """Results of one view. figures : the figures' numbers in the paper."""
 
     view: PhantomView
     figures: tuple[int, ...]
@@ -35,10 +35,11 @@ class ViewNumbers:
 
 @dataclass(frozen=True, slots=True)
 class FigureNumbers:
-    """What all figures say.
+    """Results of all figures.
 
-    phase : of the cardiac cycle, 0 at an R wave, at the shown moment. moved_mm : mean distance of the tips from their
-    places at diastole then. shown_site : whose frames Figures 4 and 5 show. simulated_sites : how many there were.
+    phase : of the cardiac cycle at the shown moment, 0 at an R wave. moved_mm : mean distance of the tips from their
+    places at diastole at that moment. shown_site : the site of the frames in Figures 4 and 5. simulated_sites : number of
+    sites before any were rejected.
     """
 
     simulated: bool
@@ -56,13 +57,13 @@ class FigureNumbers:
 
 @dataclass(frozen=True, eq=False)
 class PaperFigures:
-    """The pictures by their number in the paper, RGB, and what they say."""
+    """The pictures, RGB, by their number in the paper, and their results."""
 
     pictures: Mapping[int, Picture]
     numbers: FigureNumbers
 
     def files(self) -> dict[str, bytes]:
-        """Name and content of every file: a PNG a figure, and ``figures.json``."""
+        """Return name and content of every file: a PNG for each figure, and ``figures.json``."""
         content = {f"figure{number}.png": encode_png(picture) for number, picture in self.pictures.items()}
         text = json.dumps(asdict(self.numbers), indent=2, allow_nan=False)
         return {**content, "figures.json": f"{text}\n".encode()}
@@ -74,23 +75,23 @@ def paper_figures(seed: int, context: Context, sites: int = SITES) -> PaperFigur
     Parameters
     ----------
     seed : int
-        Of the simulated heart.
+        Seed of the simulated heart.
     sites : int
         Mapping sites, 4 or more.
 
     Raises
     ------
     ValueError
-        When the heart does not fit into the views' fields.
+        Where the heart does not fit into the views' fields.
     Refusal
-        When a view cannot be followed or the sites make no map.
+        Where a view cannot be tracked or the sites make no map.
     """
     study = simulate_study(StudySpec(seed, sites, _FRAMES, _FRAME_RATE_HZ, heart="dog", contrast=("LAT", "PA")))
     phase = farthest_phase(study)
     context.progress(0.05)
     views = moment_in_views(study, phase, context)
     lateral, frontal = views["LAT"], views["PA"]
-    # Where the tip moved most, depth from one view has most to answer for.
+    # Single-view depth is hardest where the tip moves most.
     shown = max(lateral.sites, key=lambda site: site.moved_mm).exact.site
     numbers = FigureNumbers(
         simulated=True,
@@ -157,9 +158,9 @@ def _caption(shown: ViewNumbers, numbers: FigureNumbers) -> tuple[str, ...]:
         f"Moment: phase {numbers.phase:.2f} of the cycle, when the tips are farthest from their places at diastole "
         f"({numbers.moved_mm:.1f} mm on average). Positions are relative to the reference catheter; same colours above and "
         f"below; wall by {numbers.fuser}.",
-        f"The single view is given the positions at diastole and the cycle of the site's own two runs (the followed run is "
-        f"one of them), taken one after the other with up to {numbers.breathing_mm:g} mm of breathing. Given the cycles of "
-        f"other sites instead, as where a site has one usable view: RMS {of.other_cycles_rms_mm:.2f} mm, largest "
+        f"The single-view solver knows the positions at diastole and the cycle from the site's own two runs (the tracked run "
+        f"is one of them), taken one after the other with up to {numbers.breathing_mm:g} mm of breathing. With the cycles of "
+        f"other sites instead, as for a site with one usable view: RMS {of.other_cycles_rms_mm:.2f} mm, largest "
         f"{of.other_cycles_largest_mm:.2f} mm.",
         f"Simulated dog's heart, seed {numbers.seed}; {len(shown.sites)} of {numbers.simulated_sites} sites; electrodes at "
         f"their true pixels with {numbers.noise_px:g} px noise an axis (not segmented).",

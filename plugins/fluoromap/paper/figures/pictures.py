@@ -1,4 +1,4 @@
-"""The figures as pictures: one map above the other, with the same colours, and what to read off them."""
+"""The figures as pictures: one map above the other with the same colours, and a caption."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _OVERLAY_SCALE = 2
 _BORDER_PX = 16
 _TITLE_PX, _HEADING_PX, _CAPTION_PX = 26, 21, 19
 _LINE = 1.45
-"""Height of a line over the height of its letters."""
+"""Height of a line as a multiple of the height of its letters."""
 
 
 def shared_scale(first: ChamberMap, second: ChamberMap) -> Scale:
-    """Iso-time steps that cover both maps."""
+    """Return iso-time steps that cover both maps."""
     step = max(scale_of(first).step_ms, scale_of(second).step_ms)
     scales = [scale_of(chamber, step) for chamber in (first, second)]
     start, stop = min(scale.start_ms for scale in scales), max(scale.stop_ms for scale in scales)
@@ -32,7 +32,7 @@ def shared_scale(first: ChamberMap, second: ChamberMap) -> Scale:
 
 
 def in_space(moment: MomentInView) -> tuple[Picture, Picture]:
-    """Both maps in 3D at one scale: exact depth, single-view depth."""
+    """Draw both maps in 3D at one scale: exact depth, single-view depth."""
     times = shared_scale(moment.exact, moment.single_view)
     views = [view for view in VIEWS if view[0] in _DIRECTIONS]
     exact = draw_map_views(moment.exact, views, times=times)
@@ -40,7 +40,7 @@ def in_space(moment: MomentInView) -> tuple[Picture, Picture]:
 
 
 def on_frame(moment: MomentInView, site: str, stored: NDArray[np.uint16]) -> tuple[Picture, Picture]:
-    """Both maps fused on the frame of one site: exact depth, single-view depth. ``stored`` : the frame's pixels."""
+    """Draw both maps on the frame of one site: exact depth, single-view depth; ``stored`` are the frame's pixels."""
     shown = moment.site(site)
     low, high = np.percentile(stored, [0.5, 99.5])
     frame = np.clip((stored - low) / (high - low) * 255, 0, 255).round().astype(np.uint8)
@@ -53,7 +53,7 @@ def on_frame(moment: MomentInView, site: str, stored: NDArray[np.uint16]) -> tup
 
 
 def figure(title: str, parts: Sequence[tuple[str, Picture]], caption: Sequence[str]) -> Picture:
-    """Pictures one above the other, each under its heading, with a title on top and a caption below.
+    """Draw pictures one above the other, each under its heading, with a title on top and a caption below.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def figure(title: str, parts: Sequence[tuple[str, Picture]], caption: Sequence[s
         RGB.
     """
     width = max(picture.shape[1] for _, picture in parts)
-    lines = [line for sentence in caption for line in _wrapped(sentence, width)]
+    lines = [line for sentence in caption for line in _wrap(sentence, width)]
     heights = [_line_px(_HEADING_PX) + picture.shape[0] for _, picture in parts]
     height = _line_px(_TITLE_PX) + sum(heights) + len(lines) * _line_px(_CAPTION_PX)
     page = Image.new("RGB", (width + 2 * _BORDER_PX, height + (len(parts) + 2) * _BORDER_PX), BACKGROUND)
@@ -84,7 +84,7 @@ def _line_px(size: int) -> int:
     return round(_LINE * size)
 
 
-def _wrapped(sentence: str, width_px: int) -> Iterator[str]:
+def _wrap(sentence: str, width_px: int) -> Iterator[str]:
     line = ""
     for word in sentence.split():
         longer = f"{line} {word}".strip()

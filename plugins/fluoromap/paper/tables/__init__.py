@@ -1,7 +1,7 @@
-"""The paper's tables beside ours, and the same simulated data through the solvers that do find depth.
+"""The paper's tables beside ours, and the same simulated data through the solvers that estimate depth.
 
-Everything here is simulated. The helices are the paper's own simulation (Table 1); the hearts are the phantom's, in the
-paper's design of Table 2, whose own data are not public.
+Everything here is simulated. The helices are the paper's own simulation (Table 1). The hearts are the phantom's, in the
+design of the paper's Table 2, whose data are not public.
 """
 
 from fluoromap.paper.tables.depth_figures import DepthFigures

@@ -25,12 +25,12 @@ class DepthFigures:
 
 
 def depth_figures(errors_mm: Sequence[Array], axes: Sequence[Array]) -> DepthFigures:
-    """Figures over several sequences.
+    """Return the figures over several sequences.
 
     Parameters
     ----------
     errors_mm : sequence of ndarray, each shape (images, m, 3)
-        Position found less position true.
+        Found position minus true position, world.
     axes : sequence of ndarray, each shape (3,)
         Central ray of the view of each sequence.
     """

@@ -1,4 +1,4 @@
-"""The paper's simulation: a helix of 30 points that turns and moves a little from image to image."""
+"""The paper's simulation: a helix of 30 points that rotates and moves a little from image to image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SOURCE_ISOCENTRE_MM = 500.0
 _PRINCIPAL_PX = 256.0
 _SIZE_PX = 512
 # World to camera; right-handed, unlike a C-arm's view: the paper's simulation looks along +Z (AP) and +X (LAT).
-_TURNED: dict[HelixView, Array] = {
+_ROTATIONS: dict[HelixView, Array] = {
     "AP": np.eye(3),
     "LAT": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
 }
@@ -31,7 +31,7 @@ _TURNED: dict[HelixView, Array] = {
 
 @dataclass(frozen=True, slots=True)
 class Helix:
-    """Radius and length in mm, the world axis (0, 1, 2) it winds about, and its centre in mm."""
+    """A helix: radius and length in mm, the world axis (0, 1, 2) of its windings, and its centre in mm."""
 
     radius_mm: float
     length_mm: float
@@ -39,7 +39,7 @@ class Helix:
     centre_mm: tuple[float, float, float]
 
     def points_mm(self) -> Array:
-        """Shape (30, 3): right-handed, from phase 0, both ends included."""
+        """Return the points (30, 3), world mm: right-handed, from phase 0, both ends included."""
         along = np.linspace(0.0, 1.0, POINTS)
         angle = 2 * np.pi * TURNS * along
         points = np.empty((POINTS, 3))
@@ -53,19 +53,24 @@ HELICES: dict[HelixName, Helix] = {
     "H77": Helix(77.0, 250.0, 2, (-12.0, -15.0, -19.0)),
     "H18": Helix(18.0, 60.0, 1, (-12.0, -13.0, -16.0)),
 }
-"""The paper gives no helix. H77 was fitted to its Table 1 and lies outside the field of view; H18 would fit into a heart."""
+"""The paper describes no helix. H77 was fitted to its Table 1 and lies outside the field of view; H18 would fit into a
+heart."""
 
 
 def helix_camera(view: HelixView) -> Camera:
-    """Source 500 mm from the isocentre, detector 1000 mm from the source, 178 mm over 512 px, principal point (256, 256)."""
+    """Return the camera of a view.
+
+    The source is 500 mm from the isocentre and 1000 mm from the detector of 178 mm over 512 px; the principal point is
+    (256, 256).
+    """
     inner = np.array([[_FOCAL_PX, 0.0, _PRINCIPAL_PX], [0.0, _FOCAL_PX, _PRINCIPAL_PX], [0.0, 0.0, 1.0]])
-    return Camera(inner @ np.column_stack([_TURNED[view], [0.0, 0.0, _SOURCE_ISOCENTRE_MM]]), _SIZE_PX, _SIZE_PX)
+    return Camera(inner @ np.column_stack([_ROTATIONS[view], [0.0, 0.0, _SOURCE_ISOCENTRE_MM]]), _SIZE_PX, _SIZE_PX)
 
 
-def moved(points_mm: Array) -> Array:
-    """The points (m, 3) one image later, eq. (11) of the paper: X' = R X + T.
+def next_points_mm(points_mm: Array) -> Array:
+    """Move points (m, 3) to the next image, eq. (11) of the paper: X' = R X + T.
 
-    R turns by 0.5 degrees about X, then Y, then Z, round the isocentre; T is 1 mm along each axis.
+    R rotates by 0.5 degrees about X, then Y, then Z, around the isocentre; T is 1 mm along each axis.
     """
     turn = Rotation.from_euler("xyz", [STEP_DEG] * 3, degrees=True).as_matrix()
     later: Array = points_mm @ turn.T + STEP_MM
@@ -73,8 +78,8 @@ def moved(points_mm: Array) -> Array:
 
 
 def motion_mm(helix: Helix, images: int) -> Array:
-    """Points of a helix in successive images, shape (images, 30, 3)."""
+    """Return the points of a helix in successive images, shape (images, 30, 3)."""
     points = [helix.points_mm()]
     for _ in range(images - 1):
-        points.append(moved(points[-1]))
+        points.append(next_points_mm(points[-1]))
     return np.array(points)

@@ -1,4 +1,4 @@
-"""A moving helix as a monoplane solver gets it: every point an electrode, its position in the first image known."""
+"""A moving helix as a solver's input: every point is an electrode with a known position in the first image."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _EXACT_MM = 1e-5
 
 
 def helix_run(camera: Camera, points_mm: Array, pixels_uv: Array, noise_px: float = 0.5) -> MonoplaneView:
-    """A run of n images.
+    """Return a run of n images.
 
     Parameters
     ----------
     points_mm : ndarray, shape (n, m, 3)
-        The first image's are given away exactly.
+        World points; those of the first image are the exact a-priori positions.
     pixels_uv : ndarray, shape (n, m, 2)
-        As seen.
+        Pixels (u, v) of the points.
     noise_px : float
-        Their stated standard deviation.
+        Stated standard deviation of the pixels.
     """
     images, m = pixels_uv.shape[:2]
     electrodes = tuple(range(1, m + 1))

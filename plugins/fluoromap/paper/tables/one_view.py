@@ -1,4 +1,4 @@
-"""All tables of what one view tells, made in one go."""
+"""All tables of single-view tracking."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ HEARTS = (9401, 9402, 9403, 9404)
 """Seeds of the simulated hearts; no solver was tuned on them."""
 SITES = 20
 """Mapping sites of a heart, as in the paper."""
-FOLLOWED_SITES = 4
-"""Sites of a heart that are followed over the whole cycle; the others lend their cycles."""
+TRACKED_SITES = 4
+"""Sites of a heart that are tracked over the whole cycle; the others contribute their cycles."""
 BREATHING_MM = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class OneViewTables:
-    """The paper's two tables, and the same data through the other solvers. Everything is simulated.
+    """The paper's two tables, and the same simulated data through the other solvers.
 
     motion_prior : empty where that solver does not load.
     """
@@ -36,7 +36,7 @@ class OneViewTables:
 
 
 def one_view_tables(
-    context: Context, hearts: tuple[int, ...] = HEARTS, sites: int = SITES, followed_sites: int = FOLLOWED_SITES
+    context: Context, hearts: tuple[int, ...] = HEARTS, sites: int = SITES, tracked_sites: int = TRACKED_SITES
 ) -> OneViewTables:
     """Make all tables; the same arguments give the same figures.
 
@@ -44,8 +44,8 @@ def one_view_tables(
     ----------
     hearts : tuple of int
         Seeds of the simulated hearts of Table 2 and of the whole cycle.
-    sites, followed_sites : int
-        Sites of each heart, and how many of them are followed over the whole cycle.
+    sites, tracked_sites : int
+        Sites of each heart, and the number of them that are tracked over the whole cycle.
     """
     helices = table1()
     context.progress(0.05)
@@ -55,17 +55,17 @@ def one_view_tables(
     breathing: list[PhantomRun] = []
     for number, heart in enumerate(hearts, start=1):
         held += phantom_runs(heart, sites, sites, 0.0)
-        breathing += phantom_runs(heart, sites, followed_sites, BREATHING_MM)
+        breathing += phantom_runs(heart, sites, tracked_sites, BREATHING_MM)
         context.progress(0.25 + 0.25 * number / len(hearts))
     hearts_moved = table2(held)
     context.progress(0.6)
-    one_body = rigid_phantom_rows(_first_sites(held, followed_sites))
+    one_body = rigid_phantom_rows(_first_sites(held, tracked_sites))
     context.progress(0.65)
-    followed_held = _first_sites(held, followed_sites)
+    tracked_held = _first_sites(held, tracked_sites)
     scenarios: tuple[tuple[Scenario, list[PhantomRun]], ...] = (
-        ("breath held, own cycle", followed_held),
+        ("breath held, own cycle", tracked_held),
         ("breathing, own cycle", breathing),
-        ("breath held, cycles of other sites", [run.without_own_cycle(tuple(held)) for run in followed_held]),
+        ("breath held, cycles of other sites", [run.without_own_cycle(tuple(held)) for run in tracked_held]),
     )
     cycles: list[WholeCycleRow] = []
     for number, (scenario, runs) in enumerate(scenarios if _installed("motion-prior") else ()):
@@ -77,15 +77,15 @@ def one_view_tables(
 
 
 def _installed(solver: str) -> bool:
-    """A solver that does not load must not take the other tables with it."""
+    """Return True where a solver loads; the other tables must work without it."""
     return any((row.kind, row.name) == ("monoplane", solver) and row.error is None for row in plugins())
 
 
 def _first_sites(runs: list[PhantomRun], count: int) -> list[PhantomRun]:
-    """The runs of the first sites of each heart."""
+    """Return the runs of the first sites of each heart."""
     first: dict[int, list[str]] = {}
     for run in runs:
         names = first.setdefault(run.heart, [])
-        if run.seen.site not in names and len(names) < count:
-            names.append(run.seen.site)
-    return [run for run in runs if run.seen.site in first[run.heart]]
+        if run.solver_input.site not in names and len(names) < count:
+            names.append(run.solver_input.site)
+    return [run for run in runs if run.solver_input.site in first[run.heart]]

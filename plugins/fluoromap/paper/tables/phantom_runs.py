@@ -1,8 +1,8 @@
-"""Runs of simulated hearts as a monoplane solver gets them in a study, with their truth.
+"""Runs of simulated hearts as input of a monoplane solver, with their truth.
 
-The electrodes' pixels are the true ones with noise, so that the tables show the solvers alone; names, phases and the gantry
-are right. Everything else comes about as in a study: two runs of a site one after the other, their frames matched by
-cardiac phase, positions from two views by the triangulator.
+The electrodes' pixels are the true ones with noise, so that the tables show the solvers alone. Names, phases and the gantry
+are correct. Everything else is as in a study: the two runs of a site are taken one after the other, frames are matched by
+cardiac phase, and the triangulator computes positions from two views.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PhantomView = Literal["LAT", "PA"]
 CYCLE_IMAGES = 15
 """Images of one cardiac cycle, as in the paper."""
 NOISE_PX = 0.5
-# About as many as that in a cycle of a dog's heart. Were it exactly as many, all beats would show the same few phases.
+# A cycle of a dog's heart then has about 15 images. With exactly 15, all beats would show the same few phases.
 _FRAME_RATE_HZ = 30.0
 _FRAMES = 3 * CYCLE_IMAGES
 _DIASTOLE = 0.8
@@ -44,60 +44,64 @@ _DIASTOLE = 0.8
 class PhantomRun:
     """A simulated run.
 
-    seen : what a solver gets; its a-priori frame is diastolic and a whole cycle follows. truth_mm : (n, m, 3), the
-    electrodes in the order of ``seen.a_priori``.
+    solver_input : the solver's input; its a-priori frame is diastolic and a whole cycle follows. truth_mm : (n, m, 3) world, the
+    electrodes in the order of ``solver_input.a_priori``.
     """
 
     view: PhantomView
     heart: int
-    seen: MonoplaneView
+    solver_input: MonoplaneView
     truth_mm: Array
 
     @property
     def electrodes(self) -> tuple[tuple[str, int], ...]:
         """(catheter, electrode) of each row of the truth."""
-        return tuple((point.catheter, point.electrode) for point in self.seen.a_priori)
+        return tuple((point.catheter, point.electrode) for point in self.solver_input.a_priori)
 
     def part(self, images: int) -> PhantomRun:
-        """The images from the a-priori frame on."""
-        start = self.seen.a_priori_frame
-        kept = slice(start, start + images)
+        """Return this many images from the a-priori frame on."""
+        start = self.solver_input.a_priori_frame
+        frames = slice(start, start + images)
         observations = tuple(
-            replace(observation, frame=frame) for frame, observation in enumerate(self.seen.observations[kept])
+            replace(observation, frame=frame)
+            for frame, observation in enumerate(self.solver_input.observations[frames])
         )
-        seen = replace(
-            self.seen, frame_times_ms=self.seen.frame_times_ms[kept], observations=observations, a_priori_frame=0
+        solver_input = replace(
+            self.solver_input,
+            frame_times_ms=self.solver_input.frame_times_ms[frames],
+            observations=observations,
+            a_priori_frame=0,
         )
-        return replace(self, seen=seen, truth_mm=self.truth_mm[kept])
+        return replace(self, solver_input=solver_input, truth_mm=self.truth_mm[frames])
 
     def of_catheter(self, catheter: str) -> PhantomRun:
-        """The same run with one catheter in it."""
-        kept = [index for index, (name, _) in enumerate(self.electrodes) if name == catheter]
-        a_priori = tuple(self.seen.a_priori[index] for index in kept)
-        return replace(self, seen=replace(self.seen, a_priori=a_priori), truth_mm=self.truth_mm[:, kept])
+        """Return the same run with one catheter only."""
+        own = [index for index, (name, _) in enumerate(self.electrodes) if name == catheter]
+        a_priori = tuple(self.solver_input.a_priori[index] for index in own)
+        return replace(self, solver_input=replace(self.solver_input, a_priori=a_priori), truth_mm=self.truth_mm[:, own])
 
     def without_own_cycle(self, others: tuple[PhantomRun, ...]) -> PhantomRun:
-        """The same run at a site whose cycle is not known, only those of other sites of the heart."""
-        cycles = {run.seen.site: run.seen.cycle for run in others if run.heart == self.heart}
-        known = tuple(cycle for site, cycle in cycles.items() if site != self.seen.site and cycle is not None)
-        return replace(self, seen=replace(self.seen, cycle=None, others=known))
+        """Return the same run with the cycles of the heart's other sites instead of the site's own."""
+        cycles = {run.solver_input.site: run.solver_input.cycle for run in others if run.heart == self.heart}
+        known = tuple(cycle for site, cycle in cycles.items() if site != self.solver_input.site and cycle is not None)
+        return replace(self, solver_input=replace(self.solver_input, cycle=None, others=known))
 
 
 def phantom_runs(heart: int, sites: int, recorded: int, breathing_mm: float) -> tuple[PhantomRun, ...]:
-    """Both runs of sites of a simulated dog's heart, about 15 images a cycle.
+    """Simulate both runs of sites of a dog's heart, about 15 images a cycle.
 
     Parameters
     ----------
     heart : int
-        Seed of the heart; every heart is another.
+        Seed of the heart.
     sites, recorded : int
-        Sites of the heart, and how many of them, from the first on, are recorded.
+        Sites of the heart, and the number of them, from the first on, that are recorded.
     breathing_mm : float
-        Furthest shift of the heart to head or feet between runs; 0: the breath is held all through.
+        Largest shift of the heart to head or feet between runs; 0 means that the breath is held all the time.
     """
     study = simulate_study(StudySpec(heart, sites, _FRAMES, _FRAME_RATE_HZ, heart="dog", breathing_mm=breathing_mm))
     rng = np.random.default_rng([heart, sites])
-    matched = tuple(_matched(site, rng) for site in study.sites[:recorded])
+    matched = tuple(_matched_site(site, rng) for site in study.sites[:recorded])
     located: Triangulation = build_triangulator("maximum-likelihood", {}).triangulate(
         matched, study.catalogue, Silent()
     )
@@ -107,15 +111,15 @@ def phantom_runs(heart: int, sites: int, recorded: int, breathing_mm: float) -> 
         if pairs.site not in places:
             continue
         for run in site.runs:
-            seen = _seen(run, pairs, places[pairs.site], study.catalogue, located)
+            solver_input = _monoplane_view(run, pairs, places[pairs.site], study.catalogue, located)
             truth = np.stack(
-                [run.truth.points_mm[point.catheter][:, point.electrode - 1] for point in seen.a_priori], axis=1
+                [run.truth.points_mm[point.catheter][:, point.electrode - 1] for point in solver_input.a_priori], axis=1
             )
-            runs.append(PhantomRun("LAT" if run.view == "a" else "PA", heart, seen, truth))
+            runs.append(PhantomRun("LAT" if run.view == "a" else "PA", heart, solver_input, truth))
     return tuple(runs)
 
 
-def _matched(site: SimulatedSite, rng: np.random.Generator) -> MatchedSite:
+def _matched_site(site: SimulatedSite, rng: np.random.Generator) -> MatchedSite:
     tracks = tuple(_track(run, rng) for run in site.runs)
     diastole = tuple(track[_diastolic_frame(track)] for track in tracks)
     cameras = tuple(camera_from_gantry(run.gantry) for run in site.runs)
@@ -153,12 +157,12 @@ def _track(run: SimulatedRun, rng: np.random.Generator) -> tuple[Observation, ..
 
 
 def _diastolic_frame(track: tuple[Observation, ...]) -> int:
-    """The frame nearest to diastole that a whole cycle follows."""
-    phases = np.array([seen.phase for seen in track[: _FRAMES - CYCLE_IMAGES]], dtype=np.float64)
+    """Return the frame nearest to diastole after which a whole cycle remains."""
+    phases = np.array([observation.phase for observation in track[: _FRAMES - CYCLE_IMAGES]], dtype=np.float64)
     return int(np.argmin(np.abs(phases - _DIASTOLE)))
 
 
-def _seen(
+def _monoplane_view(
     run: SimulatedRun, site: MatchedSite, located: LocatedSite, catalogue: Catalogue, study: Triangulation
 ) -> MonoplaneView:
     lateral = run.view == "a"

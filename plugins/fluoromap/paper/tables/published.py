@@ -1,4 +1,4 @@
-"""What the paper prints, mm.
+"""Numbers printed in the paper, mm.
 
 P. Fallavollita, 3D/2D Registration of Mapping Catheter Images for Arrhythmia Interventional Assistance, IJCSI.
 """
@@ -13,7 +13,7 @@ DEPTH_STEPS_MM = (0, 1, 2, 3, 4, 5)
 IMAGES = (3, 4, 5, 6)
 """Lengths of the sequences of Table 1; Table 2 has the first and the last."""
 
-# A row a dz; in it (mean, min, max, 3D RMS) for 3, 4, 5 and 6 images.
+# A row for each dz; in it (mean, min, max, 3D RMS) for 3, 4, 5 and 6 images.
 _TABLE_1: dict[HelixView, tuple[tuple[tuple[float, float, float, float], ...], ...]] = {
     "LAT": (
         ((2.188, .148, 3.840, 3.976), (1.752, .094, 3.837, 4.527), (1.463, .003, 3.951, 5.152), (1.150, .015, 3.373, 5.324)),
@@ -34,18 +34,18 @@ _TABLE_1: dict[HelixView, tuple[tuple[tuple[float, float, float, float], ...], .
 }  # fmt: skip
 
 LATERAL_OFFSETS_MM = (0.0, 1.44, 1.95, 1.52, 0.63, -0.49)
-"""Common depth of all points of image 1 to 6 that was fitted to the lateral half of Table 1; not in the paper, which speaks
-of errors of up to 2 mm added to the coordinates without saying which."""
+"""Common depth of all points of images 1 to 6, fitted to the lateral half of Table 1. It is not in the paper, which mentions
+errors of up to 2 mm added to the coordinates without giving them."""
 
-# Of Table 2 no row is known here, only how its 3D RMS and mean are related at dz = 5 for (3, 6) images.
+# No row of Table 2 is known here, only the ratio of its 3D RMS to its mean at dz = 5 for (3, 6) images.
 _TABLE_2_RATIOS = {"LAT": {3: 1.587, 6: 3.357}, "PA": {3: 1.591, 6: 3.340}}
 
 
 def table_1(view: HelixView, dz_mm: int, images: int) -> DepthFigures:
-    """The paper's Table 1 for a view, a start value and a number of images."""
+    """Return the paper's Table 1 for a view, a start value and a number of images."""
     return DepthFigures(*_TABLE_1[view][DEPTH_STEPS_MM.index(dz_mm)][IMAGES.index(images)])
 
 
 def table_2_rms_over_mean(view: str, dz_mm: int, images: int) -> float | None:
-    """3D RMS over mean of the paper's Table 2; None where it is not known."""
+    """Return 3D RMS over mean of the paper's Table 2; None where it is not known."""
     return _TABLE_2_RATIOS[view].get(images) if dz_mm == 5 else None

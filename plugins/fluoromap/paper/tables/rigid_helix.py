@@ -1,4 +1,4 @@
-"""The helices through ``rigid-pose``: what one view can tell of a body that is rigid and known."""
+"""The helices through ``rigid-pose``: accuracy of one view for a known rigid body."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SEED = 77
 class RigidPoseRow:
     """3D RMS over points and all images but the first, over several runs, and its Cramer-Rao bound.
 
-    start_value_spread_mm : how far the answers of the start values dz = 0 and 5 mm lie apart at most, in the first run.
+    start_value_spread_mm : largest difference between the results of the start values dz = 0 and 5 mm, in the first run.
     """
 
     helix: HelixName
@@ -38,7 +38,7 @@ class RigidPoseRow:
 
 
 def rigid_pose_rows() -> Iterator[RigidPoseRow]:
-    """Rows for both helices and views, without and with pixel noise."""
+    """Yield rows for both helices and views, without and with pixel noise."""
     rng = np.random.default_rng(_SEED)
     for name, helix in HELICES.items():
         for view in ("LAT", "AP"):
@@ -56,28 +56,28 @@ def _row(
     for number in range(runs):
         pixels = camera.project(truth) + noise_px * rng.normal(size=(images, truth.shape[1], 2))
         run = helix_run(camera, truth, pixels, NOISE_PX)
-        found = _followed(run, DEPTH_STEPS_MM[0])
+        found = _positions_mm(run, DEPTH_STEPS_MM[0])
         squares.append(((found - truth)[1:] ** 2).sum(axis=2).mean())
         if number == 0:
-            spread = float(np.abs(found - _followed(run, DEPTH_STEPS_MM[-1])).max())
+            spread = float(np.abs(found - _positions_mm(run, DEPTH_STEPS_MM[-1])).max())
     return RigidPoseRow(
         name, view, noise_px, images, float(np.sqrt(np.mean(squares))), _bound_mm(camera, truth[1:], noise_px), spread
     )
 
 
-def _followed(run: MonoplaneView, dz_mm: int) -> Array:
+def _positions_mm(run: MonoplaneView, dz_mm: int) -> Array:
     return (
         build_monoplane("rigid-pose", {"depth_step_mm": dz_mm, "known_rigid": True}).track(run, Silent()).positions_mm
     )
 
 
 def _bound_mm(camera: Camera, truth_mm: Array, noise_px: float) -> float:
-    """RMS of the Cramer-Rao bound over points and images; it is proportional to the noise."""
+    """Return the RMS Cramer-Rao bound over points and images; it is proportional to the noise."""
     m = truth_mm.shape[1]
     one_px = np.broadcast_to(np.eye(2), (m, 2, 2))
-    seen = np.ones(m, dtype=np.bool_)
+    visible = np.ones(m, dtype=np.bool_)
     traces = [
-        np.trace(pose_covariance_mm2(camera, points, points.mean(axis=0), one_px, seen), axis1=1, axis2=2)
+        np.trace(pose_covariance_mm2(camera, points, points.mean(axis=0), one_px, visible), axis1=1, axis2=2)
         for points in truth_mm
     ]
     return noise_px * float(np.sqrt(np.mean(traces)))

@@ -18,7 +18,7 @@ _VIEWS: tuple[HelixView, ...] = ("LAT", "AP")
 
 @dataclass(frozen=True, slots=True)
 class Table1Row:
-    """A row of Table 1. fitted : of H77 in the lateral view, with depths added that were fitted to the paper's figures."""
+    """A row of Table 1. fitted : for H77 in the lateral view, with added depths that were fitted to the paper's figures."""
 
     view: HelixView
     helix: HelixName
@@ -30,7 +30,7 @@ class Table1Row:
 
 
 def table1() -> tuple[Table1Row, ...]:
-    """Table 1 on both helices, without pixel noise; in the paper's order, helix by helix."""
+    """Return Table 1 on both helices, without pixel noise; in the paper's order, helix by helix."""
     rows = []
     for name, helix in HELICES.items():
         for view in _VIEWS:
@@ -49,16 +49,16 @@ def table1() -> tuple[Table1Row, ...]:
 
 
 def _by_images(view: HelixView, points_mm: Array) -> dict[tuple[int, int], DepthFigures]:
-    """Figures for each start value and number of images."""
+    """Return the figures for each start value and number of images."""
     camera = helix_camera(view)
     run = helix_run(camera, points_mm, camera.project(points_mm))
     figures = {}
     for dz in DEPTH_STEPS_MM:
-        error = _followed(run, dz) - points_mm
+        error = _positions_mm(run, dz) - points_mm
         for images in IMAGES:
             figures[dz, images] = depth_figures([error[:images]], [camera.axis_world])
     return figures
 
 
-def _followed(run: MonoplaneView, dz_mm: int) -> Array:
+def _positions_mm(run: MonoplaneView, dz_mm: int) -> Array:
     return build_monoplane("a-priori-lm", {"depth_step_mm": dz_mm}).track(run, Silent()).positions_mm

@@ -17,7 +17,7 @@ from fluoromap.paper.tables.published import DEPTH_STEPS_MM, IMAGES, table_2_rms
 from fluoromap.registry import build_monoplane
 
 Electrodes = Literal["12", "mapping"]
-"""All 12, or the four of the mapping catheter."""
+"""All 12 electrodes, or the four of the mapping catheter."""
 
 PHANTOM_VIEWS: tuple[PhantomView, ...] = ("LAT", "PA")
 _IMAGES = (min(IMAGES), max(IMAGES))
@@ -27,8 +27,8 @@ _IMAGES = (min(IMAGES), max(IMAGES))
 class Table2Row:
     """A row of Table 2.
 
-    electrodes : all 12, or the tip of the mapping catheter alone. paper : None, for its figures are not known here.
-    paper_rms_over_mean : of the 12 electrodes, known for dz = 5 mm alone.
+    electrodes : all 12, or the tip of the mapping catheter alone. paper : None, because its figures are not known here.
+    paper_rms_over_mean : of the 12 electrodes, known only for dz = 5 mm.
     """
 
     view: PhantomView
@@ -45,9 +45,9 @@ class Table2Row:
 class RigidPhantomRow:
     """Runs of hearts as one rigid body.
 
-    electrodes : all 12, or the mapping catheter alone. bound_mm : RMS of the Cramer-Rao bound, were they a rigid body.
-    rms_mm : of the runs that were answered; None where all were refused. refused : runs, with the reason's code and, as an
-    example, the first sentence it came with.
+    electrodes : all 12, or the mapping catheter alone. bound_mm : RMS Cramer-Rao bound of a rigid body. rms_mm : over the
+    runs that were not refused; None where all were. refused : number of refused runs. reason, example : their most frequent
+    reason code and its first message.
     """
 
     view: PhantomView
@@ -63,14 +63,14 @@ class RigidPhantomRow:
 
 
 def table2(runs: Sequence[PhantomRun]) -> tuple[Table2Row, ...]:
-    """Table 2 over the given runs, from the diastolic image on."""
+    """Return Table 2 over the given runs, from the diastolic image on."""
     rows: list[Table2Row] = []
     for view in PHANTOM_VIEWS:
         shown = [run.part(max(_IMAGES)) for run in runs if run.view == view]
-        axes = [run.seen.camera.axis_world for run in shown]
+        axes = [run.solver_input.camera.axis_world for run in shown]
         for dz in DEPTH_STEPS_MM:
             solver = build_monoplane("a-priori-lm", {"depth_step_mm": dz})
-            errors = [solver.track(run.seen, Silent()).positions_mm - run.truth_mm for run in shown]
+            errors = [solver.track(run.solver_input, Silent()).positions_mm - run.truth_mm for run in shown]
             of_tip = [error[:, _tip(run)] for error, run in zip(errors, shown, strict=True)]
             for images in _IMAGES:
                 figures = depth_figures([error[:images] for error in errors], axes)
@@ -84,15 +84,15 @@ def table2(runs: Sequence[PhantomRun]) -> tuple[Table2Row, ...]:
 
 
 def _tip(run: PhantomRun) -> list[int]:
-    return [run.electrodes.index((run.seen.catalogue.mapping, 1))]
+    return [run.electrodes.index((run.solver_input.catalogue.mapping, 1))]
 
 
 def rigid_phantom_rows(runs: Sequence[PhantomRun]) -> tuple[RigidPhantomRow, ...]:
-    """The runs through ``rigid-pose``: 3 and 6 images, and a whole cycle."""
+    """Track the runs by ``rigid-pose``: 3 and 6 images, and a whole cycle."""
     rows = []
     for view in PHANTOM_VIEWS:
         shown = [run for run in runs if run.view == view]
-        mapping_alone = [run.of_catheter(run.seen.catalogue.mapping) for run in shown]
+        mapping_alone = [run.of_catheter(run.solver_input.catalogue.mapping) for run in shown]
         lengths = (*_IMAGES, CYCLE_IMAGES)
         rows += [_rigid(view, "12", images, [run.part(images) for run in shown]) for images in lengths]
         rows += [_rigid(view, "mapping", images, [run.part(images) for run in mapping_alone]) for images in lengths]
@@ -104,7 +104,7 @@ def _rigid(view: PhantomView, electrodes: Electrodes, images: int, runs: Sequenc
     squares: list[float] = []
     for run in runs:
         try:
-            track = build_monoplane("rigid-pose", {}).track(run.seen, Silent())
+            track = build_monoplane("rigid-pose", {}).track(run.solver_input, Silent())
         except Refusal as refusal:
             refusals.append(refusal)
         else:
@@ -120,9 +120,9 @@ def _rigid(view: PhantomView, electrodes: Electrodes, images: int, runs: Sequenc
 
 
 def _bound_mm2(run: PhantomRun) -> float:
-    """Mean square of the Cramer-Rao bound of the electrodes where they are in the first image."""
+    """Return the mean square of the Cramer-Rao bound of the electrodes in the first image."""
     points: Array = run.truth_mm[0]
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(points), 2, 2))
-    seen = np.ones(len(points), dtype=np.bool_)
-    covariance = pose_covariance_mm2(run.seen.camera, points, points.mean(axis=0), noise, seen)
+    visible = np.ones(len(points), dtype=np.bool_)
+    covariance = pose_covariance_mm2(run.solver_input.camera, points, points.mean(axis=0), noise, visible)
     return float(np.trace(covariance, axis1=1, axis2=2).mean())

@@ -1,4 +1,4 @@
-"""Simulated hearts over about a whole cardiac cycle from one view, solver by solver."""
+"""Simulated hearts over about a whole cardiac cycle from one view, for each solver."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _GOOD_MM = 2.0
 
 @dataclass(frozen=True, slots=True)
 class WholeCycleRow:
-    """3D RMS from the image after the a-priori one to the end of the cycle, and its parts along and across the rays.
+    """3D RMS from the image after the a-priori image to the end of the cycle, and its parts along and across the rays.
 
-    refused : runs that got no answer; they count in none of the figures, which are None where all are refused.
-    relative_rms_mm : of positions less the reference catheter's mean, the reference catheter left out.
-    largest_heart_rms_mm : of the worst heart. images_below_2_mm : of the cycle's images, how many have an RMS below 2 mm
-    over all runs.
+    refused : number of refused runs. They count in none of the figures, which are None where all runs are refused.
+    relative_rms_mm : of positions minus the reference catheter's mean, without the reference catheter itself.
+    largest_heart_rms_mm : of the worst heart. images_below_2_mm : number of the cycle's images with an RMS below 2 mm over
+    all runs.
     """
 
     scenario: Scenario
@@ -48,7 +48,7 @@ class WholeCycleRow:
 
 @dataclass(frozen=True, eq=False)
 class _Errors:
-    """Errors (images, m, 3) of one run's answer, in mm, NaN where there is no position, and the true rays (images, m, 3)."""
+    """Errors (images, m, 3) of one run's track, mm, NaN without a position, and the true rays (images, m, 3)."""
 
     heart: int
     absolute: Array
@@ -58,20 +58,20 @@ class _Errors:
 
 
 def whole_cycle_rows(scenario: Scenario, runs: Sequence[PhantomRun]) -> Iterator[tuple[WholeCycleRow, ...]]:
-    """The runs through the paper's method (dz = 0) and ``motion-prior``; rows of one view after the other.
+    """Track the runs by the paper's method (dz = 0) and ``motion-prior``; yield the rows of each view.
 
     Raises
     ------
     UnknownPlugin
-        When one of the two is not installed or does not load.
+        Where one of the two is not installed or does not load.
     """
     paper, prior = build_monoplane("a-priori-lm", {}), build_monoplane("motion-prior", {})
     for view in PHANTOM_VIEWS:
         found: dict[Answer, list[_Errors]] = {"a-priori-lm": [], "motion-prior baseline": [], "motion-prior": []}
         for run in (run.part(CYCLE_IMAGES) for run in runs if run.view == view):
-            track = _followed(paper, run)
+            track = _track(paper, run)
             found["a-priori-lm"].append(_errors(run, track, None if track is None else track.positions_mm))
-            track = _followed(prior, run)
+            track = _track(prior, run)
             found["motion-prior baseline"].append(_errors(run, track, None if track is None else track.baseline_mm))
             found["motion-prior"].append(_errors(run, track, None if track is None else track.positions_mm))
         yield tuple(
@@ -81,9 +81,9 @@ def whole_cycle_rows(scenario: Scenario, runs: Sequence[PhantomRun]) -> Iterator
         )
 
 
-def _followed(solver: MonoplaneSolver, run: PhantomRun) -> Track | None:
+def _track(solver: MonoplaneSolver, run: PhantomRun) -> Track | None:
     try:
-        return solver.track(run.seen, Silent())
+        return solver.track(run.solver_input, Silent())
     except Refusal:
         return None
 
@@ -93,28 +93,28 @@ def _errors(run: PhantomRun, track: Track | None, positions_mm: Array | None) ->
     if track is not None and positions_mm is not None:
         absolute = np.where(track.located[..., None], positions_mm - run.truth_mm, np.nan)[1:]
     catheters = [name for name, _ in run.electrodes]
-    reference = [name == run.seen.catalogue.reference for name in catheters]
+    reference = [name == run.solver_input.catalogue.reference for name in catheters]
     relative = absolute - absolute[:, reference].mean(axis=1, keepdims=True)
     relative[:, reference] = np.nan
-    rays = run.truth_mm[1:] - run.seen.camera.source_world_mm
+    rays = run.truth_mm[1:] - run.solver_input.camera.source_world_mm
     rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
-    mapping = tuple(k for k, name in enumerate(catheters) if name == run.seen.catalogue.mapping)
+    mapping = tuple(k for k, name in enumerate(catheters) if name == run.solver_input.catalogue.mapping)
     return _Errors(run.heart, absolute, relative, rays, mapping)
 
 
 def _row(
     scenario: Scenario, view: PhantomView, electrodes: Electrodes, solver: Answer, errors: Sequence[_Errors]
 ) -> WholeCycleRow:
-    def chosen(one: _Errors) -> list[int]:
-        return list(one.mapping) if electrodes == "mapping" else list(range(one.absolute.shape[1]))
+    def columns(run: _Errors) -> list[int]:
+        return list(run.mapping) if electrodes == "mapping" else list(range(run.absolute.shape[1]))
 
-    absolute = np.array([one.absolute[:, chosen(one)] for one in errors])
-    relative = np.array([one.relative[:, chosen(one)] for one in errors])
-    rays = np.array([one.rays[:, chosen(one)] for one in errors])
+    absolute = np.array([run.absolute[:, columns(run)] for run in errors])
+    relative = np.array([run.relative[:, columns(run)] for run in errors])
+    rays = np.array([run.rays[:, columns(run)] for run in errors])
     along = (absolute * rays).sum(axis=-1)
     lateral = absolute - along[..., None] * rays
     squares = (absolute**2).sum(axis=-1)
-    hearts = np.array([one.heart for one in errors])
+    hearts = np.array([run.heart for run in errors])
     by_heart = [_root_mean(squares[hearts == heart]) for heart in sorted(set(hearts.tolist()))]
     by_image = [_root_mean(squares[:, image]) for image in range(squares.shape[1])]
     return WholeCycleRow(
@@ -126,7 +126,7 @@ def _row(
         images=CYCLE_IMAGES,
         hearts=len(by_heart),
         runs=len(errors),
-        refused=sum(bool(np.isnan(one.absolute).all()) for one in errors),
+        refused=sum(bool(np.isnan(run.absolute).all()) for run in errors),
         rms_mm=_root_mean(squares),
         along_ray_mm=_root_mean(along**2),
         lateral_mm=_root_mean((lateral**2).sum(axis=-1)),

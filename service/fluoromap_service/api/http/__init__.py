@@ -1,1 +1,1 @@
-"""What every route shares: problems, paging, entity tags, idempotency, access."""
+"""Parts that every route shares: problems, paging, entity tags, idempotency, access."""

@@ -1,4 +1,4 @@
-"""How much of a request is taken in, whether or not it says its length."""
+"""The largest request body that the service reads."""
 
 from __future__ import annotations
 
@@ -11,25 +11,16 @@ from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 
 TEXT_BYTES = 16 * 2**20
-"""Largest JSON or CSV body: those are held in memory."""
+"""Largest JSON or CSV body: the service holds it in memory."""
 
 _STREAMED = ("multipart/", "application/dicom")
 
 
-class TooLarge(HTTPException):
-    """The body goes on after the limit. An HTTPException, as FastAPI calls any other error of reading a body malformed."""
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(413, too_large(limit).detail)
-        self.problem = too_large(limit)
-
-
-def too_large(limit: int) -> Problem:
-    return Problem(413, "too_large", f"The request body is larger than {limit} bytes; send fewer files at a time.")
-
-
 class BodyLimit:
-    """ASGI middleware that stops reading a body at the limit for its kind."""
+    """ASGI middleware that stops reading a body at the limit for its content type.
+
+    It counts the bytes that arrive, so a wrong or missing Content-Length does not matter.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -44,16 +35,21 @@ class BodyLimit:
             limit = min(limit, TEXT_BYTES)
         declared = headers.get("content-length", "")
         if declared.isdecimal() and int(declared) > limit:
-            await answer(too_large(limit))(scope, receive, send)
+            await answer(_too_large(limit))(scope, receive, send)
             return
-        taken = 0
+        received_bytes = 0
 
-        async def counted() -> Message:
-            nonlocal taken
+        async def receive_up_to_limit() -> Message:
+            nonlocal received_bytes
             message = await receive()
-            taken += len(message.get("body", b""))
-            if taken > limit:
-                raise TooLarge(limit)
+            received_bytes += len(message.get("body", b""))
+            if received_bytes > limit:
+                # FastAPI reports every other exception during the reading of a body as 400 "malformed".
+                raise HTTPException(413, _too_large(limit).detail)
             return message
 
-        await self._app(scope, counted, send)
+        await self._app(scope, receive_up_to_limit, send)
+
+
+def _too_large(limit: int) -> Problem:
+    return Problem(413, "too_large", f"The request body is larger than {limit} bytes; send fewer files at a time.")

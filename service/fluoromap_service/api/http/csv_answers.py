@@ -1,4 +1,4 @@
-"""Answers as CSV, where the client prefers that to JSON."""
+"""CSV answers, for clients that prefer CSV to JSON."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MEDIA_TYPE = "text/csv"
 
 
 def wants_csv(request: Request) -> bool:
-    """Whether the Accept header names text/csv and prefers it to application/json (RFC 9110 section 12.5.1)."""
+    """Return whether the Accept header prefers text/csv to application/json (RFC 9110 section 12.5.1)."""
     quality = {"text/csv": 0.0, "application/json": 0.0}
     for entry in request.headers.get("accept", "").lower().split(","):
         media, *parameters = (part.strip() for part in entry.split(";"))
@@ -30,7 +30,7 @@ def _number(text: str) -> float:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """CSV with a header line; None becomes an empty field. Lines end in CRLF (RFC 4180)."""
+    """Return CSV with a header line; None becomes an empty field. Lines end in CRLF (RFC 4180)."""
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(columns)
@@ -39,11 +39,12 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def csv_response(text: str, file_name: str) -> Response:
+    """Return CSV text as a download."""
     headers = {"Content-Disposition": f'attachment; filename="{file_name}"', "Vary": "Accept"}
     return Response(text, media_type="text/csv; charset=utf-8", headers=headers)
 
 
 def csv_entry(description: str, example: str) -> dict[str, Any]:
-    """OpenAPI content of a CSV answer."""
+    """Return the OpenAPI content of a CSV answer."""
     schema = {"type": "string", "description": description}
     return {MEDIA_TYPE: {"schema": schema, "example": example}}

@@ -1,4 +1,4 @@
-"""Entity tags: answers that did not change are not sent again (RFC 9110 section 13.1.2)."""
+"""Entity tags: the service does not send an unchanged answer again (RFC 9110 section 13.1.2)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from fastapi import Request, Response
 from fastapi.responses import FileResponse
 
 
-def known(request: Request, etag: str) -> bool:
-    """Whether the client holds that version already; compared weakly, as If-None-Match demands."""
+def is_known(request: Request, etag: str) -> bool:
+    """Return whether the client has this version already.
+
+    The comparison is weak, as If-None-Match demands (RFC 9110 section 8.8.3.2).
+    """
     header = request.headers.get("if-none-match")
     if header is None:
         return False
@@ -18,16 +21,17 @@ def known(request: Request, etag: str) -> bool:
 
 
 def not_modified(etag: str) -> Response:
+    """Return 304 with the entity tag."""
     return Response(status_code=304, headers={"ETag": etag})
 
 
 def file_response(
     request: Request, path: Path, sha256: str, media_type: str, file_name: str, *, inline: bool = False
 ) -> Response:
-    """A stored file with its hash as the tag, or 304."""
+    """Return a stored file with its hash as entity tag, or 304."""
     etag = f'"{sha256}"'
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-    if known(request, etag):
+    if is_known(request, etag):
         return Response(status_code=304, headers=headers)
     disposition = "inline" if inline else "attachment"
     return FileResponse(

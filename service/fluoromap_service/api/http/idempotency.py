@@ -1,7 +1,7 @@
-"""``Idempotency-Key``: the same key and content gives the same answer for 24 hours, other content is refused.
+"""``Idempotency-Key``: the same key and content gives the same answer for 24 hours; other content is an error.
 
-The answer is stored in the transaction that does the work: either both exist or neither, and of two requests at the same
-time the second waits for the first one's transaction and repeats its answer.
+The transaction that does the work also stores the answer, so both exist or neither does. Of two requests at the same time
+the second waits for the transaction of the first, then repeats its answer.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import Idempotency
 
-KEPT_SECONDS = 24 * 3600.0
-_KEPT_HEADERS = ("location", "retry-after")
+STORED_SECONDS = 24 * 3600.0
+_STORED_HEADERS = ("location", "retry-after")
 
 Key = Annotated[
     str | None,
@@ -38,13 +38,13 @@ Key = Annotated[
 
 
 class Once:
-    """Does the work of one request, or repeats the answer that its key was given before.
+    """The work of one request: done once, then repeated from the stored answer.
 
     Parameters
     ----------
     request : Request
     key : str or None
-        The client's key; without one the work is simply done.
+        The client's key; without a key the work is always done.
     content : str or None
         Hash of the request's content; None until an upload has arrived.
     """
@@ -55,14 +55,14 @@ class Once:
         self.content = content
 
     def answer(self, act: Callable[[Session], Response]) -> Response:
-        """Run ``act`` in a writing transaction and keep its answer, or repeat the one kept.
+        """Run ``act`` in a writing transaction and store its answer, or repeat the stored answer.
 
-        ``act`` may raise: then nothing is stored and the key stays free.
+        When ``act`` raises, nothing is stored and the key stays free.
 
         Raises
         ------
         Problem
-            422 when the key came with other content before.
+            422 when an earlier request with this key had other content.
         """
         with writing() as session:
             if self._key is None:
@@ -70,14 +70,14 @@ class Once:
             if self.content is None:
                 raise RuntimeError("a route that streams its body sets Once.content before it answers")
             content = _hash(self._query, self.content)
-            session.execute(delete(Idempotency).where(Idempotency.created < db_now() - KEPT_SECONDS))
+            session.execute(delete(Idempotency).where(Idempotency.created < db_now() - STORED_SECONDS))
             if not _reserve(session, self._key, content):
                 row = session.scalars(select(Idempotency).where(Idempotency.key == self._key)).one()
                 if row.request_sha256 != content:
                     raise Problem(
                         422,
                         "idempotency_key_reused",
-                        "This Idempotency-Key was sent with other content before; use a new key.",
+                        "An earlier request had this Idempotency-Key and other content; use a new key.",
                         [("Idempotency-Key", "already used for another request")],
                     )
                 headers = {**(row.headers or {}), "Idempotency-Replayed": "true"}
@@ -85,13 +85,13 @@ class Once:
             response = act(session)
             row = session.scalars(select(Idempotency).where(Idempotency.key == self._key)).one()
             row.status = response.status_code
-            row.headers = {name: response.headers[name] for name in _KEPT_HEADERS if name in response.headers}
+            row.headers = {name: response.headers[name] for name in _STORED_HEADERS if name in response.headers}
             row.body = bytes(response.body).decode()
             return response
 
 
 def _reserve(session: Session, key: str, content: str) -> bool:
-    """Add the key's row; False when it is there. PostgreSQL waits here for another request with the same key."""
+    """Add the key's row; return False when there is one. PostgreSQL waits here for another request with this key."""
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     added = session.execute(
         insert(Idempotency)

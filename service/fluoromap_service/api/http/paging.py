@@ -1,4 +1,4 @@
-"""Lists a page at a time: ``?limit=&cursor=``, ``next`` in the answer and ``Link: rel="next"``."""
+"""Lists in pages: ``?limit=&cursor=``, ``next`` in the answer and ``Link: rel="next"``."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, Field
+from sqlalchemy import ColumnElement, select, tuple_
+from sqlalchemy.orm import Session
 
 from fluoromap_service.problem import Problem
+from fluoromap_service.store.models import Job, Study
 
 Item = TypeVar("Item")
 Model = TypeVar("Model")
+Created = TypeVar("Created", Study, Job)
 
 
 class Page(BaseModel, Generic[Item]):
@@ -25,9 +29,10 @@ class Page(BaseModel, Generic[Item]):
 
 
 class Paging:
-    """What a client asked for, and how to answer it.
+    """The page that a client asks for.
 
-    ``after`` is the sort key of the last item already seen (None: from the start); ask the store for ``limit + 1`` items.
+    A cursor is the sort key of the last item on the page before. The store is asked for one item more than ``limit``: it
+    shows that another page follows.
     """
 
     def __init__(
@@ -35,50 +40,66 @@ class Paging:
         request: Request,
         response: Response,
         limit: Annotated[int, Query(ge=1, le=500, description="Most items on a page.")] = 50,
-        cursor: Annotated[
-            str | None, Query(max_length=500, description="`next` of the page before; it means nothing to a client.")
-        ] = None,
+        cursor: Annotated[str | None, Query(max_length=500, description="`next` of the page before.")] = None,
     ) -> None:
         self._request = request
         self._response = response
         self.limit = limit
-        self.after: Any = None if cursor is None else _decode(cursor)
+        self._after: Any = None if cursor is None else _decode(cursor)
 
-    def key(self, *kinds: type) -> tuple[Any, ...] | None:
-        """``after`` as a sort key of those types; None from the start.
+    def newest_first(
+        self, session: Session, kind: type[Created], *conditions: ColumnElement[bool]
+    ) -> Sequence[Created]:
+        """Return the rows of the page and one more, the newest first.
 
         Raises
         ------
         Problem
-            400 when the cursor was not made for this list.
+            400 when the cursor belongs to another list.
         """
-        if self.after is None:
-            return None
-        if not isinstance(self.after, list) or [type(part) for part in self.after] != list(kinds):
-            raise _bad_cursor()
-        return tuple(self.after)
+        query = select(kind).where(*conditions).order_by(kind.created.desc(), kind.id.desc()).limit(self.limit + 1)
+        after = self._key(float, str)
+        if after is not None:
+            query = query.where(tuple_(kind.created, kind.id) < after)
+        return session.scalars(query).all()
 
-    def page(
-        self, found: Sequence[Model], shape: Callable[[Model], Item], sort_key: Callable[[Model], Sequence[Any]]
+    def page_of_newest(self, rows: Sequence[Created], shape: Callable[[Created], Item]) -> Page[Item]:
+        """Return the page of the rows that :meth:`newest_first` found."""
+        return self._page(rows, shape, lambda row: [row.created, row.id])
+
+    def page_of_all(
+        self, items: Sequence[Model], shape: Callable[[Model], Item], name: Callable[[Model], str]
     ) -> Page[Item]:
-        """The page of the first ``limit`` of ``found``; one more than ``limit`` says that another page follows."""
-        shown = found[: self.limit]
-        following = _encode(list(sort_key(shown[-1]))) if len(found) > self.limit else None
+        """Return a page of a short list; ``name`` gives the unique name of an item.
+
+        Raises
+        ------
+        Problem
+            400 when the cursor belongs to another list.
+        """
+        key = self._key(str)
+        names = [name(item) for item in items]
+        if key is not None and key[0] not in names:
+            raise _bad_cursor()
+        start = 0 if key is None else names.index(key[0]) + 1
+        return self._page(items[start:], shape, lambda item: [name(item)])
+
+    def _key(self, *kinds: type) -> tuple[Any, ...] | None:
+        if self._after is None:
+            return None
+        if not isinstance(self._after, list) or [type(part) for part in self._after] != list(kinds):
+            raise _bad_cursor()
+        return tuple(self._after)
+
+    def _page(
+        self, items: Sequence[Model], shape: Callable[[Model], Item], sort_key: Callable[[Model], list[Any]]
+    ) -> Page[Item]:
+        shown = items[: self.limit]
+        following = _encode(sort_key(shown[-1])) if len(items) > self.limit else None
         if following is not None:
             link = self._request.url.include_query_params(limit=self.limit, cursor=following)
             self._response.headers["Link"] = f'<{link}>; rel="next"'
         return Page(items=[shape(item) for item in shown], next=following)
-
-    def slice(
-        self, everything: Sequence[Model], shape: Callable[[Model], Item], sort_key: Callable[[Model], str]
-    ) -> Page[Item]:
-        """A page of a short list that is at hand in full, named by a unique text of each item."""
-        key = self.key(str)
-        names = [sort_key(item) for item in everything]
-        if key is not None and key[0] not in names:
-            raise _bad_cursor()
-        start = 0 if key is None else names.index(key[0]) + 1
-        return self.page(everything[start:], shape, lambda item: [sort_key(item)])
 
 
 Pages = Annotated[Paging, Depends()]

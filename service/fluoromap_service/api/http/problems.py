@@ -1,4 +1,4 @@
-"""Errors as RFC 9457 problem documents with a stable code. No stack trace and no patient data ever stands in one."""
+"""Errors as RFC 9457 problem documents with a stable code, without stack traces and patient data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ log = structlog.get_logger(__name__)
 
 
 class ProblemDetail(BaseModel):
-    """One place in the request that is wrong."""
+    """A place in the request that is wrong."""
 
     where: str = Field(
         description="Field path, 'row 7, column lat_ms' or a DICOM keyword.", examples=["row 7, column lat_ms"]
@@ -30,12 +30,12 @@ class ProblemDetail(BaseModel):
 
 
 class ProblemDocument(BaseModel):
-    """RFC 9457 problem document."""
+    """An RFC 9457 problem document."""
 
     type: str = Field(examples=["about:blank"])
     title: str = Field(examples=["Unprocessable Content"])
     status: int = Field(examples=[422])
-    detail: str = Field(description="A sentence that says what to do.")
+    detail: str = Field(description="What is wrong and what to do.")
     code: str = Field(description="Stable name of the error.", examples=["no_ready_site"])
     errors: list[ProblemDetail] = Field(default_factory=list)
 
@@ -59,21 +59,28 @@ def answer(problem: Problem) -> JSONResponse:
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries for the problems a route may answer with."""
+    """Return the OpenAPI entries of the problems that a route may answer with."""
     return {
         status: {"model": ProblemDocument, "content": {MEDIA_TYPE: {}}, "description": HTTPStatus(status).phrase}
         for status in statuses
     }
 
 
-_CODES = {400: "malformed", 404: "not_found", 405: "method_not_allowed", 415: "unsupported_media_type"}
+_CODES = {
+    400: "malformed",
+    404: "not_found",
+    405: "method_not_allowed",
+    413: "too_large",
+    415: "unsupported_media_type",
+}
+"""Codes of errors that the framework raises."""
 
 
 def install(app: FastAPI) -> None:
     """Make every error of the application a problem document."""
 
     @app.exception_handler(Problem)
-    async def refused(request: Request, error: Problem) -> JSONResponse:
+    async def problem(request: Request, error: Problem) -> JSONResponse:
         return answer(error)
 
     @app.exception_handler(HTTPException)
@@ -89,18 +96,22 @@ def install(app: FastAPI) -> None:
         if bodiless and not (media_type == "application/json" or media_type.endswith("+json")):
             return answer(Problem(415, "unsupported_media_type", "Send the body as application/json."))
         if bodiless and not await request.body():
-            return answer(Problem(400, "malformed", "The request has no body."))
+            return answer(Problem(400, "malformed", "The request has no body; send JSON."))
         places = [
             (".".join(str(part) for part in item["loc"]), item["msg"].removeprefix("Value error, "))
             for item in error.errors()
         ]
         if malformed:
-            return answer(Problem(400, "malformed", "The request body is not valid JSON.", places))
-        return answer(Problem(422, "invalid", "Some fields of the request are wrong.", places))
+            return answer(
+                Problem(400, "malformed", "The request body is not valid JSON; see 'errors' for the place.", places)
+            )
+        return answer(
+            Problem(422, "invalid", "Some fields of the request are wrong; see 'errors' for each of them.", places)
+        )
 
     @app.exception_handler(DataError)
-    async def unstorable(request: Request, error: DataError) -> JSONResponse:
-        detail = "The request holds a value that cannot be kept: a NUL character, or a number out of range."
+    async def value_out_of_range(request: Request, error: DataError) -> JSONResponse:
+        detail = "The request contains a NUL character or a number out of range; remove it."
         return answer(Problem(422, "invalid", detail))
 
     @app.exception_handler(Exception)
@@ -108,4 +119,4 @@ def install(app: FastAPI) -> None:
         log.error(
             "unexpected_error", error=type(error).__name__, path=request.scope.get("route_path", ""), exc_info=error
         )
-        return answer(Problem(500, "internal", "The service failed; its log tells more. Nothing was changed."))
+        return answer(Problem(500, "internal", "The service failed and changed nothing; see its log."))

@@ -1,4 +1,4 @@
-"""Who may do what: every request passes the doorkeeper, whatever route it is for, so no new route can forget it."""
+"""Access control: every request passes the doorkeeper, so a new route cannot forget it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
 
 OPEN_PATHS = frozenset({"/v1/health", "/v1/ready"})
-"""The only paths that answer without a token."""
+"""The paths that answer without a token."""
 
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 class Doorkeeper:
-    """ASGI middleware that lets a request in only when its caller is known and may do that kind of thing.
+    """ASGI middleware that lets a request in only when its token has the scope.
 
-    Reading needs ``read``, everything else at least ``write``; a route asks for more with :data:`Admin`.
+    Reading needs the scope ``read``, everything else ``write``.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -68,10 +68,13 @@ def _unauthorised(detail: str, challenge: str = "") -> Problem:
 
 
 def _check_local(connection: HTTPConnection) -> None:
-    """An open service is reachable from any web page in the user's browser: only its own pages may talk to it."""
+    """Check that a request to an open service comes from this machine and from the service's own pages.
+
+    Any web page in the user's browser can reach an open service.
+    """
     server = connection.scope.get("server")
     if server is None or not auth.is_loopback(str(server[0])):
-        raise _unauthorised("No access token was made yet; make one with 'fluoromap token create'.")
+        raise _unauthorised("This service has no access token yet; make one with 'fluoromap token create'.")
     host = connection.headers.get("host", "")
     name = _host_name(host)
     if name is None or not auth.is_loopback(name):
@@ -93,12 +96,12 @@ def _demand(caller: Caller, scope: Scope) -> None:
         raise Problem(
             403,
             "forbidden",
-            f"This token lacks the scope '{scope}'.",
+            f"This token lacks the scope '{scope}'; use a token that has it.",
             headers={"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{scope}"'},
         )
 
 
-# Only documents the scheme in the OpenAPI document: the doorkeeper has checked the token already.
+# The doorkeeper has checked the token already; this declares the scheme in the OpenAPI document.
 Token = Annotated[
     HTTPAuthorizationCredentials | None,
     Security(HTTPBearer(auto_error=False, description="A token made with 'fluoromap token create'.")),
@@ -121,15 +124,8 @@ async def _writer(request: Request, _: Token) -> str:
     return _caller_with(request, Scope.WRITE)
 
 
-async def _admin(request: Request, _: Token) -> str:
-    return _caller_with(request, Scope.ADMIN)
-
-
 Reader = Annotated[str, Depends(_reader)]
-"""The caller's name ("open" where no token is needed); the caller may read."""
+"""The caller's name, "open" where the service needs no token; the caller may read."""
 
 Writer = Annotated[str, Depends(_writer)]
-"""As :data:`Reader`; the caller may change things."""
-
-Admin = Annotated[str, Depends(_admin)]
-"""As :data:`Reader`; the caller may do everything."""
+"""The caller's name; the caller may also change things."""

@@ -6,22 +6,22 @@ import asyncio
 import time
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import select, tuple_
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap_service.api.http.etags import known, not_modified
+from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paths import JobId, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
-from fluoromap_service.api.jobs.finished import job_of
 from fluoromap_service.api.jobs.job_answers import JobAnswer, etag_of, read_job, read_jobs
 from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.problem import Problem, not_found
+from fluoromap_service.results.finished import job_of
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import ENDED_JOB, Job, Study
 from fluoromap_service.study.freeze import PipelineRequest, freeze
@@ -32,8 +32,6 @@ LOOK_SECONDS = 0.25
 """Time between two looks at the database while a client waits."""
 
 RETRY_SECONDS = 2
-
-JobId = Annotated[str, Path(description="The job's id.")]
 
 
 class JobRequest(BaseModel):
@@ -67,7 +65,7 @@ class JobRequest(BaseModel):
     },
 )
 def create_job(
-    study_id: Annotated[str, Path(description="The study's id.")],
+    study_id: StudyId,
     caller: Writer,
     once: OnceJson,
     body: JobRequest | None = None,
@@ -101,16 +99,10 @@ def list_jobs(
     caller: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only this study's.")] = None
 ) -> Page[JobAnswer]:
     """All jobs, the newest first."""
-    query = select(Job).order_by(Job.created.desc(), Job.id.desc()).limit(pages.limit + 1)
-    if study is not None:
-        query = query.where(Job.study_id == study)
-    after = pages.key(float, str)
-    if after is not None:
-        query = query.where(tuple_(Job.created, Job.id) < after)
     with reading() as session:
-        found = session.scalars(query).all()
+        found = pages.newest_first(session, Job, *([] if study is None else [Job.study_id == study]))
         answers = read_jobs(session, found)
-    return pages.page(found, lambda job: answers[job.id], lambda job: [job.created, job.id])
+    return pages.page_of_newest(found, lambda job: answers[job.id])
 
 
 @router.get(
@@ -135,12 +127,12 @@ async def get_job(
     conditional = "if-none-match" in request.headers
     end = time.monotonic() + wait
     while state not in ENDED_JOB and time.monotonic() < end:
-        if (not known(request, etag)) if conditional else (state != first_state):
+        if (not is_known(request, etag)) if conditional else (state != first_state):
             break
         await asyncio.sleep(min(LOOK_SECONDS, max(end - time.monotonic(), 0.0)))
         state, etag = await run_in_threadpool(_look, job_id)
     answer, etag = await run_in_threadpool(_answer, job_id)
-    if known(request, etag):
+    if is_known(request, etag):
         return not_modified(etag)
     response.headers["ETag"] = etag
     response.headers["Cache-Control"] = "private, no-cache"

@@ -1,28 +1,26 @@
-"""The chamber's activation map and its mesh."""
+"""The routes of the chamber's activation map and of its mesh files."""
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from fluoromap.contracts import ChamberMap, SurfaceSite
+from fluoromap.contracts import Array, ChamberMap, SurfaceSite
 from fluoromap.reasons import Reason
-from fluoromap_service.api.http.etags import file_response, known, not_modified
+from fluoromap_service.api.http.etags import file_response, is_known, not_modified
+from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.jobs.finished import job_of, map_of
-from fluoromap_service.api.results.origins import FrameOfReference, Origin, OriginQuery, Position
-from fluoromap_service.jobs.stage_results import MapResult
+from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position
+from fluoromap_service.results.finished import job_of
+from fluoromap_service.results.maps import FinishedMap, map_of
+from fluoromap_service.results.mesh_files import MESH_MEDIA_TYPES, MeshFormat, mesh_of
+from fluoromap_service.results.origins import Origin
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.renderings import Rendered, rendered
 
 router = APIRouter(tags=["results"])
-
-JobId = Annotated[str, Path(description="The job's id.")]
 
 
 class MapSite(BaseModel):
@@ -32,22 +30,24 @@ class MapSite(BaseModel):
     x_mm: float
     y_mm: float
     z_mm: float
-    surface_mm: Position = Field(description="Where on the surface the site counts.")
+    surface_mm: Position = Field(description="The site's place on the surface.")
     distance_mm: float = Field(description="From the site to that place.")
     lat_ms: float
     leave_one_out_error_ms: float | None = Field(
-        description="What the other sites predict here minus what was measured."
+        description="Time that the other sites predict here, minus the measured time."
     )
     reasons: list[Reason] = Field(description="For example `lat_outlier`.")
 
 
 class Earliest(BaseModel):
+    """A site that may be the earliest."""
+
     site: str
-    probability: float = Field(description="That this site is the earliest, given the errors of the times.")
+    probability: float = Field(description="Probability that this site is the earliest, given the errors of the times.")
 
 
 class Velocity(BaseModel):
-    """Speed of activation along the wall: the median where at least four sites lie within 15 mm, and its 95 % interval."""
+    """Speed of activation along the wall: median and 95 % interval, from places with four or more sites within 15 mm."""
 
     median_m_per_s: float
     low_m_per_s: float
@@ -90,7 +90,7 @@ class ActivationMap(BaseModel):
     frame: FrameOfReference
     vertices_mm: list[Position]
     faces: list[tuple[int, int, int]] = Field(description="Vertices counted from 0; outward by the right-hand rule.")
-    lat_ms: list[float | None] = Field(description="At each vertex; null where no site is near.")
+    lat_ms: list[float | None] = Field(description="Activation time at each vertex; null where no site is near.")
     lat_sd_ms: list[float | None]
     covered: list[bool]
     sites: list[MapSite]
@@ -102,42 +102,14 @@ class ActivationMap(BaseModel):
     coverage: float = Field(ge=0, le=1, description="Covered share of the area.")
     warnings: list[Reason]
     conduction_velocity: Velocity | None = Field(description="Null where no sites lie close enough together.")
-    cycle_length_ms: float | None = Field(description="Of a re-entry: times repeat after it, so that early meets late.")
+    cycle_length_ms: float | None = Field(
+        description="Cycle length of a re-entry: times repeat after it, so early meets late."
+    )
 
 
-class MeshFormat(StrEnum):
-    """File formats of the mesh."""
-
-    PLY = "ply"
-    STL = "stl"
-    GLB = "glb"
-    VTP = "vtp"
-    MAT = "mat"
-    CSV = "csv"
-
-
-MESH_MEDIA_TYPES = {
-    MeshFormat.PLY: "model/ply",
-    MeshFormat.STL: "model/stl",
-    MeshFormat.GLB: "model/gltf-binary",
-    MeshFormat.VTP: "model/vnd.vtp+xml",
-    MeshFormat.MAT: "application/x-matlab-data",
-    MeshFormat.CSV: "text/csv",
-}
-
-
-def shift_of(outcome: MapResult, origin: Origin) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """What is added to the map's coordinates, (3,) mm.
-
-    A map without ``reference_mm`` lies about the isocentre: no site's reference catheter was located.
-    """
-    if origin is Origin.REFERENCE or outcome.reference_mm is None:
-        return np.zeros(3)
-    return np.array(outcome.reference_mm)
-
-
-def activation_map(outcome: MapResult, chamber: ChamberMap, origin: Origin) -> ActivationMap:
-    shift = shift_of(outcome, origin)
+def activation_map(finished: FinishedMap, origin: Origin) -> ActivationMap:
+    """Return a finished map in the shape of the answer."""
+    chamber, shift = finished.chamber, finished.shift_mm(origin)
     covered = chamber.covered.tolist()
     return ActivationMap(
         frame=FrameOfReference(origin=origin),
@@ -172,7 +144,7 @@ def _where(covered: list[bool], values: list[float]) -> list[float | None]:
     return [value if inside else None for inside, value in zip(covered, values, strict=True)]
 
 
-def _site(site: SurfaceSite, shift: Any) -> MapSite:
+def _site(site: SurfaceSite, shift: Array) -> MapSite:
     x, y, z = (site.position_mm + shift).tolist()
     return MapSite(
         site=site.site,
@@ -187,24 +159,6 @@ def _site(site: SurfaceSite, shift: Any) -> MapSite:
     )
 
 
-def chamber_of(outcome: MapResult) -> ChamberMap:
-    """The map of an outcome that has one, as :func:`fluoromap_service.api.jobs.finished.map_of` returns it."""
-    assert outcome.chamber is not None
-    return outcome.chamber
-
-
-def mesh_of(job_id: str, outcome: MapResult, result: str, mesh_format: MeshFormat, origin: Origin) -> Rendered:
-    """The kept mesh of a map whose stage's result has the hash ``result``."""
-
-    def make() -> bytes:
-        from fluoromap.meshes.mesh_file import mesh_bytes
-
-        return mesh_bytes(chamber_of(outcome), mesh_format.value, shift_of(outcome, origin))
-
-    asked = {"mesh": mesh_format.value, "origin": origin.value, "map": result}
-    return rendered(job_id, asked, MESH_MEDIA_TYPES[mesh_format], make)
-
-
 @router.get(
     "/v1/jobs/{job_id}/map",
     summary="Activation map",
@@ -214,17 +168,18 @@ def mesh_of(job_id: str, outcome: MapResult, result: str, mesh_format: MeshForma
 def get_map(
     job_id: JobId, request: Request, response: Response, caller: Reader, origin: OriginQuery = Origin.REFERENCE
 ) -> ActivationMap | Response:
-    """The chamber's surface with activation times, as soon as the stage `fuse` is done (before: 409 `not_ready`).
+    """Return the chamber's surface with activation times.
 
-    409 `no_map` with a sentence when the located sites support no surface.
+    The map is available as soon as the stage `fuse` is done; before that the answer is 409 `not_ready`. When the located
+    sites support no surface, the answer is 409 `no_map` with a sentence that says why.
     """
     with reading() as session:
-        outcome, stage = map_of(session, job_of(session, job_id))
-    etag = f'"{stage.result}-{origin}"'
-    if known(request, etag):
+        finished = map_of(session, job_of(session, job_id))
+    etag = f'"{finished.sha256}-{origin}"'
+    if is_known(request, etag):
         return not_modified(etag)
     response.headers["ETag"] = etag
-    return activation_map(outcome, chamber_of(outcome), origin)
+    return activation_map(finished, origin)
 
 
 _MESHES = {media: {"schema": {"type": "string", "format": "binary"}} for media in MESH_MEDIA_TYPES.values()}
@@ -250,9 +205,12 @@ def get_mesh(
     caller: Reader,
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
-    """The chamber with activation times as a mesh file, coordinates in mm along DICOM patient axes."""
+    """Return the chamber with activation times as a mesh file.
+
+    Coordinates are in mm along DICOM patient axes; GLB is in metres with y up, as glTF demands.
+    """
     with reading() as session:
-        outcome, stage = map_of(session, job_of(session, job_id))
-    mesh = mesh_of(job_id, outcome, str(stage.result), mesh_format, origin)
+        finished = map_of(session, job_of(session, job_id))
+    mesh = mesh_of(job_id, finished, mesh_format, origin)
     media_type = MESH_MEDIA_TYPES[mesh_format]
     return file_response(request, mesh.path, mesh.sha256, media_type, f"chamber-{origin}.{mesh_format}")

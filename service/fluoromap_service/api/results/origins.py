@@ -1,32 +1,28 @@
-"""Where coordinates are counted from, and how answers say so."""
+"""The origin of coordinates in requests and answers."""
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Annotated, Literal
 
 from fastapi import Query
 from pydantic import BaseModel, ConfigDict, Field
 
+from fluoromap_service.results.origins import Origin
+
 Position = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
-
-
-class Origin(StrEnum):
-    """Origin of coordinates; the axes are always DICOM patient axes (LPS)."""
-
-    REFERENCE = "reference"
-    ISOCENTRE = "isocentre"
-
+"""The different elements of a symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
 OriginQuery = Annotated[
     Origin,
-    Query(description="`reference`: the reference catheter's mean in the same frames is subtracted; or the isocentre."),
+    Query(
+        description="`reference` subtracts the reference catheter's mean in the same frames; `isocentre` subtracts nothing."
+    ),
 ]
 
 
 class FrameOfReference(BaseModel):
-    """Axes, origin and unit of the coordinates beside it."""
+    """Axes, origin and unit of the coordinates in the same answer."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"axes": "LPS", "origin": "reference", "unit": "mm"}]})
 

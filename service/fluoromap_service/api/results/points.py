@@ -1,47 +1,49 @@
-"""The electrodes of a job's sites in 3D at diastole."""
+"""The routes of the electrode positions at diastole."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Grade, Triangulation
 from fluoromap.reasons import Reason
 from fluoromap_service.api.http.csv_answers import csv_entry, csv_response, csv_text, wants_csv
+from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.jobs.finished import done_stage, job_of, snapshot_of
-from fluoromap_service.api.results.origins import FrameOfReference, Origin, OriginQuery, Six
+from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Six
 from fluoromap_service.api.results.study_geometry import StudyGeometry, study_geometry
 from fluoromap_service.jobs.stage_results import load
+from fluoromap_service.results.finished import done_stage, job_of, snapshot_of
+from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.points import point_rows
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 from fluoromap_service.store.models import Point as PointRow
 
 router = APIRouter(tags=["results"])
 
-JobId = Annotated[str, Path(description="The job's id.")]
 
-
-class Seen(BaseModel):
-    """The frame of a run that a point was located in."""
+class PointView(BaseModel):
+    """The run and the frame that located a point."""
 
     sop_instance_uid: str
-    frame: int | None = Field(description="Counted from 1; null where the site was not located.")
+    frame: int | None = Field(description="Counted from 1; null where the site has no position.")
 
 
-class SeenViews(BaseModel):
-    a: Seen | None
-    b: Seen | None
+class PointViews(BaseModel):
+    """Both views of a point."""
+
+    a: PointView | None
+    b: PointView | None
 
 
 class Residuals(BaseModel):
-    """Distance between the electrode as seen and its position projected, in each view."""
+    """Distance in each view between the electrode's pixel and the projection of its position."""
 
     a: float | None
     b: float | None
@@ -56,8 +58,8 @@ class Point(BaseModel):
     x_mm: float | None
     y_mm: float | None
     z_mm: float | None
-    covariance_mm2: Six | None = Field(description="xx, xy, xz, yy, yz, zz; of the position from the chosen origin.")
-    views: SeenViews
+    covariance_mm2: Six | None = Field(description="xx, xy, xz, yy, yz, zz of the position from the chosen origin.")
+    views: PointViews
     residual_px: Residuals
     ray_angle_deg: float | None = Field(description="Angle between the two views' rays at this electrode.")
     lat_ms: float | None = Field(description="The site's activation time: mapping minus reference.")
@@ -95,6 +97,8 @@ EXAMPLE: dict[str, Any] = {
 
 
 class Points(StudyGeometry):
+    """All points of a job, with facts about the whole study."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
 
     frame: FrameOfReference
@@ -113,16 +117,14 @@ CSV_ENTRY = csv_entry(
 
 
 def points_of(session: Session, job: Job, origin: Origin) -> list[Point]:
-    """All points of a job whose triangulation is done, located or rejected.
+    """Return all points of a job, located or rejected.
 
     Raises
     ------
     Problem
-        409 ``not_ready``.
+        409 ``not_ready`` before the stage ``triangulate`` is done.
     """
-    done_stage(session, job, "triangulate")
-    rows = session.scalars(select(PointRow).where(PointRow.job_id == job.id).order_by(PointRow.id))
-    return [_point(row, origin) for row in rows]
+    return [_point(row, origin) for row in point_rows(session, job)]
 
 
 def _point(row: PointRow, origin: Origin) -> Point:
@@ -138,7 +140,7 @@ def _point(row: PointRow, origin: Origin) -> Point:
         y_mm=y,
         z_mm=z,
         covariance_mm2=covariance,
-        views=SeenViews(a=_seen(row.view_a, row.frame_a), b=_seen(row.view_b, row.frame_b)),
+        views=PointViews(a=_view(row.view_a, row.frame_a), b=_view(row.view_b, row.frame_b)),
         residual_px=Residuals(a=row.residual_a_px, b=row.residual_b_px),
         ray_angle_deg=row.ray_angle_deg,
         lat_ms=row.lat_ms,
@@ -147,21 +149,22 @@ def _point(row: PointRow, origin: Origin) -> Point:
     )
 
 
-def _seen(uid: str | None, frame: int | None) -> Seen | None:
-    return None if uid is None else Seen(sop_instance_uid=uid, frame=frame)
+def _view(uid: str | None, frame: int | None) -> PointView | None:
+    return None if uid is None else PointView(sop_instance_uid=uid, frame=frame)
 
 
 def points_csv(points: list[Point]) -> str:
+    """Return points as CSV, one line a point."""
     return csv_text(COLUMNS, _lines(points))
 
 
 def _lines(points: list[Point]) -> Iterator[list[Any]]:
     for point in points:
-        seen = point.views
+        views = point.views
         yield [
             point.site, point.catheter, point.electrode, point.x_mm, point.y_mm, point.z_mm,
             *(point.covariance_mm2 or [None] * 6),
-            seen.a.frame if seen.a else None, seen.b.frame if seen.b else None,
+            views.a.frame if views.a else None, views.b.frame if views.b else None,
             point.residual_px.a, point.residual_px.b, point.ray_angle_deg, point.lat_ms,
             point.grade.value, ";".join(point.reasons),
         ]  # fmt: skip
@@ -185,11 +188,12 @@ def _read(job_id: str, origin: Origin) -> Points:
 def get_points(
     job_id: JobId, request: Request, response: Response, caller: Reader, origin: OriginQuery = Origin.REFERENCE
 ) -> Points | Response:
-    """Every electrode of every site, with covariance, residuals and grade; as CSV where `Accept: text/csv` asks for it.
+    """Return every electrode of every site, with covariance, residuals and grade.
 
-    Available as soon as the stage `triangulate` is done; before that 409 `not_ready`. A site without a located
-    reference catheter has positions from the isocentre only. Beside them what triangulation says of the whole study: the
-    gantry's self-calibration, the error budget, and where electrodes would be if catheters were paired the other way.
+    `Accept: text/csv` gives CSV. The points are available as soon as the stage `triangulate` is done; before that the answer
+    is 409 `not_ready`. A site without a located reference catheter has positions from the isocentre only. The JSON answer
+    also contains facts about the whole study: the gantry's self-calibration, the error budget, and the positions of
+    electrodes under the other pairing of the catheters.
     """
     points = _read(job_id, origin)
     if wants_csv(request):
@@ -205,5 +209,5 @@ def get_points(
     responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422)},
 )
 def get_points_csv(job_id: JobId, caller: Reader, origin: OriginQuery = Origin.REFERENCE) -> Response:
-    """The same as `points`, always as CSV."""
+    """Return the same points as `points`, always as CSV."""
     return csv_response(points_csv(_read(job_id, origin).points), "points.csv")

@@ -1,58 +1,22 @@
-"""One self-contained page with everything a job found: pictures, 3D view, tables, and how it was made."""
+"""The route of a job's report."""
 
 from __future__ import annotations
 
-import base64
-import functools
-import gzip
-import hashlib
-import io
-import json
-from importlib.metadata import version
-from pathlib import Path as FilePath
-from typing import Annotated, Any
+from fastapi import APIRouter, Request, Response
 
-from fastapi import APIRouter, Path, Request, Response
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
-from PIL import Image
-from sqlalchemy.orm import Session
-
-from fluoromap.contracts import ChamberMap, Triangulation
-from fluoromap.drawing.colours import vertex_colours
-from fluoromap.drawing.map_picture import draw_map_views
-from fluoromap.drawing.overlay import Look
-from fluoromap.drawing.png import encode_png
 from fluoromap_service.api.http.etags import file_response
+from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.jobs.finished import job_of, map_of, snapshot_of
-from fluoromap_service.api.jobs.job_answers import read_job
-from fluoromap_service.api.results.maps import chamber_of
-from fluoromap_service.api.results.origins import Origin
-from fluoromap_service.api.results.overlays import fusion_of, overlays_of, picture_of
-from fluoromap_service.api.results.points import points_of
-from fluoromap_service.api.results.report_tables import (
-    budget_rows,
-    calibration_line,
-    electrodes,
-    glossary,
-    tips,
-    tracks,
-)
-from fluoromap_service.api.results.tracks import tracks_of
-from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
+from fluoromap_service.api.results.report_page import report_page, template_sha256
 from fluoromap_service.problem import Problem
+from fluoromap_service.results.dependencies import report_dependencies
+from fluoromap_service.results.finished import job_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import ENDED_JOB, Study
 from fluoromap_service.store.renderings import rendered
 
 router = APIRouter(tags=["results"])
-
-WEB = FilePath(__file__).parents[2] / "web"
-SCRIPTS = {"core": "three.core.js", "three": "three.module.js", "controls": "OrbitControls.js"}
-JPEG_QUALITY = 88
-"""Fluoroscopy is noise: JPEG keeps a page of 40 overlays at a few MB."""
 
 
 @router.get(
@@ -65,154 +29,18 @@ JPEG_QUALITY = 88
         **responses(401, 403, 404, 409, 422, 429),
     },
 )
-def get_report(job_id: Annotated[str, Path(description="The job's id.")], request: Request, caller: Reader) -> Response:
-    """Pictures, a 3D view, tables with grades and reasons, error budget, parameters, versions and input hashes, in one
-    HTML file without links to anything else. 409 until the job has ended.
+def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
+    """Return the report of a job as one HTML file without links to other files; 409 until the job has ended.
+
+    The page contains pictures, a 3D view, tables with grades and reasons, the error budget, parameters, versions and the
+    hashes of the input files.
     """
     with reading() as session:
         job = job_of(session, job_id)
         if job.state not in ENDED_JOB:
-            raise Problem(409, "not_ready", "The report is made when the job has ended; follow the job and ask again.")
+            detail = "The report is available when the job has ended; follow the job and ask again."
+            raise Problem(409, "not_ready", detail)
         study = session.get(Study, job.study_id)
-        asked = {"report": _template_hash(), "job": job.version, "label": study.label if study else None}
-    page = rendered(job_id, asked, "text/html", lambda: report_page(job_id).encode())
+        depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None)
+    page = rendered(job_id, depends_on, "text/html", lambda: report_page(job_id).encode())
     return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)
-
-
-def report_page(job_id: str) -> str:
-    """The page of an ended job, as far as the job came."""
-    values = _values(job_id)
-    chamber = values.pop("map")
-    values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None}
-    if chamber is not None:
-        values |= {
-            "chamber": _figures(chamber),
-            "map_png": _inline(encode_png(draw_map_views(chamber)), "image/png"),
-            "overlays": _overlays(job_id),
-            "scene": _json(_scene(chamber)),
-            "scripts": _json({name: _packed(file) for name, file in SCRIPTS.items()}),
-        }
-    return _environment().get_template("report.html.j2").render(values)
-
-
-def _values(job_id: str) -> dict[str, Any]:
-    with reading() as session:
-        job = job_of(session, job_id)
-        snapshot = snapshot_of(job)
-        chamber, no_map = None, ""
-        try:
-            chamber = chamber_of(map_of(session, job)[0])
-        except Problem as problem:
-            no_map = str(problem.detail)
-        triangulated = stage_of(session, job_id, "triangulate")
-        triangulation = load(Triangulation, triangulated) if triangulated and triangulated.result else None
-        points = points_of(session, job, Origin.REFERENCE) if triangulation else []
-        followed = (
-            tracks_of(session, job, Origin.REFERENCE) if triangulation and _all_followed(session, job_id) else None
-        )
-        study = session.get(Study, job.study_id)
-        rows = tips(points, snapshot.mapping, chamber)
-        electrode_rows = electrodes(points)
-        track_rows = tracks(followed, snapshot.mapping) if followed else []
-        return {
-            "job": read_job(session, job),
-            "label": study.label if study else "Mapping study",
-            "version": version("fluoromap"),
-            "reference": snapshot.reference,
-            "map": chamber,
-            "no_map": no_map,
-            "tips": rows,
-            "located": sum(row["grade"] != "rejected" for row in rows),
-            "grades": [(grade, sum(row["grade"] == grade for row in rows)) for grade in ("A", "B", "C", "rejected")],
-            "reasons": glossary([*rows, *electrode_rows, *track_rows]),
-            "points": electrode_rows,
-            "tracks": track_rows,
-            "budget": budget_rows(triangulation.budget) if triangulation else [],
-            "calibration": calibration_line(triangulation.calibration) if triangulation else None,
-            "notes": triangulation.notes if triangulation else (),
-            "plugins": [
-                (stage, getattr(snapshot, stage)) for stage in ("segmenter", "triangulator", "monoplane", "fuser")
-            ],
-            "catheters": snapshot.catheters,
-            "runs": sorted(snapshot.runs.items()),
-        }
-
-
-def _all_followed(session: Session, job_id: str) -> bool:
-    return all(stage.result or stage.error for stage in stages_of(session, job_id, "monoplane"))
-
-
-def _figures(chamber: ChamberMap) -> dict[str, Any]:
-    return {
-        "earliest": chamber.earliest[0][0] if chamber.earliest else "–",
-        "all_earliest": [entry for entry in chamber.earliest if entry[1] >= 0.005],
-        **{
-            name: getattr(chamber, name)
-            for name in (
-                "total_activation_time_ms", "leave_one_out_rms_ms", "conduction_velocity", "volume_ml", "area_cm2",
-                "coverage", "warnings",
-            )
-        },
-    }  # fmt: skip
-
-
-def _overlays(job_id: str) -> list[dict[str, Any]]:
-    with reading() as session:
-        job = job_of(session, job_id)
-        listed = [(entry, fusion_of(session, job, entry.sop_instance_uid, None)) for entry in overlays_of(session, job)]
-    pictures = []
-    for entry, fusion in listed:
-        try:
-            picture = picture_of(job_id, fusion, Look(covariances_mm2=fusion.covariances_mm2))
-        except Problem:
-            # A run deleted meanwhile has no picture any more; all its numbers stand in the tables.
-            continue
-        pictures.append({"site": entry.site, "view": entry.view, "frame": entry.frame, "src": _jpeg(picture.path)})
-    return pictures
-
-
-def _scene(chamber: ChamberMap) -> dict[str, Any]:
-    return {
-        "vertices": chamber.vertices_mm.round(2).tolist(),
-        "faces": chamber.faces.tolist(),
-        "colours": vertex_colours(chamber).tolist(),
-        "sites": [site.position_mm.round(2).tolist() for site in chamber.sites],
-    }
-
-
-def _jpeg(path: FilePath) -> str:
-    stream = io.BytesIO()
-    Image.open(path).save(stream, format="JPEG", quality=JPEG_QUALITY)
-    return _inline(stream.getvalue(), "image/jpeg")
-
-
-def _inline(content: bytes, media_type: str) -> str:
-    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
-
-
-def _json(value: Any) -> Markup:
-    """JSON for a script element, which ends at the first "</" whatever it stands in."""
-    return Markup(json.dumps(value, separators=(",", ":")).replace("<", "\\u003c"))
-
-
-@functools.cache
-def _packed(name: str) -> str:
-    return base64.b64encode(gzip.compress((WEB / "three" / name).read_bytes(), mtime=0)).decode()
-
-
-@functools.cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(WEB), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    environment.filters["number"] = _number
-    return environment
-
-
-@functools.cache
-def _template_hash() -> str:
-    return hashlib.sha256((WEB / "report.html.j2").read_bytes()).hexdigest()
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"

@@ -16,7 +16,7 @@ Row = dict[str, Any]
 
 
 def tips(points: Sequence[Point], mapping: str, chamber: ChamberMap | None) -> list[Row]:
-    """The mapping tip of every site, with what the map says of it."""
+    """Return a row for the mapping tip of every site, with its place on the map."""
     on_map = {site.site: site for site in chamber.sites} if chamber else {}
     rows = []
     for point in points:
@@ -38,6 +38,7 @@ def tips(points: Sequence[Point], mapping: str, chamber: ChamberMap | None) -> l
 
 
 def electrodes(points: Sequence[Point]) -> list[Row]:
+    """Return a row for every electrode."""
     return [
         {
             "site": point.site, "catheter": point.catheter, "electrode": point.electrode, "x_mm": point.x_mm,
@@ -50,10 +51,18 @@ def electrodes(points: Sequence[Point]) -> list[Row]:
     ]  # fmt: skip
 
 
-def tracks(followed: Row, mapping: str) -> list[Row]:
-    """The mapping tip of every followed view, and the views that were refused; ``followed`` as ``tracks_of`` answers."""
+def tracks(answer: Row, mapping: str) -> list[Row]:
+    """Return a row for every view: the track of its mapping tip, or the reasons why it has none.
+
+    Parameters
+    ----------
+    answer : dict
+        The answer of ``read_tracks``.
+    mapping : str
+        Name of the mapping catheter.
+    """
     rows = []
-    for track in followed["tracks"]:
+    for track in answer["tracks"]:
         if track["catheter"] != mapping or track["electrode"] != 1:
             continue
         located = [sample for sample in track["samples"] if sample["x_mm"] is not None]
@@ -66,34 +75,36 @@ def tracks(followed: Row, mapping: str) -> list[Row]:
                 "lateral_mm": median(sample["lateral_sd_mm"] for sample in located) if located else None,
             }
         )  # fmt: skip
-    for refused in followed["rejected"]:
+    for rejected in answer["rejected"]:
         rows.append(
             {
-                "site": refused["site"], "view": refused["view"], "solver": "refused", "located": 0, "frames": 0,
-                "reasons": [Reason(reason) for reason in refused["reasons"]], "along_mm": None, "lateral_mm": None,
+                "site": rejected["site"], "view": rejected["view"], "solver": "no track", "located": 0, "frames": 0,
+                "reasons": [Reason(reason) for reason in rejected["reasons"]], "along_mm": None, "lateral_mm": None,
             }
         )  # fmt: skip
     return rows
 
 
 def glossary(rows: Sequence[Row]) -> list[Reason]:
-    """Every reason that occurs, once."""
+    """Return every reason that occurs, once."""
     return sorted({reason for row in rows for reason in row["reasons"]})
 
 
 def budget_rows(budget: ErrorBudget | None) -> list[tuple[str, float]]:
+    """Return name and size in mm of each source of error."""
     if budget is None:
         return []
     return [
-        ("pixels: finding the electrodes in the image", budget.pixels_mm),
+        ("pixels: the place of the electrodes in the image", budget.pixels_mm),
         ("angles of the gantry", budget.angles_mm),
         ("distances of source and detector", budget.source_distances_mm),
-        ("the two runs caught different moments of the beat", budget.phase_mismatch_mm),
+        ("cardiac phase: the frames of the two runs show different moments of the beat", budget.phase_mismatch_mm),
         ("breathing between the two runs", budget.breathing_mm),
     ]
 
 
 def calibration_line(calibration: Calibration | None) -> Row | None:
+    """Return the figures of the gantry's self-calibration."""
     if calibration is None:
         return None
     return {

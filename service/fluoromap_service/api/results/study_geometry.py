@@ -1,18 +1,17 @@
-"""What triangulation says about a whole study, beside its points."""
+"""The part of the points' answer that concerns the whole study."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import numpy as np
 from pydantic import BaseModel, Field
 
-from fluoromap.contracts import Array, LocatedSite, Triangulation
-from fluoromap_service.api.results.origins import Origin, Position
+from fluoromap.contracts import Array, ElectrodePoint, Triangulation
+from fluoromap_service.api.results.origins import Position
+from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.points import alternative_positions
 
 
 class CalibrationOut(BaseModel):
-    """What the electrodes of the study say about the gantry: view b's camera against its header."""
+    """The gantry's self-calibration by the electrodes: the correction of view b's camera against its header."""
 
     applied: bool = Field(description="Whether the positions contain the correction.")
     rotation_deg: Position = Field(description="Rotation vector about the isocentre.")
@@ -22,7 +21,7 @@ class CalibrationOut(BaseModel):
 
 
 class ErrorBudgetOut(BaseModel):
-    """What each source of error contributes to an electrode's position: RMS over the study, 3D, from the isocentre."""
+    """The share of each source of error in an electrode's position: RMS over the study, 3D, from the isocentre."""
 
     pixels_mm: float
     angles_mm: float
@@ -32,7 +31,7 @@ class ErrorBudgetOut(BaseModel):
 
 
 class AlternativeOut(BaseModel):
-    """Where an electrode would be if its site's catheters were paired the other way across the views."""
+    """The position of an electrode under the other pairing of its site's catheters across the views."""
 
     site: str
     catheter: str
@@ -53,7 +52,7 @@ class StudyGeometry(BaseModel):
 
 
 def study_geometry(triangulation: Triangulation, reference: str, origin: Origin) -> StudyGeometry:
-    """What to tell of a triangulation; ``reference`` is the name of the reference catheter."""
+    """Return the study's part of an answer; ``reference`` is the name of the reference catheter."""
     calibration, budget = triangulation.calibration, triangulation.budget
     return StudyGeometry(
         calibration=None if calibration is None else CalibrationOut(
@@ -71,31 +70,16 @@ def study_geometry(triangulation: Triangulation, reference: str, origin: Origin)
             breathing_mm=budget.breathing_mm,
         ),
         notes=list(triangulation.notes),
-        alternatives=[one for site in triangulation.sites for one in _alternatives(site, reference, origin)],
+        alternatives=[_alternative(*found) for found in alternative_positions(triangulation, reference, origin)],
     )  # fmt: skip
 
 
-def _alternatives(site: LocatedSite, reference: str, origin: Origin) -> Iterator[AlternativeOut]:
-    zero = np.zeros(3) if origin is Origin.ISOCENTRE else _reference_mm(site, reference)
-    if zero is None:
-        return
-    for point in site.points:
-        if point.alternative_mm is not None:
-            x, y, z = _three(point.alternative_mm - zero)
-            yield AlternativeOut(
-                site=site.site, catheter=point.catheter, electrode=point.electrode, x_mm=x, y_mm=y, z_mm=z,
-                probability=point.alternative_probability,
-            )  # fmt: skip
-
-
-def _reference_mm(site: LocatedSite, reference: str) -> Array | None:
-    """The reference catheter's mean under the alternative pairing, which moves it where it is concerned itself."""
-    places = [
-        point.position_mm if point.alternative_mm is None else point.alternative_mm
-        for point in site.points
-        if point.catheter == reference
-    ]
-    return np.mean(places, axis=0) if places else None
+def _alternative(site: str, point: ElectrodePoint, position_mm: Array) -> AlternativeOut:
+    x, y, z = _three(position_mm)
+    return AlternativeOut(
+        site=site, catheter=point.catheter, electrode=point.electrode, x_mm=x, y_mm=y, z_mm=z,
+        probability=point.alternative_probability,
+    )  # fmt: skip
 
 
 def _three(vector: Array) -> Position:

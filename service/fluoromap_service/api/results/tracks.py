@@ -1,4 +1,4 @@
-"""The electrodes followed in 3D through one view, every frame."""
+"""The routes of the tracks: every electrode in 3D in every frame of one view."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
-from fluoromap.contracts import Grade, Triangulation, View
-from fluoromap.fuser.mapped_sites import map_origin
+from fluoromap.contracts import Grade, View
+from fluoromap.monoplane.track_samples import Sample
 from fluoromap.reasons import Reason
 from fluoromap_service.api.http.csv_answers import csv_entry, csv_response, csv_text, wants_csv
+from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.jobs.finished import done_stage, job_of, not_ready, snapshot_of
-from fluoromap_service.api.results.origins import FrameOfReference, Origin, OriginQuery, Position, Six
-from fluoromap_service.api.results.track_samples import Sample, camera_of, isocentre, reference, samples
-from fluoromap_service.jobs.stage_results import SiteTracks, load, stages_of
-from fluoromap_service.problem import not_found
+from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position, Six
+from fluoromap_service.results.finished import job_of
+from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.tracks import RejectedView, tracks_of
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import Job, StageRow, StageState
-from fluoromap_service.study.snapshot import Snapshot
+from fluoromap_service.store.models import Job
 
 router = APIRouter(tags=["results"])
 
@@ -32,7 +31,7 @@ _UPPER = np.triu_indices(3)
 
 
 class TrackSample(BaseModel):
-    """An electrode in one frame; without a position where ``grade`` is rejected."""
+    """An electrode in one frame; no position where ``grade`` is rejected."""
 
     frame: int = Field(description="Counted from 1.")
     x_mm: float | None
@@ -42,11 +41,13 @@ class TrackSample(BaseModel):
     lateral_sd_mm: float | None = Field(description="Standard deviation across the ray, RMS of both directions.")
     covariance_mm2: Six | None = Field(
         description=(
-            "xx, xy, xz, yy, yz, zz; with origin `reference` of the position less the reference's of the same frame where the "
-            "solver tells it, else of the position from the isocentre."
+            "xx, xy, xz, yy, yz, zz. With origin `reference`: of the position minus the reference's position in the same frame, "
+            "where the solver gives it; otherwise of the position from the isocentre."
         )
     )
-    baseline_mm: Position | None = Field(description="Plain back-projection at the known depth, for comparison.")
+    baseline_mm: Position | None = Field(
+        description="Plain back-projection at the known depth, for comparison with the position."
+    )
     u_px: float | None
     v_px: float | None
     grade: Grade
@@ -65,7 +66,7 @@ class ElectrodeTrack(BaseModel):
 
 
 class RejectedTrack(BaseModel):
-    """A view that could not be followed, and why."""
+    """A view without a track, and why."""
 
     site: str
     view: Literal["a", "b"]
@@ -74,6 +75,8 @@ class RejectedTrack(BaseModel):
 
 
 class Tracks(BaseModel):
+    """The tracks of a job."""
+
     model_config = ConfigDict(
         json_schema_extra={
             "examples": [
@@ -120,86 +123,43 @@ CSV_ENTRY = csv_entry(
 )
 
 SiteQuery = Annotated[str | None, Query(description="Only this site; without it all sites.", examples=["S03"])]
-ViewQuery = Annotated[Literal["a", "b"] | None, Query(description="Only this view; without it all followed views.")]
-JobId = Annotated[str, Path(description="The job's id.")]
+ViewQuery = Annotated[Literal["a", "b"] | None, Query(description="Only this view; without it all tracked views.")]
 
-Found = dict[str, Any]
-"""An answer as JSON types: thousands of samples are too many to check one by one."""
+TracksJson = dict[str, Any]
+"""An answer as JSON values: pydantic would take too long for thousands of samples."""
 
 
-def tracks_of(session: Session, job: Job, origin: Origin, site: str | None = None, view: View | None = None) -> Found:
-    """The tracks of one site or of all, shaped as :class:`Tracks`.
+def read_tracks(
+    session: Session, job: Job, origin: Origin, site: str | None = None, view: View | None = None
+) -> TracksJson:
+    """Return the tracks of one site or of all, in the shape of :class:`Tracks`.
 
     Raises
     ------
     Problem
-        404 for a site the job does not have, 409 ``not_ready`` while one of the asked sites is not followed yet.
+        404 for a site that the job does not have; 409 ``not_ready`` while the track of one of the sites is not done.
     """
-    snapshot = snapshot_of(job)
-    if site is not None and site not in _sites(snapshot):
-        raise not_found("site in this job")
-    triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
-    views = [entry for entry in snapshot.views if view in (None, entry)]
-    found: Found = {"frame": {"axes": "LPS", "origin": str(origin), "unit": "mm"}, "tracks": [], "rejected": []}
-    for stage in stages_of(session, job.id, "monoplane"):
-        if site in (None, stage.subject):
-            _add_site(found, job, stage, views, origin, snapshot, triangulation)
-    for plan in snapshot.rejected:
-        if site in (None, plan.site):
-            message = " ".join(reason.sentence for reason in plan.reasons)
-            found["rejected"] += [_rejected(plan.site, entry, plan.reasons, message) for entry in views]
-    return found
-
-
-def _sites(snapshot: Snapshot) -> set[str]:
-    return {plan.site for plan in snapshot.sites} | {plan.site for plan in snapshot.rejected}
-
-
-def _add_site(
-    found: Found, job: Job, stage: StageRow, views: list[View], origin: Origin, snapshot: Snapshot,
-    triangulation: Triangulation,
-) -> None:  # fmt: skip
-    if stage.state == StageState.FAILED:
-        message = str((stage.error or {}).get("detail", Reason.PLUGIN_FAILED.sentence))
-        found["rejected"] += [_rejected(stage.subject, view, (Reason.PLUGIN_FAILED,), message) for view in views]
-        return
-    if stage.state != StageState.DONE:
-        raise not_ready(job, "monoplane", stage)
-    located = next((entry for entry in triangulation.sites if entry.site == stage.subject), None)
-    refused = next((entry.reasons for entry in triangulation.rejected if entry.site == stage.subject), ())
-    others = map_origin(triangulation)
-    for followed in load(SiteTracks, stage).views:
-        if followed.view not in views:
-            continue
-        if followed.track is None or located is None:
-            reasons = (followed.refused, *refused) if followed.refused else refused
-            found["rejected"].append(_rejected(stage.subject, followed.view, reasons, followed.message))
-            continue
-        track, camera = followed.track, camera_of(located, followed.view)
-        if origin is Origin.REFERENCE:
-            mean = None if others is None else np.array(others)
-            origins = reference(track, located, snapshot.reference, mean)
+    tracks, rejected = [], []
+    for found in tracks_of(session, job, origin, site, view):
+        if isinstance(found, RejectedView):
+            codes = list(dict.fromkeys(str(reason) for reason in found.reasons))
+            rejected.append({"site": found.site, "view": found.view, "reasons": codes, "message": found.message})
         else:
-            origins = isocentre(len(track.located))
-        for index, (catheter, electrode) in enumerate(track.labels):
-            found["tracks"].append(
+            tracks.append(
                 {
-                    "site": stage.subject,
-                    "view": followed.view,
-                    "catheter": catheter,
-                    "electrode": electrode,
-                    "solver": stage.plugin,
-                    "samples": [_sample(sample) for sample in samples(track, index, camera, origins)],
+                    "site": found.site,
+                    "view": found.view,
+                    "catheter": found.catheter,
+                    "electrode": found.electrode,
+                    "solver": found.solver,
+                    "samples": [_sample(sample) for sample in found.samples],
                 }
             )
+    frame = {"axes": "LPS", "origin": str(origin), "unit": "mm"}
+    return {"frame": frame, "tracks": tracks, "rejected": rejected}
 
 
-def _rejected(site: str, view: View, reasons: tuple[Reason, ...], message: str) -> Found:
-    codes = list(dict.fromkeys(str(reason) for reason in reasons))
-    return {"site": site, "view": view, "reasons": codes, "message": message}
-
-
-def _sample(sample: Sample) -> Found:
+def _sample(sample: Sample) -> dict[str, Any]:
     x, y, z = (None, None, None) if sample.position_mm is None else sample.position_mm.tolist()
     u, v = (None, None) if sample.pixel_uv is None else sample.pixel_uv.tolist()
     return {
@@ -218,12 +178,13 @@ def _sample(sample: Sample) -> Found:
     }
 
 
-def tracks_csv(found: Found) -> str:
-    return csv_text(COLUMNS, _lines(found))
+def tracks_csv(answer: TracksJson) -> str:
+    """Return tracks as CSV, one line an electrode and frame."""
+    return csv_text(COLUMNS, _lines(answer))
 
 
-def _lines(found: Found) -> Iterator[list[Any]]:
-    for track in found["tracks"]:
+def _lines(answer: TracksJson) -> Iterator[list[Any]]:
+    for track in answer["tracks"]:
         for sample in track["samples"]:
             yield [
                 track["site"], track["view"], track["catheter"], track["electrode"], track["solver"], sample["frame"],
@@ -231,14 +192,14 @@ def _lines(found: Found) -> Iterator[list[Any]]:
                 *(sample["covariance_mm2"] or [None] * 6), *(sample["baseline_mm"] or [None] * 3),
                 sample["u_px"], sample["v_px"], sample["grade"], ";".join(sample["reasons"]),
             ]  # fmt: skip
-    for refused in found["rejected"]:
-        reasons = ";".join(refused["reasons"])
-        yield [refused["site"], refused["view"], *[None] * 20, str(Grade.REJECTED), reasons]
+    for rejected in answer["rejected"]:
+        reasons = ";".join(rejected["reasons"])
+        yield [rejected["site"], rejected["view"], *[None] * 20, str(Grade.REJECTED), reasons]
 
 
-def _read(job_id: str, origin: Origin, site: str | None, view: View | None) -> Found:
+def _read(job_id: str, origin: Origin, site: str | None, view: View | None) -> TracksJson:
     with reading() as session:
-        return tracks_of(session, job_of(session, job_id), origin, site, view)
+        return read_tracks(session, job_of(session, job_id), origin, site, view)
 
 
 @router.get(
@@ -255,16 +216,16 @@ def get_tracks(
     view: ViewQuery = None,
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
-    """Every electrode in every frame of the followed views, as JSON or CSV.
+    """Return every electrode in every frame of the tracked views, as JSON or CSV.
 
-    Origin `reference` subtracts the reference catheter's mean of the same frame, or the site's diastolic one in frames
-    where it was not located. Views that could not be followed stand under `rejected` with their reasons. 409
+    Origin `reference` subtracts the reference catheter's mean of the same frame. Frames that do not locate this catheter
+    subtract the site's diastolic mean. `rejected` lists the views without a track, with their reasons. The answer is 409
     `not_ready` until the stage `monoplane` of the site (without `site`: of all sites) is done.
     """
-    found = _read(job_id, origin, site, view)
+    answer = _read(job_id, origin, site, view)
     if wants_csv(request):
-        return csv_response(tracks_csv(found), "tracks.csv")
-    return JSONResponse(found, headers={"Vary": "Accept"})
+        return csv_response(tracks_csv(answer), "tracks.csv")
+    return JSONResponse(answer, headers={"Vary": "Accept"})
 
 
 @router.get(
@@ -280,5 +241,5 @@ def get_tracks_csv(
     view: ViewQuery = None,
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
-    """The same as `tracks`, always as CSV."""
+    """Return the same tracks as `tracks`, always as CSV."""
     return csv_response(tracks_csv(_read(job_id, origin, site, view)), "tracks.csv")

@@ -6,10 +6,10 @@ from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
+from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.csv_input import activation_times, csv_text
-from fluoromap_service.api.study.studies import StudyId
 from fluoromap_service.store.engine import writing
 from fluoromap_service.study import sites, studies
 

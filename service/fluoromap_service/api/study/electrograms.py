@@ -9,10 +9,10 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from fluoromap.electrogram import UnusableElectrogram, activation_time
+from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.csv_input import csv_text, electrogram
-from fluoromap_service.api.study.studies import StudyId
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies

@@ -6,15 +6,14 @@ import math
 from pathlib import Path as FilePath
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from fluoromap.drawing.png import encode_png
-from fluoromap_service.api.http.drawing_pool import drawn
-from fluoromap_service.api.http.etags import known, not_modified
+from fluoromap_service.api.http.etags import is_known, not_modified
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.study.instances import InstanceUid
-from fluoromap_service.api.study.studies import StudyId
 from fluoromap_service.dicom import InstanceFacts, frame_to_8bit, open_frames
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
@@ -22,8 +21,6 @@ from fluoromap_service.store.engine import reading
 from fluoromap_service.study import instances
 
 router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
-
-FrameNumber = Annotated[int, Path(ge=1, description="Counted from 1.")]
 
 
 def frame_png(path: FilePath, facts: InstanceFacts, frame: int, window: tuple[float, float] | None) -> bytes:
@@ -54,9 +51,9 @@ def get_frame(
         raise not_found("frame")
     shown = "" if chosen is None else f"-{chosen[0]:g}-{chosen[1]:g}"
     etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
-    if known(request, etag):
+    if is_known(request, etag):
         return not_modified(etag)
-    picture = drawn(frame_png, files.path_of(run.instance.sha256), run.facts, n - 1, chosen)
+    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, files.path_of(run.instance.sha256), run.facts, n - 1, chosen)
     # A stored file never changes.
     return Response(
         picture, media_type="image/png", headers={"ETag": etag, "Cache-Control": "private, max-age=3600, immutable"}

@@ -5,20 +5,20 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from fluoromap.geometry import LEAST_SOURCE_MM, Gantry
-from fluoromap_service.api.http.drawing_pool import drawn
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
-from fluoromap_service.api.study.studies import StudyId
 from fluoromap_service.api.study.uploads import Part, receive
 from fluoromap_service.dicom import InstanceFacts, read_instance
 from fluoromap_service.problem import Problem
@@ -30,7 +30,6 @@ from fluoromap_service.study.sites import BoundSite
 
 router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
 
-InstanceUid = Annotated[str, Path(description="SOP Instance UID.", max_length=64)]
 Spacing = Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)]
 SITE = "Mapping site that all runs of the request belong to."
 
@@ -205,7 +204,7 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
 def _read(part: Part) -> InstanceFacts | Problem:
     # In a process of its own: a hostile file can crash a decoder.
     try:
-        return drawn(read_instance, part.path)
+        return run_in_pool(Task.READ_FILE, read_instance, part.path)
     except Problem as problem:
         if problem.status == 429:
             raise
@@ -224,13 +223,13 @@ def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, A
 
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
-def list_instances(study_id: StudyId, paging: Pages, caller: Reader) -> Page[InstanceOut]:
+def list_instances(study_id: StudyId, pages: Pages, caller: Reader) -> Page[InstanceOut]:
     """The study's runs in the order of arrival."""
     with reading() as session:
         study = studies.get(session, study_id)
         views = sites.views_of(sites.resolve(session, study))
         runs = instances.runs_of(session, study_id)
-        return paging.slice(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
+        return pages.page_of_all(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
 
 
 def _one(session: Session, study: Study, uid: str) -> InstanceOut:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from fastapi import APIRouter, Path
+from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paths import SiteName, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
-from fluoromap_service.api.study.studies import StudyId
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies
 from fluoromap_service.study.sites import BoundSite
 
 router = APIRouter(prefix="/v1/studies/{study_id}/sites", tags=["sites"])
-
-SiteName = Annotated[str, Path(description="The site's name.", max_length=64)]
 
 
 class SiteOut(BaseModel):
@@ -61,11 +59,11 @@ def _shape(site: BoundSite) -> SiteOut:
 
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
-def list_sites(study_id: StudyId, paging: Pages, caller: Reader) -> Page[SiteOut]:
+def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]:
     """The study's sites in the order of first mention."""
     with reading() as session:
         bound = sites.resolve(session, studies.get(session, study_id))
-        return paging.slice(bound, _shape, lambda site: site.site)
+        return pages.page_of_all(bound, _shape, lambda site: site.site)
 
 
 @router.get("/{site}", responses=responses(401, 403, 404, 422))
@@ -91,4 +89,4 @@ def put_site(study_id: StudyId, site: SiteName, body: SitePut, caller: Writer) -
             row.lat_by = None if body.lat_ms is None else "explicit"
         views = body.model_dump(include={"view_a", "view_b"}, exclude_unset=True)
         sites.put_views(session, study, site, views)
-        return _shape(sites.as_it_stands(session, study, site))
+        return _shape(sites.one_or_empty(session, study, site))

@@ -1,4 +1,4 @@
-"""The paper's figures on a small simulated heart: what they say is what the positions say."""
+"""The paper's figures on a small simulated heart: their numbers agree with the positions."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_moment_is_when_the_tips_are_farthest_from_diastole(study: Simulated
     assert moved(phase) >= 0.9 * max(moved(at) for at in np.arange(20) / 20)
 
 
-def test_exact_positions_project_to_where_the_tip_is_seen(moments: dict[PhantomView, MomentInView]) -> None:
+def test_exact_positions_project_to_the_pixel_of_the_tip(moments: dict[PhantomView, MomentInView]) -> None:
     for moment in moments.values():
         for site in moment.sites:
             at = site.camera.project(site.exact.tip_mm + site.exact_origin_mm)
@@ -130,7 +130,7 @@ def test_long_captions_stay_on_the_page() -> None:
     assert (long[:, -8:] == long[0, 0]).all()
 
 
-def test_the_file_says_what_its_positions_say(made: PaperFigures) -> None:
+def test_the_file_agrees_with_its_positions(made: PaperFigures) -> None:
     content = json.loads(made.files()["figures.json"])
     assert (content["simulated"], content["seed"], content["simulated_sites"]) == (True, 6, 4)
     assert [(view["view"], view["figures"]) for view in content["views"]] == [("LAT", [3, 4]), ("PA", [5])]

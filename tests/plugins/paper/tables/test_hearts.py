@@ -22,7 +22,7 @@ def test_a_run_starts_in_diastole_and_a_whole_cycle_follows(runs: tuple[PhantomR
         assert len(run.electrodes) == 12
         cycle = run.part(CYCLE_IMAGES)
         assert len(cycle.truth_mm) == CYCLE_IMAGES
-        phases = np.array([seen.phase for seen in cycle.seen.observations])
+        phases = np.array([observation.phase for observation in cycle.solver_input.observations])
         assert phases[0] == pytest.approx(0.8, abs=0.05)
         # A dog's heart at 30 images a second: 13.6 to 18.8 of them a cycle.
         steps = np.diff(phases) % 1.0
@@ -30,21 +30,21 @@ def test_a_run_starts_in_diastole_and_a_whole_cycle_follows(runs: tuple[PhantomR
         assert 1 / 18.8 <= steps[0] <= 1 / 13.6
 
 
-def test_what_a_solver_gets_is_what_the_truth_shows(runs: tuple[PhantomRun, ...]) -> None:
+def test_a_solver_gets_the_projected_truth(runs: tuple[PhantomRun, ...]) -> None:
     for run in runs:
         by_label = {label: run.truth_mm[:, row] for row, label in enumerate(run.electrodes)}
-        for seen in run.seen.observations[:5]:
-            for chain in seen.chains:
-                truth = np.array([by_label[chain.catheter, number][seen.frame] for number in chain.electrodes])
-                off = run.seen.camera.project(truth) - chain.pixels_uv
+        for observation in run.solver_input.observations[:5]:
+            for chain in observation.chains:
+                truth = np.array([by_label[chain.catheter, number][observation.frame] for number in chain.electrodes])
+                off = run.solver_input.camera.project(truth) - chain.pixels_uv
                 assert np.abs(off).max() < 5 * 0.5
 
 
 def test_without_its_own_cycle_a_site_gets_those_of_the_others(runs: tuple[PhantomRun, ...]) -> None:
     bare = runs[0].without_own_cycle(runs)
-    assert bare.seen.cycle is None
-    assert len(bare.seen.others) == 2
-    assert all(cycle is not runs[0].seen.cycle for cycle in bare.seen.others)
+    assert bare.solver_input.cycle is None
+    assert len(bare.solver_input.others) == 2
+    assert all(cycle is not runs[0].solver_input.cycle for cycle in bare.solver_input.others)
 
 
 def test_table_2_prints_the_distance_of_the_start_from_the_truth(runs: tuple[PhantomRun, ...]) -> None:
@@ -55,7 +55,7 @@ def test_table_2_prints_the_distance_of_the_start_from_the_truth(runs: tuple[Pha
         assert row.paper is None
         assert (row.paper_rms_over_mean is not None) == (row.electrodes == "12" and row.dz_mm == 5)
         if row.dz_mm == 5:
-            # The heart hardly moves in these images: what was put in comes out, and adds up.
+            # The heart hardly moves in these images: the start value comes out and adds up.
             assert row.ours.mean_mm == pytest.approx(5, abs=0.7)
             expected = np.sqrt(np.mean(np.arange(1, row.images) ** 2))
             assert row.ours_rms_over_mean == pytest.approx(expected, rel=0.06)
@@ -72,7 +72,7 @@ def test_a_mapping_catheter_alone_is_refused_as_a_rigid_body(runs: tuple[Phantom
             assert row.bound_mm > 10
 
 
-def test_rigid_helices_are_told_without_a_start_value() -> None:
+def test_rigid_helices_need_no_start_value() -> None:
     rows: list[RigidPoseRow] = list(rigid_pose_rows())
     for row in rows:
         if row.noise_px == 0:
@@ -86,10 +86,10 @@ def test_rigid_helices_are_told_without_a_start_value() -> None:
 def test_errors_are_split_along_and_across_the_ray(
     runs: tuple[PhantomRun, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parts = {(run.seen.site, run.seen.view): run.part(CYCLE_IMAGES) for run in runs}
+    parts = {(run.solver_input.site, run.solver_input.view): run.part(CYCLE_IMAGES) for run in runs}
 
     class TooFar:
-        """Answers 1 mm behind the truth."""
+        """A solver whose positions are 1 mm behind the truth."""
 
         def track(self, view: MonoplaneView, context: Context) -> Track:
             run = parts[view.site, view.view]

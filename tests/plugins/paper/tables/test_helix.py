@@ -1,9 +1,9 @@
-"""The paper's simulation against what the paper and plain arithmetic say of it."""
+"""The paper's simulation against the paper and against plain arithmetic."""
 
 import numpy as np
 import pytest
 
-from fluoromap.paper.tables.helix import HELICES, helix_camera, motion_mm, moved
+from fluoromap.paper.tables.helix import HELICES, helix_camera, motion_mm, next_points_mm
 
 
 def test_equation_11_turns_about_x_then_y_then_z_and_shifts() -> None:
@@ -12,7 +12,7 @@ def test_equation_11_turns_about_x_then_y_then_z_and_shifts() -> None:
     y, z = c * y - s * z, s * y + c * z
     x, z = c * x + s * z, -s * x + c * z
     x, y = c * x - s * y, s * x + c * y
-    assert moved(np.array([[30.0, -20.0, 10.0]]))[0] == pytest.approx([x + 1, y + 1, z + 1], abs=1e-12)
+    assert next_points_mm(np.array([[30.0, -20.0, 10.0]]))[0] == pytest.approx([x + 1, y + 1, z + 1], abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["H77", "H18"])
@@ -21,7 +21,7 @@ def test_the_motion_is_rigid_and_applied_again_from_image_to_image(name: str) ->
     assert points.shape == (5, 30, 3)
     apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
     assert apart == pytest.approx(np.broadcast_to(apart[0], apart.shape), abs=1e-9)
-    assert moved(points[3]) == pytest.approx(points[4])
+    assert next_points_mm(points[3]) == pytest.approx(points[4])
 
 
 def test_a_helix_lies_on_its_cylinder_and_winds_twice() -> None:
@@ -34,7 +34,7 @@ def test_a_helix_lies_on_its_cylinder_and_winds_twice() -> None:
 
 
 def test_displacements_in_the_image_are_the_paper_s() -> None:
-    """The signs of the mean displacement tell which way the views look; H77 was fitted to its size."""
+    """Check signs of the mean displacement, which show the views' directions, and its size, to which H77 was fitted."""
     points = motion_mm(HELICES["H77"], 6)
     for view, mean in (("AP", (4.97, 7.12)), ("LAT", (-6.82, -6.03))):
         pixels = helix_camera(view).project(points)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Table 1: what of the paper is reproduced, and what its figures obey."""
+"""Table 1: reproduced figures of the paper, and the laws that they obey."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_the_answer_follows_the_start_value(rows: tuple[Table1Row, ...]) -> None
 def test_a_constant_error_accumulates_as_the_root_of_the_mean_of_k_squared(
     rows: tuple[Table1Row, ...], source: str
 ) -> None:
-    """Far from the true displacement the error is nearly the same in every image, in the paper as in ours."""
+    """Check that far from the true displacement the error is nearly the same in every image, as in the paper."""
     for row in of(rows, "H77", "AP"):
         if row.dz_mm >= 4:
             figures: DepthFigures = getattr(row, source)
@@ -52,7 +52,7 @@ def test_a_constant_error_accumulates_as_the_root_of_the_mean_of_k_squared(
 
 
 def test_the_best_start_value_is_the_truth_not_an_estimate(rows: tuple[Table1Row, ...]) -> None:
-    """H18's true displacement in depth is about 1 mm: dz = 1 is right by being told."""
+    """Check that dz = 1 is right only because the true displacement in depth of H18 is about 1 mm."""
     for view in ("AP", "LAT"):
         for images in IMAGES:
             means = [row.ours.mean_mm for row in of(rows, "H18", view) if row.images == images]

@@ -33,15 +33,15 @@ from sqlalchemy import select
 from fluoromap.contracts import NamedChain
 from fluoromap.drawing.animation import PICTURES
 from fluoromap_service.api.results import overlays as overlay_routes
-from fluoromap_service.api.results.overlays import fusion_of
+from fluoromap_service.results.fusion import Fusion, fusion_of
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Job, Rendering, StudyInstance
 
-pytestmark = pytest.mark.usefixtures("drawing_processes")
+pytestmark = pytest.mark.usefixtures("file_processes")
 
 
-def _fusion(study: FinishedStudy, view: str, frame: int | None) -> overlay_routes.Fusion:
+def _fusion(study: FinishedStudy, view: str, frame: int | None) -> Fusion:
     with reading() as session:
         return fusion_of(session, session.get_one(Job, study.job_id), study.uids["S01", view], frame)
 
@@ -69,7 +69,7 @@ def test_size_and_cache(client: TestClient, study: FinishedStudy, monkeypatch: p
     def never(*_: object) -> bytes:
         raise AssertionError("drawn again")
 
-    monkeypatch.setattr(overlay_routes, "drawn", never)
+    monkeypatch.setattr(overlay_routes, "run_in_pool", never)
     assert client.get(path).content == first.content
     assert client.get(f"{path}?frame={DIASTOLE + 1}").content == first.content
     assert client.get(path, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
@@ -126,7 +126,7 @@ def test_runs_without_overlay(client: TestClient, study: FinishedStudy) -> None:
         assert client.get(f"/v1/jobs/{study.job_id}/overlays/{uid}.png").status_code == 404
 
 
-def _stands_at(fusion: overlay_routes.Fusion, view: str, place_mm: NDArray[np.float64]) -> None:
+def _stands_at(fusion: Fusion, view: str, place_mm: NDArray[np.float64]) -> None:
     """The map hangs on a place that this view shows where it shows ``place_mm``, at its depth."""
     np.testing.assert_allclose(fusion.camera.project(fusion.shift_mm), camera(view).project(place_mm), atol=0.01)
     assert abs(fusion.camera.depth_mm(fusion.shift_mm) - camera(view).depth_mm(place_mm)) < 0.1

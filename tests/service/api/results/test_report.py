@@ -15,7 +15,7 @@ from finished_study import FinishedStudy, no_map
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import Study
 
-pytestmark = pytest.mark.usefixtures("drawing_processes")
+pytestmark = pytest.mark.usefixtures("file_processes")
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

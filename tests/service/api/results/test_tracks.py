@@ -24,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fluoromap_service.api.results.track_samples import reference, split_along_ray
+from fluoromap.monoplane.track_samples import reference_origins, split_along_ray
 
 
 def _tip(client: TestClient, study: FinishedStudy, query: str = "") -> list[dict[str, Any]]:
@@ -62,7 +62,7 @@ def test_the_reference_stays_in_place_when_some_of_it_is_hidden(hidden: tuple[in
     assert track is not None
     located = track.located.copy()
     located[:, list(hidden)] = False
-    origins = reference(replace(track, located=located), triangulation().sites[0], "reference", None)
+    origins = reference_origins(replace(track, located=located), triangulation().sites[0], "reference", None)
     np.testing.assert_allclose(origins.positions_mm[:2], [REFERENCE_MM + STEP_MM, REFERENCE_MM])
     # In the third frame nothing of it is seen.
     np.testing.assert_allclose(origins.positions_mm[2], REFERENCE_MM)

@@ -1,4 +1,4 @@
-"""Where heart and catheters lie in the chest, and how strongly this heart moves them."""
+"""Anatomy of one heart: places of the chamber and the catheters in the chest, and the strength of their motion."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ Array = NDArray[np.float64]
 SEMI_AXES_MM = (22.0, 22.0, 40.0)
 RADIUS_6F_MM, RADIUS_7F_MM = 1.0, 1.17
 PACING_SLIP_MM = 1.5
-"""Standard deviation an axis of where the pacing catheter's tip lies from site to site; the reference is fixed."""
+"""Standard deviation an axis of the pacing catheter's tip from site to site; the reference does not slip."""
 _SEPTUM_MM_PER_MS = 0.6
-# What the tips' mean excursion along an axis is brought to, unless that is too fast for the heart's rate.
+# Range of the tips' mean excursion along an axis, unless that is too fast at the heart's rate.
 _EXCURSION_MM = (4.4, 5.6)
-# Across the ray of a lateral or frontal view; leaves room below 9 px between frames at 60/s for beats that differ.
+# Across the ray of a lateral or frontal view. With beat-to-beat variation it stays below 9 px between frames at 60/s.
 _FASTEST_MM_PER_S = 88.0
 
 
 @dataclass(frozen=True, eq=False)
 class Resident:
-    """A catheter in place: its shaft and the displacement of its tip by each pulse of the beat, (MODES, 3) mm."""
+    """A catheter in the heart: its shaft, and the displacement of its tip by each pulse of the beat, (MODES, 3) mm."""
 
     shaft: Shaft
     vectors_mm: Array
@@ -45,9 +45,9 @@ class Resident:
 class Anatomy:
     """One heart with its catheters.
 
-    reference : in the right ventricle, fixed there. pacing : beside it, site by site, for it slips a little whenever the
-    mapping catheter is turned. mapping : in the left ventricle, site by site.
-    contacts_mm : (sites, 3) where its tip's end touches the wall at diastole.
+    reference : fixed in the right ventricle. pacing : beside it, one entry a site, because it slips a little when the
+    mapping catheter is turned. mapping : in the left ventricle, one entry a site.
+    contacts_mm : (sites, 3) points where the mapping tip's end touches the wall at diastole.
     """
 
     chamber: Chamber
@@ -58,12 +58,12 @@ class Anatomy:
     contacts_mm: Array
 
     def residents(self, site: int) -> tuple[Resident, ...]:
-        """Reference, pacing and mapping catheter at a site."""
+        """Return reference, pacing and mapping catheter at a site."""
         return (self.reference, self.pacing[site], self.mapping[site])
 
 
 def draw_anatomy(heart: HeartKind, sites: int, rng: np.random.Generator) -> Anatomy:
-    """A heart at random: pose, rate, focus, conduction and motion differ from one to the next."""
+    """Draw a random heart: pose, rate, focus, conduction and motion."""
     rate = float(rng.uniform(*HEART_RATE_HZ[heart]))
     chamber, reference, pacing = _ventricles(rng)
     contacts = spread_over_wall(chamber, sites, rng)
@@ -82,14 +82,17 @@ def draw_anatomy(heart: HeartKind, sites: int, rng: np.random.Generator) -> Anat
         chamber,
         rate,
         Resident(reference, vectors[0]),
-        tuple(Resident(pacing.slipped(slip), vectors[1]) for slip in slips),
+        tuple(Resident(pacing.with_tip_displaced(slip), vectors[1]) for slip in slips),
         tuple(Resident(shaft, v) for shaft, v in zip(mapping, vectors[2:], strict=True)),
         contacts,
     )
 
 
 def _ventricles(rng: np.random.Generator) -> tuple[Chamber, Shaft, Shaft]:
-    """The left ventricle, apex to the patient's left, front and feet, and the two catheters in the right one."""
+    """Draw the left ventricle and the two catheters in the right ventricle.
+
+    The apex points to the patient's left, front and feet.
+    """
     apex = np.array([0.55, -0.55, -0.63]) + rng.normal(0, 0.08, 3)
     apex /= np.linalg.norm(apex)
     to_right = np.array([-0.9, -0.4, -0.1]) + rng.normal(0, 0.08, 3)
@@ -125,13 +128,13 @@ def _ventricles(rng: np.random.Generator) -> tuple[Chamber, Shaft, Shaft]:
 
 
 def _mapping_shaft(chamber: Chamber, contact_mm: Array, rng: np.random.Generator) -> Shaft:
-    """The mapping catheter, come down the aorta through the valve, its tip's end on the wall."""
+    """Draw the mapping catheter: through aorta and valve, with its tip's end on the wall."""
     inward = chamber.inward(contact_mm)
     valve = chamber.centre_mm - 34 * chamber.axes[2] + rng.normal(0, 2, 3)
     to_valve = valve - contact_mm
     leaving = 0.4 * inward + to_valve / np.linalg.norm(to_valve) + rng.normal(0, 0.2, 3)
     leaving /= np.linalg.norm(leaving)
-    # However the hand turns it, the tip meets the wall rather than lying along it.
+    # The tip must meet the wall at an angle, not lie along it.
     leaving += max(0.0, 0.25 - float(leaving @ inward)) * inward
     leaving /= np.linalg.norm(leaving)
     bow = valve + 18 * np.array([-0.2, 0.2, 1.0]) + rng.normal(0, 3, 3)
@@ -141,7 +144,10 @@ def _mapping_shaft(chamber: Chamber, contact_mm: Array, rng: np.random.Generator
 
 
 def _strength(common: Array, own: Array, rate_hz: float, excursion_mm: float) -> float:
-    """How strongly this heart beats: mapping tips move ``excursion_mm`` an axis on average, no tip faster than the limit."""
+    """Return the factor of the common motion.
+
+    Mapping tips then move by ``excursion_mm`` an axis on average, and no tip is faster than the limit.
+    """
     steps = 60
     times = np.arange(steps) / steps
     pulses = Beats.even(rate_hz, 1 / rate_hz).pulses(times / rate_hz)
@@ -156,6 +162,6 @@ def _strength(common: Array, own: Array, rate_hz: float, excursion_mm: float) ->
 
 
 def electrodes_over_cycle_mm(residents: Sequence[Resident], steps: int) -> Array:
-    """All electrodes at ``steps`` phases of an average beat, shape (steps, electrodes, 3)."""
+    """Return all electrodes (steps, electrodes, 3) at ``steps`` phases of an average beat."""
     pulses = Beats.even(1.0, 1.0).pulses(np.arange(steps) / steps)
-    return np.concatenate([r.shaft.electrodes_mm(r.shaft.moved(pulses @ r.vectors_mm)) for r in residents], axis=1)
+    return np.concatenate([r.shaft.electrodes_mm(r.shaft.lines_mm(pulses @ r.vectors_mm)) for r in residents], axis=1)

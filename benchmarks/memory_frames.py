@@ -1,4 +1,4 @@
-"""Rendered frames kept in memory, for the benchmarks that segment them: rendering is not what they measure."""
+"""Rendered frames in memory, for benchmarks that segment frames and must not measure their rendering."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class KeptFrames:
-    """A :class:`fluoromap.contracts.FrameSource` of frames (rows, columns) that are all there."""
+class MemoryFrames:
+    """A :class:`fluoromap.contracts.FrameSource` of frames (rows, columns) in memory."""
 
     def __init__(self, frames: Iterable[NDArray[np.uint16]]) -> None:
         self._frames = list(frames)

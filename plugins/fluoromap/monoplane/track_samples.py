@@ -1,0 +1,152 @@
+"""The samples of a tracked view: positions from a chosen origin, with their uncertainty and grade."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Array, BoolArray, Grade, LocatedSite, Track, grade_of
+from fluoromap.geometry import Camera
+from fluoromap.reasons import Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One electrode in one frame (counted from 1).
+
+    position_mm, baseline_mm, covariance_mm2 : (3,), (3,), (3, 3); None in frames without a position.
+    along_ray_sd_mm : standard deviation along the ray of this view. lateral_sd_mm : across it, root mean square of the
+    two directions. pixel_uv : (2,) the electrode's pixel; None in frames that do not show it.
+    """
+
+    frame: int
+    position_mm: Array | None
+    baseline_mm: Array | None
+    covariance_mm2: Array | None
+    along_ray_sd_mm: float | None
+    lateral_sd_mm: float | None
+    pixel_uv: Array | None
+    grade: Grade
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameOrigins:
+    """The origin of coordinates in each of n frames.
+
+    positions_mm : (n, 3) from the isocentre; subtract it from a position. known : (n,), False in frames without an origin.
+    borrowed : (n,), True where the origin is the mean over the other sites. same_frame : (n,), True where the origin is the
+    reference catheter's mean in that frame; then it shares its errors with the positions of that frame.
+    """
+
+    positions_mm: Array
+    known: BoolArray
+    borrowed: BoolArray
+    same_frame: BoolArray
+
+
+def isocentre_origins(frames: int) -> FrameOrigins:
+    """Return the isocentre as the origin of every frame."""
+    never = np.zeros(frames, dtype=np.bool_)
+    return FrameOrigins(np.zeros((frames, 3)), ~never, never, never)
+
+
+def reference_origins(track: Track, site: LocatedSite, catheter: str, others_mm: Array | None) -> FrameOrigins:
+    """Return the mean of the reference catheter's electrodes in each frame.
+
+    A frame may show only some of the electrodes. Then each of them gives an estimate of the mean, by subtracting its
+    diastolic offset from the mean. A frame without any takes the site's own diastolic mean.
+
+    Parameters
+    ----------
+    track : Track
+    site : LocatedSite
+        The site of the track.
+    catheter : str
+        Name of the reference catheter.
+    others_mm : (3,) or None
+        Mean over the other sites, from the isocentre, for a site that has no diastolic mean of its own.
+    """
+    electrodes = [index for index, (name, _) in enumerate(track.labels) if name == catheter]
+    offsets_mm, has_offset = np.zeros((len(electrodes), 3)), np.ones(len(electrodes), dtype=np.bool_)
+    if site.reference_mm is not None:
+        for row, index in enumerate(electrodes):
+            point = site.point(*track.labels[index])
+            has_offset[row] = point is not None
+            if point is not None:
+                offsets_mm[row] = point.position_mm - site.reference_mm
+    located = track.located[:, electrodes] & has_offset
+    count = located.sum(axis=1)
+    total = np.where(located[..., None], track.positions_mm[:, electrodes] - offsets_mm, 0.0).sum(axis=1)
+    mean: Array = total / np.maximum(count, 1)[:, None]
+    same_frame: BoolArray = count > 0
+    fallback = site.reference_mm if site.reference_mm is not None else others_mm
+    if fallback is None:
+        return FrameOrigins(mean, same_frame, np.zeros_like(same_frame), same_frame)
+    mean[~same_frame] = fallback
+    borrowed = ~same_frame if site.reference_mm is None else np.zeros_like(same_frame)
+    return FrameOrigins(mean, np.ones_like(same_frame), borrowed, same_frame)
+
+
+def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigins) -> Iterator[Sample]:
+    """Return the samples of one electrode, one for each frame.
+
+    Where the origin is the reference of the same frame, the covariance is that of the difference, if the solver gives it:
+    breathing and the gantry's errors cancel. Otherwise it is the covariance of the position from the isocentre.
+
+    Parameters
+    ----------
+    track : Track
+    index : int
+        Place of the electrode in ``track.labels``.
+    camera : Camera
+        Camera of the tracked view.
+    origins : FrameOrigins
+        For all frames of the track.
+    """
+    doubts = track.reasons[index]
+    source = camera.source_world_mm
+    for frame, located in enumerate(track.located[:, index]):
+        if not located:
+            yield _without_position(frame, None, (*doubts, Reason.TRACK_INTERRUPTED))
+            continue
+        pixel = track.pixels_uv[frame, index]
+        if not origins.known[frame]:
+            yield _without_position(frame, pixel, (*doubts, Reason.NO_REFERENCE))
+            continue
+        reasons = (*doubts, Reason.NO_REFERENCE) if origins.borrowed[frame] else doubts
+        position, covariance = track.positions_mm[frame, index], track.covariance_mm2[frame, index]
+        if origins.same_frame[frame] and track.relative_covariance_mm2 is not None:
+            covariance = track.relative_covariance_mm2[frame, index]
+        along, lateral = split_along_ray(covariance, position - source)
+        origin = origins.positions_mm[frame]
+        yield Sample(
+            frame + 1, position - origin, track.baseline_mm[frame, index] - origin, covariance, along, lateral, pixel,
+            grade_of(covariance), tuple(dict.fromkeys(reasons)),
+        )  # fmt: skip
+
+
+def _without_position(frame: int, pixel: Array | None, reasons: tuple[Reason, ...]) -> Sample:
+    return Sample(frame + 1, None, None, None, None, None, pixel, Grade.REJECTED, tuple(dict.fromkeys(reasons)))
+
+
+def split_along_ray(covariance_mm2: Array, ray: Array) -> tuple[float, float]:
+    """Return the standard deviations along a ray and across it, in mm.
+
+    Parameters
+    ----------
+    covariance_mm2 : (3, 3)
+    ray : (3,)
+        Direction of any length.
+
+    Returns
+    -------
+    tuple of float
+        Along the ray; and the root mean square of the two directions across it.
+    """
+    direction = ray / np.linalg.norm(ray)
+    along = float(direction @ covariance_mm2 @ direction)
+    across = (float(np.trace(covariance_mm2)) - along) / 2
+    return float(np.sqrt(max(along, 0.0))), float(np.sqrt(max(across, 0.0)))

@@ -1,0 +1,188 @@
+"""The report of a job: one self-contained page with pictures, a 3D view, tables, plugins and parameters."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import gzip
+import hashlib
+import io
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from PIL import Image
+from sqlalchemy.orm import Session
+
+from fluoromap.contracts import ChamberMap, Triangulation
+from fluoromap.drawing.colours import vertex_colours
+from fluoromap.drawing.map_picture import draw_map_views
+from fluoromap.drawing.overlay import Look
+from fluoromap.drawing.png import encode_png
+from fluoromap_service.api.jobs.job_answers import read_job
+from fluoromap_service.api.results.overlays import picture_of
+from fluoromap_service.api.results.points import points_of
+from fluoromap_service.api.results.report_tables import (
+    budget_rows,
+    calibration_line,
+    electrodes,
+    glossary,
+    tips,
+    tracks,
+)
+from fluoromap_service.api.results.tracks import read_tracks
+from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
+from fluoromap_service.problem import Problem
+from fluoromap_service.results.finished import job_of, snapshot_of
+from fluoromap_service.results.fusion import fusion_of, located_views
+from fluoromap_service.results.maps import map_of
+from fluoromap_service.results.origins import Origin
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.models import Study
+
+WEB = Path(__file__).parents[2] / "web"
+SCRIPTS = {"core": "three.core.js", "three": "three.module.js", "controls": "OrbitControls.js"}
+JPEG_QUALITY = 88
+"""Fluoroscopy is noise: with JPEG a page of 40 overlays has a few MB."""
+
+
+def report_page(job_id: str) -> str:
+    """Return the page of an ended job, with all results that the job has."""
+    values = _values(job_id)
+    chamber = values.pop("map")
+    values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None}
+    if chamber is not None:
+        values |= {
+            "chamber": _figures(chamber),
+            "map_png": _inline(encode_png(draw_map_views(chamber)), "image/png"),
+            "overlays": _overlays(job_id),
+            "scene": _json(_scene(chamber)),
+            "scripts": _json({name: _packed(file) for name, file in SCRIPTS.items()}),
+        }
+    return _environment().get_template("report.html.j2").render(values)
+
+
+def _values(job_id: str) -> dict[str, Any]:
+    with reading() as session:
+        job = job_of(session, job_id)
+        snapshot = snapshot_of(job)
+        chamber, no_map = None, ""
+        try:
+            chamber = map_of(session, job).chamber
+        except Problem as problem:
+            no_map = str(problem.detail)
+        triangulated = stage_of(session, job_id, "triangulate")
+        triangulation = load(Triangulation, triangulated) if triangulated and triangulated.result else None
+        points = points_of(session, job, Origin.REFERENCE) if triangulation else []
+        tracked = triangulation is not None and _all_tracked(session, job_id)
+        study = session.get(Study, job.study_id)
+        rows = tips(points, snapshot.mapping, chamber)
+        electrode_rows = electrodes(points)
+        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE), snapshot.mapping) if tracked else []
+        return {
+            "job": read_job(session, job),
+            "label": study.label if study else "Mapping study",
+            "version": version("fluoromap"),
+            "reference": snapshot.reference,
+            "map": chamber,
+            "no_map": no_map,
+            "tips": rows,
+            "located": sum(row["grade"] != "rejected" for row in rows),
+            "grades": [(grade, sum(row["grade"] == grade for row in rows)) for grade in ("A", "B", "C", "rejected")],
+            "reasons": glossary([*rows, *electrode_rows, *track_rows]),
+            "points": electrode_rows,
+            "tracks": track_rows,
+            "budget": budget_rows(triangulation.budget) if triangulation else [],
+            "calibration": calibration_line(triangulation.calibration) if triangulation else None,
+            "notes": triangulation.notes if triangulation else (),
+            "plugins": [
+                (stage, getattr(snapshot, stage)) for stage in ("segmenter", "triangulator", "monoplane", "fuser")
+            ],
+            "catheters": snapshot.catheters,
+            "runs": sorted(snapshot.runs.items()),
+        }
+
+
+def _all_tracked(session: Session, job_id: str) -> bool:
+    return all(stage.result or stage.error for stage in stages_of(session, job_id, "monoplane"))
+
+
+def _figures(chamber: ChamberMap) -> dict[str, Any]:
+    return {
+        "earliest": chamber.earliest[0][0] if chamber.earliest else "–",
+        "all_earliest": [entry for entry in chamber.earliest if entry[1] >= 0.005],
+        **{
+            name: getattr(chamber, name)
+            for name in (
+                "total_activation_time_ms", "leave_one_out_rms_ms", "conduction_velocity", "volume_ml", "area_cm2",
+                "coverage", "warnings",
+            )
+        },
+    }  # fmt: skip
+
+
+def _overlays(job_id: str) -> list[dict[str, Any]]:
+    with reading() as session:
+        job = job_of(session, job_id)
+        fusions = [(view, fusion_of(session, job, view.uid, None)) for view in located_views(session, job)]
+    pictures = []
+    for view, fusion in fusions:
+        try:
+            picture = picture_of(job_id, fusion, Look(covariances_mm2=fusion.covariances_mm2))
+        except Problem:
+            # Somebody deleted the run meanwhile: its numbers are still in the tables.
+            continue
+        source = _jpeg(picture.path)
+        pictures.append({"site": view.site, "view": view.view, "frame": view.frame + 1, "src": source})
+    return pictures
+
+
+def _scene(chamber: ChamberMap) -> dict[str, Any]:
+    return {
+        "vertices": chamber.vertices_mm.round(2).tolist(),
+        "faces": chamber.faces.tolist(),
+        "colours": vertex_colours(chamber).tolist(),
+        "sites": [site.position_mm.round(2).tolist() for site in chamber.sites],
+    }
+
+
+def _jpeg(path: Path) -> str:
+    stream = io.BytesIO()
+    Image.open(path).save(stream, format="JPEG", quality=JPEG_QUALITY)
+    return _inline(stream.getvalue(), "image/jpeg")
+
+
+def _inline(content: bytes, media_type: str) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
+
+
+def _json(value: Any) -> Markup:
+    """Return JSON for a script element, which would end at the first "</" even inside a text."""
+    return Markup(json.dumps(value, separators=(",", ":")).replace("<", "\\u003c"))
+
+
+@functools.cache
+def _packed(name: str) -> str:
+    return base64.b64encode(gzip.compress((WEB / "three" / name).read_bytes(), mtime=0)).decode()
+
+
+@functools.cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(WEB), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    environment.filters["number"] = _number
+    return environment
+
+
+@functools.cache
+def template_sha256() -> str:
+    """Return the hash of the page's template."""
+    return hashlib.sha256((WEB / "report.html.j2").read_bytes()).hexdigest()
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,40 @@
+"""The environment variables that a command sets for its own process and for its children."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from fluoromap_service.settings import settings
+
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def limit_threads() -> None:
+    """Limit the numerical libraries to one thread for each process.
+
+    NumPy and numba read these variables once, at import: call it before. A value that the user has set stays.
+    """
+    # A worker already runs one process for each processor. More threads would only compete.
+    for name in THREAD_LIMITS:
+        os.environ.setdefault(name, "1")
+
+
+def apply_options(host: str | None = None, port: int | None = None, data_dir: Path | None = None) -> None:
+    """Store the options of a command as environment variables.
+
+    The settings of this process and of its children come from there. None leaves a setting unchanged.
+    """
+    for name, value in (("HOST", host), ("PORT", port), ("DATA_DIR", data_dir)):
+        if value is not None:
+            os.environ[f"FLUOROMAP_{name}"] = str(value)
+    settings.cache_clear()
+
+
+def keep_compiled_kernels() -> None:
+    """Let numba keep compiled kernels in the data folder.
+
+    numba reads this variable once, at import: a module that calls it must not import numba itself.
+    """
+    # The folder of the installed package may be read-only. The data folder is writable.
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(settings().data_dir.resolve() / "numba"))

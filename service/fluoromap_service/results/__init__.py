@@ -1,0 +1,1 @@
+"""Stored results of jobs as values: what readers ask for, without HTTP."""

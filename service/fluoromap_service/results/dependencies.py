@@ -1,0 +1,81 @@
+"""Everything that a kept picture, mesh or report depends on, in one place.
+
+The store keeps a file under the hash of these values and makes a new one when a value changes. Each list begins with the
+version of the code that makes the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from fluoromap import drawing, meshes
+from fluoromap.drawing.overlay import Look
+from fluoromap.geometry import Camera
+from fluoromap_service.results.fusion import Fusion
+from fluoromap_service.results.origins import Origin
+
+Dependencies = dict[str, Any]
+"""JSON values."""
+
+_BY_HASH = frozenset({"facts", "chamber", "covariances_mm2"})
+"""Fields of a fusion that other values imply: the hash of the file, the hash of the map, and the look."""
+
+
+def overlay_dependencies(fusion: Fusion, look: Look, *, moving: bool) -> Dependencies:
+    """Return the dependencies of an overlay (PNG), or of its propagation (GIF).
+
+    Every field of the fusion and of the look counts, so that a new field cannot be forgotten.
+    """
+    return {
+        "kind": "propagation" if moving else "overlay",
+        "drawing": drawing.VERSION,
+        "fusion": {name: value for name, value in _fields(fusion).items() if name not in _BY_HASH},
+        "look": _fields(look),
+    }
+
+
+def mesh_dependencies(map_sha256: str, mesh_format: str, origin: Origin) -> Dependencies:
+    """Return the dependencies of a mesh file; its colours come from the drawing code."""
+    return {
+        "kind": "mesh",
+        "meshes": meshes.VERSION,
+        "drawing": drawing.VERSION,
+        "map": map_sha256,
+        "format": str(mesh_format),
+        "origin": str(origin),
+    }
+
+
+def report_dependencies(template_sha256: str, job_version: int, label: str | None) -> Dependencies:
+    """Return the dependencies of a job's report, which prints the version of the package."""
+    return {
+        "kind": "report",
+        "package": version("fluoromap"),
+        "drawing": drawing.VERSION,
+        "template": template_sha256,
+        "job": job_version,
+        "label": label,
+    }
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {field.name: _json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+
+
+def _json(value: Any) -> Any:
+    if isinstance(value, Camera):
+        return [value.matrix.tolist(), value.rows, value.columns]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _json(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_json(item) for item in value]
+    if dataclasses.is_dataclass(value):
+        return _fields(value)
+    return value

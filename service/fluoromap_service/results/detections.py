@@ -1,0 +1,82 @@
+"""The electrodes that the newest job detected in one frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from fluoromap.contracts import Chain, Matching, NamedChain, Segmentation
+from fluoromap_service.jobs.stage_results import load, stage_of
+from fluoromap_service.store.models import Job, StageRow, StageState
+from fluoromap_service.study.snapshot import Snapshot
+
+
+@dataclass(frozen=True, slots=True)
+class DetectedElectrode:
+    """One electrode in stored pixels; ``catheter`` is None where no catheter of the study fits."""
+
+    catheter: str | None
+    electrode: int
+    u_px: float
+    v_px: float
+    sd_px: float
+
+
+def detected_electrodes(session: Session, study_id: str, uid: str, frame: int) -> list[DetectedElectrode]:
+    """Return the electrodes that the newest job with this run detected in a frame (counted from 0)."""
+    stage = session.scalar(
+        select(StageRow)
+        .join(Job, Job.id == StageRow.job_id)
+        .where(
+            Job.study_id == study_id,
+            StageRow.name == "segment",
+            StageRow.subject == uid,
+            StageRow.state == StageState.DONE,
+        )
+        .order_by(Job.created.desc(), Job.id)
+        .limit(1)
+    )
+    if stage is None:
+        return []
+    # A person may have deleted the correction after the job: a chain set by hand is no detection.
+    chains = tuple(chain for chain in load(Segmentation, stage).frames[frame].chains if not chain.manual)
+    found: list[DetectedElectrode] = []
+    for chain, name in zip(chains, _names(session, stage.job_id, uid, frame, chains), strict=True):
+        for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
+            sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
+            found.append(DetectedElectrode(name, electrode, float(u), float(v), sd))
+    return found
+
+
+def _names(session: Session, job_id: str, uid: str, frame: int, chains: tuple[Chain, ...]) -> list[str | None]:
+    """Return a catheter for each chain, none twice.
+
+    It is the catheter that the job's matching chose, else the most probable kind.
+    """
+    of_track = {chain.track: chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
+    names = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
+    likely = sorted(
+        ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
+        key=lambda item: (-item[0], item[1]),
+    )
+    for _, index, name in likely:
+        if names[index] is None and name not in names:
+            names[index] = name
+    return names
+
+
+def _named_chains(session: Session, job_id: str, uid: str, frame: int) -> tuple[NamedChain, ...]:
+    stage = stage_of(session, job_id, "match")
+    if stage is None or stage.state != StageState.DONE:
+        return ()
+    snapshot = Snapshot.model_validate(session.get_one(Job, job_id).snapshot)
+    views = {
+        site.site: "a" if site.view_a == uid else "b" for site in snapshot.sites if uid in (site.view_a, site.view_b)
+    }
+    for site in load(Matching, stage).sites:
+        if site.site in views:
+            return (site.track_a if views[site.site] == "a" else site.track_b)[frame].chains
+    return ()

@@ -1,0 +1,65 @@
+"""The file pool: a bad file ends one process of the pool and nothing else."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+from fluoromap_service.api.http import file_pool
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.problems import Problem
+from fluoromap_service.dicom import DicomCode, dicom_problem
+
+
+def _double(number: int) -> int:
+    return 2 * number
+
+
+def _die() -> None:
+    os._exit(1)
+
+
+def _refuse() -> None:
+    raise dicom_problem(DicomCode.UNDECODABLE, "This frame is broken.", "PixelData")
+
+
+def _hang() -> None:
+    time.sleep(600)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _processes(file_processes: None) -> None:
+    assert run_in_pool(Task.DRAW_PICTURE, _double, 2) == 4
+
+
+@pytest.mark.parametrize(
+    ("task", "begin"), [(Task.READ_FILE, "Reading this file"), (Task.DRAW_PICTURE, "Drawing this")]
+)
+def test_a_file_that_kills_its_process_is_an_error_and_the_next_request_works(task: Task, begin: str) -> None:
+    with pytest.raises(Problem) as problem:
+        run_in_pool(task, _die)
+    assert (problem.value.status, problem.value.code) == (422, "undecodable")
+    assert problem.value.detail.startswith(begin)
+    assert run_in_pool(task, _double, 21) == 42
+
+
+def test_a_problem_of_the_file_passes() -> None:
+    with pytest.raises(Problem) as problem:
+        run_in_pool(Task.DRAW_PICTURE, _refuse)
+    assert (problem.value.status, problem.value.errors[0][0]) == (422, "PixelData")
+
+
+@pytest.mark.parametrize(
+    ("task", "begin"), [(Task.READ_FILE, "Reading this file"), (Task.DRAW_PICTURE, "Drawing this")]
+)
+def test_a_function_that_hangs_is_stopped(monkeypatch: pytest.MonkeyPatch, task: Task, begin: str) -> None:
+    monkeypatch.setattr(file_pool, "LONGEST_SECONDS", 0.2)
+    with pytest.raises(Problem) as problem:
+        run_in_pool(task, _hang)
+    assert problem.value.code == "undecodable"
+    assert problem.value.detail == f"{task} takes too long; check the file."
+    assert problem.value.detail.startswith(begin)
+    monkeypatch.undo()
+    assert run_in_pool(task, _double, 1) == 2

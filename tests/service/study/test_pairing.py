@@ -1,0 +1,158 @@
+"""The pairing rules as pure functions, without a database."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+
+from fluoromap_service.study.pairing import (
+    Pairing,
+    Run,
+    Site,
+    central_ray,
+    named_run,
+    pair_runs,
+    pairs_by_time,
+    ray_angle_deg,
+    table_moved,
+)
+
+START = datetime(2026, 3, 1, 9, 30, tzinfo=UTC)
+LAT, PA = -90.0, 0.0
+
+
+def run(number: int, primary_deg: float | None, seconds: float | None = -1.0, **facts: Any) -> Run:
+    """Run ``number``; it begins 20 s after the run before unless ``seconds`` says otherwise, None: unknown."""
+    moment = None if seconds is None else START + timedelta(seconds=20.0 * number if seconds < 0 else seconds)
+    direction = None if primary_deg is None else central_ray(primary_deg, 0.0)
+    return Run(f"1.2.{number}", number, direction, moment, **facts)
+
+
+def uids(pairing: Pairing, site: str) -> tuple[str | None, str | None, str | None]:
+    runs = pairing.sites[site]
+    return (runs.a.uid if runs.a else None, runs.b.uid if runs.b else None, runs.bound_by)
+
+
+def unnamed(pairing: Pairing) -> list[tuple[str, str]]:
+    return [(first.uid, second.uid) for first, second in pairing.unnamed]
+
+
+def test_without_sites_neighbours_in_time_become_unnamed_pairs() -> None:
+    runs = [run(4, PA), run(2, PA), run(1, LAT), run(3, LAT)]
+    assert unnamed(pair_runs([], runs)) == [("1.2.1", "1.2.2"), ("1.2.3", "1.2.4")]
+
+
+@pytest.mark.parametrize(("angle", "pairs"), [(29.9, 0), (30.0, 1), (90.0, 1), (150.1, 0), (178.0, 0)])
+def test_views_less_than_30_degrees_apart_are_not_paired(angle: float, pairs: int) -> None:
+    assert len(pairs_by_time([run(1, 0.0), run(2, angle)])) == pairs
+
+
+def test_most_pairs_win_then_the_shortest_time_within_pairs_then_the_earliest() -> None:
+    repeated = [run(1, LAT, 0), run(2, PA, 20), run(3, PA, 25), run(4, LAT, 100)]
+    assert [(a.uid, b.uid) for a, b in pairs_by_time(repeated)] == [("1.2.1", "1.2.2"), ("1.2.3", "1.2.4")]
+    odd = [run(1, LAT, 0), run(2, PA, 60), run(3, LAT, 70)]
+    assert [(a.uid, b.uid) for a, b in pairs_by_time(odd)] == [("1.2.2", "1.2.3")]
+    equal = [run(1, LAT, 0), run(2, PA, 20), run(3, LAT, 40)]
+    assert [(a.uid, b.uid) for a, b in pairs_by_time(equal)] == [("1.2.1", "1.2.2")]
+
+
+def test_runs_without_time_or_angles_stay_alone() -> None:
+    assert pairs_by_time([run(1, LAT, None), run(2, PA)]) == []
+    assert pairs_by_time([run(1, None), run(2, PA)]) == []
+    assert ray_angle_deg(run(1, None), run(2, PA)) is None
+
+
+def test_a_table_that_moved_prevents_pairing_by_time() -> None:
+    still, moved = (0.0, 0.0, 0.0), (0.0, 1.1, 0.0)
+    assert not table_moved(run(1, LAT, table_mm=still), run(2, PA, table_mm=(0.0, 0.9, 0.0)))
+    assert not table_moved(run(1, LAT, table_mm=still), run(2, PA))
+    assert pairs_by_time([run(1, LAT, table_mm=still), run(2, PA, table_mm=moved)]) == []
+
+
+def test_view_a_is_nearer_to_lateral_unless_somebody_named_the_views() -> None:
+    frontal, lateral = run(1, 10.0, site="x", site_by="upload"), run(2, 70.0, site="x", site_by="upload")
+    assert uids(pair_runs([Site("x")], [frontal, lateral]), "x") == ("1.2.2", "1.2.1", "upload")
+    named = Site("x", explicit_a="1.2.1", explicit_b="1.2.2")
+    assert uids(pair_runs([named], [frontal, lateral]), "x") == ("1.2.1", "1.2.2", "explicit")
+
+
+RUN = run(1, LAT, site="upload", site_by="upload")
+OTHER = run(2, PA)
+
+
+@pytest.mark.parametrize(
+    ("sites", "site", "rule"),
+    [
+        ([Site("put", explicit_a="1.2.1"), Site("table", csv_row=2, csv_a="1.2.1"), Site("upload")], "put", "explicit"),
+        ([Site("table", csv_row=2, csv_a="1.2.1"), Site("upload")], "table", "csv"),
+        ([Site("row", csv_row=2, has_time=True), Site("upload")], "upload", "upload"),
+    ],
+)
+def test_the_stronger_rule_takes_the_run(sites: list[Site], site: str, rule: str) -> None:
+    pairing = pair_runs(sites, [RUN, OTHER])
+    assert uids(pairing, site)[0::2] == ("1.2.1", rule)
+    others = [each.name for each in sites if each.name != site]
+    assert all(uids(pairing, name) == (None, None, None) for name in others)
+
+
+def test_patch_comes_before_the_table() -> None:
+    patched = run(1, LAT, site="patched", site_by="explicit")
+    pairing = pair_runs([Site("table", csv_row=2, csv_a="1.2.1"), Site("patched")], [patched])
+    assert uids(pairing, "patched") == ("1.2.1", None, "explicit")
+
+
+def test_a_site_takes_two_runs_that_are_apart_and_leaves_the_third() -> None:
+    members = [run(number, angle, site="x", site_by="upload") for number, angle in ((1, LAT), (2, -85.0), (3, PA))]
+    assert uids(pair_runs([Site("x")], members), "x") == ("1.2.1", "1.2.3", "upload")
+
+
+def test_rows_take_the_pairs_in_order_when_the_counts_agree() -> None:
+    runs = [run(3, LAT), run(4, PA), run(1, LAT), run(2, PA)]
+    rows = [Site("zeta", has_time=True, csv_row=2), Site("alpha", has_time=True, csv_row=3)]
+    pairing = pair_runs(rows, runs)
+    assert uids(pairing, "zeta") == ("1.2.1", "1.2.2", "order")
+    assert uids(pairing, "alpha") == ("1.2.3", "1.2.4", "order")
+    assert unnamed(pairing) == []
+    one_more = pair_runs([*rows, Site("third", has_time=True, csv_row=4)], runs)
+    assert uids(one_more, "zeta") == (None, None, None)
+    assert len(one_more.unnamed) == 2
+
+
+def test_rows_that_name_runs_take_no_pair_by_order() -> None:
+    row = Site("zeta", has_time=True, csv_row=2, csv_a="missing.dcm")
+    assert uids(pair_runs([row], [run(1, LAT), run(2, PA)]), "zeta") == (None, None, None)
+
+
+EARLIER = Site("S01", paired_a="1.2.1", paired_b="1.2.2")
+
+
+def test_an_earlier_pair_stays_together() -> None:
+    runs = [run(1, LAT), run(2, PA), run(3, LAT, 41)]
+    assert uids(pair_runs([EARLIER], runs), "S01") == ("1.2.1", "1.2.2", "time")
+    assert uids(pair_runs([EARLIER], runs[1:]), "S01") == (None, None, None)
+
+
+def test_a_row_takes_over_a_pair_whose_name_the_service_invented() -> None:
+    row = Site("apex", has_time=True, csv_row=2)
+    pairing = pair_runs([EARLIER, row], [run(1, LAT), run(2, PA)])
+    assert uids(pairing, "apex") == ("1.2.1", "1.2.2", "order")
+    assert uids(pairing, "S01") == (None, None, None)
+    timed = replace(EARLIER, has_time=True)
+    assert uids(pair_runs([timed, row], [run(1, LAT), run(2, PA)]), "S01") == ("1.2.1", "1.2.2", "time")
+
+
+def test_a_table_names_runs_by_uid_series_number_or_file_name() -> None:
+    runs = [
+        run(1, LAT, series_number=7, file_name="C:\\export\\left.dcm"),
+        run(2, PA, series_number=8, file_name="right.dcm"),
+        run(3, PA, series_number=8, file_name="other/right.dcm"),
+    ]
+    for text in ("1.2.1", " 7 ", "C:\\export\\left.dcm", "left.dcm", "folder/left.dcm"):
+        assert named_run(text, runs) == runs[0], text
+    # The whole name fits one run, although the base name fits two.
+    assert named_run("right.dcm", runs) == runs[1]
+    for text in ("8", "elsewhere/right.dcm", "nowhere.dcm", ""):
+        assert named_run(text, runs) is None, text
