@@ -136,14 +136,10 @@ def score_names(score: StudyScore, site: LocatedSite, matched: MatchedSite, wron
         score.catheters += 1
         if name in wrong:
             reasons = reasons_of(site, matched, name)
-            grades = {point_grade(point.covariance_mm2, reasons) for point in site.points if point.catheter == name}
+            grades = {grade_of(point.covariance_mm2, reasons) for point in site.points if point.catheter == name}
             score.misnamed += 1
             score.misnamed_unflagged += not reasons & NAME_DOUBTS
             score.misnamed_above_c += bool(grades & {Grade.A, Grade.B})
-
-
-def point_grade(covariance: Array, reasons: Iterable[Reason]) -> Grade:
-    return grade_of(covariance)
 
 
 def is_silent(error_mm: float, grade: Grade, reasons: Iterable[Reason]) -> bool:
@@ -158,11 +154,11 @@ def score_points(
     origin = truth.diastole_mm[reference].mean(axis=0)
     for point in site.points:
         place = truth.diastole_mm[point.catheter][point.electrode - 1]
-        reasons = {*point.reasons, *site.reasons}
+        reasons = site.reasons_of(point.catheter, point.electrode)
         error = point.position_mm - place
         size = float(np.linalg.norm(error))
         sums.judged += 1
-        silent = is_silent(size, point_grade(point.covariance_mm2, reasons), reasons)
+        silent = is_silent(size, grade_of(point.covariance_mm2, reasons), reasons)
         if point.catheter not in wrong:
             sums.count += 1
             sums.squared += size**2
@@ -170,7 +166,8 @@ def score_points(
         if point.relative_mm is not None and point.relative_covariance_mm2 is not None:
             from_origin = point.relative_mm - (place - origin)
             size = float(np.linalg.norm(from_origin))
-            silent |= is_silent(size, point_grade(point.relative_covariance_mm2, reasons), reasons)
+            reasons = site.reasons_of(point.catheter, point.electrode, reference)
+            silent |= is_silent(size, grade_of(point.relative_covariance_mm2, reasons), reasons)
             if not wrong & {point.catheter, reference}:
                 sums.relative_squared += size**2
                 sums.add(1, from_origin[None], point.relative_covariance_mm2[None])
@@ -202,8 +199,8 @@ def score_track(
     relative = error - error[:, is_reference].mean(axis=1, keepdims=True) if is_reference.any() else None
     for index, name in enumerate(names):
         shown = track.located[frames, index]
-        reasons = track.reasons[index]
-        grades = np.array([point_grade(one, reasons) for one in track.covariance_mm2[frames, index]])
+        reasons = (*track.reasons[index], *site.reasons_of(*track.labels[index]))
+        grades = np.array([grade_of(one, reasons) for one in track.covariance_mm2[frames, index]])
         limit = np.where(grades == Grade.A, 3.0, np.where(grades == Grade.B, 6.0, np.inf))
         silent = shown & (size[:, index] > limit) & (not set(reasons) - NO_DOUBT)
         sums.judged += int(shown.sum())
@@ -240,6 +237,7 @@ def monoplane_view(
         a_priori_frame=site.frame_b if view else site.frame_a,
         cycle=site.cycle,
         others=() if site.cycle else tuple(one.cycle for one in located.sites if one.cycle),
+        variation=site.variation,
     )
 
 

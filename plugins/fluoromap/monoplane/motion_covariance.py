@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Self
 
 import numpy as np
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue, follows_tip
-from fluoromap.contracts import Array, MonoplaneView
+from fluoromap.contracts import Array, MonoplaneView, StudyVariation
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
 from fluoromap.monoplane.view_electrodes import isocentre_covariance_mm2
@@ -17,6 +18,8 @@ FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29
 """An R wave is timed to the nearest frame: standard deviation of a uniform distribution one frame wide."""
 _SYSTOLE_PHASE = 0.3
+_FOLLOWS_INTERVAL = 0.5
+"""Change of a beat's amplitude with the interval before it, both as shares."""
 _ALIGNED_SD_CYCLE = 0.01
 _OFFSET_HARMONICS, _SHAPE_HARMONICS = 4, 3
 _LASTING_SHARE = 0.7
@@ -53,9 +56,23 @@ class MotionParams(BaseModel, extra="forbid"):
     )
     gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of each gantry angle, degrees.")
     magnification_sd: float = Field(
-        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+        0.003, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
     )
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
+
+    def of_study(self, variation: StudyVariation) -> Self:
+        """Return the parameters with the breathing, beats and gantry errors that the study shows."""
+        return self.model_copy(
+            update={
+                "respiration_head_feet_sd_mm": variation.breathing * self.respiration_head_feet_sd_mm,
+                "respiration_other_sd_mm": variation.breathing * self.respiration_other_sd_mm,
+                "respiration_drift_sd_mm": variation.breathing * self.respiration_drift_sd_mm,
+                "beat_sd_mm": variation.beats * self.beat_sd_mm,
+                "gantry_angle_sd_deg": variation.gantry * self.gantry_angle_sd_deg,
+                "isocentre_sd_mm": variation.gantry * self.isocentre_sd_mm,
+                "magnification_sd": variation.gantry * self.magnification_sd,
+            }
+        )
 
     def respiration_sd_mm(self) -> Array:
         """Return the breathing standard deviations (3,) along the patient's axes, mm."""
@@ -110,11 +127,12 @@ class MotionCovariance:
             drift = p.respiration_drift_sd_mm * breath / breath.max()
             yield FIXED, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
         # The other view measured the depth; its wrong gantry angle rotates that depth about the isocentre.
-        turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
+        from_isocentre = mean - self._camera.isocentre_world_mm
+        turned = np.cross(np.eye(3), from_isocentre[:, :, None]).swapaxes(-1, -2)
         yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
         # This view's wrong angle is a source of its own, else its effect would be taken for another size, that is depth.
         yield FIXED, turned * np.radians(p.gantry_angle_sd_deg)
-        yield FIXED, (mean * p.magnification_sd)[..., None]
+        yield FIXED, (from_isocentre * p.magnification_sd)[..., None]
         yield from self._beats(frames, self.rays[frames])
         if expected.beats:
             yield from self._free(frames)
@@ -128,14 +146,16 @@ class MotionCovariance:
         reading = _READING_SD_FRAMES / expected.frames_per_cycle
         timing = np.hypot(p.beat_timing_sd, reading)
         uneven = _SYSTOLE_PHASE * expected.cycle_spread
-        yield FIXED, moved * p.beat_amplitude_sd
+        # A long interval fills the heart: the beat after it is stronger.
+        amplitude = np.hypot(p.beat_amplitude_sd, _FOLLOWS_INTERVAL * expected.cycle_spread)
+        yield FIXED, moved * amplitude
         yield FIXED, velocity * np.hypot(timing, uneven)
         averaged = 1 / np.sqrt(expected.beats)
         for name in self._catheters:
             yield FIXED, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
         if expected.own_cycle:
             # Depth comes from the other view's run, and this view cannot show how that run's beats differ.
-            yield FIXED, _along(rays, moved * p.beat_amplitude_sd * averaged)
+            yield FIXED, _along(rays, moved * amplitude * averaged)
             yield (
                 FIXED,
                 _along(rays, velocity * np.hypot(p.beat_timing_sd * averaged, np.hypot(uneven, _ALIGNED_SD_CYCLE))),

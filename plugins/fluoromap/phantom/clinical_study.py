@@ -23,7 +23,7 @@ from fluoromap.phantom.motion import (
     Breathing,
     wall_vectors,
 )
-from fluoromap.phantom.placement import RADIUS_6F_MM, Anatomy, Resident, draw_anatomy
+from fluoromap.phantom.anatomy import RADIUS_6F_MM, Anatomy, Resident, draw_anatomy
 from fluoromap.phantom.shaft import Shaft, arc_lengths_mm
 from fluoromap.phantom.simulated_study import FRONTAL, LATERAL
 from fluoromap.segmenter.quiet_frames import diastolic_frames
@@ -168,7 +168,7 @@ class _Times:
         pulses, rest = self.beats.pulses(self.times_s), self.beats.rest_mm(self.times_s)
         breath = self.breathing.at(self.times_s)[:, None, :]
         return [
-            resident.shaft.moved(pulses @ resident.vectors_mm + rest[:, number]) + breath
+            resident.shaft.lines_mm(pulses @ resident.vectors_mm + rest[:, number]) + breath
             for number, resident in enumerate(residents)
         ]
 
@@ -198,7 +198,7 @@ def _site(
     breath = np.mean([one.breathing.at(one.times_s).mean(axis=0) for one in times], axis=0)
     pulses = Beats.even(1.0, 1.0).pulses(np.array([DIASTOLIC_PHASE]))
     diastole = {
-        r.shaft.catheter.name: _electrodes_mm(r.shaft, r.shaft.moved(pulses @ r.vectors_mm), 0.0)[0] + breath + shift
+        r.shaft.catheter.name: _electrodes_mm(r.shaft, r.shaft.lines_mm(pulses @ r.vectors_mm), 0.0)[0] + breath + shift
         for r in residents
     }
     truth = ClinicalSite(name, (runs[0], runs[1]), diastole)

@@ -22,6 +22,10 @@ Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
 """Entry of the :class:`~fluoromap.contracts.ErrorBudget` to which an error source belongs."""
 
 
+GANTRY_SCALES, GANTRY_WEIGHTS = (1.0, 2.0, 4.0), (0.75, 0.20, 0.05)
+"""Errors of gantries as multiples of the stated standard deviations, and the share of gantries with each."""
+
+
 class UncertaintyParams(BaseModel, extra="forbid"):
     """Assumptions of both triangulators about all errors except pixel noise; standard deviations."""
 
@@ -30,7 +34,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
     )
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in each view, mm.")
     magnification_sd: float = Field(
-        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+        0.003, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
     )
     respiration_head_feet_sd_mm: float = Field(
         4.0, ge=0, le=30, description="Breathing position of the heart in each run along the patient's long axis, mm."
@@ -69,9 +73,31 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         return np.diag([other, other, head])
 
     def gantry_covariance(self) -> Array:
-        """Return the covariance (12, 12) of the gantry's errors, independent in each view; see :func:`gantry_effect_px`."""
+        """Return the covariance (14, 14) of the gantry's errors, independent in each view; see :func:`gantry_effect_px`.
+
+        It describes the usual gantry. A share of gantries is 2 or 4 times worse, see ``GANTRY_SCALES``.
+        """
         angle, offset = np.radians(self.gantry_angle_sd_deg) ** 2, self.isocentre_sd_mm**2
-        return np.diag(np.tile(np.repeat([angle, offset], 3), 2))
+        views = np.tile(np.repeat([angle, offset], 3), 2)
+        return np.diag([*views, *np.full(2, self.magnification_sd**2)])
+
+    def header_covariance(self) -> Array:
+        """Return the covariance (14, 14) of the gantry's errors over all gantries, where no data show them."""
+        share = sum(weight * scale**2 for scale, weight in zip(GANTRY_SCALES, GANTRY_WEIGHTS, strict=True))
+        covariance: Array = share * self.gantry_covariance()
+        return covariance
+
+    def scaled(self, breathing: float, beats: float) -> UncertaintyParams:
+        """Return the parameters of a heart whose breathing and beats vary by these multiples of the assumed variation."""
+        return self.model_copy(
+            update={
+                "respiration_head_feet_sd_mm": breathing * self.respiration_head_feet_sd_mm,
+                "respiration_other_sd_mm": breathing * self.respiration_other_sd_mm,
+                "respiration_drift_sd_mm": breathing * self.respiration_drift_sd_mm,
+                "beat_sd_mm": beats * self.beat_sd_mm,
+                "bend_sd_mm": beats * self.bend_sd_mm,
+            }
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,18 +150,28 @@ def effect_px(jacobian: Array, displacement_a: Array, displacement_b: Array) -> 
     return effect
 
 
-def gantry_effect_px(jacobian: Array, points_world_mm: Array) -> Array:
-    """Return the effect (4 N, 12) of the gantry's errors on the pixels.
+def gantry_effect_px(cameras: Cameras, jacobian: Array, points_world_mm: Array) -> Array:
+    """Return the effect (4 N, 14) of the gantry's errors on the pixels.
 
-    The parameters are the rotation vector about the isocentre (radians) and the offset (mm) of view a, then of view b.
-    They displace the electrodes as that view sees them: ``X' = R X + t``.
+    The first 12 parameters are the rotation vector about the isocentre (radians) and the offset (mm) of view a, then of
+    view b. They displace the electrodes as that view sees them: ``X' = R X + t``. The last two are the relative errors of
+    the source-to-detector distance in view a and b.
     """
-    x, y, z = np.moveaxis(points_world_mm, -1, 0)
+    own = [_turned_and_shifted(points_world_mm - camera.isocentre_world_mm) for camera in cameras]
+    none = np.zeros_like(own[0])
+    across = [_across(camera, points_world_mm) for camera in cameras]
+    no_scale = np.zeros_like(across[0])
+    in_a = np.concatenate([own[0], none, across[0], no_scale], axis=-1)
+    in_b = np.concatenate([none, own[1], no_scale, across[1]], axis=-1)
+    return effect_px(jacobian, in_a, in_b)
+
+
+def _turned_and_shifted(points_mm: Array) -> Array:
+    """Return the displacement (..., N, 3, 6) of points by a small rotation vector about the origin, then by an offset."""
+    x, y, z = np.moveaxis(points_mm, -1, 0)
     zero = np.zeros_like(x)
     cross_product = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), (0, 1), (-2, -1))
-    own = np.concatenate([cross_product, np.broadcast_to(np.eye(3), cross_product.shape)], axis=-1)
-    none = np.zeros_like(own)
-    return effect_px(jacobian, np.concatenate([own, none], axis=-1), np.concatenate([none, own], axis=-1))
+    return np.concatenate([cross_product, np.broadcast_to(np.eye(3), cross_product.shape)], axis=-1)
 
 
 def breathing_effect_px(jacobian: Array) -> Array:
@@ -180,19 +216,17 @@ def error_sources(
     points_world_mm : ndarray, shape (..., N, 3)
     labels : sequence of (catheter, electrode)
         Labels of the N points.
-    gantry_covariance : ndarray, shape (12, 12)
+    gantry_covariance : ndarray, shape (14, 14)
         From :meth:`UncertaintyParams.gantry_covariance` or from self-calibration.
     motion : Motion or None
         None where the heart rests.
     """
     n = len(labels)
     jacobian = jacobians(cameras, points_world_mm)
-    gantry: tuple[Share, ...] = (*("angles",) * 3, *("source_distances",) * 3) * 2
+    gantry: tuple[Share, ...] = (*(*("angles",) * 3, *("source_distances",) * 3) * 2, *("source_distances",) * 2)
     head_feet = np.array([[0.0], [0.0], [1.0]])
-    across = [_across(camera, points_world_mm) for camera in cameras]
     sources = [
-        ErrorSource(gantry_effect_px(jacobian, points_world_mm), gantry_covariance, gantry),
-        _both_views(jacobian, across[0], across[1], params.magnification_sd, "source_distances"),
+        ErrorSource(gantry_effect_px(cameras, jacobian, points_world_mm), gantry_covariance, gantry),
         ErrorSource(breathing_effect_px(jacobian), params.respiration_covariance_mm2() / 2, ("breathing",) * 3),
         _both_views(jacobian, head_feet, head_feet, params.respiration_drift_sd_mm, "breathing"),
     ]
@@ -228,8 +262,8 @@ def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Sha
 
 def _across(camera: Camera, points_world_mm: Array) -> Array:
     """Return the part of points across the central ray, (..., N, 3, 1): a wrong magnification stretches it."""
-    along = camera.axis_world
-    across: Array = (points_world_mm - (points_world_mm @ along)[..., None] * along)[..., None]
+    along, points = camera.axis_world, points_world_mm - camera.isocentre_world_mm
+    across: Array = (points - (points @ along)[..., None] * along)[..., None]
     return across
 
 
