@@ -84,7 +84,7 @@ class MotionPrior:
         baseline = view.camera.back_project(electrodes.pixels_uv, view.camera.depth_mm(expected.mean_mm))
         baseline = np.where(electrodes.visible[..., None], baseline, expected.mean_mm)
         windows = tuple(_windows(electrodes.phases))
-        run = _Run(view, electrodes, baseline, covariance.rays, expected.mean_mm)
+        run = _Run(view, electrodes, baseline, covariance.rays, expected.mean_mm, expected.common_mm2)
         trusted = self._trusted_pixels(run, [(frames, covariance.window(frames)) for frames in windows])
         n, m = electrodes.visible.shape
         positions, joint = baseline.copy(), np.zeros((n, 3 * m, 3 * m))
@@ -164,7 +164,11 @@ class MotionPrior:
         # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
         own, isocentre = self._params.of_study(run.view.variation), run.view.camera.isocentre_world_mm
         gantry = gantry_angle_covariance_mm2(positions - isocentre, own.gantry_angle_sd_deg)
-        gantry = across @ (gantry + own.isocentre_sd_mm**2 * np.eye(3)) @ across
+        gantry = gantry + own.isocentre_sd_mm**2 * np.eye(3)
+        if any(Reason.TABLE_MOVED in point.reasons for point in electrodes.a_priori):
+            # Nothing shows whether this view or the other one has the table's true place.
+            gantry = gantry + run.common_mm2
+        gantry = across @ gantry @ across
         absolute = blocks + gantry
         relative = self._relative(run, positions, joint, absolute, across)
         shown = electrodes.visible[..., None]
@@ -208,20 +212,28 @@ class MotionPrior:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One run with its baseline (n, m, 3), expected positions (n, m, 3) and the unit rays (n, m, 3) through these."""
+    """One run with its baseline (n, m, 3), expected positions (n, m, 3) and the unit rays (n, m, 3) through these.
+
+    common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times.
+    """
 
     view: MonoplaneView
     electrodes: ViewElectrodes
     baseline_mm: Array
     rays: Array
     expected_mm: Array
+    common_mm2: Array
 
     def evidence(self, frames: slice, used: BoolArray) -> Evidence:
         electrodes, view = self.electrodes, self.view
+        # Without a cycle, two views saw the distances at diastole only: other sites' motion stretches a catheter.
+        located = self.expected_mm[frames]
+        if view.cycle is None:
+            located = np.broadcast_to(electrodes.a_priori_mm, located.shape)
         moments = len(view.cycle.phases) if view.cycle is not None else 1
         variances = np.trace(electrodes.covariance_px2[electrodes.visible], axis1=1, axis2=2) / 2
         pixel_sd_mm = float(np.sqrt(np.median(variances))) / view.camera.px_per_mm
-        lengths = catheter_lengths(view.catalogue, electrodes.a_priori, self.expected_mm[frames], moments, pixel_sd_mm)
+        lengths = catheter_lengths(view.catalogue, electrodes.a_priori, located, moments, pixel_sd_mm)
         return Evidence(
             self.view.camera, electrodes.pixels_uv[frames], electrodes.covariance_px2[frames], used, lengths
         )

@@ -17,12 +17,11 @@ from fluoromap.triangulator.self_calibration import StudyBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
 from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
-from fluoromap.triangulator.table_motion import Jump
+from fluoromap.triangulator.table_motion import Jump, jump_source
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
     UncertaintyParams,
-    effect_px,
     error_sources,
     jacobians,
     pixel_noise_px2,
@@ -85,7 +84,7 @@ class SiteLocator:
         cycle = None
         if moments is not None and rest is not None:
             cycle = locate_cycle(
-                moments, rest, cameras, self.catalogue, self.params, self.method, self.belief.gantry.covariance
+                moments, rest, cameras, self.catalogue, self.params, self.method, self.belief.gantry.covariance, jump
             )
         reasons = [reason for reason, holds in (
             (Reason.NO_REFERENCE, reference_mm is None),
@@ -120,7 +119,7 @@ class SiteLocator:
             cameras, start, pixels.labels, self.catalogue, self.params, self.belief.gantry.covariance, motion
         )  # fmt: skip
         if jump is not None:
-            sources = (*sources, _jump_source(cameras, start, jump))
+            sources = (*sources, jump_source(cameras, start, jump))
         if self.method.estimates_breathing:
             pixels = widen_strays(cameras, pixels, start, sources)
         noise = pixel_noise_px2(pixels.covariances)
@@ -200,13 +199,6 @@ class Moment:
 
 def _plausible(points_mm: Array) -> bool:
     return bool(np.isfinite(points_mm).all() and np.abs(points_mm).max() < FAR_MM)
-
-
-def _jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
-    """Return the error source of a jump, in either direction: either view may show the true place."""
-    own, none = jump.displacement_mm[:, None], np.zeros((3, 1))
-    effect = effect_px(jacobians(cameras, points_mm), *((own, none) if jump.view == "a" else (none, own)))
-    return ErrorSource(effect, np.eye(1), ("breathing",))
 
 
 def _breathing_note(site: str, moment: Moment) -> list[str]:
