@@ -28,6 +28,7 @@ CATHETERS = 3
 MEASURED_ANGLE_SD_DEG, MEASURED_OFFSET_SD_MM, MEASURED_SCALE_SD = 0.28, 0.65, 0.003
 """Gantry errors of a real C-arm, an axis: centre of the ranges 0.2 to 0.33 degree and 0.5 to 0.8 mm."""
 _TAIL_SCALES, _TAIL_SHARES = (1.0, 2.0, 4.0), (0.7, 0.22, 0.08)
+"""Errors of a C-arm against those of the measured one, and the share of C-arms with each."""
 LARGEST_ANGLE_DEG, LARGEST_OFFSET_MM = 1.5, 4.0
 
 
@@ -44,12 +45,11 @@ class GantryError:
     scale: float
 
     @classmethod
-    def draw(cls, tails: bool, rng: np.random.Generator) -> GantryError:
-        """Draw an error of the size measured on a real C-arm; ``tails`` multiplies it by 1, 2 or 4.
+    def draw(cls, factor: float, rng: np.random.Generator) -> GantryError:
+        """Draw an error of the size measured on a real C-arm, times ``factor``.
 
-        With tails the rotation is at most 1.5 degrees and the offset at most 4 mm.
+        The rotation is at most 1.5 degrees and the offset at most 4 mm.
         """
-        factor = float(rng.choice(_TAIL_SCALES, p=_TAIL_SHARES)) if tails else 1.0
         rotation = factor * MEASURED_ANGLE_SD_DEG * rng.normal(size=3)
         offset = factor * MEASURED_OFFSET_SD_MM * rng.normal(size=3)
         rotation *= min(1.0, LARGEST_ANGLE_DEG / float(np.linalg.norm(rotation)))
@@ -139,8 +139,10 @@ class Conditions:
         """
         rng = np.random.default_rng([seed, 77])
         count = int(rng.integers(4, 9)) if sites is None else sites
-        gantry = "gantry" in properties
-        found = cls(seed, count, (GantryError.draw(gantry, rng), GantryError.draw(gantry, rng)))
+        drawn = float(rng.choice(_TAIL_SCALES, p=_TAIL_SHARES))
+        # One C-arm takes both views.
+        factor = drawn if "gantry" in properties else 1.0
+        found = cls(seed, count, (GantryError.draw(factor, rng), GantryError.draw(factor, rng)))
         alone = len(properties) == 1
         for name in PROPERTIES:
             # Every property is drawn, so that a study keeps its other properties when one is left out.

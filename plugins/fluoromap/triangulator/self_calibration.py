@@ -27,7 +27,7 @@ from fluoromap.triangulator.study_equations import (
     site_equations,
 )
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import GANTRY_SCALES, GANTRY_WEIGHTS, UncertaintyParams
+from fluoromap.triangulator.uncertainty import GANTRY_KINDS, LARGEST_MULTIPLE, UncertaintyParams
 
 GATE_EPIPOLAR_RATIO = 1.3
 """Ratio of epipolar RMS to pixel noise below which the header is believed."""
@@ -41,6 +41,8 @@ FARTHEST_OFFSET_MM = 6.0
 STILL_MISFIT = 2.0
 """Misfit an equation (1 is expected) above which the calibrated gantry does not explain the electrodes either."""
 _STEPS = 4
+_NEGLIGIBLE = 9.0
+"""Difference of log evidence beyond which a kind of heart counts as ruled out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +137,13 @@ def calibrate(
     at = np.concatenate([np.zeros(6), found, np.zeros(2)])
     corrected = GantryBelief(_displacement(found), mixture.gantry_covariance(at))
     after = _epipolar_rms_px(rows, mixture, np.concatenate([at, np.zeros(len(gaps))]), params)
-    distance = found**2 / (2 * GANTRY_SCALES[-1] ** 2 * np.diagonal(usual)[6:12])
+    distance = found**2 / (2 * LARGEST_MULTIPLE**2 * np.diagonal(usual)[6:12])
     offset_mm = float(np.linalg.norm(found[3:]))
     shifted = offset_mm > FARTHEST_OFFSET_MM and float(distance[:3].sum()) < float(distance[3:].sum())
     doubt = Reason.TABLE_MOVED if shifted else Reason.GEOMETRY_DOUBTFUL
     if float(distance.sum()) > FARTHEST_CHI2 or _misfit(rows) > STILL_MISFIT:
         # Something else is wrong, such as a mirrored image, a moved table or runs of another study.
-        covariance = as_header.covariance + GANTRY_SCALES[-1] ** 2 * usual
+        covariance = as_header.covariance + LARGEST_MULTIPLE**2 * usual
         return kept, _belief(GantryBelief(np.eye(4), covariance), mixture.scale, params, doubt)
     calibration = Calibration(True, np.degrees(found[:3]), found[3:], before, after)
     return calibration, _belief(corrected, mixture.scale, params, doubt if shifted else None)
@@ -191,20 +193,24 @@ def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
     No electrode shows an error that both views share, so each kind of gantry keeps its own prior there.
     """
 
-    def prior(scale: float) -> Array:
+    def prior(scale: Array) -> Array:
         whole = np.zeros((GANTRY_UNKNOWNS + gaps,) * 2)
-        whole[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] = scale**2 * usual
+        whole[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] = scale[:, None] * usual * scale
         whole[GANTRY_UNKNOWNS:, GANTRY_UNKNOWNS:] = GAP_SD_MM**2 * np.eye(gaps)
         return whole
 
+    widest = prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE))
+    best = max(heart.log_evidence(widest) for heart in hearts)
+    plausible = [heart for heart in hearts if heart.log_evidence(widest) > best - _NEGLIGIBLE]
     kinds = [
-        (heart, of_gantry, float(np.log(weight)) + heart.log_evidence(of_gantry))
-        for of_gantry, weight in zip(map(prior, GANTRY_SCALES), GANTRY_WEIGHTS, strict=True)
-        for heart in hearts
+        (heart, of_gantry, float(np.log(kind.share)) + heart.log_evidence(of_gantry))
+        for kind in GANTRY_KINDS
+        for of_gantry in [prior(kind.multiples)]
+        for heart in plausible
     ]
     evidence = np.array([one for *_, one in kinds])
     weights = np.exp(evidence - logsumexp(evidence))
-    exact = logsumexp([heart.log_evidence(prior(0.0)) for heart in hearts])
+    exact = logsumexp([heart.log_evidence(prior(np.zeros(GANTRY_UNKNOWNS))) for heart in hearts])
     likely = [(kind, weight) for kind, weight in zip(kinds, weights, strict=True) if weight > 1e-4]
     total = sum(weight for _, weight in likely)
     answers = [(heart.posterior(of_gantry), weight / total) for (heart, of_gantry, _), weight in likely]

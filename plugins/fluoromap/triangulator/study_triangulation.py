@@ -29,7 +29,7 @@ from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
-    GANTRY_SCALES,
+    LARGEST_MULTIPLE,
     Share,
     UncertaintyParams,
     error_sources,
@@ -133,7 +133,7 @@ def _first_look(
     """Return nominal cameras, pixels, points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise."""
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
     points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
-    widest = GANTRY_SCALES[-1] ** 2 * params.gantry_covariance()
+    widest = LARGEST_MULTIPLE**2 * params.gantry_covariance()
     sources = error_sources(cameras, points, pixels.labels, catalogue, params, widest, None)
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))

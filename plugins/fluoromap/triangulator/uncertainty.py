@@ -22,8 +22,33 @@ Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
 """Entry of the :class:`~fluoromap.contracts.ErrorBudget` to which an error source belongs."""
 
 
-GANTRY_SCALES, GANTRY_WEIGHTS = (1.0, 2.0, 4.0), (0.75, 0.20, 0.05)
-"""Errors of gantries as multiples of the stated standard deviations, and the share of gantries with each."""
+@dataclass(frozen=True, slots=True)
+class GantryKind:
+    """A kind of gantry: its errors as multiples of the stated standard deviations, and its share of all gantries."""
+
+    angle: float
+    offset: float
+    share: float
+
+    @property
+    def multiples(self) -> Array:
+        """Multiples (14,) of the unknowns' standard deviations; see :func:`gantry_effect_px`."""
+        return np.array([*([self.angle] * 3 + [self.offset] * 3) * 2, self.angle, self.angle])
+
+
+GANTRY_KINDS = tuple(
+    GantryKind(angle, offset, share * given)
+    for angle, share, by_offset in (
+        (0.5, 0.30, (0.50, 0.36, 0.14)),
+        (1.0, 0.45, (0.50, 0.36, 0.14)),
+        (2.0, 0.20, (0.20, 0.50, 0.30)),
+        (4.0, 0.05, (0.05, 0.25, 0.70)),
+    )
+    for offset, given in zip((1.0, 2.0, 4.0), by_offset, strict=True)
+)
+"""Kinds of gantry. A real C-arm had 0.2 to 0.33 degree and 0.5 to 0.8 mm, with tails to 0.8 degree and 2.2 mm. Offsets exceed
+their stated value more often than angles do; a C-arm with wrong angles tends to have wrong offsets too."""
+LARGEST_MULTIPLE = 4.0
 
 
 class UncertaintyParams(BaseModel, extra="forbid"):
@@ -75,7 +100,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
     def gantry_covariance(self) -> Array:
         """Return the covariance (14, 14) of the gantry's errors, independent in each view; see :func:`gantry_effect_px`.
 
-        It describes the usual gantry. A share of gantries is 2 or 4 times worse, see ``GANTRY_SCALES``.
+        It describes the usual gantry. Other gantries are better or worse, see ``GANTRY_KINDS``.
         """
         angle, offset = np.radians(self.gantry_angle_sd_deg) ** 2, self.isocentre_sd_mm**2
         views = np.tile(np.repeat([angle, offset], 3), 2)
@@ -83,8 +108,8 @@ class UncertaintyParams(BaseModel, extra="forbid"):
 
     def header_covariance(self) -> Array:
         """Return the covariance (14, 14) of the gantry's errors over all gantries, where no data show them."""
-        share = sum(weight * scale**2 for scale, weight in zip(GANTRY_SCALES, GANTRY_WEIGHTS, strict=True))
-        covariance: Array = share * self.gantry_covariance()
+        shares = sum((kind.share * kind.multiples**2 for kind in GANTRY_KINDS), np.zeros(14))
+        covariance: Array = self.gantry_covariance() * shares
         return covariance
 
     def scaled(self, breathing: float, beats: float) -> UncertaintyParams:
