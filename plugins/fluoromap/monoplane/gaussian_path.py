@@ -25,20 +25,22 @@ _SETTLED_MM = 0.005
 class PathPrior:
     """Prior of the paths, before the view's pixels are used.
 
-    mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. parts : (q,) the part of each
-    column; the columns of part p > 0 are multiplied by the square root of its gain. white_mm2 : (n, 3 m, 3 m) covariance of
+    mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. unseen_mm : (n, m, 3, q) deviations
+    along the rays that no view shows: they belong to the covariance alone. parts : (q,) the part of each column; the columns
+    of part p > 0 are multiplied by the square root of its gain. white_mm2 : (n, 3 m, 3 m) covariance of
     each frame's own deviation.
     """
 
     mean_mm: Array
     columns_mm: Array
+    unseen_mm: Array
     parts: IntArray
     white_mm2: Array
 
     def variance_mm2(self, gains: Array, parts: Sequence[int], directions: Array) -> Array:
         """Return the prior variance (n, m) along unit directions (n, m, 3), of some parts and the white share."""
         chosen = np.isin(self.parts, parts)
-        along = np.einsum("nmi,nmiq->nmq", directions, self.columns_mm[..., chosen])
+        along = np.einsum("nmi,nmiq->nmq", directions, (self.columns_mm + self.unseen_mm)[..., chosen])
         white = np.einsum("nmi,nmij,nmj->nm", directions, _own_blocks(self.white_mm2), directions)
         variance: Array = (along**2 * gains[self.parts[chosen]]).sum(axis=-1) + white
         return variance
@@ -211,6 +213,8 @@ def most_probable(prior: PathPrior, evidence: Evidence, gains: Array, start_mm: 
     left = (columns - share @ white.by_w).reshape(n * 3 * m, -1)
     half = solve_triangular(factor, left.T, lower=True, check_finite=False).T.reshape(n, 3 * m, -1)
     covariance = half @ np.swapaxes(half, 1, 2) + prior.white_mm2 - share @ np.swapaxes(share, 1, 2)
+    unseen = (prior.unseen_mm * np.sqrt(gains)[prior.parts]).reshape(n, 3 * m, -1)
+    covariance = covariance + unseen @ np.swapaxes(unseen, 1, 2)
     return Paths(positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2)
 
 

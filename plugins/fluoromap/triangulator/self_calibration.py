@@ -34,6 +34,8 @@ GATE_EPIPOLAR_RATIO = 1.3
 GATE_LOG_ODDS = 3.0
 """Natural logarithm of the odds for a wrong header against a right one (20 to 1) above which calibration may apply."""
 FEWEST_SITES = 3
+FEWEST_ELECTRODES = 28
+"""Twice the gantry's unknowns: on a real C-arm, calibration from fewer landmarks made distances worse."""
 FARTHEST_CHI2 = 22.46
 """99.9th percentile of chi-squared with 6 degrees of freedom: a larger difference from the header is no gantry error."""
 FARTHEST_OFFSET_MM = 6.0
@@ -125,7 +127,8 @@ def calibrate(
     before = _epipolar_rms_px(rows, mixture, np.zeros(unknowns), params)
     as_header = GantryBelief(np.eye(4), mixture.gantry_covariance(np.zeros(GANTRY_UNKNOWNS)))
     kept = Calibration(False, np.zeros(3), np.zeros(3), before, before)
-    if before <= GATE_EPIPOLAR_RATIO * noise or mixture.log_odds <= GATE_LOG_ODDS:
+    electrodes = sum(one.epipolar for one in rows)
+    if electrodes < FEWEST_ELECTRODES or before <= GATE_EPIPOLAR_RATIO * noise or mixture.log_odds <= GATE_LOG_ODDS:
         return kept, _belief(as_header, mixture.scale, params)
     found = np.zeros(6)
     for _ in range(_STEPS):

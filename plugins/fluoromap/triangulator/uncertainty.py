@@ -18,7 +18,7 @@ from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.two_view_pixels import Cameras
 
-Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
+Share = Literal["pixels", "angles", "source_distances", "phase_mismatch", "breathing"]
 """Entry of the :class:`~fluoromap.contracts.ErrorBudget` to which an error source belongs."""
 
 
@@ -78,6 +78,12 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         ge=0,
         le=10,
         description="Displacement of an electrode beyond the share that follows its catheter's tip, mm an axis.",
+    )
+    tip_centre_sd_mm: float = Field(
+        0.2,
+        ge=0,
+        le=5,
+        description="Distance along the shaft from the tip electrode's middle to its centre in the image, mm.",
     )
     beat_amplitude_sd: float = Field(
         0.04, ge=0, le=1, description="Variation of the motion's amplitude from beat to beat, as a share of it."
@@ -259,6 +265,11 @@ def error_sources(
     for name in sorted({catheter for catheter, _ in labels}):
         own = follows * np.array([catheter == name for catheter, _ in labels])[:, None, None]
         sources.append(_both_views(jacobian, own, own, params.beat_sd_mm, "phase_mismatch"))
+        tip = _tip_along_shaft(points_world_mm, labels, name)
+        if tip is not None:
+            # Both views show the same centre, so that no epipolar distance reveals it.
+            effect = effect_px(jacobian, tip, tip)
+            sources.append(ErrorSource(effect, np.array([[params.tip_centre_sd_mm**2]]), ("pixels",)))
     each = np.eye(3 * n).reshape(n, 3, 3 * n)
     sources.append(_both_views(jacobian, each, each, params.bend_sd_mm, "phase_mismatch"))
     if motion is not None:
@@ -272,6 +283,17 @@ def error_sources(
         )  # fmt: skip
         sources.append(ErrorSource(late, timing, ("phase_mismatch",) * 2))
     return tuple(sources)
+
+
+def _tip_along_shaft(points_world_mm: Array, labels: Sequence[tuple[str, int]], catheter: str) -> Array | None:
+    """Return the displacement (..., N, 3, 1) of a catheter's tip along its shaft; None where two electrodes are missing."""
+    if (catheter, 1) not in labels or (catheter, 2) not in labels:
+        return None
+    tip, second = labels.index((catheter, 1)), labels.index((catheter, 2))
+    along = points_world_mm[..., tip, :] - points_world_mm[..., second, :]
+    displaced = np.zeros((*points_world_mm.shape, 1))
+    displaced[..., tip, :, 0] = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    return displaced
 
 
 def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Share) -> ErrorSource:
