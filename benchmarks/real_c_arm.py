@@ -3,7 +3,7 @@
 DIR holds the eight runs of a static phantom of Vukicevic et al. (see ``tests/plugins/geometry/real_c_arm.json`` for the source)
 and ``landmarks.json`` with ten points marked by hand. The table shows the reprojection error of one set of static points over
 four and over eight runs, with the table's position and without it, and with every other convention of signs and flips. Below are
-the distances between landmarks from every pair of runs at least 30 degrees apart against those from all runs: their error, the
+the distances between landmarks from every pair of runs at least 30 degrees apart against those from the other runs: their error, the
 ratio of error to stated standard deviation (z), and the same after self-calibration.
 """
 
@@ -152,16 +152,17 @@ class PairDistances:
 
 
 def pair_distances(runs: Sequence[StaticRun], belief: Belief) -> list[PairDistances]:
-    """Return the distances from every pair of runs at least 30 degrees apart against those from all runs.
+    """Return the distances from every pair of runs at least 30 degrees apart against those from the other runs.
 
     The standard deviations contain pixel noise and the gantry's errors: "stated" takes those of the parameters, "study" those
     that self-calibration leaves, with its cameras.
     """
     origin = runs[0].table_mm
     cameras = [run.camera(origin) for run in runs]
-    places, _ = static_points(cameras, runs)
     found = []
     for i, j in itertools.combinations(range(len(runs)), 2):
+        others = [k for k in range(len(runs)) if k not in (i, j)]
+        places, _ = static_points([cameras[k] for k in others], [runs[k] for k in others])
         names = sorted(set(runs[i].landmarks) & set(runs[j].landmarks) & set(places))
         if len(names) < 2 or ray_angle_deg(cameras[i], cameras[j]) < LEAST_ANGLE_DEG:
             continue

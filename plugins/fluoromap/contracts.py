@@ -449,12 +449,14 @@ class SiteCycle:
 class StudyVariation:
     """Variation that a study shows, as multiples of the assumed standard deviations.
 
-    breathing : between runs. beats : of a catheter's place from beat to beat. gantry : remaining error of the gantry.
+    breathing : between runs. beats : of a catheter's place from beat to beat. gantry_angle, gantry_offset : remaining error of
+    the gantry.
     """
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry: float = 1.0
+    gantry_angle: float = 1.0
+    gantry_offset: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,9 +68,9 @@ class MotionParams(BaseModel, extra="forbid"):
                 "respiration_other_sd_mm": variation.breathing * self.respiration_other_sd_mm,
                 "respiration_drift_sd_mm": variation.breathing * self.respiration_drift_sd_mm,
                 "beat_sd_mm": variation.beats * self.beat_sd_mm,
-                "gantry_angle_sd_deg": variation.gantry * self.gantry_angle_sd_deg,
-                "isocentre_sd_mm": variation.gantry * self.isocentre_sd_mm,
-                "magnification_sd": variation.gantry * self.magnification_sd,
+                "gantry_angle_sd_deg": variation.gantry_angle * self.gantry_angle_sd_deg,
+                "isocentre_sd_mm": variation.gantry_offset * self.isocentre_sd_mm,
+                "magnification_sd": variation.gantry_angle * self.magnification_sd,
             }
         )
 

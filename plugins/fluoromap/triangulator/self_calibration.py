@@ -155,10 +155,10 @@ def calibrate(
 def _belief(
     gantry: GantryBelief, scale: HeartScale, params: UncertaintyParams, doubt: Reason | None = None
 ) -> StudyBelief:
-    usual = np.diagonal(params.gantry_covariance())[:12]
-    shares = np.diagonal(gantry.covariance)[:12][usual > 0] / usual[usual > 0]
-    wide = float(np.sqrt(shares.mean())) if len(shares) else 1.0
-    variation = StudyVariation(scale.breathing, scale.beats, wide)
+    usual = np.diagonal(params.gantry_covariance())[:12].reshape(2, 2, 3)
+    shares = np.diagonal(gantry.covariance)[:12].reshape(2, 2, 3) / np.maximum(usual, 1e-12)
+    angle, offset = np.sqrt(shares.mean(axis=(0, 2)))
+    variation = StudyVariation(scale.breathing, scale.beats, float(angle), float(offset))
     return StudyBelief(gantry, params.scaled(scale.breathing, scale.beats), variation, doubt)
 
 

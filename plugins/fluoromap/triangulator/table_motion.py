@@ -57,10 +57,27 @@ def table_jumps(
     own = params.model_copy(update={"respiration_head_feet_sd_mm": scale * params.respiration_head_feet_sd_mm})
     # Few sites show their scatter inaccurately: Student's distribution instead of the normal one.
     limit = max(_BEYOND_SD, float(t.isf(_CHANCE, len(sites) - 1)))
-    return [
+    return _with_boundary([
         None if moved is None else _site_jump(cameras, moved, common, own, limit)
         for (cameras, *_), moved in zip(sites, found, strict=True)
-    ]
+    ])  # fmt: skip
+
+
+def _with_boundary(jumps: list[Jump | None]) -> list[Jump | None]:
+    """Return the jumps with the sites at which a lasting move may have happened.
+
+    The table may move between the two runs of a site and stay there. If view b differs at the first sites, the move may have
+    happened at the next site; if view a differs at the last sites, at the site before them.
+    """
+    found = list(jumps)
+    first = next((k for k, jump in enumerate(jumps) if jump is None or jump.view != "b"), len(jumps))
+    if 0 < first < len(jumps) and jumps[first] is None:
+        found[first] = jumps[first - 1]
+    last = next((k for k, jump in enumerate(reversed(jumps)) if jump is None or jump.view != "a"), len(jumps))
+    before = len(jumps) - last - 1
+    if 0 < last < len(jumps) and jumps[before] is None:
+        found[before] = jumps[before + 1]
+    return found
 
 
 def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]:
