@@ -23,7 +23,7 @@ import httpx
 from rich.console import Console
 
 from fluoromap_service.cli.client import Client
-from fluoromap_service.cli.demo import SPEC
+from fluoromap_service.cli.commands.demo import SPEC
 from fluoromap_service.cli.progress import progress_bars
 from fluoromap_service.cli.submission import find_files, upload
 from fluoromap_service.cli.supervisor import private_service

@@ -50,7 +50,7 @@ SITES = 4
 FRAMES = 30
 FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
 GANTRIES = {"gantry as assumed": (0.5, 0.5), "gantry exact": (0.0, 0.0), "gantry 0.7 deg, 1.4 mm a view": (0.7, 1.4)}
-"""Standard deviation, an axis, of a view's rotation in degrees and of its offset in mm."""
+"""Standard deviation per axis of a view's rotation in degrees and of its offset in mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,10 @@ def segment_rendered(run: SimulatedRun, seed: int) -> Segmentation:
 
 
 def segment_ideally(run: SimulatedRun, seed: int) -> Segmentation:
-    """Return the run's true pixels with noise, as from an ideal segmenter; diastole by the segmenters' own rule."""
+    """Return the run's true pixels with noise, as an ideal segmenter.
+
+    Diastole follows the segmenters' own rule.
+    """
     rng = np.random.default_rng([seed, int(run.start_seconds * 1000)])
     names = DEFAULT_CATALOGUE.names
     n = len(run.frame_times_ms)
@@ -158,7 +161,7 @@ def point_samples(heart: Heart) -> Iterator[Sample]:
 
 
 def misidentified(matched: MatchedSite, truth: SimulatedSite, label: tuple[str, int]) -> bool:
-    """Return True where either view took something else for this electrode at diastole."""
+    """Return whether a view took something else for this electrode at diastole."""
     for observation, run in zip((matched.diastole.a, matched.diastole.b), truth.runs, strict=True):
         for chain in observation.chains:
             if chain.catheter == label[0] and label[1] in chain.electrodes:

@@ -88,7 +88,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def spread(truth: Truth, count: int, rng: np.random.Generator) -> IntArray:
-    """Choose wall points far from each other, as an operator does who maps the whole chamber."""
+    """Choose wall points far from each other.
+
+    An operator who maps the whole chamber does so.
+    """
     candidates = rng.permutation(truth.wall)
     chosen = [int(candidates[0])]
     nearest = np.full(len(candidates), np.inf)
@@ -149,7 +152,7 @@ def _weighted_median(values: Array, weight: Array) -> float:
 
 
 def _show(table: dict[str, list[dict[str, float]]]) -> None:
-    """Print one line for each figure, one column for each setting and fuser."""
+    """Print a line for each figure, a column for each setting and fuser."""
     headings = list(table)
     for line in zip(*(heading.split(", ") for heading in headings), strict=True):
         print(" " * 13 + "".join(f"{cell:>23}" for cell in line))
@@ -176,9 +179,9 @@ SETTINGS: dict[str, tuple[Placing, float]] = {
 
 
 def main(first: int, chambers: int) -> None:
-    """All tables, on seeds ``first`` to ``first + chambers - 1``."""
+    """Print all tables, on seeds ``first`` to ``first + chambers - 1``."""
     print(
-        f"{chambers} chambers from seed {first}, 20 sites with that noise an axis, times read to {TIME_SD_MS} ms; "
+        f"{chambers} chambers from seed {first}, 20 sites with that noise per axis, times read to {TIME_SD_MS} ms; "
         "mean (95 % interval)"
     )
     table: dict[str, list[dict[str, float]]] = {}
@@ -217,7 +220,10 @@ def main(first: int, chambers: int) -> None:
 
 
 def _overlays(seed: int) -> None:
-    """Print the median milliseconds to draw a map of 20 sites into a frame and to encode its PNG."""
+    """Print the median time of an overlay of 20 sites, ms.
+
+    The time includes drawing the map into a frame and encoding its PNG.
+    """
     rng = np.random.default_rng(seed)
     truth = draw_chamber(rng)
     sites = sites_at(truth, spread(truth, 20, rng), 0.7, rng)
@@ -240,7 +246,10 @@ def _overlays(seed: int) -> None:
 
 
 def _cost(seed: int, name: str, count: int) -> tuple[float, float, float]:
-    """Return seconds, peak MB of arrays, and peak MB of a separate process that imports all plugins."""
+    """Return seconds and peak memory of a fuser.
+
+    The memory is the peak MB of arrays, and the peak MB of a separate process that imports all plugins.
+    """
     rng = np.random.default_rng(seed)
     truth = draw_chamber(rng)
     sites = sites_at(truth, spread(truth, count, rng), 0.7, rng)

@@ -1,7 +1,7 @@
 """Correct pairing and naming of catheters: ``python benchmarks/matching.py [first seed] [studies] [rendered studies]``.
 
 The first part tests matching alone, on the true electrodes of simulated hearts. They have pixel noise, 1 degree gantry error
-an axis and view, different breathing in the two runs, wrong votes for the tip and, in some runs, a chain without its tip.
+per axis and view, different breathing in the two runs, wrong votes for the tip and, in some runs, a chain without its tip.
 Two more designs have an irregular rhythm, and conditions so hard that pairs are in doubt. The last part runs a few rendered
 studies through the real segmenter. Each part prints:
 
@@ -87,7 +87,10 @@ class Design:
 
 
 def true_chains(seed: int, design: Design) -> Study:
-    """Simulate a study without pictures: a lateral and a frontal view, or any two at least 60 degrees apart."""
+    """Simulate a study without pictures.
+
+    The views are a lateral and a frontal one, or any two at least 60 degrees apart.
+    """
     rng = np.random.default_rng([seed, 20])
     heart: HeartKind = "human" if seed % 2 else "dog"
     anatomy = draw_anatomy(heart, design.sites, rng)
@@ -295,7 +298,10 @@ def _apart_px(electrodes: Sequence[int], pixels_uv: Array, truth: Array) -> floa
 
 
 def phase_errors(study: Study) -> list[float]:
-    """Return the squared error of each frame's phase without the mean offset of its run; 0.25 where unknown."""
+    """Return the squared phase error of each frame.
+
+    The mean offset of its run is subtracted. An unknown phase counts as 0.25.
+    """
     squares: list[float] = []
     for runs, truths in zip(study.sites, study.phases, strict=True):
         views = ((runs.segmentation_a, runs.camera_a), (runs.segmentation_b, runs.camera_b))
@@ -363,7 +369,10 @@ def main(first: int, studies: int, rendered: int) -> None:
 
 
 def segment_study(seed: int) -> Study:
-    """Segment a rendered study of 8 sites: a lateral and a postero-anterior view of 2 s at 15 frames/s."""
+    """Segment a rendered study of 8 sites.
+
+    Each site has a lateral and a postero-anterior view of 2 s at 15 frames/s.
+    """
     spec = StudySpec(seed, sites=8, contrast=("LAT", "PA"), gantry_error_deg=GANTRY_ERROR_DEG)
     simulated = simulate_study(spec)
     segmenter = CatheterChain()

@@ -75,7 +75,10 @@ def helix(name: str) -> Array:
 
 
 def simulate(name: str, view: str, frames: int) -> Simulation:
-    """Simulate the paper's motion, X' = Rz Ry Rx X + (1, 1, 1) mm, in a right-handed camera 500 mm from the isocentre."""
+    """Simulate the paper's motion, X' = Rz Ry Rx X + (1, 1, 1) mm.
+
+    The camera is right-handed and 500 mm from the isocentre.
+    """
     intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])
     camera = Camera(intrinsic @ np.column_stack([ROTATIONS[view], [0, 0, 500]]), 512, 512)
     about = rotation_of(np.radians(0.5) * np.eye(3))
@@ -98,7 +101,10 @@ def rms(errors: Array) -> float:
 
 
 def accuracy(rng: np.random.Generator) -> Iterator[str]:
-    """Yield RMS 3D and depth error beside the bound for exact a-priori positions; the last frame's RMS over its bound."""
+    """Yield RMS 3D and depth errors for exact a-priori positions.
+
+    The bound is beside each error. The last value is the last frame's RMS over its bound.
+    """
     yield f"A body of known shape, {POSES} frames a row. RMS 3D over frames 2..n, mm; ratios to the bound"
     yield f"{'':10}{'frames':>7}{'RMS':>9}{'depth':>9}{'bound':>9}{'ratio':>8}{'last frame':>12}{'noise-free, dz 0..5':>22}"
     for name in ("H18", "H77"):
@@ -123,7 +129,10 @@ def accuracy(rng: np.random.Generator) -> Iterator[str]:
 
 
 def noise_free_mm(s: Simulation) -> float:
-    """Return the largest error from exact pixels over start values of 0 to 5 mm depth a frame."""
+    """Return the largest error from exact pixels.
+
+    The start values are 0 to 5 mm depth a frame.
+    """
     visible = np.ones(s.pixels_uv.shape[:2], dtype=bool)
     body = s.points_mm[0] - s.points_mm[0].mean(axis=0)
     largest = 0.0
@@ -135,7 +144,10 @@ def noise_free_mm(s: Simulation) -> float:
 
 
 def view_of(s: Simulation, pixels: Array, a_priori: Array, covariance_mm2: Array) -> MonoplaneView:
-    """Return a simulation as solver input; the positions of frame 1 are known with this covariance."""
+    """Return a simulation as solver input.
+
+    The positions of frame 1 are known with this covariance.
+    """
     electrodes = tuple(range(1, 31))
     noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (30, 2, 2))
     return MonoplaneView(
@@ -149,8 +161,11 @@ def view_of(s: Simulation, pixels: Array, a_priori: Array, covariance_mm2: Array
 
 
 def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
-    """Yield the RMS with fixed a-priori positions and with adjusted ones, for exact and for wrong positions."""
-    yield f"\nA-priori positions with errors up to a limit an axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
+    """Yield the RMS with fixed and with adjusted a-priori positions.
+
+    The a-priori positions are exact, then wrong.
+    """
+    yield f"\nA-priori positions with errors up to a limit per axis, LAT, {BODIES} bodies a row. RMS 3D over frames 2..n, mm"
     yield (
         f"{'limit':>9}{'frames':>10}{'fixed':>10}{'adjusted':>10}{'bound':>8}{'ratio':>7}{'in 95 %':>9}"
         f"{'smooth path':>13}{'bound':>8}{'in 95 %':>9}"
@@ -191,7 +206,10 @@ def a_priori_errors(rng: np.random.Generator) -> Iterator[str]:
 
 
 def opencv_poses(cv2: Any, s: Simulation) -> dict[str, Callable[[Array], tuple[Array, Array]]]:
-    """Return OpenCV's pose solvers: pixels (30, 2) to rotation vector and translation in the camera's axes."""
+    """Return OpenCV's pose solvers.
+
+    Each takes pixels (30, 2) and returns rotation vector and translation in the camera's axes.
+    """
     body = np.ascontiguousarray(s.points_mm[0] - s.points_mm[0].mean(axis=0))
     intrinsic = np.array([[FOCAL_PX, 0, 256], [0, FOCAL_PX, 256], [0, 0, 1]])
     view = np.linalg.solve(intrinsic, s.camera.matrix)
@@ -219,7 +237,10 @@ def opencv_poses(cv2: Any, s: Simulation) -> dict[str, Callable[[Array], tuple[A
 
 
 def speed(rng: np.random.Generator) -> Iterator[str]:
-    """Yield accuracy and poses a second on the same images, from the pose of the frame before."""
+    """Yield accuracy and poses per second on the same images.
+
+    Each pose starts from the pose of the frame before.
+    """
     yield f"\nThe same {SPEED_POSES} images of 30 points (LAT), each from the pose of the frame before; one thread"
     yield f"{'':32}{'RMS mm':>9}{'to best':>9}{'poses/s':>10}{'rigid-pose is':>16}"
     try:
@@ -261,7 +282,10 @@ def speed(rng: np.random.Generator) -> Iterator[str]:
 
 
 def one_catheter(_: np.random.Generator) -> Iterator[str]:
-    """Yield the bound of the mapping catheter's four electrodes as a rigid body of known shape."""
+    """Yield the bound of the mapping catheter's electrodes as a rigid body.
+
+    The body has four electrodes and a known shape.
+    """
     yield "\nOne catheter of four electrodes, shape exactly known: bound of a frame, RMS 3D, mm"
     yield f"{'bend radius':>12}" + "".join(f"{f'tilt {tilt} deg':>14}" for tilt in (0, 30, 60))
     camera = simulate("H18", "AP", 1).camera
@@ -276,9 +300,12 @@ def one_catheter(_: np.random.Generator) -> Iterator[str]:
 
 
 def beating_hearts(rng: np.random.Generator) -> Iterator[str]:
-    """Yield refusals for three catheters in a beating heart, with known_rigid and with a known cycle."""
+    """Yield refusals for three catheters in a beating heart.
+
+    The solver is rigid-pose, once with known_rigid and once with a known cycle.
+    """
     yield (
-        f"\nThree catheters in {HEARTS} beating hearts, two views, 30 frames at 15/s; a-priori positions within 0.15 mm an axis.\n"
+        f"\nThree catheters in {HEARTS} beating hearts, two views, 30 frames at 15/s; a-priori positions within 0.15 mm per axis.\n"
         "Runs that rigid-pose refuses, at full and at reduced motion, and RMS 3D of the other runs, mm.\n"
         "Without a cycle and without known_rigid it refuses all of them"
     )

@@ -101,7 +101,10 @@ class Scores:
 
 @contextmanager
 def stressed(factor: float) -> Iterator[None]:
-    """Make hearts whose catheters move more on their own and whose beats vary more."""
+    """Make hearts with more own motion and more varied beats.
+
+    The catheters move more on their own than in the default hearts.
+    """
     from fluoromap.phantom import motion
 
     with patch.multiple(motion, **{name: factor * getattr(motion, name) for name in STRESSED}):
@@ -129,7 +132,10 @@ def biplane(scene: Scene, seed: int) -> tuple[tuple[MatchedSite, ...], Triangula
 
 
 def monoplane_view(matched: MatchedSite, located: LocatedSite, a: bool, others: Sequence[LocatedSite]) -> MonoplaneView:
-    """Return the solver's input for view a or b; it has the site's own cycle only without ``others``."""
+    """Return the solver's input for view a or b.
+
+    It has the site's own cycle only without ``others``.
+    """
     return MonoplaneView(
         site=matched.site,
         view="a" if a else "b",
@@ -250,7 +256,10 @@ def main(first: int, hearts: int, coverage_hearts: int) -> None:
 
 
 def frame_rates(seeds: Sequence[int]) -> None:
-    """Print the error at lower frame rates, also as a multiple of the error at 60 frames/s."""
+    """Print the error at lower frame rates.
+
+    It is also printed as a multiple of the error at 60 frames/s.
+    """
     print("\nhuman hearts, runs of 2 s, own cycle, breath held: 12 electrodes (times the error at 60 frames/s)")
     print(f"frames/s{'true phases':>30}{'R waves to the frame':>30}{'no R waves':>30}")
     by_phase_source: dict[bool | None, list[list[float]]] = {True: [], False: [], None: []}

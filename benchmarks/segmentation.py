@@ -1,6 +1,6 @@
 """Accuracy of segmentation: ``python benchmarks/segmentation.py [first seed] [seeds] [frames]``.
 
-Both segmenters process runs of the phantom at 60 frames a second. The benchmark prints, with a bootstrap interval over runs:
+All segmenters process runs of the phantom at 60 frames a second. The benchmark prints, with a bootstrap interval over runs:
 
 - recall and precision; a detection is correct within 5 px of the truth,
 - the share of frames with all electrodes of the reference and the mapping catheter,
@@ -14,6 +14,7 @@ speed.
 
 from __future__ import annotations
 
+import io
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +23,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from memory_frames import MemoryFrames
 from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
 from scipy.optimize import linear_sum_assignment
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
@@ -32,6 +35,7 @@ from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.four_step.plugin import FourStep
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 Array = NDArray[np.float64]
 
@@ -39,8 +43,14 @@ NEAR_PX = 5.0
 TRACK_PX = 6.0
 MOVING_PX = 3.0
 FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
+DISPLAYED = PixelFacts(logarithmic=True, bits_stored=8, monochrome1=False)
 CHI2_95_2D = 5.991464547107979
-SEGMENTERS: dict[str, Callable[[], Segmenter]] = {"four-step": FourStep, "catheter-chain": CatheterChain}
+SEGMENTERS: dict[str, Callable[[], Segmenter]] = {
+    "four-step": FourStep,
+    "catheter-chain": CatheterChain,
+    "learned-chain": LearnedChain,
+}
+CHAINS = "catheter-chain", "learned-chain"
 VIEWS: tuple[Contrast, Contrast] = ("LAT", "PA")
 
 
@@ -117,7 +127,12 @@ def main(first: int, seeds: int, frames: int) -> None:
             _score_run(table, spent, view, simulated, tuple(SEGMENTERS))
         for what, spec in _hard(seed, frames).items():
             for view, simulated in zip(VIEWS, simulate_study(spec).sites[0].runs, strict=True):
-                _score_run(table, None, f"{view} {what}", simulated, ("catheter-chain",))
+                _score_run(table, None, f"{view} {what}", simulated, CHAINS)
+        for width_mm, spec in _displayed(seed, frames).items():
+            for view, simulated in zip(VIEWS, simulate_study(spec).sites[0].runs, strict=True):
+                _score_run(
+                    table, None, f"{view} {1024 / width_mm:.2f} px/mm, 8 bit JPEG", simulated, CHAINS, displayed=True
+                )
     print(f"seeds {first} to {first + seeds - 1}, {frames} frames a run; mean and 95 % bootstrap interval over runs")
     table.show()
     for name, (seconds, count) in spent.items():
@@ -145,22 +160,66 @@ def _without_catheters(first: int, seeds: int) -> None:
 
 
 def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
-    wide = tuple(Gantry(angle, 0.0, 1000.0, 500.0, (250 / 512, 250 / 512), 512, 512) for angle in (90.0, 0.0))
     return {
         "dose 0.4": StudySpec(seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, dose=0.4),
         "4.1 px/mm": StudySpec(
-            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=(wide[0], wide[1])
+            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=_gantries(250.0)
         ),
     }
 
 
+def _displayed(seed: int, frames: int) -> dict[float, StudySpec]:
+    """Return the studies whose runs are shown as 8 bit JPEG.
+
+    The key is the width of the field on the detector, mm.
+    """
+    return {
+        width_mm: StudySpec(
+            seed,
+            sites=1,
+            frames=frames,
+            frame_rate_hz=60.0,
+            heart="dog",
+            contrast=VIEWS,
+            gantries=_gantries(width_mm),
+        )
+        for width_mm in (178.0, 250.0, 330.0)
+    }
+
+
+def _gantries(width_mm: float) -> tuple[Gantry, Gantry]:
+    spacing = width_mm / 512
+    lateral, frontal = (Gantry(angle, 0.0, 1000.0, 500.0, (spacing, spacing), 512, 512) for angle in (90.0, 0.0))
+    return lateral, frontal
+
+
+def _as_jpeg(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Return a frame as a lab displays and stores it.
+
+    The steps are logarithm, sharpening, 8 bit and JPEG of quality 85.
+    """
+    level = np.log(frame.astype(np.float64) + 1.0)
+    level += 0.8 * (level - gaussian_filter(level, 3.0))
+    low, high = np.percentile(level, [0.5, 99.5])
+    stored = io.BytesIO()
+    Image.fromarray((np.clip((level - low) / (high - low), 0.0, 1.0) * 255).astype(np.uint8)).save(
+        stored, "JPEG", quality=85
+    )
+    return np.asarray(Image.open(stored))
+
+
 def _score_run(
-    table: Table, spent: dict[str, list[float]] | None, view: str, simulated: SimulatedRun, names: tuple[str, ...]
+    table: Table,
+    spent: dict[str, list[float]] | None,
+    view: str,
+    simulated: SimulatedRun,
+    names: tuple[str, ...],
+    displayed: bool = False,
 ) -> None:
-    in_memory = MemoryFrames(simulated.frames)
+    in_memory = MemoryFrames([_as_jpeg(frame) for frame in simulated.frames] if displayed else simulated.frames)
     gantry = simulated.gantry
     px_per_mm = gantry.source_detector_mm / gantry.source_isocentre_mm / gantry.pixel_spacing_mm[0]
-    run = Run(in_memory, simulated.frame_times_ms, px_per_mm, FACTS)
+    run = Run(in_memory, simulated.frame_times_ms, px_per_mm, DISPLAYED if displayed else FACTS)
     truth = simulated.truth.pixels_uv
     moved = np.linalg.norm(np.diff(np.concatenate(list(truth.values()), axis=1), axis=0), axis=2).max(axis=1)
     moving = np.concatenate([moved[:1], moved]) > MOVING_PX

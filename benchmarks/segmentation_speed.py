@@ -36,8 +36,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.phantom import Contrast, SimulatedRun, StudySpec, simulate_study
-from fluoromap.segmenter.catheter_chain.blob_chains import BlobDetector
-from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain, blob_chains
 from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.four_step.blobs import find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
@@ -103,7 +102,7 @@ def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
     mask = find_field(run.frames, run.pixels)
     x: Image = mask.fill(LogTransform.of_run(run.pixels, mask.mean_level)(frame))
     steps = FourStepDetector(DEFAULT_CATALOGUE, mask, px_per_mm, FourStepParams())
-    blobs = BlobDetector(DEFAULT_CATALOGUE, mask, px_per_mm)
+    blobs = blob_chains(DEFAULT_CATALOGUE, mask, px_per_mm)
     filtered = homomorphic(x)
     k = edge_scale(filtered, mask.inside)
     assert k is not None
@@ -184,7 +183,10 @@ def decoding() -> None:
 
 
 def starting() -> None:
-    """Print the start time of a worker process; the modules' byte code exists, as after any first start."""
+    """Print the start time of a worker process.
+
+    The modules' byte code exists, as after any first start.
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
         environment["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "code")
@@ -253,7 +255,7 @@ def _twins() -> Any:
 
 
 def _peer(name: str) -> Any:
-    """Return a peer's module, limited to one thread; None where it is not installed."""
+    """Return a peer's module with one thread; None if not installed."""
     try:
         module: Any = importlib.import_module(name)
     except ImportError:

@@ -202,9 +202,9 @@ def _package(name: str) -> Path:
 
 
 def _reachable(programs: Path, home: Path) -> Path:
-    """Return a folder of the programs that every user can enter; copy them when their own folder is closed.
+    """Return a folder of the programs that every user can enter.
 
-    An environment below root's home is closed to other users.
+    They are copied when their own folder is closed. An environment below root's home is closed to other users.
     """
     if all(folder.stat().st_mode & 0o001 for folder in (programs, *programs.parents)):
         return programs
@@ -219,7 +219,10 @@ def _reachable(programs: Path, home: Path) -> Path:
 
 @contextmanager
 def fresh_database(server_url: str, name: str) -> Iterator[str]:
-    """Make an empty database on a server, yield its URL and drop it at the end."""
+    """Make an empty database on a server and yield its URL.
+
+    It is dropped at the end.
+    """
     url = sqlalchemy.make_url(server_url).set(drivername="postgresql+psycopg")
     server = sqlalchemy.create_engine(url, isolation_level="AUTOCOMMIT", poolclass=sqlalchemy.NullPool)
     with server.connect() as connection:
@@ -233,7 +236,10 @@ def fresh_database(server_url: str, name: str) -> Iterator[str]:
 
 @contextmanager
 def fresh_redis(server_url: str) -> Iterator[str]:
-    """Empty the next database number of a server, yield its URL and empty it at the end."""
+    """Empty the next database number and yield its URL.
+
+    It is emptied again at the end.
+    """
     with Redis.from_url(f"{server_url.rstrip('/')}/0") as server:
         numbers = int(server.config_get("databases")["databases"])
         number = 1 + int(server.incr("fluoromap-test-databases")) % (numbers - 1)

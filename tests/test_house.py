@@ -27,7 +27,10 @@ PROJECT: dict[str, Any] = tomllib.loads((TOP / "pyproject.toml").read_text())["p
 
 
 def _parse(arguments: list[str]) -> None:
-    """Parse the arguments as the program does, without running the command; raise where they are wrong."""
+    """Parse the arguments as the program does.
+
+    The command does not run. A wrong argument raises.
+    """
     command = program
     context = command.make_context("fluoromap", list(arguments))
     while hasattr(command, "resolve_command"):
@@ -110,14 +113,14 @@ def test_everything_the_image_copies_exists_and_is_sent_to_the_builder() -> None
                 assert source in allowed
 
 
-def test_settings_page_tells_every_setting_and_no_other() -> None:
+def test_settings_page_shows_every_setting_and_no_other() -> None:
     page = (TOP / "docs" / "settings.md").read_text()
     rows = dict(re.findall(r"^\| `(FLUOROMAP_\w+)` \| .+? \| (.+) \|$", page, flags=re.MULTILINE))
     described = {f"FLUOROMAP_{name.upper()}": field.description for name, field in Settings.model_fields.items()}
     assert rows == described
 
 
-def test_settings_page_tells_the_defaults() -> None:
+def test_settings_page_shows_the_defaults() -> None:
     page = (TOP / "docs" / "settings.md").read_text()
     for name, field in Settings.model_fields.items():
         if name in ("data_dir", "workers") or field.default == "":
@@ -186,7 +189,10 @@ def test_run_names_what_to_install_when_venv_is_missing(tmp_path: Path) -> None:
 
 
 def _run_in_a_copy(tmp_path: Path) -> subprocess.CompletedProcess[str]:
-    """``./run demo`` in a folder without an environment, with only the tools it needs and a prepared Python on PATH."""
+    """Run ``./run demo`` in a folder without an environment.
+
+    PATH has only the tools it needs and a prepared Python.
+    """
     copy = tmp_path / "checkout"
     copy.mkdir()
     for name in ("run", "requirements.lock", "pyproject.toml"):

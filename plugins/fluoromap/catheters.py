@@ -118,6 +118,53 @@ class Catalogue:
         return tuple(catheter.name for catheter in self.catheters)
 
 
+def _alternating(pairs: int, pair_mm: float, apart_mm: float) -> tuple[float, ...]:
+    """Return the edge gaps of ``pairs`` pairs of electrodes.
+
+    ``pair_mm`` lies within a pair and ``apart_mm`` between pairs; a name like 2-5-2 lists such gaps.
+    """
+    return tuple(pair_mm if index % 2 == 0 else apart_mm for index in range(2 * pairs - 1))
+
+
+CATHETER_TYPES: dict[str, tuple[tuple[float, ...], float, float]] = {
+    "quadripolar-2-5-2": (_alternating(2, 2.0, 5.0), 2.0, 1.0),
+    "quadripolar-5-5-5": ((5.0,) * 3, 2.0, 1.0),
+    "quadripolar-2-2-2": ((2.0,) * 3, 2.0, 1.0),
+    "hexapolar-2-5-2": (_alternating(3, 2.0, 5.0), 2.0, 1.0),
+    "octapolar-2-5-2": (_alternating(4, 2.0, 5.0), 2.0, 1.0),
+    "decapolar-2-5-2": (_alternating(5, 2.0, 5.0), 2.0, 1.0),
+    "decapolar-2-8-2": (_alternating(5, 2.0, 8.0), 2.0, 1.0),
+    "decapolar-2-2-2": ((2.0,) * 9, 2.0, 1.0),
+    "decapolar-5-5-5": ((5.0,) * 9, 2.0, 1.0),
+    "duodecapolar-2-2-2": ((2.0,) * 19, 2.0, 1.0),
+    "ablation-3.5": (_alternating(2, 2.0, 5.0), 3.5, 1.3),
+    "ablation-4": (_alternating(2, 2.0, 5.0), 4.0, 1.3),
+    "ablation-8": (_alternating(2, 2.0, 5.0), 8.0, 1.3),
+    "circular-10": ((5.0,) * 9, 1.0, 1.0),
+    "circular-20": ((2.0,) * 19, 1.0, 1.0),
+    "pacing-lead": ((8.0,), 1.5, 2.5),
+    "defibrillator-lead": ((10.0,), 1.5, 2.5),
+}
+"""Gaps between electrode edges from the tip on, length of the tip and of each ring, all mm, of catheters as their makers name
+them. Makers differ by some tenths of a millimetre; lengths given with a study count before these."""
+
+
+def catheter_type(type_name: str, name: str) -> Catheter:
+    """Return the catheter of a named type under its own name.
+
+    A type is for example ``decapolar-2-5-2``.
+
+    Raises
+    ------
+    ValueError
+        When no type has that name.
+    """
+    if type_name not in CATHETER_TYPES:
+        raise ValueError(f"no catheter type is named {type_name!r}: use one of {', '.join(CATHETER_TYPES)}")
+    gaps, tip_mm, ring_mm = CATHETER_TYPES[type_name]
+    return Catheter.from_edge_spacing(name, len(gaps) + 1, gaps, tip_mm, ring_mm)
+
+
 DEFAULT_CATALOGUE = Catalogue(
     catheters=(
         Catheter("reference", 4, (3.5, 6.0, 3.0), tip_mm=2.0, ring_mm=1.0),
@@ -138,9 +185,8 @@ def follows_tip(
 ) -> NDArray[np.float64]:
     """Return each electrode's displacement for a displaced tip, (..., N, 3, 3).
 
-    The shaft is not stretched: along it all electrodes move with the tip. The vessel holds the shaft, which bends: across
-    it,
-    electrodes farther back move less.
+    The shaft is not stretched: along it all electrodes move with the tip. The vessel holds the shaft, which bends:
+    across it, electrodes farther back move less.
     """
     follows = np.empty((*points_mm.shape, 3))
     for catheter in {name for name, _ in labels}:

@@ -1,10 +1,9 @@
 """The data that travels between stages, and the four stage protocols.
 
-Everything here is a frozen dataclass that is validated once when built: an object that exists is valid. Frames are counted
-from 0 inside the project (from 1 in files and in the API). Pixels are (u, v) = (column, row), (0, 0) the centre of the
-top-left pixel. World points are millimetres along DICOM patient axes (LPS) from the isocentre. Where a name says
-``relative``,
-the mean of the reference catheter's electrodes in the same frames has been subtracted.
+Everything here is a frozen dataclass that is validated once when built: an object that exists is valid. Frames are
+counted from 0 inside the project (from 1 in files and in the API). Pixels are (u, v) = (column, row), (0, 0) the centre
+of the top-left pixel. World points are millimetres along DICOM patient axes (LPS) from the isocentre. Where a name says
+``relative``, the mean of the reference catheter's electrodes in the same frames has been subtracted.
 """
 
 from __future__ import annotations
@@ -100,8 +99,7 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
     """Return a read-only copy of ``value`` after checking shape and numbers.
 
     A length of None in ``shape`` allows any length. Floating-point values must be finite. An array that is already a
-    read-only copy
-    is returned unchanged.
+    read-only copy is returned unchanged.
 
     Raises
     ------
@@ -125,7 +123,10 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
 
 
 def _is_frozen(array: NDArray[Any]) -> bool:
-    """Return whether nobody can write to the array, neither through it nor through the memory that it shows."""
+    """Return whether nobody can write to the array.
+
+    Neither the array nor the memory that it shows is writeable.
+    """
     if array.flags.writeable or not array.flags.c_contiguous:
         return False
     owner = array.base
@@ -259,9 +260,8 @@ class Segmentation:
     """A segmenter's result for one run.
 
     frames : one entry per frame of the run, in order.
-    diastole : chains in the mean of the quiet frames round diastole; its ``frame`` is the middle one of them. None where
-    there is
-    no quiet stretch: then single frames are used.
+    diastole : chains in the mean of the quiet frames round diastole; its ``frame`` is the middle one of them. None
+    where there is no quiet stretch: then single frames are used.
     diastole_frames : the averaged frames, ascending.
     motion : (n,) change of the image from the previous frame, low-passed, arbitrary unit; the first value repeats the
     second.
@@ -393,11 +393,11 @@ class ElectrodePoint:
 
     position_mm : (3,), covariance_mm2 : (3, 3), from the isocentre.
     relative_mm, relative_covariance_mm2 : the same from the reference catheter's mean; None where that was not located.
-    residual_px : reprojection residual in view a and b. A shift of the whole heart between the runs is subtracted where the
-    triangulator estimates one. reasons : why the point deserves less trust.
+    residual_px : reprojection residual in view a and b. A shift of the whole heart between the runs is subtracted where
+    the triangulator estimates one.
+    reasons : why the point deserves less trust.
     alternative_mm : (3,) position from the isocentre for the other possible pairing of the catheters; None where it was
-    ruled
-    out. The covariance contains it, weighted with ``alternative_probability``.
+    ruled out. The covariance contains it, weighted with ``alternative_probability``.
     """
 
     catheter: str

@@ -8,7 +8,10 @@ import structlog
 
 
 def configure() -> None:
-    """Set up the logging of this process; call it once, before the first log line."""
+    """Set up the logging of this process.
+
+    Call it once, before the first log line.
+    """
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,

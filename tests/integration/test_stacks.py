@@ -20,7 +20,10 @@ pytestmark = pytest.mark.timeout(900)
 
 
 def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Send the study, run a job and kill the worker in the middle; return the ended job and its points."""
+    """Send the study, run a job and kill the worker meanwhile.
+
+    Return the ended job and its points.
+    """
     with Client(url) as client:
         study = client.make_study("stack")
         inputs = find_files(folder)

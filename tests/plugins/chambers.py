@@ -30,13 +30,19 @@ def sites_at(tips_mm: Array, lat_ms: Array, lat_sd_ms: float = 1.0) -> tuple[Map
 
 
 def sphere(count: int, radius_mm: float = 25.0, slope_ms_per_mm: float = 1.0) -> tuple[MappedSite, ...]:
-    """Return a plane wave along X over a sphere about (10, -20, 5), from negative to positive times."""
+    """Return a plane wave along X over a sphere.
+
+    The centre is (10, -20, 5). Times go from negative to positive.
+    """
     tips = radius_mm * directions(count) + [10.0, -20.0, 5.0]
     return sites_at(tips, slope_ms_per_mm * (tips[:, 0] - 10.0))
 
 
 def wave(count: int, seed: int, lat_sd_ms: float = 1.5) -> tuple[tuple[MappedSite, ...], Array]:
-    """Return a wave from one focus over an ellipsoid with irregular sites and noise, and the times without noise."""
+    """Return a wave from one focus over an ellipsoid.
+
+    Sites are irregular and times have noise; the times without noise are returned too.
+    """
     rng = np.random.default_rng(seed)
     spread = directions(count) + 0.2 * rng.normal(size=(count, 3))
     spread /= np.linalg.norm(spread, axis=1, keepdims=True)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
+from fluoromap.catheters import CATHETER_TYPES, DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
 
 
 def test_edge_spacings_become_the_default_catalogue_s_centre_spacings() -> None:
@@ -45,3 +45,18 @@ def test_a_catalogue_needs_different_names_and_two_roles() -> None:
         Catalogue((one, two), "reference", "reference")
     with pytest.raises(KeyError):
         DEFAULT_CATALOGUE["nobody"]
+
+
+def test_types_by_name_have_their_makers_spacings() -> None:
+    cs = catheter_type("decapolar-2-5-2", "coronary sinus")
+    assert cs.name == "coronary sinus"
+    assert cs.electrodes == 10
+    assert cs.spacing_mm == pytest.approx((3.5, 6, 3, 6, 3, 6, 3, 6, 3))
+    assert catheter_type("ablation-4", "mapping").looks_like(DEFAULT_CATALOGUE["mapping"])
+    with pytest.raises(ValueError, match="decapolar-2-5-2"):
+        catheter_type("decapolar", "cs")
+
+
+@pytest.mark.parametrize("name", CATHETER_TYPES)
+def test_every_type_describes_a_catheter(name: str) -> None:
+    assert 2 <= catheter_type(name, "one").electrodes <= 20

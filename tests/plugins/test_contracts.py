@@ -90,6 +90,6 @@ def test_cycles_and_tracks_agree_with_their_labels() -> None:
         Track(labels, np.ones((n, 1), dtype=bool), *arrays, reasons=())
 
 
-def test_a_refusal_says_its_reason_s_sentence_unless_told_better() -> None:
+def test_a_refusal_says_its_reason_s_sentence_unless_given_a_better_one() -> None:
     assert str(Refusal(Reason.NO_A_PRIORI)) == Reason.NO_A_PRIORI.sentence
     assert str(Refusal(Reason.DEPTH_UNOBSERVABLE, "17 mm")) == "17 mm"

@@ -23,13 +23,19 @@ def functions(folder: Path) -> Iterator[tuple[Path, Function]]:
 
 
 def named_in_docstring(function: Function) -> set[int]:
-    """ "eq. (n) of the paper": what other authors' equations are cited by looks otherwise."""
+    """Return the equations that a docstring cites as the paper's.
+
+    Only "eq. (n) of the paper" counts: equations of other authors are cited in another form.
+    """
     text = ast.get_docstring(function) or ""
     return {int(number) for number in re.findall(r"[Ee]q\. \((\d+)\) of the paper", text)}
 
 
 def named_by_test(function: Function) -> set[int]:
-    """From ``test_equation_4_...``, ``test_equations_8_9_10_...`` and ``test_..._equations_5_and_6_...``."""
+    """Return the equations in a test's name.
+
+    It is ``test_equation_4_...``, ``test_equations_8_9_10_...`` or ``test_..._equations_5_and_6_...``.
+    """
     listed = re.search(r"equations?_(\d+(?:_(?:and_)?\d+)*)(?:_|$)", function.name)
     return {int(number) for number in re.findall(r"\d+", listed[1])} if listed else set()
 

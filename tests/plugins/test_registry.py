@@ -35,7 +35,7 @@ class ParamsNotAModel(Working):
 
 @pytest.fixture
 def entry(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
-    """Entry points that load the classes of this file, or what cannot be loaded."""
+    """Entry points that load the classes of this file, or fail to load."""
     known = {cls.__name__: cls for cls in (Working, Again, WithoutMethod, ParamsNotAModel)}
 
     class Point(EntryPoint):
@@ -72,7 +72,7 @@ def test_a_plugin_that_does_not_import_is_a_row_with_its_traceback(entry) -> Non
         ("params-not-a-model", "ParamsNotAModel", "pydantic model"),
     ],
 )
-def test_a_class_that_is_no_stage_is_told_what_it_lacks(entry, name: str, value: str, words: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_class_that_is_no_stage_is_reported_with_what_it_lacks(entry, name: str, value: str, words: str) -> None:  # type: ignore[no-untyped-def]
     (row,) = registry.discover("fuser", [entry(name, value)])
     assert row.stage is None
     assert words in (row.error or "")
@@ -85,7 +85,7 @@ def test_of_two_plugins_with_one_name_the_first_is_used(entry) -> None:  # type:
     assert "found first" in (second.error or "")
 
 
-def test_unknown_and_broken_plugins_are_told_apart(entry, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+def test_unknown_and_broken_plugins_are_distinguished(entry, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
     rows = registry.discover("fuser", [entry("working", "Working"), entry("zz-broken", "no_such_module_here:Fuser")])
     monkeypatch.setattr(registry, "plugins", lambda: rows)
     assert registry.plugin("fuser", "working").stage is Working

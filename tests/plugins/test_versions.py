@@ -41,13 +41,22 @@ from fluoromap.contracts import (
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.phantom import SimulatedRun, SimulatedStudy, StudySpec, simulate_study
-from fluoromap.phantom.known_pixels import matched_sites
+from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.registry import Kind, build_fuser, build_monoplane, build_segmenter, build_triangulator, plugins
 from fluoromap.segmenter.warm_up import SyntheticFrames
 
 KNOWN = Path(__file__).with_name("result_fingerprints.json")
-TOLERANCE = 1e-5
-"""Largest change of a weighted sum that processors may cause, as a share of the norm."""
+TOLERANCE = 1e-6
+"""Largest change of a weighted sum between processors, as a share of the norm."""
+TOLERANCES = {
+    "Chain.covariance_px2": 1e-5,
+    "Chain.scores": 3e-3,  # read at the nearest pixel, which may be another one
+    "ChamberMap.lat_ms": 5e-4,  # an optimiser sets the prior of the field
+    "ChamberMap.lat_sd_ms": 5e-4,
+    "ChamberMap.leave_one_out_rms_ms": 5e-4,
+    "SurfaceSite.leave_one_out_error_ms": 5e-4,
+}
+"""Exceptions, measured by compiling for a generic processor (NUMBA_CPU_NAME=generic, OPENBLAS_CORETYPE=Nehalem)."""
 
 MATCHING = "matching"
 BUILT_IN = {
@@ -59,7 +68,10 @@ STAGES = (*BUILT_IN, MATCHING)
 
 
 def numbers(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield (field, content) of all contents of a result, depth first."""
+    """Yield all contents of a result as (field, content).
+
+    The order is depth first.
+    """
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             yield from numbers(getattr(value, field.name), f"{type(value).__name__}.{field.name}")
@@ -94,7 +106,7 @@ def fingerprint(result: object) -> dict[str, Any]:
 
 @functools.cache
 def study() -> SimulatedStudy:
-    """Five sites of a heart, two seconds a view."""
+    """Simulate five sites of a heart, two seconds a view."""
     return simulate_study(StudySpec(41, sites=5, frames=24, breathing_mm=1.0))
 
 
@@ -105,7 +117,7 @@ def located() -> Triangulation:
 
 def segmented(name: str) -> object:
     frames = SyntheticFrames(DEFAULT_CATALOGUE)
-    run = Run(frames, 66.7 * np.arange(len(frames)), 5.75, PixelFacts(False, 12, False))
+    run = Run(frames, 66.7 * np.arange(len(frames), dtype=np.float64), 5.75, PixelFacts(False, 12, False))
     return build_segmenter(name, {}).segment(run, DEFAULT_CATALOGUE, {}, Silent())
 
 
@@ -126,7 +138,10 @@ def tracked(name: str) -> object:
 
 
 def rigid_view() -> MonoplaneView:
-    """A view of the first site's electrodes that move as one rigid body, which a beating heart does not."""
+    """Return a view of the first site's electrodes as a rigid body.
+
+    They move as one, which a beating heart does not.
+    """
     place = located().sites[0]
     points = np.array([point.position_mm for point in place.points])
     noise = np.random.default_rng(7)
@@ -142,8 +157,9 @@ def rigid_view() -> MonoplaneView:
             chains.append(NamedChain(catheter, electrodes, pixels[own], np.tile(0.09 * np.eye(2), (len(own), 1, 1))))
         observations.append(Observation(frame, None, tuple(chains)))
     return MonoplaneView(
-        site="S01", view="a", camera=place.camera_a, catalogue=DEFAULT_CATALOGUE, frame_times_ms=66.7 * np.arange(6),
-        observations=tuple(observations), a_priori=place.points, a_priori_frame=0, cycle=None, others=(),
+        site="S01", view="a", camera=place.camera_a, catalogue=DEFAULT_CATALOGUE,
+        frame_times_ms=66.7 * np.arange(6, dtype=np.float64), observations=tuple(observations),
+        a_priori=place.points, a_priori_frame=0, cycle=None, others=(),
     )  # fmt: skip
 
 
@@ -156,8 +172,10 @@ def matched() -> object:
     runs = [
         SiteRuns(
             site.name,
-            *(camera_from_gantry(run.gantry) for run in site.runs),
-            *(chains_of(run, 10 * number + view) for view, run in enumerate(site.runs)),
+            camera_from_gantry(site.runs[0].gantry),
+            camera_from_gantry(site.runs[1].gantry),
+            chains_of(site.runs[0], 10 * number),
+            chains_of(site.runs[1], 10 * number + 1),
         )
         for number, site in enumerate(study().sites)
     ]
@@ -165,7 +183,10 @@ def matched() -> object:
 
 
 def chains_of(run: SimulatedRun, seed: int) -> Segmentation:
-    """The true chains of a run with noise, the tip's length being the only sign of the catheter."""
+    """Return the true chains of a run with noise.
+
+    The tip's length is the only sign of the catheter.
+    """
     rng = np.random.default_rng(seed)
     n = len(run.frame_times_ms)
 
@@ -193,7 +214,7 @@ RESULTS: dict[Kind, Callable[[str], object]] = {
 
 
 def current(stage: str) -> dict[str, Any]:
-    """Return version and fingerprint of a stage as it is now."""
+    """Return the present version and fingerprint of a stage."""
     if stage == MATCHING:
         return {"version": matching.VERSION, **fingerprint(matched())}
     row = BUILT_IN[stage]
@@ -204,12 +225,9 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Return the fields in which two fingerprints differ."""
     fields = [] if old["sha256"] == new["sha256"] else ["sha256"]
     for name in {*old["sums"], *new["sums"]}:
-        before, after = old["sums"].get(name), new["sums"].get(name)
-        if (
-            before is None
-            or after is None
-            or max(abs(a - b) for a, b in zip(before, after, strict=True)) > TOLERANCE * max(before[1], 1e-9)
-        ):
+        before, after = (one["sums"].get(name, [math.nan, math.nan]) for one in (old, new))
+        allowed = TOLERANCES.get(name, TOLERANCE) * max(before[1], 1e-9)
+        if not all(abs(a - b) <= allowed for a, b in zip(before, after, strict=True)):
             fields.append(name)
     return sorted(fields)
 

@@ -25,7 +25,10 @@ def run_uid(number: int) -> str:
 def small_run(
     folder: Path, number: int, primary_deg: float, *, secondary_deg: float = 0.0, seconds: float | None = None
 ) -> bytes:
-    """Run ``number``; it begins ``seconds`` after the first one, by default 20 s for each number."""
+    """Return the DICOM file of run ``number``.
+
+    It begins ``seconds`` after the first one, by default 20 s for each number.
+    """
     pixels = np.random.default_rng(number).integers(0, 4096, (FRAMES, ROWS, COLUMNS)).astype(np.uint16)
     path = folder / f"small{number}.dcm"
     write_cine(
@@ -45,7 +48,7 @@ def small_run(
 
 
 def edited(content: bytes, **attributes: Any) -> bytes:
-    """The same file with other attributes; None removes one."""
+    """Return the file with other attributes; None removes one."""
     dataset = pydicom.dcmread(io.BytesIO(content))
     for keyword, value in attributes.items():
         if value is not None:

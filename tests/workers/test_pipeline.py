@@ -47,7 +47,7 @@ def _job(service: TestClient, study_path: str, **body: Any) -> dict[str, Any]:
 
 
 def _fresh_stages(job: dict[str, Any]) -> Counter[str]:
-    """How many stages of each kind were really computed."""
+    """Count the stages of each kind that were really computed."""
     return Counter(row["name"] for row in job["stages"] if row["state"] == "done" and not row["reused"])
 
 
@@ -91,7 +91,7 @@ def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sen
         job_row = session.get_one(Job, job["id"])
         fusions = [fusion_of(session, job_row, overlay["sop_instance_uid"], None) for overlay in overlays]
     for fusion in fusions:
-        # The heart stood elsewhere in each of a site's runs; on the frame the site must stand where its tip is seen.
+        # The heart lay elsewhere in each of a site's runs; on the frame the site must lie where its tip is seen.
         drawn = next(site.position_mm for site in fusion.chamber.sites if site.site == fusion.site) + fusion.shift_mm
         assert np.linalg.norm(fusion.camera.project(drawn) - fusion.tip_uv) < 3
     tracks = service.get(f"{base}/tracks", params={"site": tips[0]["site"], "view": "a"}).json()["tracks"]
@@ -175,7 +175,7 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     site = next(site["site"] for site in sites if failed[0]["subject"] in (site["view_a"], site["view_b"]))
     points = [p for p in service.get(f"/v1/jobs/{job['id']}/points").json()["points"] if p["site"] == site]
     assert {p["grade"] for p in points} == {"rejected"}
-    assert {tuple(p["reasons"]) for p in points} == {("plugin_failed",)}
+    assert {tuple(p["reasons"]) for p in points} == {("plugin_failed", "paired_by_order")}
 
 
 REFUSALS = {
@@ -203,7 +203,7 @@ def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
     if kind in ("segmenter", "triangulator"):
         points = service.get(f"{base}/points").json()["points"]
         assert len(points) == 5 * 12
-        assert {tuple(point["reasons"]) for point in points} == {(str(reason),)}
+        assert {tuple(point["reasons"]) for point in points} == {(str(reason), "paired_by_order")}
     elif kind == "monoplane":
         answer = service.get(f"{base}/tracks").json()
         assert answer["tracks"] == []

@@ -176,7 +176,7 @@ def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch
 
 def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: Any) -> str:
-        raise RuntimeError("a name that must not be told")
+        raise RuntimeError("a name that must stay secret")
 
     monkeypatch.setattr(files, "keep", broken)
     row = _run(stage, monkeypatch, lambda context: ())

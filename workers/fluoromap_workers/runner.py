@@ -15,7 +15,7 @@ from fluoromap_service.jobs import job_life
 from fluoromap_service.jobs.job_life import Claim, StoredResult
 from fluoromap_service.jobs.stage_results import load_file, remember
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import MEDIA_TYPE, encode
+from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
@@ -101,7 +101,7 @@ def _run(held: Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
     heartbeat.check()
     with files.incoming() as path, writing() as session:
         path.write_bytes(content)
-        sha256 = files.keep(session, path, MEDIA_TYPE)
+        sha256 = files.keep(session, path)
         session.merge(StageResult(key=work.key, sha256=sha256))
         if not job_life.finish(session, held, StoredResult(sha256, rows), reused=False):
             raise StageStopped("the claim was lost while the result was stored")

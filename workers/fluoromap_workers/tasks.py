@@ -28,7 +28,8 @@ log = structlog.get_logger(__name__)
 def run_stage(stage_id: int) -> None:
     """Run the stage of that row, then for a while others of its job.
 
-    A stage that cannot be claimed is left alone. So the stages of a chain need no message each. Their messages find them claimed.
+    A stage that cannot be claimed is left alone. After a stage, this worker runs the stages of the same job that are ready, and
+    does not wait for their messages. A message that arrives later finds its stage claimed.
     """
     worker = f"{socket.gethostname()}:{os.getpid()}"
     end = time.monotonic() + queue.STAYS_SECONDS

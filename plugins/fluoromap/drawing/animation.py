@@ -29,7 +29,7 @@ def draw_propagation(
     tip_uv: ArrayLike | None,
     look: Look,
 ) -> bytes:
-    """Draw a GIF that runs through the map's times from the earliest to the latest, again and again.
+    """Draw a GIF that runs through the map's times again and again.
 
     The parameters are those of :func:`fluoromap.drawing.overlay.draw_overlay`; ``look.until_ms`` is not used. Each picture
     is the overlay at one time, which is written in the corner. The wall is coloured where it is activated by that time.

@@ -61,7 +61,10 @@ class Scale:
         return self.start_ms + self.step_ms * np.arange(self.bands + 1, dtype=np.float64)
 
     def band(self, lat_ms: Array) -> NDArray[np.int64]:
-        """Return the band of each time; times outside the scale belong to the first or last band."""
+        """Return the band of each time.
+
+        Times outside the scale belong to the first or last band.
+        """
         bands = (lat_ms - self.start_ms) / self.step_ms
         # Conversion to an integer rounds towards 0, which is downwards only after clipping.
         return np.clip(bands, 0, self.bands - 1).astype(np.int64)
@@ -76,7 +79,10 @@ class Scale:
 
 
 def colour_map(fraction: Array, palette: Palette = "safe") -> Colours:
-    """Return the RGB (k, 3) of fractions (k,) of the scale, 0 early, 1 late; values outside are clipped."""
+    """Return the RGB (k, 3) of fractions (k,) of the scale, 0 early, 1 late.
+
+    Values outside are clipped.
+    """
     anchors = _ANCHORS_RGB[palette]
     position = np.clip(fraction, 0, 1) * (len(anchors) - 1)
     channels = [np.interp(position, np.arange(len(anchors)), channel) for channel in anchors.T]
@@ -115,5 +121,8 @@ def vertex_colours(chamber: ChamberMap) -> Colours:
 
 
 def milliseconds(lat_ms: float) -> str:
-    """Return a time in whole milliseconds, as written beside a site. (Pillow's typeface has no true minus sign.)"""
+    """Return a time in whole milliseconds, as written beside a site.
+
+    Pillow's typeface has no true minus sign.
+    """
     return str(round(lat_ms))

@@ -64,7 +64,10 @@ def _lines(chamber: ChamberMap, covered: IntArray, corners: IntArray, level: flo
 
 
 def _chains(segments: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Join segments (s, 2) end to end where two meet in a node; return (nodes, segments) of each chain."""
+    """Join segments (s, 2) into chains.
+
+    Two segments join end to end where they alone meet in a node. The result is (nodes, segments) of each chain.
+    """
     ends, nodes = np.unique(segments, return_inverse=True)
     nodes = nodes.reshape(-1, 2)
     numbers = np.arange(1, len(segments) + 1)

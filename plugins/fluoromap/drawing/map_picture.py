@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, ChamberMap
+from fluoromap.drawing.colour_bar import draw_colour_bar
 from fluoromap.drawing.colours import Scale, scale_of
 from fluoromap.drawing.isochrones import Isochrone, isochrones
-from fluoromap.drawing.lettering import Labels, Point, draw_colour_bar, font
+from fluoromap.drawing.lettering import Labels, Point, font
 from fluoromap.drawing.raster import rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_time, is_outlier
 from fluoromap.drawing.wall import colour_table, line_parts, outline_edges, pixel_bands
@@ -48,10 +49,10 @@ def draw_map_views(
     like: ChamberMap | None = None,
     times: Scale | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw the map from several directions, with sites, isochrones, colour bar and figures of merit.
+    """Draw the map from several directions.
 
-    All panels are orthographic and have one scale. The viewer is at the place of a C-arm's detector. Sites on the far wall
-    are not drawn.
+    The picture has sites, isochrones, colour bar and figures of merit. All panels are orthographic and have one scale.
+    The viewer is at the place of a C-arm's detector. Sites on the far wall are not drawn.
 
     Parameters
     ----------
@@ -97,7 +98,10 @@ class _Panel:
         self._px_per_mm = px_per_mm
 
     def project(self, points_mm: Array, factor: int) -> tuple[Array, Array]:
-        """Return picture coordinates (k, 2) in a panel ``factor`` times as large, and nearness to the viewer (k,), mm."""
+        """Return picture coordinates (k, 2) and nearness to the viewer (k,), mm.
+
+        The panel is ``factor`` times as large.
+        """
         offset = points_mm - self._middle
         uv = (offset @ self._axes.T * self._px_per_mm + PANEL_PX / 2) * factor - 0.5
         return uv, offset @ self._to_viewer

@@ -19,10 +19,11 @@ def map_shift_mm(
 
     It is the first of these that exists:
 
-    1. the position of the reference catheter that the track of this view gives for this frame;
-    2. its position at diastole, moved across the rays to the place where this frame shows it: the heart breathes between
-       the two runs of a site;
-    3. its mean position over the sites.
+    1. The position of the reference catheter in this frame by the track of this view.
+    2. The diastolic position of the reference catheter at this site. It is moved across the rays to the place where this
+       frame shows the catheter, because the heart breathes between the two runs of a site. In a frame that does not show
+       the catheter, the diastolic position is used unmoved.
+    3. The mean position of the reference catheter over the sites.
 
     Parameters
     ----------

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, ChamberMap
+from fluoromap.drawing.colour_bar import bar_box, draw_colour_bar
 from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, bar_box, draw_colour_bar, halo_text
+from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
 from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, colour_table, line_parts, outline_edges, pixel_bands
@@ -151,7 +152,10 @@ class _Canvas:
         return self.to_picture(np.where(behind[:, None], OUT_OF_SIGHT_PX, uv)), depth
 
     def ellipse(self, point_mm: Array, covariance_mm2: Array) -> Array:
-        """Return the outline (k, 2) in the picture of the 95 % ellipse of a point's projection, to first order."""
+        """Return the outline (k, 2) of a point's 95 % ellipse.
+
+        It is the ellipse of the point's projection into the picture, to first order.
+        """
         step = 1e-3
         ends = self.project(point_mm + step * np.concatenate([np.eye(3), -np.eye(3)]))[0]
         jacobian = (ends[:3] - ends[3:]).T / (2 * step)
@@ -162,7 +166,10 @@ class _Canvas:
         return outline
 
     def facing(self, chamber: ChamberMap) -> BoolArray:
-        """Return True for faces that face the detector: the ray from the source leaves the chamber through them."""
+        """Return True for faces that face the detector.
+
+        The ray from the source leaves the chamber through such a face.
+        """
         normals = face_normals(chamber.vertices_mm, chamber.faces)
         rays = chamber.vertices_mm[chamber.faces].mean(axis=1) - self._camera.source_world_mm
         outward: BoolArray = (normals * rays).sum(axis=1) > 0
@@ -181,7 +188,10 @@ def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale) -> None:
 def _draw_lines(
     image: Image.Image, canvas: _Canvas, chamber: ChamberMap, facing: BoolArray, times: Scale, look: Look
 ) -> None:
-    """Draw isochrones, outline and ellipses at twice the size and average them, for smooth lines."""
+    """Draw isochrones, outline and ellipses.
+
+    They are drawn at twice the size and averaged, for smooth lines.
+    """
     thickness = max(2, round(2 * canvas.unit))
 
     def draw(lines: Sequence[Array], colour: RGB, share: float, width: int) -> None:

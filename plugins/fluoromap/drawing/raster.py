@@ -35,7 +35,10 @@ class Raster:
         return sampled if cycle is None else values.min() + (sampled - values.min()) % cycle
 
     def visible(self, uv: Array, nearness: Array, tolerance_mm: float = 1.5) -> BoolArray:
-        """Return True for points (k, 2) of nearness (k,) that are not behind the surface by more than the tolerance."""
+        """Return which points (k, 2) are not behind the surface.
+
+        ``nearness`` (k,) may be behind it by the tolerance.
+        """
         rows, columns = self.face.shape
         pixel = np.rint(uv).astype(np.int64)
         u, v = np.clip(pixel[:, 0], 0, columns - 1), np.clip(pixel[:, 1], 0, rows - 1)
@@ -98,7 +101,10 @@ def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, sh
 
 
 def _ranges(first: Array, last: Array, end: int) -> tuple[IntArray, IntArray]:
-    """Return the integers from ``first`` (k,) to below ``last`` (k,) within 0 to ``end``: count of each (k,), and all."""
+    """Return the integers of several ranges, within 0 to ``end``.
+
+    Range k goes from ``first`` (k,) to below ``last`` (k,). The result is the count of each (k,), and all integers.
+    """
     start, stop = (np.ceil(np.clip(bound, 0, end)).astype(np.int64) for bound in (first, last))
     count = stop - start
     past = np.cumsum(count)

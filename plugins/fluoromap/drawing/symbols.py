@@ -25,12 +25,18 @@ def is_outlier(site: SurfaceSite) -> bool:
 
 
 def time_text(site: SurfaceSite) -> str:
-    """Return the site's time in ms, with a question mark where its neighbours contradict it."""
+    """Return the site's time in ms.
+
+    A question mark follows where its neighbours contradict it.
+    """
     return milliseconds(site.lat_ms) + ("?" if is_outlier(site) else "")
 
 
 def draw_dot(image: Image.Image, place: Point, site: SurfaceSite, times: Scale, unit: float, *, near: bool) -> None:
-    """Draw a site as a dot in the colour of its time: filled on the near wall, a ring on the far wall, amber for an outlier."""
+    """Draw a site as a dot in the colour of its time.
+
+    It is filled on the near wall and a ring on the far wall; an outlier is amber.
+    """
     band = tuple(times.band_colours()[times.band(np.array(site.lat_ms))].tolist())
     colour = OUTLIER_RGB if is_outlier(site) else band
     radius = (DOT_RADIUS if near else RING_RADIUS) * unit
@@ -46,7 +52,10 @@ def draw_time(
     draw: ImageDraw.ImageDraw, labels: Labels, place: Point, site: SurfaceSite, unit: float, size: int, *,
     near: bool, on_light: bool = False,
 ) -> None:  # fmt: skip
-    """Draw the site's time beside its dot, in dark letters where the picture's background is light."""
+    """Draw the site's time beside its dot.
+
+    The letters are dark where the picture's background is light.
+    """
     text = time_text(site)
     if on_light:
         ink, halo = DARK_OUTLIER_RGB if is_outlier(site) else DARK_RGB, WHITE
@@ -65,7 +74,10 @@ def draw_star(image: Image.Image, place: Point, radius: float) -> None:
 
 
 def _stamp(image: Image.Image, place: Point, shapes: list[tuple[Array, RGB]]) -> None:
-    """Draw polygons around ``place`` larger and average them: their centre is correct to a tenth of a pixel."""
+    """Draw polygons around ``place`` larger and average them.
+
+    Their centre is then correct to a tenth of a pixel.
+    """
     reach = int(np.ceil(max(float(np.abs(shape).max()) for shape, _ in shapes))) + 2
     corner = (round(place[0]) - reach, round(place[1]) - reach)
     patch = Image.new("RGBA", ((2 * reach + 1) * FINER, (2 * reach + 1) * FINER), (0, 0, 0, 0))

@@ -1,4 +1,4 @@
-"""The chamber's wall in a picture: the band of each pixel, the outline, and the visible parts of a line."""
+"""The chamber's wall in a picture: bands of pixels, outline, visible parts of lines."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ _WITHIN = -4
 def pixel_bands(
     raster: Raster, chamber: ChamberMap, times: Scale, unit: float, until_ms: float | None = None
 ) -> NDArray[np.int32]:
-    """Return the band of ``times`` of each pixel (rows, columns); ``NO_DATA``, ``HATCH`` or ``NOTHING`` without a band.
+    """Return the band of ``times`` of each pixel (rows, columns).
 
-    With ``until_ms``, only the wall that is activated by that time has a band. ``unit`` is the size of the picture's
-    details, 1 for a picture of 512 pixels. The negative values index the table of :func:`colour_table` from its end.
+    A pixel without a band has ``NO_DATA``, ``HATCH`` or ``NOTHING``. With ``until_ms``, only the wall that is activated
+    by that time has a band. ``unit`` is the size of the picture's details, 1 for a picture of 512 pixels. The negative
+    values index the table of :func:`colour_table` from its end.
     """
     lat, cycle = _times_past_rim(chamber), chamber.cycle_length_ms
 
@@ -59,10 +60,10 @@ def colour_table(times: Scale, nothing: tuple[int, int, int]) -> NDArray[np.uint
 
 
 def _times_past_rim(chamber: ChamberMap) -> Array:
-    """Return the times at the vertices within one cycle, extended past the rim of the covered part.
+    """Return the vertices' times, extended past the covered part.
 
-    Vertices just past the rim get the mean of their covered neighbours. Otherwise a face on the rim would run through all
-    bands down to 0.
+    The times lie within one cycle. Vertices just past the rim get the mean of their covered neighbours. Otherwise a
+    face on the rim would run through all bands down to 0.
     """
     lat, faces, cycle = chamber.lat_ms.copy(), chamber.faces, chamber.cycle_length_ms
     if not chamber.covered.any():
@@ -98,6 +99,9 @@ def outline_edges(faces: IntArray, facing: BoolArray) -> IntArray:
 
 
 def line_parts(flags: BoolArray) -> list[slice]:
-    """Return slices of a line's points, one for each connected part of segments whose flag is set."""
+    """Return the slices of a line's flagged parts.
+
+    There is one slice of points for each connected part of flagged segments.
+    """
     changes = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in changes.reshape(-1, 2)]

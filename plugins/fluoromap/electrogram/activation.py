@@ -31,7 +31,7 @@ _QUARTILE_OF_NORMAL = 0.31863936396437514
 
 
 class UnusableElectrogram(ValueError):
-    """This electrogram gives no activation time; the message says why."""
+    """An electrogram without an activation time; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +52,11 @@ class ElectrogramResult:
 def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike) -> ElectrogramResult:
     """Return the local activation time of one site from its two electrograms.
 
-    The slope at each sample is that of a cubic fitted to the samples within 5 ms on each side (Savitzky and Golay, Anal.
-    Chem. 36 (1964) 1627, for samples at any spacing), which follows a deflection of a few ms. The steepest place lies
-    between samples where the cubic's curvature vanishes. The standard deviation follows from two things: the sharpness of
-    that
-    minimum, and the curvatures that the same fits have in the quieter parts of the recording. So hum, far field and
-    filtered noise
-    count with their real size, and not as independent errors of the samples.
+    The slope at each sample is that of a cubic fitted to the samples within 5 ms on each side (Savitzky and Golay,
+    Anal. Chem. 36 (1964) 1627, for samples at any spacing), which follows a deflection of a few ms. The steepest place
+    lies between samples where the cubic's curvature vanishes. The standard deviation follows from two things: the
+    sharpness of that minimum, and the curvatures that the same fits have in the quieter parts of the recording. So hum,
+    far field and filtered noise count with their real size, and not as independent errors of the samples.
 
     Parameters
     ----------
@@ -68,9 +66,8 @@ def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike
     Raises
     ------
     UnusableElectrogram
-        When a signal is too short, not finite, flat, saturated or without a deflection above the noise; or when times do
-        not
-        ascend. The message names the signal.
+        When a signal is too short, not finite, flat, saturated or without a deflection above the noise; or when times
+        do not ascend. The message names the signal.
     """
     times = np.asarray(time_ms, dtype=np.float64)
     if times.ndim != 1 or len(times) < _LEAST_SAMPLES:
@@ -154,9 +151,9 @@ def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> 
 
 
 def _steepest_place(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[float, float]:
-    """Return (time, standard deviation) of the steepest place near a sample.
+    """Return the steepest place near a sample.
 
-    The cubics are as wide as the deflection.
+    The result is (time, standard deviation). The cubics are as wide as the deflection.
     """
     spacing = float(np.median(np.diff(times)))
     if cubic[3] <= 0:

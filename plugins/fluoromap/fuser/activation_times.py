@@ -1,4 +1,4 @@
-"""Activation times over the wall, with standard deviation, from the times at the sites; with or without a cycle."""
+"""Activation times over the wall from the times at the sites, with or without a cycle."""
 
 from __future__ import annotations
 

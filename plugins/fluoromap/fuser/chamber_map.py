@@ -1,4 +1,4 @@
-"""The chamber's map on a given surface, shared by all fusers: sites, activation times, and figures of merit."""
+"""The chamber's map on a given surface, shared by all fusers."""
 
 from __future__ import annotations
 

@@ -26,7 +26,9 @@ def map_origin(triangulation: Triangulation) -> tuple[float, float, float] | Non
 def mapped_sites(
     triangulation: Triangulation, catalogue: Catalogue, times_ms: Mapping[str, tuple[float, float]]
 ) -> tuple[MappedSite, ...]:
-    """Return the mapping tip of every located site, relative to the reference catheter, with its activation time.
+    """Return the mapping tip of every located site with its time.
+
+    Positions are relative to the reference catheter.
 
     Parameters
     ----------

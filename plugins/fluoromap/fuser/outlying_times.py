@@ -68,7 +68,10 @@ def agreeing_sites(
 
 
 def _alone(between_ms: Array, apart_mm: Array) -> int | None:
-    """Return the only site whose time no wave explains from any other site; None without exactly one such site."""
+    """Return the only site whose time no wave explains from any other site.
+
+    The result is None without exactly one such site.
+    """
     connected = between_ms <= apart_mm / NO_WAVE_MM_PER_MS
     np.fill_diagonal(connected, False)
     neighbours = connected.sum(axis=1)

@@ -43,10 +43,11 @@ class Cycle:
         return phase
 
     def times(self, mean: Array, variance: Array) -> tuple[Array, Array]:
-        """Return times and standard deviations (n,), (n,) in ms from cosine and sine of phases.
+        """Return times and standard deviations (n,), (n,) in ms.
 
-        ``mean`` and ``variance`` (n, 2) are those of cosine and sine. To first order the phase's error is the vector's error
-        across its direction, over its length. It is at most that of a uniform distribution over the cycle.
+        They follow from cosine and sine of phases. ``mean`` and ``variance`` (n, 2) are those of cosine and sine. To
+        first order the phase's error is the vector's error across its direction, over its length. It is at most that of
+        a uniform distribution over the cycle.
         """
         square = np.maximum((mean**2).sum(axis=1), 1e-12)
         across = (mean[:, 1] ** 2 * variance[:, 0] + mean[:, 0] ** 2 * variance[:, 1]) / square
@@ -56,7 +57,10 @@ class Cycle:
 
 
 def around(difference_ms: Array, cycle_length_ms: float) -> Array:
-    """Move differences (...) by whole cycles to between minus half a cycle (included) and half a cycle."""
+    """Move differences (...) by whole cycles to within half a cycle.
+
+    Minus half a cycle is included.
+    """
     half = cycle_length_ms / 2
     near: Array = np.mod(difference_ms + half, cycle_length_ms) - half
     return near

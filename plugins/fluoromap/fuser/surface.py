@@ -39,9 +39,9 @@ class SurfacePoints:
 
 
 def hull_surface(points_mm: Array) -> tuple[Array, IntArray]:
-    """Return the convex hull of points (k, 3) as a closed outward surface of its extreme points.
+    """Return the convex hull of points (k, 3).
 
-    There are at least four points, not all in one plane.
+    It is a closed outward surface of its extreme points. There are at least four points, not all in one plane.
     """
     hull = ConvexHull(points_mm)
     if not is_watertight(np.asarray(hull.simplices, dtype=np.int64)):
@@ -64,7 +64,10 @@ def is_watertight(faces: IntArray) -> bool:
 
 
 def face_normals(vertices_mm: Array, faces: IntArray) -> Array:
-    """Return the outward normals (f, 3); the length of each is twice its face's area in mm²."""
+    """Return the outward normals (f, 3).
+
+    The length of each is twice its face's area in mm².
+    """
     corners = vertices_mm[faces]
     normals: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals
@@ -109,7 +112,10 @@ def refine(vertices_mm: Array, faces: IntArray, edge_mm: float) -> tuple[Array, 
 
 
 def _split_faces(vertices_mm: Array, faces: IntArray, middles: IntArray) -> IntArray:
-    """Replace faces by 1 to 4, given the new vertex on each edge (01, 12, 20), -1 where the edge is whole."""
+    """Replace each face by 1 to 4 faces.
+
+    ``middles`` (f, 3) are the new vertices on the edges 01, 12, 20 of each face; -1 where an edge stays whole.
+    """
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
 
@@ -157,7 +163,10 @@ def nearest_on_surface(vertices_mm: Array, faces: IntArray, points_mm: Array) ->
 
 
 def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
-    """Return the face nearest to a point, of faces with corners (f, 3, 3), and the barycentric weights (3,) there."""
+    """Return the face nearest to a point.
+
+    The faces have corners (f, 3, 3). The second value is the barycentric weights (3,) there.
+    """
     a, ab, ac = corners_mm[:, 0], corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     bc = corners_mm[:, 2] - corners_mm[:, 1]
     aa, bb, cc = (np.maximum((edge**2).sum(axis=1), 1e-12) for edge in (ab, ac, bc))
@@ -203,7 +212,10 @@ def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfaceP
 
 
 def _edges_and_shortcuts(vertices_mm: Array, faces: IntArray) -> tuple[IntArray, Array]:
-    """Return each edge with its length, and each straight line across an edge that stays within its two faces."""
+    """Return the edges and shortcuts of a surface with their lengths.
+
+    A shortcut is a straight line across an edge that stays within the edge's two faces.
+    """
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     opposite = faces[:, [2, 0, 1]].ravel()
     order = np.lexsort((np.sort(half, axis=1)[:, 1], np.sort(half, axis=1)[:, 0]))

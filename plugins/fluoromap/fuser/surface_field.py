@@ -67,7 +67,10 @@ class SurfaceField:
         return points.rows(self.faces, len(self.modes))
 
     def regress(self, points: SurfacePoints, values: Array, variance: Array, prior: FieldPrior) -> Regression:
-        """Condition on values (k, c) of c quantities with the same prior and variances (k,), at k points."""
+        """Compute the regression on values (k, c) at k points.
+
+        All c quantities have the same prior and variances (k,).
+        """
         return Regression(self, points, values, variance, prior)
 
 

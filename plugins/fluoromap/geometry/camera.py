@@ -180,5 +180,16 @@ class Camera:
 
 def ray_angle_deg(first: Camera, second: Camera) -> float:
     """Return the angle between two views' central rays, folded to 0..90 degrees."""
-    cosine = abs(float(first.axis_world @ second.axis_world))
+    return direction_angle_deg(first.axis_world, second.axis_world)
+
+
+def direction_angle_deg(first: ArrayLike, second: ArrayLike) -> float:
+    """Return the angle between two rays, folded to 0..90 degrees.
+
+    Parameters
+    ----------
+    first, second : array_like, shape (3,)
+        Unit vectors in the same frame.
+    """
+    cosine = abs(float(np.dot(first, second)))
     return float(np.degrees(np.arccos(min(cosine, 1.0))))

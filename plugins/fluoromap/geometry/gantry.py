@@ -73,8 +73,12 @@ class Gantry:
             raise ValueError("ImagerPixelSpacing must be between 0.01 and 5 mm")
         if self.rows < 1 or self.columns < 1:
             raise ValueError("an image has at least one row and one column")
-        if abs(round(float(np.linalg.det(np.array(self.image_axes))))) != 1:
-            raise ValueError("image_axes must be a flip, a quarter turn or both")
+        lines = (*self.image_axes, *zip(*self.image_axes, strict=True))
+        if any(sorted(map(abs, line)) != [0, 1] for line in lines):
+            raise ValueError(
+                f"image_axes is {self.image_axes}; it must be a turn by 0, 90, 180 or 270 degrees, with or without a flip: "
+                "each row and each column has one 0 and one 1 or -1"
+            )
 
 
 def view_axes(primary_deg: float, secondary_deg: float) -> Array:
@@ -109,9 +113,8 @@ def view_axes(primary_deg: float, secondary_deg: float) -> Array:
 def camera_from_gantry(gantry: Gantry) -> Camera:
     """Return the perspective camera of a gantry position, for stored pixels.
 
-    The same position returns the same object. The axes are those of :func:`view_axes`; the isocentre projects to the middle
-    of the
-    field (DICOM PS3.17 FFF.2.1.5.2).
+    The same position returns the same object. The axes are those of :func:`view_axes`; the isocentre projects to the
+    middle of the field (DICOM PS3.17 FFF.2.1.5.2).
     """
     axes = view_axes(gantry.primary_deg, gantry.secondary_deg)
     # Millimetres on the detector are turned like the image, then converted to stored pixels.

@@ -29,11 +29,9 @@ def is_irregular(marks_ms: Array) -> bool:
 def systole_starts_ms(places: Array, step_ms: float) -> Array:
     """Return the times of the starts of systole, from the first place on.
 
-    The result is empty where the motion shows no beats. Once a beat the catheters leave their resting place and return to
-    it.
-    Along the direction of the largest motion, the time of a beat is half way up its rise, where the motion is steepest. The
-    start
-    of systole lies earlier by the mean difference over the beats.
+    The result is empty where the motion shows no beats. Once a beat the catheters leave their resting place and return
+    to it. Along the direction of the largest motion, the time of a beat is half way up its rise, where the motion is
+    steepest. The start of systole lies earlier by the mean difference over the beats.
 
     Parameters
     ----------

@@ -59,10 +59,9 @@ def mirrored_gain(original: Hypotheses, mirrored: Sequence[Hypotheses]) -> float
 def mirrored_sites(gains: Sequence[float]) -> tuple[list[bool], list[bool]]:
     """Return which sites have a mirrored view, and which other sites might.
 
-    A site is mirrored where its gain is clear. Where the gain of the whole study is clear, all sites are mirrored except
-    those that
-    clearly fit worse. Catheters near the central rays look the same in the mirror, so that many sites give more evidence
-    than one.
+    A site is mirrored where its gain is clear. Where the gain of the whole study is clear, all sites are mirrored
+    except those that clearly fit worse. Catheters near the central rays look the same in the mirror, so that many sites
+    give more evidence than one.
     """
     study = sum(gains)
     mirrored = [gain > (_CLEARLY_NOT if study > MIRRORED_STUDY else MIRRORED_SITE) for gain in gains]
@@ -79,9 +78,8 @@ def gantry_angles(camera_a: Camera, camera_b: Camera) -> tuple[float, ...]:
 def geometry_is_doubtful(table: PairTable, pairs: IntArray, px_per_mm: float) -> bool:
     """Return whether the paired catheters (s, 2) contradict the geometry.
 
-    They contradict it in two cases: they lie farther from their epipolar lines than breathing and gantry explain, or more
-    than one
-    of them lies askew to these lines.
+    They contradict it in two cases: they lie farther from their epipolar lines than breathing and gantry explain, or
+    more than one of them lies askew to these lines.
     """
     i, j = pairs[pairs[:, 0] >= 0].T
     if not len(i):
@@ -104,8 +102,7 @@ def groups_with_extra(
     """Return the groups of look-alikes of which the site shows one too many.
 
     The evidence is a chain of view a and a chain of view b that are not paired, are present in much of their runs, and
-    would pair
-    as well as the others.
+    would pair as well as the others.
     """
     filled = pairs[pairs[:, 0] >= 0]
     if not len(filled):

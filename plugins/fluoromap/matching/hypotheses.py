@@ -22,12 +22,12 @@ _WORTH_KEEPING = 30.0
 class Hypotheses:
     """The h ways to fill the s slots of the catalogue with pairs of chains.
 
-    pairs : (h, s, 2) index of the chain in view a and in view b, -1 where the slot is empty. fixed_cost : (h,) the part of
-    the cost
-    that does not depend on the gantry. distance_px, variance_px2 : (h, s), NaN where empty; turn_px : (h, s, 3), as in
-    :class:`~fluoromap.matching.pairs.PairTable`. position_mm : (h, s, 3), NaN where empty. shift_variance_px2 : variance of
-    a
-    common displacement by breathing.
+    pairs : (h, s, 2) index of the chain in view a and in view b, -1 where the slot is empty.
+    fixed_cost : (h,) the part of the cost that does not depend on the gantry.
+    distance_px, variance_px2 : (h, s), NaN where empty.
+    turn_px : (h, s, 3), as in :class:`~fluoromap.matching.pairs.PairTable`.
+    position_mm : (h, s, 3), NaN where empty.
+    shift_variance_px2 : variance of a common displacement by breathing.
     """
 
     pairs: IntArray

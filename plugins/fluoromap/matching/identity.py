@@ -25,9 +25,8 @@ _COMMON_MM2 = np.concatenate([[0.0], np.geomspace(0.1, 1000.0, 13)])
 class PairedCatheter:
     """One catheter in both views of a site.
 
-    position_mm : (3,) mean of its electrodes at diastole, from the isocentre. place : index within its group, the same over
-    all
-    sites of the study.
+    position_mm : (3,) mean of its electrodes at diastole, from the isocentre.
+    place : index within its group, the same over all sites of the study.
     """
 
     a: RunCatheter
@@ -68,11 +67,9 @@ def name_look_alikes(
 
     1. Names set by hand at any site decide.
     2. Else the reference is the catheter that moves least between the sites. Breathing moves all alike; it is their
-    covariance and
-       is subtracted.
-    3. With one site only, or where the motion is too similar, the reference is the catheter that moves least within its own
-    runs.
-       Then the reason says that two catheters could be exchanged.
+       covariance and is subtracted.
+    3. With one site only, or where the motion is too similar, the reference is the catheter that moves least within its
+       own runs. Then the reason says that two catheters could be exchanged.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from fluoromap.matching.hypotheses import PRIOR_TURN, Hypotheses
 from fluoromap.matching.pairs import student_cost
 
 PLACE_SD_MM = 4.0
-"""Prior variation of a catheter's diastolic place from site to site, an axis."""
+"""Prior variation of a catheter's diastolic place from site to site, per axis."""
 _PLACE_PRIOR_SITES = 3.0
 _NEUTRAL = float(student_cost(np.array(3.0), 3))
 _ANCHORS_PER_SITE = 6
@@ -30,9 +30,9 @@ class SiteChoice:
     """The chosen pairing of one site.
 
     pairs : (s, 2) chain of view a and of view b in each slot of the catalogue, -1 where empty; over the study, one slot
-    of a group of look-alikes contains one catheter. alternative : the next best pairing, or None. probability : of the
-    alternative,
-    0 to 0.5.
+    of a group of look-alikes contains one catheter.
+    alternative : the next best pairing, or None.
+    probability : of the alternative, 0 to 0.5.
     """
 
     pairs: IntArray
@@ -63,9 +63,11 @@ class _Study:
 class _Configuration:
     """One explanation of the whole study.
 
-    chosen : the row chosen at each site. order : the order in which its slots fill the places. own_cost : (N,) cost of each
-    row,
-    given the gantry. centres_mm, variance_mm2 : of the places. cost : over all sites.
+    chosen : the row chosen at each site.
+    order : the order in which its slots fill the places.
+    own_cost : (N,) cost of each row, given the gantry.
+    centres_mm, variance_mm2 : of the places.
+    cost : over all sites.
     """
 
     chosen: IntArray
@@ -82,8 +84,7 @@ def choose_pairings(
     """Choose the pairings that make the study as a whole most likely.
 
     All catheters but the roving one hardly move between the sites. The gantry's angles have the same error at all sites
-    with the
-    same angles. So the other sites can rule out a pairing that fits well at its own site.
+    with the same angles. So the other sites can rule out a pairing that fits well at its own site.
 
     Parameters
     ----------
@@ -184,7 +185,7 @@ def _choose(study: _Study, own_cost: Array, centres_mm: Array, variance_mm2: Arr
 
 
 def _refine(study: _Study, configuration: _Configuration) -> _Configuration:
-    """Alternate between estimating places and gantry, and choosing rows."""
+    """Estimate places and gantry, and choose rows, in turns."""
     for _ in range(_ROUNDS):
         turns = {gantry: _fit_turn(study, configuration, gantry) for gantry in dict.fromkeys(study.gantries)}
         prior = sum(float(turn @ np.linalg.solve(PRIOR_TURN[1], turn)) / 2 for turn, _ in turns.values())
@@ -209,7 +210,7 @@ def _place_positions(study: _Study, configuration: _Configuration) -> Array:
 
 
 def _places(positions: Array, otherwise: Array) -> tuple[Array, Array]:
-    """Return centre (p, 3) and variance an axis (p,) of each place.
+    """Return centre (p, 3) and variance per axis (p,) of each place.
 
     ``otherwise`` is the centre of a place that no site shows.
     """

@@ -31,13 +31,14 @@ _BEND_SD_DEG = 35.0
 class PairTable:
     """Every chain of view a (n of them) against every chain of view b (m).
 
-    possible : (n, m), whether the two can be one catheter at all. distance_px : (n, m) mean signed epipolar distance of
-    their electrodes. variance_px2 : (n, m) of that, for a correct gantry and the heart at one place in both runs.
-    turn_px : (n, m, 3) its change for a rotation of view b about the world's axes by one radian. shape_cost : (n, m), for
-    differences of the distance along the catheter and for bends that a catheter does not have. group_cost : (groups, n, m),
-    spacing
-    and votes; infinite where the name is impossible. motion_cost : (n, m, shifts) over the cycle, for each shift of
-    view b's phases. position_mm : (n, m, 3), mean of the electrodes in the world.
+    possible : (n, m), whether the two can be one catheter at all.
+    distance_px : (n, m) mean signed epipolar distance of their electrodes.
+    variance_px2 : (n, m) of that, for a correct gantry and the heart at one place in both runs.
+    turn_px : (n, m, 3) its change for a rotation of view b about the world's axes by one radian.
+    shape_cost : (n, m), for differences of the distance along the catheter and for bends that a catheter does not have.
+    group_cost : (groups, n, m), spacing and votes; infinite where the name is impossible.
+    motion_cost : (n, m, shifts) over the cycle, for each shift of view b's phases.
+    position_mm : (n, m, 3), mean of the electrodes in the world.
     """
 
     possible: BoolArray
@@ -71,9 +72,8 @@ def common_distance(distances: Array, variances: Array) -> float:
 def spacing_cost(points_world_mm: Array, electrodes: Sequence[int], catheter: Catheter) -> float:
     """Return the cost of the difference between measured and catalogue spacings.
 
-    points_world_mm : (m, 3) of the electrodes with these numbers, ascending. The cost is 0 for one electrode, and infinite
-    for more
-    than the catheter has.
+    points_world_mm : (m, 3) of the electrodes with these numbers, ascending. The cost is 0 for one electrode, and
+    infinite for more than the catheter has.
     """
     if electrodes[-1] > catheter.electrodes:
         return np.inf

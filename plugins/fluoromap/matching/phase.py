@@ -27,10 +27,9 @@ _BINS = 60
 class Rhythm:
     """The cardiac cycle in one run.
 
-    phases : (n,) of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next. irregular : whether
-    the beats
-    differ in length. phase_uncertainty : the largest possible error of phase 0, in cycles. R waves are known to the nearest
-    frame;
+    phases : (n,) of each frame, 0 at the R wave or at the start of systole, rising to 1 at the next.
+    irregular : whether the beats differ in length.
+    phase_uncertainty : the largest possible error of phase 0, in cycles. R waves are known to the nearest frame;
     without them phase 0 may lie anywhere.
     """
 
@@ -119,9 +118,9 @@ def _places(segmentation: Segmentation, catheters: Sequence[RunCatheter], grid_m
 def cycle_length_ms(signal: Array, step_ms: float) -> float | None:
     """Return the length of a signal's cycle.
 
-    The signal (g, k) is on an even time grid. The length is the first lag at which the signal returns to itself nearly as
-    well as
-    at its best lag, between 300 and 1600 ms and at most 0.7 of the run. None where the signal does not repeat.
+    The signal (g, k) is on an even time grid. The length is the first lag at which the signal returns to itself nearly
+    as well as at its best lag, between 300 and 1600 ms and at most 0.7 of the run. None where the signal does not
+    repeat.
     """
     n = len(signal)
     spread = 2.0 * float(signal.var(axis=0).sum())

@@ -116,9 +116,8 @@ def phase_shift(
 ) -> float:
     """Return the shift of view b's phases for which both views count alike.
 
-    It lies between -0.5 and 0.5. It is the shift for which the paired catheters' epipolar distances vary least, within the
-    limits of
-    the R waves. It is 0 where hardly anything moves across the epipolar lines.
+    It lies between -0.5 and 0.5. It is the shift for which the paired catheters' epipolar distances vary least, within
+    the limits of the R waves. It is 0 where hardly anything moves across the epipolar lines.
     """
     allowed = _allowed_shifts(folded)
     variation = np.nansum(_variations(cameras, folded, pairs)[0], axis=0) / max(len(pairs), 1)
@@ -143,11 +142,9 @@ def _allowed_shifts(folded: tuple[FoldedRun, FoldedRun]) -> BoolArray:
 def pair_by_phase(track_a: Sequence[Observation], track_b: Sequence[Observation]) -> tuple[PhasePair, ...]:
     """Pair each frame of view a with view b at the same phase.
 
-    The pairs have rising phases, and only frames with catheters are used. The partner is view b's frame nearest in phase,
-    of any
-    beat. At low frame rates there may be none near enough. Then the positions are interpolated between the frames before
-    and after
-    in phase. A moment between frames that differ too much is left out.
+    The pairs have rising phases, and only frames with catheters are used. The partner is view b's frame nearest in
+    phase, of any beat. At low frame rates there may be none near enough. Then the positions are interpolated between
+    the frames before and after in phase. A moment between frames that differ too much is left out.
     """
     shown_a = [seen for seen in track_a if seen.chains and seen.phase is not None]
     shown_b = sorted((seen for seen in track_b if seen.chains and seen.phase is not None), key=_phase_of)

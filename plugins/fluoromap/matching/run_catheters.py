@@ -206,9 +206,8 @@ def _from_diastole(frame: int, centre: int, averaged: set[int], phases: Array | 
 def link_chains(segmentation: Segmentation, px_per_mm: float) -> dict[int, dict[int, Chain]]:
     """Return key -> frame -> chain for all catheters of a run.
 
-    The key is the segmenter's track number. Chains without one join the nearest catheter. Frames are visited from diastole
-    outwards,
-    so that a catheter begins where it moves least.
+    The key is the segmenter's track number. Chains without one join the nearest catheter. Frames are visited from
+    diastole outwards, so that a catheter begins where it moves least.
     """
     groups: dict[int, dict[int, Chain]] = {}
     for entry in segmentation.frames:

@@ -25,9 +25,9 @@ from fluoromap.reasons import Reason
 class SiteRuns:
     """The segmented runs of one site.
 
-    A segmentation is None where the segmenter failed. content : names the segmentations and cameras, for example by the
-    hashes of
-    their stored form: equal only where these are equal. None where the caller does not know.
+    A segmentation is None where the segmenter failed.
+    content : names the segmentations and cameras, for example by the hashes of their stored form: equal only where
+    these are equal. None where the caller does not know.
     """
 
     site: str
@@ -72,9 +72,8 @@ class ComparedSite:
 class SiteComparisons:
     """Earlier comparisons of sites, by their content.
 
-    The caller of :func:`~fluoromap.matching.match_study` owns this object. With it only new or changed sites are compared,
-    for
-    example after a correction. Sites without ``content`` are not stored.
+    The caller of :func:`~fluoromap.matching.match_study` owns this object. With it only new or changed sites are
+    compared, for example after a correction. Sites without ``content`` are not stored.
     """
 
     def __init__(self, most: int = 64) -> None:

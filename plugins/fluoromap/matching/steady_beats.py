@@ -21,11 +21,9 @@ _INDEPENDENT = 2.0
 def steady_beats_ms(r_waves_ms: Array, half_frame_ms: float, times_ms: Array, places: Array | None) -> Array:
     """Return the times of the R waves of a steady rhythm.
 
-    The times of the file are returned where no steady rhythm lies within half a frame of each. A frame gives its R wave to
-    half a
-    frame. All beats together give the length of a steady cycle and its start more precisely. So do the catheters, which
-    return to
-    their places after one cycle. The result is the mean over all rhythms that both permit.
+    The times of the file are returned where no steady rhythm lies within half a frame of each. A frame gives its R wave
+    to half a frame. All beats together give the length of a steady cycle and its start more precisely. So do the
+    catheters, which return to their places after one cycle. The result is the mean over all rhythms that both permit.
 
     Parameters
     ----------

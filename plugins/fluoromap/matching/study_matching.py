@@ -57,11 +57,9 @@ def match_study(
 ) -> Matching:
     """Name the catheters of all sites, pair them across views and match the phases.
 
-    The mapping catheter is identified by its tip, look-alikes by hand or by their motion over the whole study. A site needs
-    its
-    mapping catheter in both views; it does not need the reference catheter. Pairs are chosen over the whole study at once.
-    Where
-    another pairing cannot be ruled out at a site, it becomes the site's alternative.
+    The mapping catheter is identified by its tip, look-alikes by hand or by their motion over the whole study. A site
+    needs its mapping catheter in both views; it does not need the reference catheter. Pairs are chosen over the whole
+    study at once. Where another pairing cannot be ruled out at a site, it becomes the site's alternative.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 
 PARALLEL_BELOW_DEG = 20.0 - 1e-6
-"""Views whose central rays are closer than this give no depth."""
+"""Views whose central rays are closer than 20 degrees give no depth; the tolerance lets 20 degrees count as 20 degrees."""
 
 
 def fundamental_matrix(camera_a: Camera, camera_b: Camera) -> Array:

@@ -1,4 +1,7 @@
-"""The chamber as binary glTF 2.0 (Khronos glTF 2.0 specification, section 4, "GLB File Format")."""
+"""The chamber as binary glTF 2.0 (Khronos glTF 2.0 specification, section 4, "GLB File Format").
+
+glTF counts in metres, with +Y up and +Z forward (section 3.4 there). So the patient's head is up and the front is forward.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +19,27 @@ FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 5126, 5121, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
+STATEMENT = "fluoromap chamber, unit m, axes +X left, +Y head, +Z front of the patient"
+_METRES_PER_MM = 1e-3
 
-def glb_bytes(chamber: ChamberMap, vertices_mm: Array, statement: str) -> bytes:
-    """Return the file: one mesh with colours and scalars; unit and axes as ``extras``."""
+
+def to_gltf_m(points_mm: Array) -> Array:
+    """Return points (n, 3), mm along DICOM patient axes (LPS), in glTF's metres and axes."""
+    left, back, head = points_mm.T
+    return _METRES_PER_MM * np.stack([left, head, -back], axis=1)
+
+
+def glb_bytes(chamber: ChamberMap, vertices_mm: Array) -> bytes:
+    """Return the file: one mesh with colours and scalars.
+
+    Unit and axes are ``extras``.
+    """
     n = len(vertices_mm)
     colours = np.full((n, 4), 255, dtype=np.uint8)
     colours[:, :3] = vertex_colours(chamber)
     # Vertex attributes must be aligned to 4 bytes, hence a float for a truth value.
     attributes: dict[str, NDArray[Any]] = {
-        "POSITION": vertices_mm.astype("<f4"),
+        "POSITION": to_gltf_m(vertices_mm).astype("<f4"),
         "COLOR_0": colours,
         "_LAT_MS": chamber.lat_ms.astype("<f4"),
         "_LAT_SD_MS": chamber.lat_sd_ms.astype("<f4"),
@@ -49,7 +64,7 @@ def glb_bytes(chamber: ChamberMap, vertices_mm: Array, statement: str) -> bytes:
         "asset": {
             "version": "2.0",
             "generator": "fluoromap",
-            "extras": {"note": statement, "unit": "mm", "axes": "LPS"},
+            "extras": {"note": STATEMENT, "unit": "m", "axes": ["left", "head", "front"]},
         },
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -1,4 +1,7 @@
-"""The map as a mesh file: millimetres, DICOM patient axes (LPS), faces outward; the same map gives the same bytes."""
+"""The map as a mesh file: millimetres, DICOM patient axes (LPS), faces outward; GLB in metres with the head up.
+
+The same map gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,8 @@ def mesh_bytes(chamber: ChamberMap, format: MeshFormat, origin_shift_mm: ArrayLi
     format : {"ply", "stl", "glb", "vtp", "mat", "csv"}
         - PLY: binary, colours and the scalars ``lat_ms``, ``lat_sd_ms`` (NaN where not covered), ``covered``.
         - STL: binary, the shape alone.
-        - GLB: colours, the same scalars as ``_LAT_MS``, ``_LAT_SD_MS`` (0 where not covered) and ``_COVERED``. Its numbers
-          are millimetres and LPS too, although glTF assumes metres.
+        - GLB: colours, the same scalars as ``_LAT_MS``, ``_LAT_SD_MS`` (0 where not covered) and ``_COVERED``. Metres, +Y to
+          the head and +Z to the front, as glTF demands.
         - VTP: the scalars, NaN where not covered, and the sites as field data.
         - MAT: OpenEP's structure.
         - CSV: a line for each vertex, the scalars empty where not covered.
@@ -49,7 +52,7 @@ def mesh_bytes(chamber: ChamberMap, format: MeshFormat, origin_shift_mm: ArrayLi
         case "stl":
             return _stl(chamber, vertices)
         case "glb":
-            return glb_bytes(chamber, vertices, STATEMENT)
+            return glb_bytes(chamber, vertices)
         case "vtp":
             return vtp_bytes(chamber, vertices, shift, STATEMENT)
         case "mat":

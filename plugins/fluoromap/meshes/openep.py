@@ -25,7 +25,9 @@ def openep_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, state
     - ``surface.act_bip`` holds activation time in ms, NaN where no site is near, and bipolar voltage, which is unknown: NaN.
     - ``electric`` holds one mapping point for each site: ``egmX`` its position, ``egmSurfX`` its point on the surface, and
       its annotation in samples (1 ms) from the reference's.
-    - ``egm`` is NaN over the window of interest: electrograms are not part of a map.
+    - ``egm``, ``egmUni``, ``egmRef`` and ``ecg`` are 0 over the window of interest: electrograms are not part of a map, but
+      OpenEP's readers drop mapping points without signals. ``notes`` says so.
+    - ``rf`` has all its fields and no ablation.
     - ``surface.lat_sd_ms`` and ``surface.covered`` are additions to OpenEP's fields.
 
     Parameters
@@ -45,10 +47,16 @@ def openep_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, state
     """
     stream = io.BytesIO()
     userdata = {
-        "notes": _cells([statement, "made from fluoroscopy: positions are single moments at diastole; times in ms"]),
+        "notes": _cells(
+            [
+                statement,
+                "made from fluoroscopy: positions are single moments at diastole; times in ms",
+                "all electrograms are 0: they are not part of this map",
+            ]
+        ),
         "surface": _surface(chamber, vertices_mm),
         "electric": _electric(chamber, vertices_mm, shift_mm),
-        "rf": {"originaldata": {"ablparams": {}}},
+        "rf": {"originaldata": _no_ablation()},
     }
     options: dict[str, Any] = {"format": "5", "long_field_names": True, "oned_as": "column", "do_compression": True}
     savemat(stream, {"userdata": userdata}, **options)  # type: ignore[arg-type]
@@ -80,7 +88,8 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
     reference = 1 - window[0]
     surface_mm = np.array([site.surface_mm for site in sites]) + shift_mm
     nearest = cKDTree(vertices_mm).query(surface_mm)[1]
-    signals = np.full((len(sites), int(window[1] - window[0]) + 1), np.nan)
+    signals = np.zeros((len(sites), int(window[1] - window[0]) + 1))
+    position_mm = np.array([site.position_mm for site in sites]) + shift_mm
     per_site = np.full((len(sites), 1), np.nan)
     return {
         "tags": names,
@@ -88,10 +97,13 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
         "include": np.ones((len(sites), 1)),
         "sampleFrequency": SAMPLES_PER_S,
         "electrodeNames_bip": _cells([""] * len(sites)),
-        "egmX": np.array([site.position_mm for site in sites]) + shift_mm,
+        "electrodeNames_uni": _cells([""] * len(sites)),
+        "egmX": position_mm,
+        "egmUniX": np.stack([position_mm, position_mm], axis=2),
         "egmSurfX": surface_mm,
         "barDirection": _vertex_normals(vertices_mm, chamber.faces)[nearest],
         "egm": signals,
+        "egmUni": np.stack([signals, signals], axis=2),
         "egmRef": signals,
         "ecg": signals,
         "annotations": {
@@ -99,8 +111,20 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
             "referenceAnnot": np.full((len(sites), 1), reference),
             "mapAnnot": (reference + np.round(lat))[:, None],
         },
-        "voltages": {"bipolar": per_site, "unipolar": per_site},
+        "voltages": {"bipolar": per_site, "unipolar": np.full((len(sites), 2), np.nan)},
         "impedances": {"time": per_site, "value": per_site},
+    }
+
+
+def _no_ablation() -> dict[str, Any]:
+    """Return the ablation data of a study without ablation.
+
+    Every field that OpenEP's readers ask for exists and is empty.
+    """
+    none = np.zeros((0, 1))
+    return {
+        "ablparams": dict.fromkeys(("time", "power", "impedance", "distaltemp"), none),
+        "force": {**dict.fromkeys(("time", "force", "axialangle", "lateralangle"), none), "position": np.zeros((0, 3))},
     }
 
 

@@ -16,7 +16,10 @@ _TYPES = {"<f8": "Float64", "<f4": "Float32", "<i8": "Int64", "|u1": "UInt8"}
 
 
 def vtp_bytes(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array, statement: str) -> bytes:
-    """Return the file: one piece with point data ``lat_ms``, ``lat_sd_ms``, ``covered``; sites and unit as field data."""
+    """Return the file: one piece with point data ``lat_ms``, ``lat_sd_ms``, ``covered``.
+
+    Sites and unit are field data.
+    """
     root = ElementTree.Element(
         "VTKFile", type="PolyData", version="1.0", byte_order="LittleEndian", header_type="UInt32"
     )
@@ -59,7 +62,10 @@ def _array(parent: ElementTree.Element, name: str, values: NDArray[Any]) -> Elem
 
 
 def _text(parent: ElementTree.Element, name: str, values: list[str]) -> None:
-    """Add strings as VTK writes them: the codes of their bytes, with a 0 after each string."""
+    """Add strings as VTK writes them.
+
+    VTK writes the codes of their bytes, with a 0 after each string.
+    """
     codes = " ".join(str(code) for value in values for code in (*value.encode("utf-8"), 0))
     attributes = {"type": "String", "Name": name, "NumberOfTuples": str(len(values)), "format": "ascii"}
     ElementTree.SubElement(parent, "DataArray", attributes).text = codes

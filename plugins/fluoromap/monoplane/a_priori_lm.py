@@ -133,11 +133,12 @@ class APrioriLM:
 
 
 def motion_variance_share(phases: Array, start: int) -> Array:
-    """Return the variance (n,) of the displacement since frame ``start``, as a share of its mean over the cycle.
+    """Return the variance (n,) of the displacement since frame ``start``.
 
-    The heart's motion is modelled as a random sum of the cycle's first harmonics whose amplitudes fall as h^-1.5. The
-    share is ``1 - k`` with ``k`` the motion's correlation at the difference of phase. It is 0 at the start and at the same
-    phase of other beats, and largest half a cycle away. It is 1 where phases are unknown.
+    It is a share of its mean over the cycle. The heart's motion is modelled as a random sum of the cycle's first
+    harmonics whose amplitudes fall as h^-1.5. The share is ``1 - k`` with ``k`` the motion's correlation at the
+    difference of phase. It is 0 at the start and at the same phase of other beats, and largest half a cycle away. It is
+    1 where phases are unknown.
     """
     weights = _HARMONICS**-3.0
     apart = phases - phases[start]

@@ -18,7 +18,10 @@ deviations of half a turn and ten metres. It keeps the bound finite where the im
 
 
 def determines_pose(points_mm: Array) -> bool:
-    """Return True where points (m, 3) determine a pose: at least four that do not lie on one line."""
+    """Return True where points (m, 3) determine a pose.
+
+    At least four points that do not lie on one line are needed.
+    """
     if len(points_mm) < FEWEST_ELECTRODES:
         return False
     return bool(np.linalg.svd(points_mm - points_mm.mean(axis=0), compute_uv=False)[1] > LEAST_BREADTH_MM)
@@ -82,11 +85,11 @@ def track_body(
 def solve_poses(
     camera: Camera, model_mm: Array, pixels_uv: Array, rotations: Array, centres: Array, iterations: int
 ) -> tuple[Array, Array]:
-    """Solve the least-squares poses of B images of one body by compiled Levenberg-Marquardt steps.
+    """Solve the least-squares poses of one body in B images.
 
-    A point is ``R A + c``. The update is ``R <- exp([w]x) R``, ``c <- c + t``, solved from 6x6 normal equations. The
-    iteration works in the camera's axes. Where these are left-handed, the transform into them is a reflection too, so that
-    R stays a rotation.
+    The compiled steps are Levenberg-Marquardt's. A point is ``R A + c``. The update is ``R <- exp([w]x) R``, ``c <- c +
+    t``, solved from 6x6 normal equations. The iteration works in the camera's axes. Where these are left-handed, the
+    transform into them is a reflection too, so that R stays a rotation.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Bundle adjustment of a rigid body: its uncertain points and its pose in every frame of one view together.
+"""Bundle adjustment of a rigid body's uncertain points and its poses in one view.
 
 The unknowns are the body's m points in the a-priori frame, each with a prior, and one pose a frame. In the normal equations
 each frame couples to the points, and under the acceleration prior to its two neighbours on either side. The poses thus form

@@ -37,7 +37,10 @@ class CycleCurve:
         return found
 
     def sd_mm(self, phases: Array) -> Array:
-        """Return the standard deviation (n,) of one coordinate at phases (n,), from gaps and scatter of the moments."""
+        """Return the standard deviation (n,) of one coordinate at phases (n,).
+
+        Gaps between the moments and their scatter make it larger.
+        """
         waves = _waves(phases)
         found: Array = np.sqrt(np.einsum("nk,kl,nl->n", waves, self.covariance, waves))
         return found
@@ -85,7 +88,10 @@ def _evidence(waves: Array, flat: Array, width: float) -> tuple[float, float, fl
 
 
 def _strengths(width: float) -> Array:
-    """Return the expected size of the constant, the cosines and the sines; it falls faster for a larger ``width``."""
+    """Return the expected size of the constant, the cosines and the sines.
+
+    It falls faster for a larger ``width``.
+    """
     falling = np.exp(-0.5 * (width * _HARMONICS) ** 2)
     return np.concatenate([[1.0], falling, falling])
 

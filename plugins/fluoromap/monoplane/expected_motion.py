@@ -1,4 +1,4 @@
-"""Expected motion of the electrodes in a single view, from two views: mean and uncertainty of the prior."""
+"""Expected motion in a single view, from two views: mean and uncertainty of the prior."""
 
 from __future__ import annotations
 
@@ -159,7 +159,10 @@ def _from_own_cycle(
 
 
 def _nearest(curve: CycleCurve, label: tuple[str, int]) -> int | None:
-    """Return the cycle's row of the electrode, or of the nearest electrode on its catheter; None without either."""
+    """Return the cycle's row of the electrode, or of the nearest electrode on its catheter.
+
+    The result is None without either.
+    """
     rows = [row for row, (name, _) in enumerate(curve.labels) if name == label[0]]
     return min(rows, key=lambda row: abs(curve.labels[row][1] - label[1]), default=None)
 

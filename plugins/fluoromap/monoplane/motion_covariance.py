@@ -153,7 +153,10 @@ class MotionCovariance:
             yield from self._free(frames)
 
     def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, bool, Array]]:
-        """Yield the differences between this beat and the mean beat, and between the mean beats of the two views."""
+        """Yield the deviations of this beat from the mean beat.
+
+        The mean beats of the two views differ too.
+        """
         p, expected = self._params, self._expected
         if not expected.beats:
             return
@@ -178,7 +181,10 @@ class MotionCovariance:
             )
 
     def _free(self, frames: slice) -> Iterator[tuple[int, bool, Array]]:
-        """Yield each catheter's offset, tilt and bend over the beat; the view itself determines their sizes."""
+        """Yield each catheter's offset, tilt and bend over the beat.
+
+        The view itself determines their sizes.
+        """
         offset_sd = np.hypot(self._expected.offset_sd_mm[frames], self._params.beat_sd_mm)
         slow, fast = (_over_cycle(self._phases[frames], k) for k in (_SHAPE_HARMONICS, _OFFSET_HARMONICS))
         for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
@@ -189,7 +195,10 @@ class MotionCovariance:
             yield BEND, True, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
 
     def _looseness(self, name: str) -> tuple[float, float]:
-        """Return a catheter's deviation from its expected shape: tilt in radians, bend in mm at the ends."""
+        """Return a catheter's deviation from its expected shape.
+
+        Tilt in radians, and bend in mm at the ends.
+        """
         if self._expected.own_cycle:
             return 0.02, 0.08
         return (0.045, 0.2) if name == self._mapping else (0.02, 0.05)
@@ -232,7 +241,10 @@ def _shapes(catalogue: Catalogue, labels: tuple[tuple[str, int], ...], name: str
 
 
 def _over_cycle(phases: Array, harmonics: int) -> Array:
-    """Return unit-variance courses (n, 1 + 2 h) over the cycle: a constant, and waves whose strength falls as h^-1.5."""
+    """Return unit-variance courses (n, 1 + 2 h) over the cycle.
+
+    They are a constant, and waves whose strength falls as h^-1.5.
+    """
     order = np.arange(1, harmonics + 1)
     shares = order**-3.0 / (order**-3.0).sum() * (1 - _LASTING_SHARE)
     angle = 2 * np.pi * phases[:, None] * order

@@ -81,7 +81,9 @@ Site = tuple[Array, Array]
 
 
 def _site(curve: CycleCurve, catheter: str, at: Array, wanted: Sequence[int] | None) -> Site | None:
-    """Return a catheter's displacements from the first phase of ``at`` to the others, then its velocities there.
+    """Return a catheter's displacements and velocities at one site.
+
+    The displacements are from the first phase of ``at`` to the others; the velocities at the others follow.
 
     The electrodes are those of the site, or the numbers ``wanted``; the site's neighbours are interpolated for numbers
     that it lacks.

@@ -1,4 +1,4 @@
-"""Depth over the whole cardiac cycle: motion expected from two views, refined by the pixels of one view."""
+"""Depth over the cardiac cycle: expected motion, refined by the pixels of one view."""
 
 from __future__ import annotations
 
@@ -147,7 +147,10 @@ class MotionPrior:
         return positions, _with_baseline(paths.covariance_mm2, outside, alone), np.broadcast_to(closed, outside.shape)
 
     def _gated_catheters(self, electrodes: ViewElectrodes, used: BoolArray, deeper: Array, usual: Array) -> BoolArray:
-        """Return the electrodes (m,) of catheters whose depth the view changes by more than the prior allows."""
+        """Return the electrodes (m,) of catheters whose depth moved too far.
+
+        The view changes that depth by more than the prior allows.
+        """
         closed = np.zeros(used.shape[1], dtype=np.bool_)
         names = np.array(electrodes.catheters)
         for name in dict.fromkeys(electrodes.catheters):
@@ -254,7 +257,10 @@ class _Run:
 
 
 def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Array:
-    """Return the root mean square over each catheter's visible electrodes, repeated for each electrode (n, m)."""
+    """Return the root mean square over each catheter's visible electrodes.
+
+    It is repeated for each electrode, (n, m).
+    """
     names = np.array(electrodes.catheters)
     together = np.zeros_like(found)
     for name in dict.fromkeys(electrodes.catheters):
@@ -265,7 +271,10 @@ def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Arr
 
 
 def _windows(phases: Array) -> Iterator[slice]:
-    """Yield windows of about one beat: from one wrap of the phase to the next, never longer than 64 frames."""
+    """Yield windows of about one beat.
+
+    They reach from one wrap of the phase to the next and are never longer than 64 frames.
+    """
     wraps = np.flatnonzero(np.diff(phases) < -0.5) + 1
     edges = [0, *wraps.tolist(), len(phases)]
     for first, last in pairwise(edges):

@@ -14,7 +14,10 @@ _CONVERGED = 1e-9
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _normal_equations(focal, model, offsets, turn, centre, rows, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill the lower half of the 7x7 ``normal``: J'J, below it J'r, in the corner r'r; return r'r."""
+    """Fill the lower half of the 7x7 ``normal`` and return r'r.
+
+    It holds J'J, below it J'r, in the corner r'r.
+    """
     m = model.shape[1]
     nearest = 2 * _NEAREST_MM
     for i in range(m):
@@ -50,7 +53,10 @@ def _normal_equations(focal, model, offsets, turn, centre, rows, normal):  # typ
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _step(normal, damping, factor, step):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Solve the damped 6x6 system by Cholesky; return the expected fall of the cost, or -1 where it is singular."""
+    """Solve the damped 6x6 system by Cholesky.
+
+    Return the expected fall of the cost, or -1 where it is singular.
+    """
     falls = 0.0
     for p in range(7):
         for q in range(min(p + 1, 6)):
@@ -98,7 +104,9 @@ def _apply_step(step, turn, centre, trial_turn, trial_centre):  # type: ignore[n
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def solve_batch(focal, model, offsets, turns, centres, iterations):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Run Levenberg-Marquardt for each of B images; overwrite the start in ``turns`` and ``centres`` by the result.
+    """Run Levenberg-Marquardt for each of B images.
+
+    Overwrite the start in ``turns`` and ``centres`` by the result.
 
     focal : (3,) of u over x, u over y, v over y, px. model : (3, m) mm. offsets : (B, m, 2) pixels minus the principal
     point. turns : (B, 3, 3) and centres : (B, 3) in the camera's axes, depth last. A turn that is a reflection stays one.

@@ -81,7 +81,9 @@ class RigidPose:
         self._params = params
 
     def track(self, view: MonoplaneView, context: Context) -> Track:
-        """Track the body of all electrodes with an a-priori position, and refine its shape within its covariance.
+        """Track the body of all electrodes with an a-priori position.
+
+        Its shape is refined within its covariance.
 
         Raises
         ------
@@ -111,7 +113,10 @@ class RigidPose:
         return track
 
     def _shown_rigid(self, view: MonoplaneView, electrodes: ViewElectrodes) -> bool:
-        """Return True where cycles from two views confirm a rigid body; raise Refusal where they contradict one."""
+        """Return True where cycles from two views confirm a rigid body.
+
+        Raise Refusal where they contradict one.
+        """
         cycles = view.others if view.cycle is None else (view.cycle,)
         whole = [cycle for cycle in cycles if covers_body(cycle, electrodes.labels)]
         known = [rigid_error_mm(view.camera, cycle, electrodes.labels) for cycle in whole or cycles]
@@ -229,7 +234,10 @@ class RigidPose:
 
 
 def _too_few(view: MonoplaneView, electrodes: ViewElectrodes) -> Refusal:
-    """Return the refusal of too few electrodes, with the bound of the frame that shows most."""
+    """Return the refusal of too few electrodes.
+
+    It names the bound of the frame that shows most.
+    """
     best = int(electrodes.visible.sum(axis=1).argmax())
     body, shown = electrodes.a_priori_mm, electrodes.visible[best]
     bound = np.inf
@@ -257,10 +265,11 @@ def _shape_unknown(view: MonoplaneView, electrodes: ViewElectrodes) -> Refusal:
 
 
 def _prior_covariances(electrodes: ViewElectrodes) -> tuple[Array, Array]:
-    """Return the prior covariances of the body: (m, 3, 3) of each point, (3, 3) of a displacement of all points.
+    """Return the prior covariances of the body.
 
-    The error of a point relative to the reference catheter is the error of the body's shape. The rest of its error from
-    the isocentre, mainly breathing, is common to all points.
+    (m, 3, 3) of each point, (3, 3) of a displacement of all points. The error of a point relative to the reference
+    catheter is the error of the body's shape. The rest of its error from the isocentre, mainly breathing, is common to
+    all points.
     """
     absolute = np.array([point.covariance_mm2 for point in electrodes.a_priori])
     known = [point.relative_covariance_mm2 for point in electrodes.a_priori]

@@ -20,7 +20,9 @@ _LONGEST_GAP = 0.25
 
 
 def rigid_error_mm(camera: Camera, cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> float | None:
-    """Return the RMS 3D error of rigid poses in one view over a cycle known from two views.
+    """Return the RMS 3D error of rigid poses in one view.
+
+    Two views know the cycle that it is measured over.
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ def rigid_error_mm(camera: Camera, cycle: SiteCycle, labels: Collection[tuple[st
 
 
 def covers_body(cycle: SiteCycle, labels: Collection[tuple[str, int]]) -> bool:
-    """Return True where a cycle contains all electrodes of the body and has no long gap.
+    """Return whether a cycle contains all electrodes and no long gap.
 
     Only such a cycle can show that the electrodes keep their distances.
     """

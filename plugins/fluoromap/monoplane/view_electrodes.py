@@ -87,7 +87,10 @@ def gantry_angle_covariance_mm2(points_world_mm: Array, angle_sd_deg: float) -> 
 
 
 def isocentre_covariance_mm2(camera: Camera, sd_mm: float) -> Array:
-    """Return the covariance (3, 3) of positions from an error of the view's isocentre across its central ray."""
+    """Return the covariance (3, 3) that an error of the isocentre causes.
+
+    The error is across the view's central ray.
+    """
     covariance: Array = sd_mm**2 * (np.eye(3) - np.outer(camera.axis_world, camera.axis_world))
     return covariance
 

@@ -1,4 +1,4 @@
-"""Anatomy of one heart: places of the chamber and the catheters in the chest, and the strength of their motion."""
+"""Anatomy of one heart: chamber and catheters in the chest, and the strength of their motion."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ _FASTEST_MM_PER_S = 88.0
 
 @dataclass(frozen=True, eq=False)
 class Resident:
-    """A catheter in the heart: its shaft, and the displacement of its tip by each pulse of the beat, (MODES, 3) mm."""
+    """A catheter in the heart.
+
+    shaft : at rest. vectors_mm : (MODES, 3) displacement of its tip by each pulse of the beat.
+    """
 
     shaft: Shaft
     vectors_mm: Array
@@ -128,7 +131,10 @@ def _ventricles(rng: np.random.Generator) -> tuple[Chamber, Shaft, Shaft]:
 
 
 def _mapping_shaft(chamber: Chamber, contact_mm: Array, rng: np.random.Generator) -> Shaft:
-    """Draw the mapping catheter: through aorta and valve, with its tip's end on the wall."""
+    """Draw the mapping catheter through aorta and valve.
+
+    Its tip's end lies on the wall.
+    """
     inward = chamber.inward(contact_mm)
     valve = chamber.centre_mm - 34 * chamber.axes[2] + rng.normal(0, 2, 3)
     to_valve = valve - contact_mm

@@ -1,4 +1,4 @@
-"""Appearance of a view, independent of its angles: photons, scatter, contrast of platinum, and bones behind the heart."""
+"""Appearance of a view, independent of its angles: photons, scatter, contrast, bones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The left ventricle at diastole: an ellipsoid, the focus on its wall, and the spread of activation along the wall."""
+"""The left ventricle at diastole: an ellipsoid with a focus, and activation along its wall."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ _SWEEPS = 60
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
-    """Endocardial wall of the ventricle at diastole, between breaths; millimetres along LPS axes from the isocentre.
+    """Endocardial wall of the ventricle at diastole, between breaths.
+
+    Coordinates are millimetres along LPS axes from the isocentre.
 
     Parameters
     ----------
@@ -91,7 +93,10 @@ class Chamber:
         return times
 
     def _pull_tight(self, before: Array, points: Array, after: Array) -> Array:
-        """Move points of the unit sphere, as images of wall points, along the wall to the middle of their neighbours."""
+        """Move points along the wall to the middle of their neighbours.
+
+        Points are those of the unit sphere that is the image of the wall.
+        """
         pull = ((before + after) / 2 - points) * self.semi_axes_mm
         normal = _unit(points / self.semi_axes_mm)
         pull -= (pull * normal).sum(axis=-1, keepdims=True) * normal
@@ -113,10 +118,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def spread_over_wall(chamber: Chamber, count: int, rng: np.random.Generator) -> Array:
-    """Return wall points (count, 3) far from each other, apex and basal ring included, in random order.
+    """Return wall points (count, 3) far from each other, in random order.
 
-    The valve plane leaves the basal quarter of the ellipsoid without wall. Each next point is, of 1500 random candidates,
-    the farthest from the points chosen so far.
+    Apex and basal ring are included. The valve plane leaves the basal quarter of the ellipsoid without wall. Each next
+    point is, of 1500 random candidates, the farthest from the points chosen so far.
     """
     candidates = chamber._from_sphere(_unit(rng.normal(size=(6000, 3))))
     height = (candidates - chamber.centre_mm) @ chamber.axes[2] / chamber.semi_axes_mm[2]

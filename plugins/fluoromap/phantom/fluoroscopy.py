@@ -28,7 +28,9 @@ _EVERY = 2
 
 
 class RenderedFrames:
-    """Frames of one run, rendered on access; the order of access does not change a frame.
+    """Frames of one run, rendered on access.
+
+    The order of access does not change a frame.
 
     The object holds only the function that renders a frame. It gives no access to the truth.
     """
@@ -101,7 +103,10 @@ def transmission(camera: Camera, shafts: Sequence[Shaft], lines_mm: Sequence[Arr
 
 
 def _line_samples(camera: Camera, lines_mm: Array) -> Image:
-    """Return the kernel's input (t, k, 5) for centre lines (t, k, 3): u, v, arc length, px per mm, 1/sin to the ray."""
+    """Return the kernel's input (t, k, 5) for centre lines (t, k, 3).
+
+    The columns are u, v, arc length, px per mm and 1/sin of the angle to the ray.
+    """
     along = arc_lengths_mm(lines_mm)[:, ::_EVERY]
     lines_mm = lines_mm[:, ::_EVERY]
     pixels = camera.project(lines_mm)

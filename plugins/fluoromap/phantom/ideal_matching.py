@@ -27,7 +27,9 @@ from fluoromap.phantom.simulated_study import SimulatedRun, SimulatedStudy
 def matched_sites(
     study: SimulatedStudy, noise_px: float = 0.5, seed: int = 0, exact_phases: bool = False, r_waves: bool = True
 ) -> tuple[MatchedSite, ...]:
-    """Return all sites as after matching, with every electrode segmented to ``noise_px`` an axis.
+    """Return all sites as after matching.
+
+    Every electrode is segmented to ``noise_px`` an axis.
 
     - Default phases come from matching: from R waves at the nearest frame, as files state them.
     - Without ``r_waves``, phases come from the motion alone.
@@ -71,7 +73,10 @@ def _noisy_pixels(run: SimulatedRun, noise_px: float, rng: np.random.Generator) 
 def _phases(
     runs: Sequence[SimulatedRun], pixels: Sequence[dict[str, Array]], cameras: tuple[Camera, Camera], r_waves: bool
 ) -> list[Array] | list[None]:
-    """Return the phases of both runs from R waves and motion; None for both where one of them is unknown."""
+    """Return the phases of both runs from R waves and motion.
+
+    Both are None where one of them is unknown.
+    """
     phases, folded = [], []
     for run, own, camera in zip(runs, pixels, cameras, strict=True):
         segmentation = _ideal_segmentation(run, own, r_waves)
@@ -116,7 +121,10 @@ def _observations(pixels: dict[str, Array], phases: Array | None, noise_px: floa
 
 
 def _phase_from_rest(observation: Observation) -> float:
-    """Return the distance of an observation's phase from rest, in cycles; 1 where its phase is unknown."""
+    """Return the distance of an observation's phase from rest, in cycles.
+
+    The result is 1 where its phase is unknown.
+    """
     if observation.phase is None:
         return 1.0
     return abs((observation.phase - DIASTOLIC_PHASE + 0.5) % 1.0 - 0.5)

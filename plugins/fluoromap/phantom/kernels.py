@@ -98,7 +98,10 @@ def add_tube(
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def absorb(thickness: Image, touched: NDArray[np.uint8], absorbed: Image, weight: float) -> None:
-    """Add ``weight`` times the absorbed share of each touched pixel to ``absorbed``; clear ``thickness`` and ``touched``."""
+    """Add ``weight`` times the absorbed share of each touched pixel to ``absorbed``.
+
+    Clear ``thickness`` and ``touched``.
+    """
     rows, columns = touched.shape
     ss = SUPERSAMPLING
     share = np.float32(1.0 / (ss * ss))
@@ -127,7 +130,10 @@ def _mix_bits(state: np.uint64) -> np.uint64:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
 def _normal(bits: np.int64, middle: Image, tail: Image) -> Any:
-    """Return a standard normal number from 32 random bits, by the two tables of :func:`normal_quantiles`."""
+    """Return a standard normal number from 32 random bits.
+
+    It uses the two tables of :func:`normal_quantiles`.
+    """
     cell = bits >> 20
     if cell == 0 or cell == _CELLS - 1:
         within = (bits >> 8) & (_CELLS - 1)
@@ -138,9 +144,10 @@ def _normal(bits: np.int64, middle: Image, tail: Image) -> Any:
 
 
 def normal_quantiles() -> tuple[Image, Image]:
-    """Return the normal quantiles at 4096 equal steps, and at 4096 equal steps of the lowest of these.
+    """Return the normal quantiles at 4096 equal steps, in two tables.
 
-    Numbers between two quantiles are uniform. The variance is correct to 1 part in 10 000, the tail to 5 sigma.
+    The first has equal steps of the whole range, the second 4096 equal steps of the lowest of these. Numbers between
+    two quantiles are uniform. The variance is correct to 1 part in 10 000, the tail to 5 sigma.
     """
     steps = np.arange(_CELLS + 1) / _CELLS
     tail = ndtri(np.maximum(steps, 0.25 / _CELLS) / _CELLS)
@@ -152,10 +159,11 @@ def normal_quantiles() -> tuple[Image, Image]:
 def count_photons(
     expected: Image, key: np.uint64, noise: float, middle: Image, tail: Image, photons: Image, electronic: Image
 ) -> None:
-    """Draw Poisson counts of mean ``expected`` and normal noise of standard deviation ``noise``, pixel by pixel.
+    """Draw Poisson counts of mean ``expected`` plus normal noise, pixel by pixel.
 
-    Counts below a mean of 30 come from inversion and are exact. Others come from the Cornish-Fisher expansion of the
-    Poisson quantile, which has its mean, variance and skewness. A pixel's numbers depend only on ``key`` and its place.
+    ``noise`` is the standard deviation of the normal noise. Counts below a mean of 30 come from inversion and are
+    exact. Others come from the Cornish-Fisher expansion of the Poisson quantile, which has its mean, variance and
+    skewness. A pixel's numbers depend only on ``key`` and its place.
     """
     rows, columns = expected.shape
     one, twelfth, sixth = np.float32(1.0), np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)

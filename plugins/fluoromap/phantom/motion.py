@@ -61,7 +61,10 @@ def wall_vectors(chamber: Chamber, points_mm: Array, rocking_mm: Array) -> Array
 
 
 def non_affine_vectors(rng: np.random.Generator) -> Array:
-    """Draw a motion (MODES, 3) of one catheter's own, 0.6 mm standard deviation an axis over the cycle."""
+    """Draw a motion (MODES, 3) of one catheter's own.
+
+    Its standard deviation is 0.6 mm an axis over the cycle.
+    """
     vectors = np.zeros((MODES, 3))
     vectors[2:] = rng.normal(size=(2, 3))
     scaled: Array = vectors * (NON_AFFINE_MM / (_cycle_pulses() @ vectors).std(axis=0))
@@ -138,7 +141,10 @@ class Beats:
         return shift
 
     def phases(self, times_s: Array) -> Array:
-        """Return the cardiac phase (t,) at times ``(t,)``: 0 at an R wave, rising to 1 at the next."""
+        """Return the cardiac phase (t,) at times ``(t,)``.
+
+        It is 0 at an R wave and rises to 1 at the next.
+        """
         phase: Array = ((times_s - self.r_waves_s[0]) / self.period_s) % 1.0
         return phase
 

@@ -1,4 +1,4 @@
-"""A catheter's shaft: its centre line at rest, and the line bent by the moving tip without stretching."""
+"""A catheter's shaft: its centre line at rest and bent by the moving tip."""
 
 from __future__ import annotations
 

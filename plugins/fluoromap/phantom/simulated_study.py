@@ -46,7 +46,9 @@ FRONTAL = _standard(0.0)
 
 @dataclass(frozen=True, slots=True)
 class StudySpec:
-    """Specification of a simulated study; the same specification gives the same study, to the last pixel.
+    """Specification of a simulated study.
+
+    The same specification gives the same study, to the last pixel.
 
     Parameters
     ----------
@@ -217,7 +219,10 @@ def _true_camera(spec: StudySpec, view: int) -> Camera:
 
 
 def _anatomy_in_field(spec: StudySpec, cameras: tuple[Camera, Camera]) -> Anatomy:
-    """Draw hearts until the electrodes of one stay in both fields over the cycle and all breathing positions."""
+    """Draw hearts until one fits into both fields.
+
+    Its electrodes must stay inside over the cycle and all breathing positions.
+    """
     rng = np.random.default_rng([spec.seed, _ANATOMY])
     breaths = np.array([[0.0, 0.0, -1.2], [0.0, 0.0, 1.2]]) * spec.breathing_mm
     for _ in range(_ATTEMPTS):

@@ -1,4 +1,4 @@
-"""The torso behind the catheters as one image: heart shadow, diaphragm, ribs, spine, ECG wires and soft tissue.
+"""The torso behind the catheters: heart shadow, diaphragm, ribs, spine, ECG wires, soft tissue.
 
 Sizes are millimetres at the isocentre; attenuation is in log units.
 """
@@ -91,7 +91,10 @@ def _attenuation(
 
 
 def _tissue(rows: int, columns: int, rng: np.random.Generator) -> Image:
-    """Draw noise whose amplitude falls as frequency to the power -1.4, with mean 0 and standard deviation 1."""
+    """Draw noise whose amplitude falls as frequency to the power -1.4.
+
+    It has mean 0 and standard deviation 1.
+    """
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None, :])
     amplitude = np.maximum(frequency, 2 / max(rows, columns)) ** -1.4
     amplitude[0, 0] = 0
@@ -119,7 +122,10 @@ def _rib(x: Image, y: Image, rng: np.random.Generator) -> Image:
 
 
 def _spine(x: Image, y: Image, rng: np.random.Generator) -> Image:
-    """Draw vertebral bodies and discs; each body has two pedicles, dark ovals of about an electrode's contrast."""
+    """Draw vertebral bodies and discs.
+
+    Each body has two pedicles, dark ovals of about an electrode's contrast.
+    """
     middle, pitch = rng.normal(0, 4.3), rng.uniform(16.5, 20)
     first = rng.uniform(0, pitch)
     from_middle = np.abs(x - middle)
@@ -141,5 +147,8 @@ def _wire(x: Image, y: Image, rng: np.random.Generator) -> Image:
 
 
 def _step(value: NDArray[np.floating[Any]], width: float) -> Image:
-    """Return a smooth step from 0 where ``value`` is negative to 1, over about ``width``."""
+    """Return a smooth step from 0 to 1, over about ``width``.
+
+    It is 0 where ``value`` is negative.
+    """
     return np.asarray(expit(value / np.float32(width)), dtype=np.float32)

@@ -44,9 +44,9 @@ def fit_chains(
     noise: float,
     sure: int | None = None,
 ) -> tuple[FittedChain, ...]:
-    """Fit each chain with every catheter of as many electrodes, in both orders.
+    """Fit each chain with every catheter of as many electrodes.
 
-    The catheter and the order with the highest likelihood win.
+    Each catheter is fitted in both orders. The catheter and the order with the highest likelihood win.
 
     Parameters
     ----------

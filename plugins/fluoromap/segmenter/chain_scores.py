@@ -15,6 +15,7 @@ from fluoromap.segmenter.log_image import Image
 
 _SPACING_SD = 0.06
 _TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
+_MANY_SPACINGS, _DRIFT_SD_PER_MM, _LEAST_SLOPE = 5, 0.03, 0.15
 _BEND_SD = 0.36
 _S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
 _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
@@ -51,7 +52,10 @@ def score_paths(
 def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
     chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out
 ):  # fmt: skip
-    """Write places and variances of each path, and its score without spacings and shaft."""
+    """Write places, variances and score of each path.
+
+    The score excludes spacings and shaft.
+    """
     count, m = chosen.shape
     total = 0.0
     for k in range(m - 1):
@@ -95,14 +99,44 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
 def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, px_per_mm: float) -> Array:
     """Return the log-likelihood of these spacings at the places, up to a constant, (n,).
 
-    One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2``
-    (n, electrodes) is the variance of each place. The variance of each ratio between visible and true spacing contains
-    those of
-    its two ends and of the bend.
+    One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2`` (n,
+    electrodes) is the variance of each place. The variance of each ratio between visible and true spacing contains
+    those of its two ends and of the bend.
     """
     out = np.empty(len(places))
-    _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)
+    if len(spacing_px) >= _MANY_SPACINGS:
+        _fit_many_spacings(places, spacing_px, variance_px2, px_per_mm, out)
+    else:
+        _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)
     return out
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _fit_many_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the log-likelihoods for a long catheter, whose foreshortening may rise and fall again.
+
+    The ratio of visible to true spacing drifts from gap to gap as far as a bend in depth allows; a Kalman filter follows it.
+    """
+    for row in range(places.shape[0]):
+        ratio = spread = rest = before = 0.0
+        for k in range(spacing_px.size):
+            du, dv = places[row, k + 1, 0] - places[row, k, 0], places[row, k + 1, 1] - places[row, k, 1]
+            spacing = spacing_px[k]
+            seen = math.sqrt(du * du + dv * dv) / spacing
+            noise = _SPACING_SD * _SPACING_SD + (variance_px2[row, k] + variance_px2[row, k + 1]) / (spacing * spacing)
+            if k == 0:
+                ratio, spread = seen, noise
+            else:
+                slope = _DRIFT_SD_PER_MM * 0.5 * (before + spacing) / px_per_mm
+                spread += slope * slope * max(1.0 - ratio * ratio, _LEAST_SLOPE)
+                total = spread + noise
+                away = seen - ratio
+                rest += away * away / total + math.log(total / noise)
+                gain = spread / total
+                ratio += gain * away
+                spread *= 1.0 - gain
+            before = spacing
+        out[row] = -0.5 * rest
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -173,9 +207,9 @@ def shaft_evidence(
 def _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add, over three pieces, the mean of the darker side less the middle.
 
-    Pixels outside the image do not count. A piece has the direction from its first to its second electrode. ``reach`` is
-    where it
-    begins and ends beyond the second electrode: in millimetres behind and before the catheter, in parts of the gap between.
+    Pixels outside the image do not count. A piece has the direction from its first to its second electrode. ``reach``
+    is where it begins and ends beyond the second electrode: in millimetres behind and before the catheter, in parts of
+    the gap between.
     """
     rows, columns = smooth.shape
     shift = 0.5 / reduction - 0.5

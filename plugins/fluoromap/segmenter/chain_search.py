@@ -1,8 +1,7 @@
 """Search for paths through candidates, and for their best set.
 
-The kernels here and in :mod:`~fluoromap.segmenter.chain_scores` are written for a short compile time: they call no kernel,
-sort
-nothing and assign no whole rows or arrays. Each of these would add seconds to the first start of a worker.
+The kernels here and in :mod:`~fluoromap.segmenter.chain_scores` are written for a short compile time: they call no
+kernel, sort nothing and assign no whole rows or arrays. Each of these would add seconds to the first start of a worker.
 """
 
 from __future__ import annotations
@@ -56,7 +55,10 @@ def find_paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write all paths with one more electrode and their spacing ratios; return their number."""
+    """Write all paths with one more electrode; return their number.
+
+    Their spacing ratios are written too.
+    """
     count = 0
     spacing = spacing_px[step]
     shortest = SHORTEST * _END_SLACK[0] * spacing
@@ -97,9 +99,8 @@ def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore
 def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> IntArray:
     """Return how many candidates each two chains have in common, (n, n).
 
-    ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may give
-    two
-    candidates. Rows of ``chosen`` are filled up with -1.
+    ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may
+    give two candidates. Rows of ``chosen`` are filled up with -1.
     """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)
@@ -117,11 +118,9 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
 def best_set(values: Array, shared: IntArray, family: IntArray, capacity: IntArray, price: float) -> IntArray:
     """Return the indices of the best set of chains by branch and bound.
 
-    The best set has the largest sum of values less ``price`` for each shared candidate. It has at most ``capacity`` chains
-    of each
-    family, and two of its chains share one candidate at most. For a catalogue of very many catheters the search ends after
-    300000
-    tries.
+    The best set has the largest sum of values less ``price`` for each shared candidate. It has at most ``capacity``
+    chains of each family, and two of its chains share one candidate at most. For a catalogue of very many catheters the
+    search ends after 300000 tries.
 
     Parameters
     ----------

@@ -32,11 +32,9 @@ _NEAR_CENTRE = 0.1
 def within_collimator(picture: Image) -> BoolArray:
     """Return the pixels inside all collimator edges that the image shows.
 
-    Edges are searched on an image of about 128 pixels, where the logarithm falls steeply. A circle is fitted to the steep
-    pixels
-    by position = centre + radius x direction of the fall, which is linear in its three unknowns. A Hough transform collects
-    the
-    remaining steep pixels into straight lines. An edge is accepted under three conditions:
+    Edges are searched on an image of about 128 pixels, where the logarithm falls steeply. A circle is fitted to the
+    steep pixels by position = centre + radius x direction of the fall, which is linear in its three unknowns. A Hough
+    transform collects the remaining steep pixels into straight lines. An edge is accepted under three conditions:
 
     - The level falls by 30 % along three quarters of the edge's bright inner side.
     - The edge covers a fifth of the image (a circle: a third of its rim).

@@ -56,12 +56,10 @@ class FieldMask:
 def find_field(frames: FrameSource, facts: PixelFacts) -> FieldMask:
     """Return the field mask of a run.
 
-    Shutter attributes are used where the header has them. Otherwise the median of at most 9 evenly spaced frames is cut at
-    6 % of
-    its bright level, and at straight and circular collimator edges that are fitted to it. A grey level alone either keeps
-    the
-    penumbra of the collimator or removes dark parts of the patient. The field is eroded by 10 px. All steps use half the
-    size.
+    Shutter attributes are used where the header has them. Otherwise the median of at most 9 evenly spaced frames is cut
+    at 6 % of its bright level, and at straight and circular collimator edges that are fitted to it. A grey level alone
+    either keeps the penumbra of the collimator or removes dark parts of the patient. The field is eroded by 10 px. All
+    steps use half the size.
     """
     median = _median_of_samples(frames)
     if facts.shutter is not None:

@@ -19,9 +19,8 @@ from fluoromap.segmenter.log_image import Image
 def gaussian(x: Image, sigma: float) -> Image:
     """Blur an image by a Gaussian with reflected edges.
 
-    A large sigma is applied to a reduced image. The reduction by area means and the linear enlargement add variance, which
-    is
-    subtracted from sigma squared. The remaining error is about 1e-3 of the range.
+    A large sigma is applied to a reduced image. The reduction by area means and the linear enlargement add variance,
+    which is subtracted from sigma squared. The remaining error is about 1e-3 of the range.
     """
     if sigma <= 0:
         return x.copy()

@@ -12,12 +12,14 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.proposals import log_odds
 
-_EVIDENCE_FROM, _EVIDENCE_MOST = 4.0, 2.2
+_EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
 _SHAFT_WEIGHT = 0.4
 _SHARED = 1.5
 _LOST = 2.0
 _WORTH = 6.0
+_FLOOR_FALLS = 0.6
 _BEST = 80
 _SIDE_MM = 1.75
 _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
@@ -56,9 +58,17 @@ class CatheterFamily:
     def floor(self) -> float:
         """Score below which a chain may be anatomy.
 
-        The floor is higher for two electrodes: there is no second spacing to check.
+        The floor is higher for two electrodes: there is no second spacing to check. It is lower for more than four: bends and
+        spacings cost a long catheter more, and its row is rarer in anatomy.
         """
-        return 1.0 if self.catheter.electrodes > 2 else 3.0
+        if self.catheter.electrodes == 2:
+            return 3.0
+        return 1.0 - _FLOOR_FALLS * max(self.catheter.electrodes - 4, 0)
+
+    @property
+    def worth(self) -> float:
+        """What a chain of this family adds to the value of a set, besides its score."""
+        return _WORTH * max(1.0, self.catheter.electrodes / 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +96,27 @@ def catheter_families(catalogue: Catalogue) -> tuple[CatheterFamily, ...]:
     return tuple(CatheterFamily(tuple(member.name for member in group), group[0]) for group in groups)
 
 
-def evidence(contrast_over_noise: Array) -> Array:
-    """Return the weight of candidates with these contrasts in a chain's score.
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """The worth of one candidate's log-odds in a chain.
 
-    The weight is 0 at 4 sigma, grows with the logarithm, and lies between -1 and 2.2.
+    share : 1 where candidates were judged one by one; less where the proposer saw the neighbours too, so that its errors go
+    together. chain : added for each candidate, because candidates in a chain are electrodes more often than others.
     """
-    rising: Array = np.log(np.maximum(contrast_over_noise, 1e-3) / _EVIDENCE_FROM)
-    return np.clip(rising, -1.0, _EVIDENCE_MOST)
+
+    share: float = 1.0
+    chain: float = 0.0
+
+
+ONE_BY_ONE = Trust()
+
+
+def evidence(probability: Array, trust: Trust = ONE_BY_ONE) -> Array:
+    """Return the weight of candidates with these probabilities in a chain's score.
+
+    The weight is the log-odds: 0 for an even chance, between -1 and 2.2.
+    """
+    return np.clip(trust.chain + trust.share * log_odds(probability), _EVIDENCE_LEAST, _EVIDENCE_MOST)
 
 
 def link_candidates(
@@ -115,11 +139,10 @@ def link_candidates(
     - rings of unlike weight.
 
     A dark shaft between the electrodes and behind the last one raises the score; a dark shaft before the tip lowers it.
-    The value of a set is the sum of its scores plus 6 for each chain, so that a third, weaker catheter is not dropped.
-    Crossing
-    catheters may share one candidate at a price, but two chains must not lie at the same place. A set has at most as many
-    chains
-    of a family as the catalogue has catheters.
+    The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
+    weaker catheter is not dropped, nor a part of a long one preferred. Crossing catheters may share one candidate at a
+    price, but two chains must not lie at the same place. A set has at most as many chains of a family as the catalogue
+    has catheters.
 
     Parameters
     ----------
@@ -167,12 +190,13 @@ def link_candidates(
         ]
     if not found:
         return ()
-    found = sorted(found, key=lambda chain: -chain.score)[:_BEST]
+    values = {id(chain): chain.score + families[chain.family].worth for chain in found}
+    found = sorted(found, key=lambda chain: -values[id(chain)])[:_BEST]
     within = np.full((len(found), max(len(chain.candidates) for chain in found)), -1, np.int64)
     for row, chain in enumerate(found):
         within[row, : len(chain.candidates)] = chain.candidates
     chosen = chain_search.best_set(
-        np.array([chain.score + _WORTH for chain in found]),
+        np.array([values[id(chain)] for chain in found]),
         chain_search.count_shared(within, points, _SAME_PLACE_MM * shaft_image.px_per_mm, _SAME_PLACES),
         np.array([chain.family for chain in found]),
         np.array([len(family.names) for family in families]),
@@ -205,9 +229,8 @@ def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_pe
 def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage) -> Array:
     """Return how clearly each chain (n, electrodes, 2) shows a shaft.
 
-    The result (n,) lies between -3 and 3. Dark pixels in the widest gap and behind the last electrode count for a shaft,
-    dark
-    pixels before the tip against it.
+    The result (n,) lies between -3 and 3. Dark pixels in the widest gap and behind the last electrode count for a
+    shaft, dark pixels before the tip against it.
     """
     return chain_scores.shaft_evidence(
         points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,

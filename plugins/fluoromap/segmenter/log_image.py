@@ -63,9 +63,10 @@ def robust_sd(values: Image) -> float:
 class LogTransform:
     """The map from stored grey levels to log units for one run.
 
-    Dark stays low. offset : grey levels that are added before the logarithm. highest : the grey level at which MONOCHROME1
-    is
-    mirrored, else None. table : float32, the log value of each grey level.
+    Dark stays low.
+    offset : grey levels that are added before the logarithm.
+    highest : the grey level at which MONOCHROME1 is mirrored, else None.
+    table : float32, the log value of each grey level.
     """
 
     offset: float
@@ -78,8 +79,7 @@ class LogTransform:
         """Choose offset and table from the header and the mean grey level.
 
         The mean is in stored pixels. For up to 9 bits the offset is 2 % of the mean: an offset of one grey level would
-        amplify the
-        noise of dark regions.
+        amplify the noise of dark regions.
         """
         highest = 2**facts.bits_stored - 1 if facts.monochrome1 else None
         level = mean_level if highest is None else highest - mean_level

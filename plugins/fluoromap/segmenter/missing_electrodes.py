@@ -1,7 +1,7 @@
 """Catheters with one electrode that has no blob of its own.
 
 A steeply foreshortened tip hides the ring behind it, or another catheter crosses. The other electrodes predict the missing
-one; the image must be dark there.
+one; the image must allow it there.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.linking import CatheterFamily
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES, trace_rows
 from fluoromap.segmenter.refinement import predict_on_curve
 
 _LEAST_KNOWN = 3
-_DARK = 0.0
-_INNER_SD_MM, _END_SD_MM = 0.4, 0.7
+_INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM = 0.4, 0.7, 0.9
+_TRACED_LEAST = -1.0
 _MOST = 100
 
 
@@ -28,9 +29,8 @@ _MOST = 100
 class CompletedChains:
     """Chains of candidates with one predicted electrode each.
 
-    points_uv, weights, variance_px2 : the candidates, then the predicted electrodes. rows : for each family, the indices of
-    its
-    chains from the tip on, (n, electrodes).
+    points_uv, weights, variance_px2 : the candidates, then the predicted electrodes.
+    rows : for each family, the indices of its chains from the tip on, (n, electrodes).
     """
 
     points_uv: Array
@@ -44,19 +44,23 @@ def complete_chains(
     weights: Array,
     variance_px2: Array,
     evidence_at: Callable[[Array], Array],
+    least_evidence: float,
     families: Sequence[CatheterFamily],
     px_per_mm: float,
 ) -> CompletedChains:
-    """Complete all chains of candidates that lack one electrode.
+    """Complete all chains of candidates that lack electrodes.
 
-    The missing electrode is predicted on a smooth curve through the others.
+    A chain may lack one electrode, or a few of many. The missing electrode is predicted on a smooth curve through the
+    others.
 
     Parameters
     ----------
     points_uv, weights, variance_px2 : (n, 2), (n,), (n,)
         As in :func:`~fluoromap.segmenter.linking.link_candidates`.
     evidence_at : callable
-        (k, 2) pixels -> (k,) evidence. A predicted electrode without evidence is dropped.
+        (k, 2) pixels -> (k,) evidence.
+    least_evidence : float
+        A predicted electrode that has no more is dropped.
     families : sequence of CatheterFamily
     px_per_mm : float
         At the isocentre.
@@ -68,12 +72,27 @@ def complete_chains(
     for family in families:
         electrodes = family.catheter.electrodes
         of_family = [np.zeros((0, electrodes), np.int64)]
+        if electrodes >= MANY_ELECTRODES:
+            traced, positions = trace_rows(points, weights, np.asarray(family.catheter.spacing_mm) * px_per_mm, _MOST)
+            for row, position in zip(traced, positions, strict=True):
+                lacking = np.flatnonzero(row < 0)
+                # The electrodes on both sides vouch for the place; what shows there may be another catheter.
+                dark = np.clip(evidence_at(position[lacking]), _TRACED_LEAST, 0.0) if len(lacking) else np.zeros(0)
+                numbered = row.copy()
+                numbered[lacking] = count + np.arange(len(lacking))
+                of_family.append(numbered[None])
+                places.append(position[lacking])
+                gained.append(dark)
+                spread.append(np.full(len(lacking), (_TRACED_SD_MM * px_per_mm) ** 2))
+                count += len(lacking)
+            rows.append(np.concatenate(of_family))
+            continue
         for missing in range(electrodes) if electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1 else ():
             arc_mm = np.delete(family.catheter.arc_lengths_mm, missing)
             paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm)
             predicted = _curve_weights(family.catheter, missing) @ points[paths]
             dark = evidence_at(predicted)
-            kept = np.flatnonzero(dark > _DARK)
+            kept = np.flatnonzero(dark > least_evidence)
             kept = kept[np.argsort(-(dark[kept] + weights[paths[kept]].sum(axis=1)), kind="stable")[:_MOST]]
             numbers = count + np.arange(len(kept))
             of_family.append(np.insert(paths[kept], missing, numbers, axis=1))

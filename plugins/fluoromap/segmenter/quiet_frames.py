@@ -25,11 +25,9 @@ _USUAL_CYCLE_MS = 800.0
 class MotionMeter:
     """RMS difference of each log image to the previous one, where the run moves.
 
-    This is the paper's criterion for the diastolic frame. A Gaussian of sigma 3 px is applied first; otherwise photon noise
-    would
-    decide. Only the twentieth of the field that varies most is compared; at most 15 evenly spaced log images determine it.
-    The
-    object stores one reduced image.
+    This is the paper's criterion for the diastolic frame. A Gaussian of sigma 3 px is applied first; otherwise photon
+    noise would decide. Only the twentieth of the field that varies most is compared; at most 15 evenly spaced log
+    images determine it. The object stores one reduced image.
     """
 
     def __init__(self, samples: Iterable[Image], inside: BoolArray) -> None:
@@ -58,9 +56,8 @@ def _reduced(x: Image) -> Image:
 def is_quiet(motion: Array) -> BoolArray:
     """Return which frames differ from the previous one by little more than noise, (n,).
 
-    Motion and noise add in squares. The quietest fifth determines the noise, unless it moves already. A frame is quiet up
-    to a
-    fifteenth of the largest motion, or up to the motion that noise alone can cause.
+    Motion and noise add in squares. The quietest fifth determines the noise, unless it moves already. A frame is quiet
+    up to a fifteenth of the largest motion, or up to the motion that noise alone can cause.
     """
     if len(motion) < 3:
         return np.ones(len(motion), dtype=np.bool_)

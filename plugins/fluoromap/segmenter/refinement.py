@@ -41,9 +41,9 @@ _LOCAL, _LEAST_SHORTENING = 0.75, 0.15
 class ElectrodeFit:
     """Positions of the electrodes of several chains.
 
-    points_uv : (n, electrodes, 2) px. covariance_px2 : (n, electrodes, 2, 2). misfits : (n, electrodes), the share of each
-    band's
-    profile that its template does not explain.
+    points_uv : (n, electrodes, 2) px.
+    covariance_px2 : (n, electrodes, 2, 2).
+    misfits : (n, electrodes), the share of each band's profile that its template does not explain.
     """
 
     points_uv: Array
@@ -77,13 +77,12 @@ def refine(
     hidden: BoolArray,
     without_blob: BoolArray,
 ) -> ElectrodeFit:
-    """Move each electrode to where a band of its length and width fits best.
+    """Move each electrode to where its band fits best.
 
-    Along the axis the profile is compared with a box of the electrode's foreshortened length (the tip's far end is
-    rounded),
-    across the axis with the chord of a cylinder. The fit maximises the zero-mean correlation with a parabola through the
-    best
-    shift, in two rounds. Then points far off the catalogue's spacing are pulled towards it according to their uncertainty.
+    The band has the electrode's length and width. Along the axis the profile is compared with a box of the electrode's
+    foreshortened length (the tip's far end is rounded), across the axis with the chord of a cylinder. The fit maximises
+    the zero-mean correlation with a parabola through the best shift, in two rounds. Then points far off the catalogue's
+    spacing are pulled towards it according to their uncertainty.
 
     Parameters
     ----------
@@ -159,11 +158,11 @@ def _diameter_mm(catheter: Catheter) -> float:
 def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write arc lengths, axes, band lengths and profile lengths of all electrodes.
 
-    arc : visible arc length up to each electrode, pixels. axes : unit vector along the catheter. bands : half the
-    foreshortened
-    length of the band, from the gaps beside it and from the whole catheter. sides : number of steps to each side over which
-    the
-    profile is compared. The profile ends before the next electrode's band, which would push the fit away.
+    arc : visible arc length up to each electrode, pixels.
+    axes : unit vector along the catheter.
+    bands : half the foreshortened length of the band, from the gaps beside it and from the whole catheter.
+    sides : number of steps to each side over which the profile is compared. The profile ends before the next
+    electrode's band, which would push the fit away.
     """
     last = arc_mm.size - 1
     for row in range(points.shape[0]):
@@ -194,11 +193,11 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
     """Move the points to the best nearby positions of bands along these axes.
 
     Writes the standard deviations along and across for a pixel noise of 1, and the share of the variance along the axis
-    that stays
-    unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a dome of its
-    radius.
-    ``shifts`` and ``sides`` : largest shift and half length of the template, in steps. ``scratch`` : three lines of work
-    space.
+    that stays unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a
+    dome of its radius.
+
+    shifts, sides : largest shift and half length of the template, in steps.
+    scratch : three lines of work space.
     """
     highest_u, highest_v = x.shape[1] - 1.001, x.shape[0] - 1.001
     template, profile, scores = scratch[0], scratch[1], scratch[2]
@@ -277,9 +276,8 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
 def _position_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:
     """Return the standard deviations along and across, (n, electrodes, 2) pixels.
 
-    ``noise_sd`` is the contribution of white noise. The detector's blur increases it. Badly fitting bands have long-tailed
-    errors.
-    Without noise the simplifications of the templates remain, most of all at a tip's rounded end.
+    ``noise_sd`` is the contribution of white noise. The detector's blur increases it. Badly fitting bands have
+    long-tailed errors. Without noise the simplifications of the templates remain, most of all at a tip's rounded end.
     """
     gain, floor = _gains_and_floors(misfits.shape[1], tip_mm >= _LONG_TIP_MM)
     blur_gain = 1.0 + _BLUR_GAIN * np.maximum(_USUAL_CLEARNESS - _clearness(misfits), 0.0)

@@ -64,15 +64,14 @@ def segment_run(
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
 ) -> Segmentation:
-    """Segment a run: chains of all frames with their tracks, and chains at diastole.
+    """Segment a run: tracked chains of all frames, and diastolic chains.
 
     Chains at diastole come from the mean of the quiet frames round diastole. Marks replace the automatic chains of their
     frames, and the tracks start from the first marked frame. At diastole a mark counts as follows:
 
     - A mark in one of the averaged frames replaces the automatic chain of the same catheter or place.
     - A mark elsewhere, of a catheter that is missing at diastole, moves diastole to the quietest marked frame. The
-    automatic
-      chains of that frame are added.
+      automatic chains of that frame are added.
 
     Parameters
     ----------
@@ -132,7 +131,7 @@ def segment_run(
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
     reason = None if chains else Reason.MANUAL_NEEDED
-    if len(chains) >= catheters and detector.shows_extra_catheter(mean_image, chains):
+    if chains and detector.shows_extra_catheter(mean_image, chains):
         reason = Reason.EXTRA_CATHETER
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)

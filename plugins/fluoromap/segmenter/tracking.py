@@ -91,9 +91,8 @@ def track_chains(
 ) -> tuple[FrameChains, ...]:
     """Give the chains of a run track numbers.
 
-    The tracks start at one frame and extend in both directions. The start is the first frame with a mark, else the seed,
-    else
-    the frame that most other frames confirm. In each frame:
+    The tracks start at one frame and extend in both directions. The start is the first frame with a mark, else the
+    seed, else the frame that most other frames confirm. In each frame:
 
     1. Each track predicts its chain from 0.6 of its last velocity.
     2. The chains of the frame are assigned to the predictions at the least total cost: mean shift, twice the largest change
@@ -118,8 +117,7 @@ def track_chains(
     -------
     tuple of FrameChains
         ``manual_needed`` is MANUAL_NEEDED in a frame without chains. It is TRACK_INTERRUPTED in a frame that lacks a
-        catheter
-        which most frames have.
+        catheter which most frames have.
     """
     if not found:
         return ()

@@ -20,9 +20,8 @@ _LEVEL, _SHAFT, _ELECTRODE = 1000.0, 0.9, 0.45
 class SyntheticFrames:
     """Frames with straight catheters side by side, one pixel lower in each frame.
 
-    The last catheter is absent from one frame, so that the segmenter has to search for it. Stored pixels are 12 bits in 16,
-    with
-    the noise of 1000 photons.
+    The last catheter is absent from one frame, so that the segmenter has to search for it. Stored pixels are 12 bits in
+    16, with the noise of 1000 photons.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:

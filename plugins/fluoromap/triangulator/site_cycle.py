@@ -101,9 +101,9 @@ def locate_cycle(
     gantry_covariance: Array,
     jump: Jump | None = None,
 ) -> SiteCycle:
-    """Locate the electrodes at every moment, with a covariance that grows where the heart moves fast.
+    """Locate the electrodes at every moment.
 
-    A ``jump`` of the table between the two runs displaces all moments alike.
+    The covariance grows where the heart moves fast. A ``jump`` of the table between the two runs displaces all moments alike.
     """
     start, pixels = moments.positions_mm, moments.pixels
     motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
@@ -133,7 +133,10 @@ def _fit(phases: Array, positions_mm: Array) -> Array:
 
 
 def _waves(phases: ArrayLike, derivative: bool = False) -> Array:
-    """Return 1, cos and sin of the harmonics at phases (...), or their derivatives by phase, shape (..., k)."""
+    """Return 1, cos and sin of the harmonics at phases (...).
+
+    ``derivative``: their derivatives by phase. Shape (..., k).
+    """
     angle = 2 * np.pi * np.asarray(phases, dtype=np.float64)[..., None] * np.arange(1, _HARMONICS + 1)
     rate = 2 * np.pi * np.arange(1, _HARMONICS + 1)
     pairs = (-rate * np.sin(angle), rate * np.cos(angle)) if derivative else (np.cos(angle), np.sin(angle))

@@ -54,7 +54,10 @@ def locate_study(
 def calibrate_and_locate(
     sites: Sequence[MatchedSite], catalogue: Catalogue, context: Context, params: UncertaintyParams, method: Method
 ) -> Triangulation:
-    """Locate every site after checking the study for moved tables, wrong spacings and a wrong gantry."""
+    """Locate every site after checks of the whole study.
+
+    The checks are for moved tables, wrong spacings and a wrong gantry.
+    """
     usable, rejected, notes = _usable_sites(sites, catalogue)
     first = [_first_look(site, catalogue, params) for site in usable]
     resting = frozenset(catalogue.names) - {catalogue.mapping}
@@ -130,7 +133,10 @@ def _locate_sites(
 def _first_look(
     site: MatchedSite, catalogue: Catalogue, params: UncertaintyParams
 ) -> tuple[Cameras, TwoViewPixels, Array, Array]:
-    """Return nominal cameras, pixels, points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise."""
+    """Return a site's nominal cameras, pixels and first points.
+
+    Points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise.
+    """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
     points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
     widest = LARGEST_MULTIPLE**2 * params.gantry_covariance()
@@ -141,7 +147,10 @@ def _first_look(
 
 
 def _same_gantry(sites: Sequence[MatchedSite]) -> list[int]:
-    """Return the indices of the most sites with the same two gantry positions: only they share the gantry's errors."""
+    """Return the indices of the most sites with the same two gantry positions.
+
+    Only such sites share the gantry's errors.
+    """
     best: list[int] = []
     for one in sites:
         alike = [
@@ -206,7 +215,10 @@ def _calibration_note(calibration: Calibration) -> str:
 
 
 def _budget(moments: Sequence[Moment]) -> ErrorBudget | None:
-    """Return the RMS of each source of error over all located electrodes; None where no electrode was located."""
+    """Return the RMS of each source of error over all located electrodes.
+
+    The result is None where no electrode was located.
+    """
     count = sum(len(moment.found.points_mm) for moment in moments)
     if not count:
         return None

@@ -81,7 +81,10 @@ def _with_boundary(jumps: list[Jump | None]) -> list[Jump | None]:
 
 
 def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]:
-    """Return a sentence for each view that jumped: at which sites, and how far."""
+    """Return a sentence for each view that jumped.
+
+    It says at which sites, and how far.
+    """
     notes = []
     for view in ("a", "b"):
         at = [index for index, jump in enumerate(jumps) if jump is not None and jump.view == view]
@@ -189,7 +192,10 @@ def _site_jump(
 
 
 def _common_displacement(displacements_mm: Array) -> Array:
-    """Return the displacement (3,) common to k catheters (k, 3): their mean, or the least where one of them slipped."""
+    """Return the displacement (3,) common to k catheters (k, 3).
+
+    It is their mean, or the smallest where one of them slipped.
+    """
     mean = displacements_mm.mean(axis=0)
     if np.linalg.norm(displacements_mm - mean, axis=1).max() <= _SLIP_MM:
         return np.asarray(mean)

@@ -46,7 +46,7 @@ class TwoViewPixels:
 
 
 def pixels_in_both_views(pair: PhasePair) -> TwoViewPixels:
-    """Return the electrodes that both views of a pair show, paired by catheter and number."""
+    """Return the electrodes that both views of a pair show."""
     first, second = _by_label(pair.a.chains), _by_label(pair.b.chains)
     labels = tuple(label for label in first if label in second)
 

@@ -91,7 +91,10 @@ async def _warm_up() -> None:
 
 
 async def _sweep() -> None:
-    """Free the stages of dead workers and announce ready stages, as long as the service runs."""
+    """Free the stages of dead workers and announce ready stages.
+
+    It repeats this as long as the service runs.
+    """
     failing = False
     while True:
         try:

@@ -18,7 +18,7 @@ from fluoromap_service.cli.failures import sentence_of
 
 COMMANDS = {
     "demo": "Simulate a study, run it through the real service and compare the results with the truth.",
-    "up": "Run the API and a worker; by default they use SQLite and files, no server.",
+    "up": "Run the API and a worker.",
     "run": "Run the pipeline over a folder, on a private service.",
     "simulate": "Simulate a study: DICOM runs, activation times and the truth.",
     "tables": "Print the paper's tables beside our own, computed on simulated data.",
@@ -46,7 +46,7 @@ class CommandGroup(TyperGroup):
 
 def load(name: str) -> Any:
     """Import the module of a command and return the command."""
-    module = import_module(f"fluoromap_service.cli.{name.replace('-', '_')}")
+    module = import_module(f"fluoromap_service.cli.commands.{name.replace('-', '_')}")
     return typer.main.get_command(module.app)
 
 

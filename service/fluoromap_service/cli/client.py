@@ -48,7 +48,10 @@ class Client:
         return study
 
     def upload(self, study: str, path: Path) -> list[str]:
-        """Send one DICOM file and return the service's objections; empty when it accepts the file."""
+        """Send one DICOM file and return the service's objections.
+
+        They are empty when it accepts the file.
+        """
         with path.open("rb") as stream:
             part = {"file": (path.name, stream, "application/dicom")}
             answer = self._http.post(f"/v1/studies/{study}/instances", files=part)
@@ -75,7 +78,10 @@ class Client:
         return job
 
     def follow(self, job: str) -> Iterator[dict[str, Any]]:
-        """Yield the job as the API shows it, again and again, until it has ended."""
+        """Yield the job as the API shows it, until it has ended.
+
+        The client asks again and again.
+        """
         while True:
             state = self._json("GET", f"/v1/jobs/{job}")
             yield state
@@ -84,7 +90,10 @@ class Client:
             time.sleep(POLL_SECONDS)
 
     def points(self, job: str) -> list[dict[str, Any]]:
-        """Return all points of a job, in mm along LPS axes, relative to the reference catheter."""
+        """Return all points of a job, in mm along LPS axes.
+
+        They are relative to the reference catheter.
+        """
         points: list[dict[str, Any]] = self._json("GET", f"/v1/jobs/{job}/points")["points"]
         return points
 

@@ -30,13 +30,19 @@ _FITTED = (
 
 
 def as_json(tables: OneViewTables) -> str:
-    """Return one JSON object with a list for each table; values that the paper omits are null."""
+    """Return one JSON object with a list for each table.
+
+    Values that the paper omits are null.
+    """
     content = {"simulated": True, "notes": [_UNKNOWN_TABLE_2, _FITTED], **asdict(tables)}
     return json.dumps(content, indent=2, allow_nan=False)
 
 
 def as_csv(tables: OneViewTables) -> str:
-    """Return the rows of all tables as CSV; the column ``source`` is paper, ours or fitted."""
+    """Return the rows of all tables as CSV.
+
+    The column ``source`` is paper, ours or fitted.
+    """
     lines = [line for name in _TABLES for row in getattr(tables, name) for line in _lines(name, asdict(row))]
     columns = list(dict.fromkeys(column for line in lines for column in line))
     text = io.StringIO()

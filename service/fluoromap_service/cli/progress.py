@@ -44,7 +44,10 @@ class BarContext:
 
 @contextmanager
 def one_bar(title: str) -> Iterator[BarContext]:
-    """Show one bar on standard error, so that standard output holds the results alone."""
+    """Show one bar on standard error.
+
+    So standard output holds the results alone.
+    """
     with progress_bars(Console(stderr=True)) as progress:
         bar = progress.add_task(title, total=1.0)
         yield BarContext(lambda fraction: progress.update(bar, completed=fraction))

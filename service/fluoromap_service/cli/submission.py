@@ -95,6 +95,9 @@ def run_job(client: Client, study: str, progress: Progress) -> dict[str, Any]:
 
 
 def _progress_of(stages: Sequence[dict[str, Any]]) -> float:
-    """Return the mean progress of stages, 0 to 1; a stage that ended counts as 1."""
+    """Return the mean progress of stages, 0 to 1.
+
+    A stage that ended counts as 1.
+    """
     ended = ("done", "failed", "cancelled")
     return sum(1.0 if row["state"] in ended else row["progress"] for row in stages) / max(len(stages), 1)

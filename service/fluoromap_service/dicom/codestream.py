@@ -1,4 +1,4 @@
-"""One compressed frame: what it says of itself, and its pixels."""
+"""One compressed frame: its header, and its pixels."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _START_OF_SCAN = 0xDA
 
 @dataclass(frozen=True, slots=True)
 class Codestream:
-    """Size of a compressed image by its own header."""
+    """The size of a compressed image by its own header."""
 
     rows: int
     columns: int
@@ -39,15 +39,18 @@ class Codestream:
 
 
 def largest_codestream(layout: PixelLayout) -> int:
-    """Bytes beyond which a compressed frame is no compressed frame: twice its pixels and some for headers."""
+    """Return the largest plausible size of a compressed frame in bytes.
+
+    It is twice its pixels, and some for headers.
+    """
     return 2 * layout.frame_bytes + _SLACK_BYTES
 
 
 def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
-    """Pixels of one compressed frame, shape (rows, columns), uint8 or uint16, writable.
+    """Return the pixels of one compressed frame, (rows, columns) uint8 or uint16, writable.
 
-    The codestream's own size is compared with the header's before anything is decoded, so that a few bytes that claim
-    gigabytes allocate none.
+    The function first compares the codestream's own size with the header's. So a few bytes that claim gigabytes allocate
+    nothing.
 
     Raises
     ------
@@ -56,10 +59,10 @@ def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
     """
     if layout.transfer_syntax in RLE:
         return _decode_rle(layout, codestream)
-    found = _describe(layout, codestream)
-    if found is None:
+    parsed = _parse(layout, codestream)
+    if parsed is None:
         raise _undecodable(layout, "its codestream has no valid header")
-    described, essential = found
+    described, essential = parsed
     if (described.rows, described.columns, described.components) != (layout.rows, layout.columns, 1):
         raise dicom_problem(
             DicomCode.PIXEL_DATA_MISMATCH,
@@ -81,7 +84,7 @@ def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
         "columns": layout.columns,
         "number_of_frames": 1,
         "samples_per_pixel": 1,
-        # GDCM's pixel container follows the codestream, whatever BitsAllocated and BitsStored tell.
+        # GDCM sizes its pixels by the codestream, not by BitsAllocated and BitsStored.
         "bits_allocated": 8 if described.precision <= 8 else 16,
         "bits_stored": described.precision,
         "pixel_representation": 0,
@@ -92,38 +95,40 @@ def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
         decoder = get_decoder(layout.transfer_syntax)
         pixels, _ = decoder.as_array(encapsulate([essential]), index=0, raw=True, decoding_plugin="gdcm", **options)
     except Exception as error:
-        raise _undecodable(layout, "the decoder refuses it") from error
+        raise _undecodable(layout, "the decoder fails") from error
     if pixels.shape != (layout.rows, layout.columns) or pixels.dtype.kind != "u":
-        raise _undecodable(layout, "the decoder returned something else")
+        raise _undecodable(layout, "the decoder returned another size or type of pixels")
     return np.require(pixels, requirements=["C", "W"])
 
 
 def _undecodable(layout: PixelLayout, why: str) -> Problem:
     return dicom_problem(
-        DicomCode.UNDECODABLE, f"A frame in {syntax_name(layout.transfer_syntax)} does not decode: {why}.", "PixelData"
+        DicomCode.UNDECODABLE,
+        f"A frame in {syntax_name(layout.transfer_syntax)} does not decode: {why}; export the run again.",
+        "PixelData",
     )
 
 
-def _describe(layout: PixelLayout, codestream: bytes) -> tuple[Codestream, bytes] | None:
-    """What the codestream says of itself, and what of it the decoder shall see; None when its header is damaged."""
+def _parse(layout: PixelLayout, codestream: bytes) -> tuple[Codestream, bytes] | None:
+    """Return the codestream's header and the bytes for the decoder; None when the header is damaged."""
     try:
         if layout.transfer_syntax not in JPEG_2000:
-            return _describe_jpeg(codestream)
-        described = _describe_jpeg_2000(codestream)
+            return _parse_jpeg(codestream)
+        described = _parse_jpeg_2000(codestream)
     except (struct.error, IndexError):
         return None
     return (described, codestream) if described else None
 
 
-def _describe_jpeg(codestream: bytes) -> tuple[Codestream, bytes] | None:
-    """Marker segments up to the first scan, ITU-T T.81 annex B (T.87 for JPEG-LS).
+def _parse_jpeg(codestream: bytes) -> tuple[Codestream, bytes] | None:
+    """Parse the marker segments up to the first scan, ITU-T T.81 annex B (T.87 for JPEG-LS).
 
-    The decoder is given only segments that pixels depend on, with nothing between them: GDCM ends the whole process by an
-    uncaught exception when its JPEG library has anything to warn of in a header (stray bytes, an odd JFIF or Adobe segment).
+    The decoder gets only the segments that pixels depend on, with nothing between them. Stray bytes or an odd JFIF or Adobe
+    segment make GDCM's JPEG library warn, and then an uncaught exception ends the whole process.
     """
     if codestream[:2] != b"\xff\xd8":
         return None
-    kept = [codestream[:2]]
+    essential = [codestream[:2]]
     described: Codestream | None = None
     position = 2
     while codestream[position] == 0xFF:
@@ -136,17 +141,20 @@ def _describe_jpeg(codestream: bytes) -> tuple[Codestream, bytes] | None:
             precision, rows, columns, components = struct.unpack_from(">BHHB", codestream, position + 4)
             described = Codestream(rows, columns, precision, components)
         elif marker == _START_OF_SCAN:
-            return (described, b"".join(kept) + codestream[position:]) if described else None
+            return (described, b"".join(essential) + codestream[position:]) if described else None
         if marker in _FRAME_HEADERS or marker in _TABLES:
-            kept.append(codestream[position : position + 2 + length])
+            essential.append(codestream[position : position + 2 + length])
         elif marker not in _NOTES:
             return None
         position += 2 + length
     return None
 
 
-def _describe_jpeg_2000(codestream: bytes) -> Codestream | None:
-    """SIZ marker segment of ITU-T T.800 A.5.1, which comes first in a bare codestream."""
+def _parse_jpeg_2000(codestream: bytes) -> Codestream | None:
+    """Parse the SIZ marker segment of ITU-T T.800 A.5.1.
+
+    It comes first in a bare codestream.
+    """
     if codestream[:4] != b"\xff\x4f\xff\x51":
         return None
     x1, y1, x0, y0, tile_width, tile_height, _, _, components, depth, dx, dy = struct.unpack_from(
@@ -160,13 +168,14 @@ def _describe_jpeg_2000(codestream: bytes) -> Codestream | None:
 
 
 def _decode_rle(layout: PixelLayout, codestream: bytes) -> Pixels:
-    """RLE of PS3.5 annex G: one segment a byte plane, the most significant first.
+    """Decode RLE of PS3.5 annex G.
 
-    Not pydicom's: that one expands a segment to whatever it claims before looking at the frame's size.
+    There is one segment for each byte plane, the most significant first. pydicom's decoder expands a segment fully
+    before it checks the frame's size; this one stops at that size.
     """
     planes = layout.bits_allocated // 8
     if len(codestream) < 64:
-        raise _undecodable(layout, "its RLE header is cut short")
+        raise _undecodable(layout, "its RLE header ends too early")
     count, *offsets = struct.unpack_from("<16L", codestream)
     bounds = [*offsets[:planes], len(codestream)]
     if count != planes or bounds != sorted(bounds) or bounds[0] < 64:
@@ -182,7 +191,7 @@ def _decode_rle(layout: PixelLayout, codestream: bytes) -> Pixels:
 
 
 def _unpack_bits(segment: bytes, size: int) -> bytearray:
-    """At most ``size`` bytes of one segment, PS3.5 G.3.2."""
+    """Return at most ``size`` bytes of one segment, PS3.5 G.3.2."""
     unpacked = bytearray()
     position, end = 0, len(segment)
     while position < end and len(unpacked) < size:

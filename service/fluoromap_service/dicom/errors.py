@@ -1,4 +1,4 @@
-"""Why a DICOM file was refused: a closed list of codes, each with its HTTP status."""
+"""The problems of DICOM files: a closed list of codes, each with its HTTP status."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from fluoromap_service.problem import Problem
 
 
 class DicomCode(StrEnum):
-    """Stable codes of a refusal.
+    """Stable codes of the problems of DICOM files.
 
-    The status says who has to act: 400 and 413 the sender's transfer or archive, 415 the sender's choice of file, 422
-    the modality's export settings.
+    The status shows what to change: 400 and 413 the transfer or the archive, 415 the choice of the file, 422 the export
+    settings of the modality.
     """
 
     NOT_DICOM = "not_dicom"
@@ -19,11 +19,11 @@ class DicomCode(StrEnum):
     NO_PART10_HEADER = "no_part10_header"
     """A bare data set: the preamble and file meta information of PS3.10 section 7.1 are missing (415)."""
     MALFORMED = "malformed"
-    """The header cannot be parsed, or lacks an attribute every object has (400)."""
+    """The header is damaged, or lacks an attribute that every object has (400)."""
     TRUNCATED = "truncated"
-    """The file ends before what it announces (400)."""
+    """The file ends before its announced end (400)."""
     PIXEL_DATA_MISMATCH = "pixel_data_mismatch"
-    """Pixel data is whole but is not what NumberOfFrames, Rows, Columns and BitsAllocated announce (400)."""
+    """Pixel data is whole but contradicts NumberOfFrames, Rows, Columns or BitsAllocated (400)."""
     HEADER_TOO_LARGE = "header_too_large"
     """The attributes before the pixel data exceed every sensible size (413)."""
     FRAME_TOO_LARGE = "frame_too_large"
@@ -37,11 +37,11 @@ class DicomCode(StrEnum):
     UNSUPPORTED_PIXELS = "unsupported_pixels"
     """Colour, signed or otherwise unusual pixels (422)."""
     UNDECODABLE = "undecodable"
-    """A transfer syntax this service cannot decode, or a frame that does not decode (422)."""
+    """A transfer syntax that this service cannot decode, or a frame that does not decode (422)."""
 
     @property
     def status(self) -> int:
-        """HTTP status of the refusal."""
+        """HTTP status of the problem."""
         return _STATUS[self]
 
 
@@ -62,14 +62,14 @@ _STATUS: dict[DicomCode, int] = {
 
 
 def dicom_problem(code: DicomCode, message: str, where: str | None = None) -> Problem:
-    """Return the problem of a DICOM file that cannot be used.
+    """Return the problem of a DICOM file that the service cannot use.
 
     Parameters
     ----------
     code : DicomCode
         Stable code; its ``status`` is the HTTP status.
     message : str
-        One sentence for a PACS engineer: what is wrong and what to do. It holds no file name and no value that could
+        One sentence for a PACS engineer: what is wrong and what to do. It contains no file name and no value that could
         identify a patient.
     where : str, optional
         The DICOM keyword at fault.

@@ -1,4 +1,4 @@
-"""What the service keeps of one DICOM instance: a run's geometry, timing and pixels, nothing of the patient."""
+"""The facts of one DICOM instance: a run's geometry, timing and pixels, without patient data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _UID = re.compile(r"[0-9]+(\.[0-9]+)*")
 
 
 class HeaderWarning(StrEnum):
-    """What in a header is odd but can be lived with. ``sentence`` tells it to a PACS engineer."""
+    """Oddities of a header that the service can work with; ``sentence`` explains them to a PACS engineer."""
 
     FRAME_TIME_ASSUMED = "frame_time_assumed"
     PIXEL_SPACING_FROM_FIELD_OF_VIEW = "pixel_spacing_from_field_of_view"
@@ -39,42 +39,43 @@ class HeaderWarning(StrEnum):
 
     @property
     def sentence(self) -> str:
+        """The warning in a sentence."""
         return _SENTENCES[self]
 
 
 _SENTENCES: dict[HeaderWarning, str] = {
-    HeaderWarning.FRAME_TIME_ASSUMED: "The header tells no frame rate; 15 frames a second are assumed.",
+    HeaderWarning.FRAME_TIME_ASSUMED: "The header has no frame rate; the service assumes 15 frames a second.",
     HeaderWarning.PIXEL_SPACING_FROM_FIELD_OF_VIEW: (
-        "ImagerPixelSpacing is missing; FieldOfViewDimensions divided by the matrix size is used."
+        "ImagerPixelSpacing is missing; the service uses FieldOfViewDimensions divided by the matrix size."
     ),
     HeaderWarning.PIXEL_SPACING_FROM_INTENSIFIER: (
-        "ImagerPixelSpacing is missing; IntensifierSize divided by the matrix size is used."
+        "ImagerPixelSpacing is missing; the service uses IntensifierSize divided by the matrix size."
     ),
     HeaderWarning.SOURCE_ISOCENTRE_FROM_MAGNIFICATION: (
-        "DistanceSourceToPatient is missing; it was computed from EstimatedRadiographicMagnificationFactor."
+        "DistanceSourceToPatient is missing; the service computes it from EstimatedRadiographicMagnificationFactor."
     ),
-    HeaderWarning.GEOMETRY_IMPLAUSIBLE: "A geometry attribute holds what no C-arm can do; it counts as missing.",
+    HeaderWarning.GEOMETRY_IMPLAUSIBLE: "A geometry attribute has a value that no C-arm can have; it counts as missing.",
     HeaderWarning.ORIENTATION_CONFLICT: (
-        "PatientOrientation contradicts FieldOfViewRotation or FieldOfViewHorizontalFlip; the field of view is believed."
+        "PatientOrientation contradicts FieldOfViewRotation or FieldOfViewHorizontalFlip; the service uses the field of view."
     ),
     HeaderWarning.ORIENTATION_UNUSABLE: (
-        "PatientOrientation or the field of view's rotation does not fit the gantry angles; an upright image is assumed."
+        "PatientOrientation or FieldOfViewRotation does not fit the gantry angles; the service assumes an upright image."
     ),
-    HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; only its first position is used.",
+    HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; the service uses its first position only.",
     HeaderWarning.TABLE_MOVED: "The table moved during this run.",
     HeaderWarning.PIXEL_INTENSITY_UNKNOWN: (
-        "PixelIntensityRelationship is missing; the pixels are taken as prepared for display."
+        "PixelIntensityRelationship is missing; the service assumes pixels prepared for display."
     ),
-    HeaderWarning.BITS_STORED_EXCEEDED: "The pixels use more bits than BitsStored tells; the larger number is used.",
-    HeaderWarning.PIXEL_DATA_LONGER: "There is more pixel data than NumberOfFrames tells; the rest is ignored.",
-    HeaderWarning.SHUTTER_IGNORED: "A shutter or collimator attribute makes no sense and is ignored.",
-    HeaderWarning.R_WAVES_IGNORED: "RWavePointer names frames that do not exist; those are ignored.",
+    HeaderWarning.BITS_STORED_EXCEEDED: "The pixels use more bits than BitsStored says; the service uses the larger number.",
+    HeaderWarning.PIXEL_DATA_LONGER: "There is more pixel data than NumberOfFrames says; the service ignores the rest.",
+    HeaderWarning.SHUTTER_IGNORED: "A shutter or collimator attribute makes no sense; the service ignores it.",
+    HeaderWarning.R_WAVES_IGNORED: "RWavePointer names frames that do not exist; the service ignores them.",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class InstanceFacts:
-    """One run as its file describes it.
+    """One run by the header of its file.
 
     Parameters
     ----------
@@ -88,24 +89,24 @@ class InstanceFacts:
     frame_time_ms : float
         Mean interval; 0 for a single frame.
     acquired : datetime or None
-        Start of the run, UTC. A clock time without zone in the file is taken as UTC: it orders runs, no more.
+        Start of the run, UTC. A time without zone in the file counts as UTC: it serves to order runs only.
     plane : {"single", "A", "B"}
         Plane of a biplane system.
     primary_deg, secondary_deg, source_detector_mm, source_isocentre_mm, pixel_spacing_mm
-        Gantry values as in :class:`fluoromap.geometry.Gantry`; None where the header does not tell.
+        Gantry values as in :class:`fluoromap.geometry.Gantry`; None where the header has no value.
     image_axes : ImageAxes
         Upright to stored offsets, as in :class:`fluoromap.geometry.Gantry`.
     patient_orientation : tuple of str or None
         PatientOrientation's row and column direction, for :func:`image_axes_from_orientation` once angles are known.
     table_mm : tuple of float or None
-        Table top (lateral, longitudinal, vertical) in the machine's own frame: only differences between runs mean anything.
+        Table top (lateral, longitudinal, vertical) in the machine's own frame; only differences between runs have a meaning.
     pixels : PixelFacts
     window : tuple of float or None
         The file's display window (centre, width) in stored values.
     r_wave_frames : tuple of int
         Frames of R waves, from 0.
     missing : tuple of str
-        DICOM keywords of gantry values that neither the header nor a substitute told.
+        DICOM keywords of gantry values that neither the header nor a substitute gives.
     warnings : tuple of HeaderWarning
 
     Raises
@@ -144,7 +145,7 @@ class InstanceFacts:
     def __post_init__(self) -> None:
         uids = (self.sop_class_uid, self.sop_instance_uid, self.study_instance_uid, self.series_instance_uid)
         if not all(is_uid(uid) for uid in uids):
-            raise ValueError("an instance needs valid UIDs")
+            raise ValueError("an instance needs valid UIDs: digits and dots, at most 64 characters")
         if min(self.frames, self.rows, self.columns) < 1:
             raise ValueError("a run has at least one frame of at least one pixel")
         times = self.frame_times_ms
@@ -156,7 +157,7 @@ class InstanceFacts:
             raise ValueError("r_wave_frames must be frames of the run")
 
     def to_json(self) -> dict[str, Any]:
-        """All fields as JSON types; :meth:`from_json` takes it back."""
+        """Return all fields as JSON types, for :meth:`from_json`."""
         value = dataclasses.asdict(self)
         value["acquired"] = self.acquired.isoformat() if self.acquired else None
         value["warnings"] = [str(warning) for warning in self.warnings]
@@ -165,7 +166,7 @@ class InstanceFacts:
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> InstanceFacts:
-        """The instance that :meth:`to_json` wrote."""
+        """Return the instance that :meth:`to_json` wrote."""
         fields: dict[str, Any] = {key: _tuples(item) for key, item in value.items()}
         pixels = dict(fields["pixels"])
         shutter = pixels["shutter"]
@@ -182,7 +183,10 @@ class InstanceFacts:
 
 
 def is_uid(value: str) -> bool:
-    """Whether ``value`` is a UID of PS3.5 section 9.1 (leading zeros are let pass: real systems write them)."""
+    """Return whether ``value`` is a UID of PS3.5 section 9.1.
+
+    Leading zeros pass, because real systems write them.
+    """
     return len(value) <= 64 and _UID.fullmatch(value) is not None
 
 

@@ -1,4 +1,4 @@
-"""The frames of a stored run, decoded one at a time."""
+"""The frames of a stored run, decoded frame by frame."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fluoromap.drawing.png import encode_png
 from fluoromap_service.dicom.codestream import Pixels, decode, largest_codestream
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.facts import InstanceFacts, Pair
-from fluoromap_service.dicom.header import read_header, truncated
+from fluoromap_service.dicom.header import read_header, truncation_problem
 from fluoromap_service.dicom.pixel_layout import NATIVE, PixelLayout, pixel_layout
 
 
 class DicomFrames:
-    """A :class:`fluoromap.contracts.FrameSource` over one file; holds where each frame lies, never more than one frame.
+    """A :class:`fluoromap.contracts.FrameSource` over one file.
 
-    It keeps no file open: it can be passed to another thread or process.
+    It knows the place of each frame in the file, and decodes a frame when it is asked for. It keeps no file open, so that it
+    can go to another thread or process.
     """
 
     def __init__(self, path: Path, layout: PixelLayout) -> None:
@@ -35,13 +37,13 @@ class DicomFrames:
         return self._layout.frames
 
     def __getitem__(self, index: int) -> Pixels:
-        """Stored pixels of frame ``index`` (from 0), shape (rows, columns), uint8 or uint16.
+        """Return the stored pixels of frame ``index`` (from 0), (rows, columns) uint8 or uint16.
 
         Raises
         ------
         IndexError
         Problem
-            ``undecodable`` or ``pixel_data_mismatch`` for a frame that is broken inside.
+            ``undecodable`` or ``pixel_data_mismatch`` for a damaged frame.
         """
         if not 0 <= index < len(self):
             raise IndexError(f"the run has {len(self)} frames")
@@ -55,32 +57,40 @@ class DicomFrames:
 
 
 def open_frames(path: Path, facts: InstanceFacts) -> DicomFrames:
-    """The frames of the file whose facts these are.
+    """Return the frames of a file with these facts.
 
     Raises
     ------
     Problem
-        When the file is no longer what it was when ``facts`` were read.
+        ``pixel_data_mismatch`` when the file no longer fits the facts.
     """
     with path.open("rb") as file:
         layout = pixel_layout(file, read_header(file), [])
     if (layout.frames, layout.rows, layout.columns) != (facts.frames, facts.rows, facts.columns):
-        raise dicom_problem(DicomCode.PIXEL_DATA_MISMATCH, "The file changed since it was received.", "PixelData")
+        raise dicom_problem(
+            DicomCode.PIXEL_DATA_MISMATCH,
+            "The stored file has changed since its upload; restore it from a backup.",
+            "PixelData",
+        )
     return DicomFrames(path, layout)
 
 
 def read_frame(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
-    """Stored pixels of one frame from an open file."""
+    """Return the stored pixels of one frame of an open file."""
     if layout.transfer_syntax in NATIVE:
         pixels: Pixels = np.empty((layout.rows, layout.columns), dtype=f"<u{layout.bits_allocated // 8}")
         ((offset, _),) = layout.extents[index]
         file.seek(offset)
         if file.readinto(pixels.data) != pixels.nbytes:
-            raise truncated("PixelData")
+            raise truncation_problem("PixelData")
         return pixels
     extents = layout.extents[index]
     if sum(length for _, length in extents) > largest_codestream(layout):
-        raise dicom_problem(DicomCode.PIXEL_DATA_MISMATCH, "A compressed frame is larger than its pixels.", "PixelData")
+        raise dicom_problem(
+            DicomCode.PIXEL_DATA_MISMATCH,
+            "A compressed frame is larger than its pixels; export the run again.",
+            "PixelData",
+        )
     pieces = []
     for offset, length in extents:
         file.seek(offset)
@@ -89,15 +99,17 @@ def read_frame(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
 
 
 def frame_to_8bit(pixels: Pixels, facts: InstanceFacts, window: Pair | None = None) -> NDArray[np.uint8]:
-    """A frame for display: 0 black, 255 white, dark catheters dark, in the stored orientation.
+    """Return a frame for display, (rows, columns) uint8, in the stored orientation.
+
+    0 is black and 255 is white; catheters are dark.
 
     Parameters
     ----------
     pixels : (rows, columns)
         Stored pixels.
     window : tuple of float, optional
-        (centre, width) in stored values, the linear function of PS3.3 C.11.2.1.2.1. Without it the file's own window,
-        else the frame's 0.5th to 99.5th percentile.
+        (centre, width) in stored values, the linear function of PS3.3 C.11.2.1.2.1. By default the file's own window,
+        otherwise the frame's 0.5th to 99.5th percentile.
     """
     chosen = window or facts.window
     if chosen is None:
@@ -110,3 +122,8 @@ def frame_to_8bit(pixels: Pixels, facts: InstanceFacts, window: Pair | None = No
     shown = np.clip(np.rint(scaled), 0, 255)
     display: NDArray[np.uint8] = (255 - shown if facts.pixels.monochrome1 else shown).astype(np.uint8)
     return display
+
+
+def frame_png(path: Path, facts: InstanceFacts, frame: int, window: Pair | None) -> bytes:
+    """Return frame ``frame`` (from 0) of a file as a greyscale PNG; ``window`` as in :func:`frame_to_8bit`."""
+    return encode_png(frame_to_8bit(open_frames(path, facts)[frame], facts, window))

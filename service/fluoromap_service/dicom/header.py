@@ -1,4 +1,4 @@
-"""Reading the attributes before the pixel data, in bounded memory and without believing a single length."""
+"""The attributes before the pixel data, read in bounded memory and with a check of every length."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from pydicom.uid import (
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.problem import Problem
 
-# pydicom's warnings quote the values they complain about, and a damaged header may have anyone's name in any place.
+# pydicom's warnings quote values, and a damaged header may have a person's name in any place.
 config.settings.reading_validation_mode = config.IGNORE
 
 HEADER_BYTES = 16 * 2**20
-"""An Enhanced XA run of 1000 frames needs about 2 MB of functional groups."""
+"""Largest header; an Enhanced XA run of 1000 frames has about 2 MB of functional groups."""
 HEADER_READS = 250_000
 SEQUENCE_ITEMS = 50_000
 UNDEFINED_LENGTH = 0xFFFFFFFF
@@ -81,24 +81,24 @@ def _tag(keyword: str) -> BaseTag:
     return Tag(tag)
 
 
-# Only these are ever read: what identifies the patient stays in the file.
+# The service reads only these: patient data stays in the file.
 _WANTED: list[BaseTag | int] = [_tag(keyword) for keyword in (*_PLAIN, *_MACRO_OF, *_FRAME_GROUPS)]
 
 
 @dataclass(frozen=True, slots=True)
 class PixelElement:
-    """Where the top-level PixelData value lies in the file: offset and announced length in bytes."""
+    """The place of the top-level PixelData value in the file: offset and announced length in bytes."""
 
     offset: int
     length: int
 
 
 class Header:
-    """The wanted attributes of one instance.
+    """The attributes of one instance that the service reads.
 
-    An attribute that an Enhanced object keeps in a functional group is looked up by its own keyword: in the data set
-    itself, then in the group shared by all frames, then in the first frame's. An optional attribute whose value cannot be
-    read counts as absent.
+    An Enhanced object keeps some attributes in functional groups. A look-up by keyword takes the first value of these places:
+    the data set itself, the group shared by all frames, the first frame's group. An optional attribute with an unreadable
+    value counts as absent.
     """
 
     def __init__(self, dataset: Dataset, transfer_syntax: str, pixel_element: PixelElement | None, size: int) -> None:
@@ -110,48 +110,60 @@ class Header:
         self._groups = [*shared[:1], *self._per_frame[:1]]
 
     def numbers(self, keyword: str) -> tuple[float, ...]:
-        """All values of a numeric attribute; empty when it is absent, empty, unreadable or not finite."""
+        """Return all values of a numeric attribute.
+
+        There are none when it is absent, empty, unreadable or not finite.
+        """
         for dataset in self._places(keyword):
             if values := self._numbers(dataset, keyword):
                 return values
         return ()
 
     def holds(self, keyword: str) -> bool:
-        """Whether an attribute is there and not empty, readable or not."""
+        """Return whether an attribute exists and is not empty, readable or not."""
         return any(self._value(dataset, keyword) not in (None, "", b"") for dataset in self._places(keyword))
 
     def number(self, keyword: str) -> float | None:
-        """The first value of a numeric attribute."""
+        """Return the first value of a numeric attribute."""
         values = self.numbers(keyword)
         return values[0] if values else None
 
     def integer(self, keyword: str) -> int | None:
-        """The first value of an attribute that counts something; None also when it is not a whole number."""
+        """Return the first value of an attribute that counts.
+
+        None also when it is not a whole number.
+        """
         value = self.number(keyword)
         return int(value) if value is not None and value == int(value) else None
 
     def texts(self, keyword: str) -> tuple[str, ...]:
-        """All values of a text or UID attribute, stripped; empty when absent or unreadable."""
+        """Return all values of a text or UID attribute, stripped.
+
+        There are none when it is absent or unreadable.
+        """
         for dataset in self._places(keyword):
             if values := self._texts(dataset, keyword):
                 return values
         return ()
 
     def text(self, keyword: str) -> str:
-        """The first value of a text attribute, "" when absent."""
+        """Return the first value of a text attribute, "" when absent."""
         values = self.texts(keyword)
         return values[0] if values else ""
 
     def numbers_per_frame(self, keyword: str) -> list[tuple[float, ...]]:
-        """The values each frame's own functional groups hold; empty for objects without such groups."""
+        """Return the values in each frame's own functional groups.
+
+        There are none for objects without such groups.
+        """
         return [self._numbers(item, keyword) for item in self._macro_items(keyword)]
 
     def texts_per_frame(self, keyword: str) -> list[tuple[str, ...]]:
-        """As :meth:`numbers_per_frame`, for text."""
+        """Return texts as :meth:`numbers_per_frame` returns numbers."""
         return [self._texts(item, keyword) for item in self._macro_items(keyword)]
 
     def tags(self, keyword: str) -> tuple[int, ...]:
-        """The values of an attribute that points to others (VR AT)."""
+        """Return the values of an attribute that refers to other attributes (VR AT)."""
         return tuple(int(value) for value in _values(self._value(self._dataset, keyword)) if isinstance(value, int))
 
     def _places(self, keyword: str) -> Iterator[Dataset]:
@@ -169,13 +181,15 @@ class Header:
         if tag not in dataset:
             return []
         raw = dataset.get_item(tag)
-        # pydicom builds an object of about 2 kB for each item, however empty.
+        # pydicom makes an object of about 2 kB for each item, even for an empty one.
         if (
             isinstance(raw, RawDataElement)
             and raw.value is not None
             and raw.value.count(b"\xfe\xff\x00\xe0") > SEQUENCE_ITEMS
         ):
-            raise dicom_problem(DicomCode.HEADER_TOO_LARGE, f"{keyword} holds too many items.", keyword)
+            raise dicom_problem(
+                DicomCode.HEADER_TOO_LARGE, f"{keyword} has too many items; export the run again.", keyword
+            )
         items = self._value(dataset, keyword)
         return list(items) if items is not None and not isinstance(items, str | bytes) else []
 
@@ -195,8 +209,8 @@ class Header:
         tag = _tag(keyword)
         if tag not in dataset:
             return None
-        # Converting a value raises nearly anything, from ValueError to struct.error; an optional value is then absent,
-        # and the caller complains about one it needs.
+        # The conversion of a damaged value raises nearly anything, from ValueError to struct.error. The value then counts
+        # as absent, and the caller reports a value that it needs.
         try:
             return dataset[tag].value
         except Problem:
@@ -217,7 +231,10 @@ def _values(value: Any) -> list[Any]:
 
 
 class _BoundedReader:
-    """A file that refuses to be read beyond its end or beyond a budget. Remembers why: pydicom hides some exceptions."""
+    """A file with a limit on reading: its end, and a budget.
+
+    It remembers the problem, because pydicom hides some exceptions.
+    """
 
     def __init__(self, file: BufferedReader) -> None:
         self._file = file
@@ -230,13 +247,14 @@ class _BoundedReader:
         self._reads -= 1
         if count < 0 or self._bytes < 0 or self._reads < 0:
             self.problem = dicom_problem(
-                DicomCode.HEADER_TOO_LARGE, "The attributes before the pixel data are too large for an image."
+                DicomCode.HEADER_TOO_LARGE,
+                "The attributes before the pixel data are too large for an image; export the run without private data.",
             )
             raise self.problem
         value = self._file.read(count)
-        # pydicom asks for the 8 bytes of the next element's header to find out whether the file is at its end.
+        # pydicom asks for the 8 bytes of the next element's header to detect the end of the file.
         if len(value) < count and not (count == 8 and not value):
-            self.problem = truncated()
+            self.problem = truncation_problem()
             raise self.problem
         return value
 
@@ -247,15 +265,13 @@ class _BoundedReader:
         return self._file.tell()
 
 
-def truncated(where: str | None = None) -> Problem:
-    """The refusal of a file that ends too early."""
-    return dicom_problem(
-        DicomCode.TRUNCATED, "The file ends before what it announces; the transfer was cut short, send it again.", where
-    )
+def truncation_problem(where: str | None = None) -> Problem:
+    """Return the problem of a file that ends too early."""
+    return dicom_problem(DicomCode.TRUNCATED, "The file ends before its announced end; send it again.", where)
 
 
 def read_header(file: BufferedReader) -> Header:
-    """The wanted attributes of a DICOM file, and where its pixel data lies.
+    """Read the attributes of a DICOM file, and the place of its pixel data.
 
     Parameters
     ----------
@@ -265,8 +281,8 @@ def read_header(file: BufferedReader) -> Header:
     Raises
     ------
     Problem
-        ``not_dicom``, ``no_part10_header``, ``malformed``, ``truncated``, ``header_too_large``, and ``undecodable`` for
-        transfer syntaxes whose header cannot be read in bounded memory.
+        ``not_dicom``, ``no_part10_header``, ``malformed``, ``truncated``, ``header_too_large``. ``undecodable`` for transfer
+        syntaxes whose header needs unbounded memory.
 
     References
     ----------
@@ -286,8 +302,8 @@ def read_header(file: BufferedReader) -> Header:
         if reader.problem is not None:
             raise reader.problem from None
         if reader.tell() >= size:
-            raise truncated() from None
-        raise dicom_problem(DicomCode.MALFORMED, "The DICOM header cannot be parsed.") from error
+            raise truncation_problem() from None
+        raise dicom_problem(DicomCode.MALFORMED, "The DICOM header is damaged; export the run again.") from error
 
 
 def _parse(reader: _BoundedReader, size: int) -> Header:
@@ -299,7 +315,9 @@ def _parse(reader: _BoundedReader, size: int) -> Header:
     syntax = str(meta.get("TransferSyntaxUID", "")).strip(" \0")
     if not syntax:
         raise dicom_problem(
-            DicomCode.MALFORMED, "The file meta information has no TransferSyntaxUID.", "TransferSyntaxUID"
+            DicomCode.MALFORMED,
+            "The file meta information has no TransferSyntaxUID; export the run again.",
+            "TransferSyntaxUID",
         )
     if syntax in (DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian):
         name = "Deflated" if syntax == DeflatedExplicitVRLittleEndian else "Big Endian"
@@ -316,7 +334,7 @@ def _parse(reader: _BoundedReader, size: int) -> Header:
             found.append(PixelElement(reader.tell(), length))
             return True
         if length != UNDEFINED_LENGTH and reader.tell() + length > size:
-            raise truncated()
+            raise truncation_problem()
         return False
 
     dataset = read_dataset(
@@ -332,4 +350,4 @@ def _no_preamble(start: bytes) -> Problem:
             DicomCode.NO_PART10_HEADER,
             "This looks like a bare DICOM data set; export it as a DICOM file with preamble and file meta information.",
         )
-    return dicom_problem(DicomCode.NOT_DICOM, "This is not a DICOM file.")
+    return dicom_problem(DicomCode.NOT_DICOM, "This is not a DICOM file; send DICOM files only.")

@@ -1,4 +1,4 @@
-"""What the stored numbers mean: intensity relationship, bits, display window, and the part that was exposed."""
+"""The meaning of the stored pixels: intensity relationship, bits, display window and shutter."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ _Circle = tuple[float, float, float]
 
 
 def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warnings: list[HeaderWarning]) -> PixelFacts:
-    """Meaning of the pixels; ``bits_stored`` as measured, which BitsStored (0028,0101) need not be.
+    """Return the meaning of the pixels.
 
-    PixelIntensityRelationship (0028,1040): LIN, LOG or DISP, PS3.3 C.8.7.1.1.2.
+    ``bits_stored`` is measured, because BitsStored (0028,0101) may be wrong. PixelIntensityRelationship (0028,1040) is LIN,
+    LOG or DISP, PS3.3 C.8.7.1.1.2. GE also writes DRM: prepared for display, with a compressed dynamic range.
     """
     relationship = header.text("PixelIntensityRelationship")
-    if relationship not in ("LIN", "LOG", "DISP"):
+    if relationship not in ("LIN", "LOG", "DISP", "DRM"):
         warnings.append(HeaderWarning.PIXEL_INTENSITY_UNKNOWN)
     return PixelFacts(
         logarithmic=relationship != "LIN",
@@ -27,22 +28,28 @@ def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warni
 
 
 def window(header: Header) -> Pair | None:
-    """The first display window (centre, width), WindowCenter (0028,1050) and WindowWidth (0028,1051)."""
+    """Return the first display window (centre, width): WindowCenter (0028,1050), WindowWidth (0028,1051)."""
     centre, width = header.number("WindowCenter"), header.number("WindowWidth")
     return (centre, width) if centre is not None and width is not None and width >= 1 else None
 
 
 def r_wave_frames(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[int, ...]:
-    """Frames of R waves from 0, ascending; RWavePointer (0028,6040) counts from 1."""
-    told = {int(value) - 1 for value in header.numbers("RWavePointer")}
-    inside = tuple(sorted(frame for frame in told if 0 <= frame < frames))
-    if len(inside) < len(told):
+    """Return the frames of R waves, counted from 0, ascending.
+
+    RWavePointer (0028,6040) counts from 1.
+    """
+    pointers = {int(value) - 1 for value in header.numbers("RWavePointer")}
+    inside = tuple(sorted(frame for frame in pointers if 0 <= frame < frames))
+    if len(inside) < len(pointers):
         warnings.append(HeaderWarning.R_WAVES_IGNORED)
     return inside
 
 
 def _shutter(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> Shutter | None:
-    """Collimator (0018,1700) ff. and display shutter (0018,1600) ff., PS3.3 C.8.7.4 and C.7.6.11; both count from 1."""
+    """Return the exposed part of the image, in pixels from 0.
+
+    Collimator (0018,1700) ff. and display shutter (0018,1600) ff., PS3.3 C.8.7.4 and C.7.6.11; both count from 1.
+    """
     rectangle: _Rectangle | None = None
     circle: _Circle | None = None
     polygon: tuple[Pair, ...] | None = None

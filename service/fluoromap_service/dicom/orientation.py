@@ -1,7 +1,7 @@
-"""How the stored image lies: flips and quarter turns, from the header and into it.
+"""The orientation of the stored image: flips and quarter turns, from the header and into it.
 
-An image is upright when a frontal view shows the patient's left on its right and the head on top (SCIENCE: e_u, e_v);
-``image_axes`` takes offsets (u, v) of that image to offsets of the stored one.
+An image is upright when a frontal view shows the patient's left on its right and the head on top: its axes are the first two
+of :func:`fluoromap.geometry.view_axes`. ``image_axes`` takes offsets (u, v) of that image to offsets of the stored image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fluoromap.geometry.gantry import UPRIGHT, ImageAxes, view_axes
 Array = NDArray[np.float64]
 
 _LETTERS = {"L": (0, 1), "R": (0, -1), "P": (1, 1), "A": (1, -1), "H": (2, 1), "F": (2, -1)}
-# A direction is named by its main letter and those of further axes it leans to by more than about 12 degrees.
+# The name of a direction has its main letter, and the letters of axes to which it leans by more than about 12 degrees.
 _LEAN = 0.2
 # PatientOrientation names directions to within about 30 degrees in each axis.
 _AGREEMENT = 0.6
@@ -27,9 +27,10 @@ _FLIP: Array = np.array([[-1, 0], [0, 1]], dtype=np.float64)
 
 
 def image_axes_from_field_of_view(rotation_deg: float, flipped: bool) -> ImageAxes | None:
-    """FieldOfViewRotation (0018,7032), clockwise, then FieldOfViewHorizontalFlip (0018,7034).
+    """Return the image axes of a field of view.
 
-    PS3.3 C.8.11.4. None when the rotation is no quarter turn: such an image has no pixel axes of its own.
+    First FieldOfViewRotation (0018,7032), clockwise, then FieldOfViewHorizontalFlip (0018,7034); PS3.3 C.8.11.4. None when the
+    rotation is no multiple of 90 degrees.
     """
     turns = rotation_deg / 90
     if turns != round(turns):
@@ -39,17 +40,19 @@ def image_axes_from_field_of_view(rotation_deg: float, flipped: bool) -> ImageAx
 
 
 def field_of_view_of(image_axes: ImageAxes) -> tuple[int, bool]:
-    """(FieldOfViewRotation, FieldOfViewHorizontalFlip) that mean ``image_axes``."""
+    """Return FieldOfViewRotation and FieldOfViewHorizontalFlip of image axes."""
     for turns, flipped in itertools.product(range(4), (False, True)):
         if image_axes_from_field_of_view(90.0 * turns, flipped) == image_axes:
             return 90 * turns, flipped
-    raise ValueError("image_axes must be a flip, a quarter turn or both")
+    raise ValueError(
+        f"image_axes is {image_axes}; it must be a turn by 0, 90, 180 or 270 degrees, with or without a flip"
+    )
 
 
 def image_axes_from_orientation(
     orientation: Sequence[str], primary_deg: float, secondary_deg: float
 ) -> ImageAxes | None:
-    """The flip or turn under which the upright image's directions agree best with PatientOrientation (0020,0020).
+    """Return the image axes that agree best with PatientOrientation (0020,0020).
 
     Parameters
     ----------
@@ -64,20 +67,20 @@ def image_axes_from_orientation(
     named = [_direction(letters) for letters in orientation]
     if len(named) != 2 or named[0] is None or named[1] is None:
         return None
-    told = np.stack([named[0], named[1]])
+    letters = np.stack([named[0], named[1]])
     upright = view_axes(primary_deg, secondary_deg)[:2]
     candidates = [
         np.linalg.matrix_power(_TURN, turns) if not flip else _FLIP @ np.linalg.matrix_power(_TURN, turns)
         for flip in (False, True)
         for turns in range(4)
     ]
-    agreements = [np.sum(told * (axes @ upright), axis=1) for axes in candidates]
+    agreements = [np.sum(letters * (axes @ upright), axis=1) for axes in candidates]
     best = max(range(len(candidates)), key=lambda index: float(agreements[index].sum()))
     return _as_axes(candidates[best]) if agreements[best].min() >= _AGREEMENT else None
 
 
 def patient_orientation(primary_deg: float, secondary_deg: float, image_axes: ImageAxes = UPRIGHT) -> tuple[str, str]:
-    """PatientOrientation (0020,0020) of a stored image."""
+    """Return PatientOrientation (0020,0020) of a stored image."""
     rows, columns = np.array(image_axes, dtype=np.float64) @ view_axes(primary_deg, secondary_deg)[:2]
     return _letters(rows), _letters(columns)
 

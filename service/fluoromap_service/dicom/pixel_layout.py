@@ -1,4 +1,4 @@
-"""How the pixels of one instance lie in its file: checked against the file's bytes, nothing decoded, nothing loaded."""
+"""The place of each frame in its file, checked against the file's bytes without decoding or loading pixels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydicom import uid
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.facts import HeaderWarning
-from fluoromap_service.dicom.header import UNDEFINED_LENGTH, Header, truncated
+from fluoromap_service.dicom.header import UNDEFINED_LENGTH, Header, truncation_problem
 from fluoromap_service.problem import Problem
 
 LARGEST_SIDE = 8192
@@ -32,16 +32,16 @@ Extent = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class PixelLayout:
-    """Size and encoding of the frames, and where each lies.
+    """Size and encoding of the frames, and the place of each.
 
     Parameters
     ----------
     rows, columns, frames : int
     bits_allocated, bits_stored : int
-        As the header tells.
+        By the header.
     transfer_syntax : str
     extents : tuple of tuple of Extent
-        For each frame the pieces of the file that make it up, in order.
+        For each frame its pieces of the file, in order.
     """
 
     rows: int
@@ -59,12 +59,12 @@ class PixelLayout:
 
 
 def syntax_name(transfer_syntax: str) -> str:
-    """Name of a transfer syntax for messages; an unknown one is named by its UID."""
+    """Return the name of a transfer syntax for messages; the UID where the syntax is unknown."""
     return uid.UID(transfer_syntax).name
 
 
 def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarning]) -> PixelLayout:
-    """Check what the header announces against the bytes that are there, and find every frame.
+    """Check the header against the bytes of the file, and find every frame.
 
     Raises
     ------
@@ -80,11 +80,13 @@ def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarn
     bits_allocated, bits_stored = _bits(header)
     element, syntax = header.pixel_element, header.transfer_syntax
     if element is None or element.length == 0:
-        raise dicom_problem(DicomCode.NO_PIXEL_DATA, "The object holds no image (no PixelData).", "PixelData")
+        raise dicom_problem(
+            DicomCode.NO_PIXEL_DATA, "The object has no image (no PixelData); send a run with pixels.", "PixelData"
+        )
     if syntax not in DECODABLE:
         raise dicom_problem(
             DicomCode.UNDECODABLE,
-            f"Transfer syntax {syntax_name(syntax)} cannot be decoded; send uncompressed, RLE, JPEG, JPEG-LS or JPEG 2000.",
+            f"The service cannot decode transfer syntax {syntax_name(syntax)}; send uncompressed, RLE, JPEG, JPEG-LS or JPEG 2000.",
             "TransferSyntaxUID",
         )
     if syntax in NATIVE:
@@ -100,11 +102,15 @@ def _size(header: Header) -> tuple[int, int, int]:
     frames = _count(header, "NumberOfFrames") if header.holds("NumberOfFrames") else 1
     if max(rows, columns) > LARGEST_SIDE:
         raise dicom_problem(
-            DicomCode.FRAME_TOO_LARGE, f"Frames larger than {LARGEST_SIDE} pixels a side are not accepted.", "Rows"
+            DicomCode.FRAME_TOO_LARGE,
+            f"The frames are larger than {LARGEST_SIDE} pixels a side; send a smaller matrix.",
+            "Rows",
         )
     if frames > MOST_FRAMES:
         raise dicom_problem(
-            DicomCode.TOO_MANY_FRAMES, f"Runs of more than {MOST_FRAMES} frames are not accepted.", "NumberOfFrames"
+            DicomCode.TOO_MANY_FRAMES,
+            f"The run has more than {MOST_FRAMES} frames; send a shorter one.",
+            "NumberOfFrames",
         )
     return rows, columns, frames
 
@@ -112,7 +118,9 @@ def _size(header: Header) -> tuple[int, int, int]:
 def _count(header: Header, keyword: str) -> int:
     value = header.integer(keyword)
     if value is None or value < 1:
-        raise dicom_problem(DicomCode.MALFORMED, f"{keyword} is missing or not a positive number.", keyword)
+        raise dicom_problem(
+            DicomCode.MALFORMED, f"{keyword} is missing or not a positive number; export the run again.", keyword
+        )
     return value
 
 
@@ -123,19 +131,27 @@ def _bits(header: Header) -> tuple[int, int]:
     ):
         raise dicom_problem(
             DicomCode.UNSUPPORTED_PIXELS,
-            "Only grey-scale images (MONOCHROME1, MONOCHROME2) can be used.",
+            "The image is not greyscale; send MONOCHROME1 or MONOCHROME2.",
             "PhotometricInterpretation",
         )
     allocated = header.integer("BitsAllocated")
     if allocated not in (8, 16):
-        raise dicom_problem(DicomCode.UNSUPPORTED_PIXELS, "Only 8 or 16 bits a pixel can be used.", "BitsAllocated")
+        raise dicom_problem(
+            DicomCode.UNSUPPORTED_PIXELS,
+            "The pixels have neither 8 nor 16 bits; set BitsAllocated to one of these.",
+            "BitsAllocated",
+        )
     stored = header.integer("BitsStored") or allocated
     if not 1 <= stored <= allocated or header.integer("HighBit") not in (stored - 1, None):
         raise dicom_problem(
-            DicomCode.UNSUPPORTED_PIXELS, "BitsStored and HighBit do not fit BitsAllocated.", "BitsStored"
+            DicomCode.UNSUPPORTED_PIXELS,
+            "BitsStored and HighBit do not fit BitsAllocated; export the run again.",
+            "BitsStored",
         )
     if header.integer("PixelRepresentation") not in (0, None):
-        raise dicom_problem(DicomCode.UNSUPPORTED_PIXELS, "Signed pixels cannot be used.", "PixelRepresentation")
+        raise dicom_problem(
+            DicomCode.UNSUPPORTED_PIXELS, "The pixels are signed; send unsigned pixels.", "PixelRepresentation"
+        )
     return allocated, stored
 
 
@@ -150,13 +166,13 @@ def _native_extents(
     assert element is not None
     announced = frames * frame_bytes
     if element.length == UNDEFINED_LENGTH:
-        raise _mismatch("Uncompressed PixelData has no length.", "PixelData")
+        raise _mismatch("Uncompressed PixelData has no length; export the run again.", "PixelData")
     if element.length < announced:
         raise _mismatch(
-            f"PixelData holds {element.length} bytes, but NumberOfFrames, Rows and Columns announce {announced}."
+            f"PixelData has {element.length} bytes, but NumberOfFrames, Rows and Columns announce {announced}; send it again."
         )
     if element.offset + element.length > header.file_size:
-        raise truncated("PixelData")
+        raise truncation_problem("PixelData")
     if element.length > announced + announced % 2:
         warnings.append(HeaderWarning.PIXEL_DATA_LONGER)
     return tuple(((element.offset + frame * frame_bytes, frame_bytes),) for frame in range(frames))
@@ -164,7 +180,7 @@ def _native_extents(
 
 @dataclass(frozen=True, slots=True)
 class _Fragments:
-    """The pieces of encapsulated pixel data: the basic offset table, and value offset and length of each fragment."""
+    """The pieces of encapsulated pixel data: the basic offset table, and offset and length of each fragment's value."""
 
     offset_table: tuple[int, ...]
     extents: tuple[Extent, ...]
@@ -182,23 +198,31 @@ def _fragments(file: BufferedReader, header: Header) -> _Fragments:
         file.seek(position)
         start = file.read(8)
         if len(start) < 8:
-            raise truncated("PixelData")
+            raise truncation_problem("PixelData")
         group, number, length = struct.unpack("<HHL", start)
         position += 8
         if (group, number) == _DELIMITER:
             break
         if (group, number) != _ITEM or length == UNDEFINED_LENGTH:
-            raise dicom_problem(DicomCode.MALFORMED, "The compressed PixelData is not made of items.", "PixelData")
+            raise dicom_problem(
+                DicomCode.MALFORMED,
+                "The compressed PixelData does not consist of items; export the run again.",
+                "PixelData",
+            )
         if position + length > header.file_size:
-            raise truncated("PixelData")
+            raise truncation_problem("PixelData")
         if table is None:
             if length > 4 * MOST_FRAMES:
-                raise dicom_problem(DicomCode.MALFORMED, "The offset table is too long.", "PixelData")
+                raise dicom_problem(
+                    DicomCode.MALFORMED, "The offset table is too long; export the run again.", "PixelData"
+                )
             table = struct.unpack(f"<{length // 4}L", file.read(length // 4 * 4))
         elif length:
             extents.append((position, length))
             if len(extents) > _MOST_FRAGMENTS:
-                raise dicom_problem(DicomCode.MALFORMED, "PixelData has too many fragments.", "PixelData")
+                raise dicom_problem(
+                    DicomCode.MALFORMED, "PixelData has too many fragments; export the run again.", "PixelData"
+                )
         position += length
     return _Fragments(table or (), tuple(extents))
 
@@ -206,19 +230,23 @@ def _fragments(file: BufferedReader, header: Header) -> _Fragments:
 def _group(
     file: BufferedReader, fragments: _Fragments, frames: int, syntax: str, warnings: list[HeaderWarning]
 ) -> tuple[tuple[Extent, ...], ...]:
-    """Which fragments belong to which frame: one each; else as the offset table tells; else a frame begins where a
-    compressed image does (PS3.5 A.4: a fragment never holds parts of two frames).
+    """Return the fragments of each frame.
+
+    With as many fragments as frames, each frame has one. Otherwise the offset table divides them; without a usable table a
+    frame begins at each start of a compressed image (PS3.5 A.4: a fragment never contains parts of two frames).
     """
     extents = fragments.extents
     if len(extents) < frames:
-        raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData holds {len(extents)} fragments.")
+        raise _mismatch(
+            f"NumberOfFrames announces {frames} frames, but PixelData has {len(extents)} fragments; send it again."
+        )
     if len(extents) == frames:
         return tuple((extent,) for extent in extents)
     if frames == 1 and len(fragments.offset_table) <= 1:
         return (extents,)
     starts = _starts_by_table(fragments) or _starts_by_signature(file, extents, syntax)
     if len(starts) < frames:
-        raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData holds {len(starts)}.")
+        raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData has {len(starts)}; send it again.")
     if len(starts) > frames:
         warnings.append(HeaderWarning.PIXEL_DATA_LONGER)
     ends = [*starts[1:], len(extents)]
@@ -226,7 +254,10 @@ def _group(
 
 
 def _starts_by_table(fragments: _Fragments) -> list[int]:
-    """Number of the first fragment of each frame; empty when the table is empty or names places where none begins."""
+    """Return the number of each frame's first fragment.
+
+    The list is empty when the table is empty or wrong.
+    """
     table, extents = fragments.offset_table, fragments.extents
     if not table or table[0] != 0:
         return []

@@ -1,4 +1,4 @@
-"""Where gantry and table stood, as far as the header tells."""
+"""Positions of gantry and table by the header."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _STILL_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class GantryFacts:
-    """The gantry values of a header, None where it does not tell; fields as in ``InstanceFacts``."""
+    """The gantry values of a header, None where it has none; fields as in ``InstanceFacts``."""
 
     primary_deg: float | None
     secondary_deg: float | None
@@ -26,23 +26,23 @@ class GantryFacts:
 
 
 def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> GantryFacts:
-    """Gantry values of legacy XA (PS3.3 C.8.7.5, C.8.7.3) or Enhanced XA (C.8.19.6), each checked for what a C-arm can do.
+    """Return the gantry values of legacy XA (PS3.3 C.8.7.5, C.8.7.3) or Enhanced XA (C.8.19.6).
 
-    A distance of 0, which some systems write for "unknown", counts as absent.
+    A value that no C-arm can have counts as absent. So does a distance of 0, which some systems write for "unknown".
     """
     primary = _within(header.number("PositionerPrimaryAngle"), -180, 180, warnings)
     secondary = _within(header.number("PositionerSecondaryAngle"), -90, 90, warnings)
     detector = _within(header.number("DistanceSourceToDetector") or None, LEAST_SOURCE_MM, 3000, warnings)
     isocentre = _source_isocentre_mm(header, detector, warnings)
     spacing = _pixel_spacing_mm(header, rows, columns, warnings)
-    told = {
+    values = {
         "PositionerPrimaryAngle": primary,
         "PositionerSecondaryAngle": secondary,
         "DistanceSourceToDetector": detector,
         "DistanceSourceToPatient": isocentre,
         "ImagerPixelSpacing": spacing,
     }
-    missing = tuple(keyword for keyword, value in told.items() if value is None)
+    missing = tuple(keyword for keyword, value in values.items() if value is None)
     return GantryFacts(primary, secondary, detector, isocentre, spacing, missing)
 
 
@@ -60,8 +60,8 @@ def _warn(warnings: list[HeaderWarning], warning: HeaderWarning) -> None:
 
 def _source_isocentre_mm(header: Header, detector_mm: float | None, warnings: list[HeaderWarning]) -> float | None:
     farthest = detector_mm - 1e-3 if detector_mm else 3000
-    told = header.number("DistanceSourceToIsocenter") or header.number("DistanceSourceToPatient") or None
-    isocentre = _within(told, LEAST_SOURCE_MM, farthest, warnings)
+    distance = header.number("DistanceSourceToIsocenter") or header.number("DistanceSourceToPatient") or None
+    isocentre = _within(distance, LEAST_SOURCE_MM, farthest, warnings)
     if isocentre is not None or detector_mm is None:
         return isocentre
     # ERMF = SID / SOD, PS3.3 C.8.7.5.
@@ -73,13 +73,14 @@ def _source_isocentre_mm(header: Header, detector_mm: float | None, warnings: li
 
 
 def _pixel_spacing_mm(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> Pair | None:
-    """Row and column spacing at the detector. PixelSpacing (0028,0030) is never used: it may be divided by the
-    magnification already.
+    """Return row and column spacing at the detector.
+
+    The service never uses PixelSpacing (0028,0030), because some systems divide it by the magnification.
     """
-    told = header.numbers("ImagerPixelSpacing")
-    if len(told) == 2 and any(told):
-        if all(0.01 <= value <= 5 for value in told):
-            return told[0], told[1]
+    stated = header.numbers("ImagerPixelSpacing")
+    if len(stated) == 2 and any(stated):
+        if all(0.01 <= value <= 5 for value in stated):
+            return stated[0], stated[1]
         _warn(warnings, HeaderWarning.GEOMETRY_IMPLAUSIBLE)
     substitutes = (
         (
@@ -91,8 +92,7 @@ def _pixel_spacing_mm(header: Header, rows: int, columns: int, warnings: list[He
     for warning, size in substitutes:
         if not 1 <= len(size) <= 2:
             continue
-        # Which of two dimensions lies along the rows is read both ways in practice: pixels are square, so take the
-        # order that makes them so.
+        # Systems write the two dimensions in either order. Pixels are square: take the order that makes them square.
         orders = ((size[0], size[-1]), (size[-1], size[0]))
         height, width = min(orders, key=lambda order: abs(order[0] * columns - order[1] * rows))
         spacing = height / rows, width / columns
@@ -103,7 +103,10 @@ def _pixel_spacing_mm(header: Header, rows: int, columns: int, warnings: list[He
 
 
 def image_axes(header: Header, gantry: GantryFacts, warnings: list[HeaderWarning]) -> ImageAxes:
-    """Upright to stored offsets, from the field of view's rotation and flip, else from PatientOrientation."""
+    """Return the image axes.
+
+    They follow from the field of view's rotation and flip, otherwise from PatientOrientation.
+    """
     by_view = _by_field_of_view(header, warnings)
     orientation = orientation_letters(header)
     by_patient: ImageAxes | None = None
@@ -127,15 +130,15 @@ def _by_field_of_view(header: Header, warnings: list[HeaderWarning]) -> ImageAxe
 
 
 def orientation_letters(header: Header) -> tuple[str, str] | None:
-    """PatientOrientation (0020,0020) as two strings of letters, None when absent."""
+    """Return PatientOrientation (0020,0020) as two strings of letters; None when absent."""
     letters = header.texts("PatientOrientation")
     return (letters[0], letters[1]) if len(letters) == 2 and all(letters) else None
 
 
 def table_mm(header: Header) -> tuple[float, float, float] | None:
-    """Table top (lateral, longitudinal, vertical) in the machine's frame, where the header tells all three.
+    """Return the table top (lateral, longitudinal, vertical) in the machine's frame; None unless all three exist.
 
-    (300A,0128) to (300A,012A), else the Enhanced objects' table position to the isocentre (0018,9466) to (0018,9468).
+    (300A,0128) to (300A,012A), otherwise the Enhanced objects' table position to the isocentre (0018,9466) to (0018,9468).
     """
     for keywords in (
         ("TableTopLateralPosition", "TableTopLongitudinalPosition", "TableTopVerticalPosition"),
@@ -148,8 +151,10 @@ def table_mm(header: Header) -> tuple[float, float, float] | None:
 
 
 def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
-    """Warn when gantry or table moved during the run: increments of legacy XA (0018,1520), (0018,1521), (0018,1135) to
-    (0018,1137), or differing functional groups.
+    """Warn when gantry or table moved during the run.
+
+    Legacy XA has increments (0018,1520), (0018,1521), (0018,1135) to (0018,1137); Enhanced XA has functional groups that
+    differ between frames.
     """
     gantry_moved = any(
         _spread(header, f"{axis}Increment", axis) > _STILL_DEG
@@ -168,7 +173,11 @@ def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
 
 
 def _spread(header: Header, increments: str, *per_frame: str) -> float:
-    """Largest distance from the first frame: legacy increments are relative to the first frame already."""
+    """Return the largest change of a value during the run.
+
+    Legacy XA gives each frame's difference from the first frame (``increments``): the largest absolute value counts.
+    Enhanced XA gives the value of each frame (``per_frame``): the largest value less the smallest counts.
+    """
     spreads = [max((abs(value) for value in header.numbers(increments)), default=0.0)]
     for keyword in per_frame:
         values = [numbers[0] for numbers in header.numbers_per_frame(keyword) if numbers]

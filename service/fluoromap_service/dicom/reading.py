@@ -1,4 +1,4 @@
-"""One DICOM file to the facts of a run, or to the reason why not."""
+"""Read one DICOM file into the facts of a run, with all checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fluoromap_service.dicom.header import Header, read_header
 from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
 from fluoromap_service.dicom.pixel_layout import PixelLayout, pixel_layout
 from fluoromap_service.dicom.positioner import gantry_facts, image_axes, orientation_letters, table_mm, warn_of_motion
-from fluoromap_service.dicom.timing import acquired, frame_times_ms
+from fluoromap_service.dicom.timing import acquisition_time, frame_times_ms
 from fluoromap_service.problem import Problem
 
 _PROJECTIONS = frozenset(
@@ -33,7 +33,7 @@ _PROJECTIONS = frozenset(
         EnhancedXRFImageStorage,
     }
 )
-# Archives and workstations save XA runs as secondary captures; the modality still tells what they are.
+# Archives and workstations save XA runs as secondary captures; the modality is still XA or RF.
 _CAPTURES = frozenset(
     {
         SecondaryCaptureImageStorage,
@@ -44,9 +44,10 @@ _CAPTURES = frozenset(
 
 
 def read_instance(path: Path) -> InstanceFacts:
-    """Read and check one file; every fault that can be found without decoding all frames is found here.
+    """Read and check one file.
 
-    The first frame is decoded as a proof. Memory does not grow with the file.
+    The function finds every fault that does not need all frames decoded. It decodes the first frame. Memory does not grow
+    with the file.
 
     Raises
     ------
@@ -74,13 +75,13 @@ def _check_kind(header: Header) -> None:
         raise _lacks("SOPClassUID")
     raise dicom_problem(
         DicomCode.NOT_XA,
-        "Only X-ray angiographic (XA) and radiofluoroscopic (RF) runs can be used; this object is of another kind.",
+        "This object is no X-ray angiographic (XA) or radiofluoroscopic (RF) run; send XA or RF.",
         "SOPClassUID",
     )
 
 
 def _lacks(keyword: str) -> Problem:
-    return dicom_problem(DicomCode.MALFORMED, f"{keyword} is missing or invalid.", keyword)
+    return dicom_problem(DicomCode.MALFORMED, f"{keyword} is missing or invalid; export the run again.", keyword)
 
 
 def _bits_used(file: BufferedReader, layout: PixelLayout) -> int:
@@ -107,7 +108,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
         transfer_syntax=layout.transfer_syntax,
         frame_times_ms=times,
         frame_time_ms=times[-1] / (frames - 1) if frames > 1 else 0.0,
-        acquired=acquired(header),
+        acquired=acquisition_time(header),
         plane=_plane(header),
         primary_deg=gantry.primary_deg,
         secondary_deg=gantry.secondary_deg,
@@ -133,9 +134,12 @@ def _uid(header: Header, keyword: str) -> str:
 
 
 def _plane(header: Header) -> Plane:
-    """ImageType (0008,0008) value 3 of legacy XA, PS3.3 C.8.7.1.1.1; PlaneIdentification (0018,9457) of Enhanced XA."""
+    """Return the plane of a biplane system.
+
+    ImageType (0008,0008) value 3 of legacy XA, PS3.3 C.8.7.1.1.1; PlaneIdentification (0018,9457) of Enhanced XA.
+    """
     image_type = header.texts("ImageType")
-    told = {*image_type[2:3], header.text("PlaneIdentification")}
-    if told & {"BIPLANE A", "PLANE A"}:
+    names = {*image_type[2:3], header.text("PlaneIdentification")}
+    if names & {"BIPLANE A", "PLANE A"}:
         return "A"
-    return "B" if told & {"BIPLANE B", "PLANE B"} else "single"
+    return "B" if names & {"BIPLANE B", "PLANE B"} else "single"

@@ -1,4 +1,4 @@
-"""A simulated study as files: what a stranger would send, and beside it the truth."""
+"""A simulated study as files: DICOM runs and activation times as a user sends them, and the truth."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy, Study
 from fluoromap_service.dicom import deterministic_uid, write_cine
 
 STARTED = datetime(2026, 1, 5, 9, 0, tzinfo=UTC)
-"""When every simulated study begins."""
+"""The start of every simulated study."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedFiles:
-    """Where the files of a simulated study stand; ``truth`` is never to be uploaded."""
+    """The files of a simulated study; never upload ``truth``."""
 
     runs: tuple[Path, ...]
     activation_times: Path
@@ -42,13 +42,13 @@ def simulate(
     Parameters
     ----------
     folder : Path
-        Made when it does not exist; files of an earlier simulation are replaced.
+        The function makes the folder and replaces the files of an earlier simulation.
     spec : StudySpec
         The same spec gives the same files.
     processes : int, optional
-        How many render at the same time; by default one a processor.
+        Number of processes that render; by default one a processor.
     on_run : callable
-        Called after each run that was written.
+        Called after each written run.
 
     Raises
     ------
@@ -80,9 +80,9 @@ def simulate(
 
 
 def truth_of(study: SimulatedStudy) -> dict[str, Any]:
-    """What a perfect pipeline would answer, as JSON types.
+    """Return the answers of a perfect pipeline, as JSON types.
 
-    Millimetres along LPS axes; ``relative_mm`` from the reference catheter's mean, everything else from the isocentre.
+    Millimetres along LPS axes. ``relative_mm`` counts from the reference catheter's mean, everything else from the isocentre.
     """
     chamber = study.chamber
     return {
@@ -121,7 +121,7 @@ def _run_path(folder: Path, site: SimulatedSite, run: SimulatedRun) -> Path:
 
 def _write_run(study: SimulatedStudy, number: int, view: int, path: Path) -> None:
     run = study.sites[number].runs[view]
-    # Another renderer makes other pixels, and other pixels must not come under a known UID.
+    # Another version of the renderer makes other pixels, and other pixels need another UID.
     names = ("simulated-study", version("fluoromap"), repr(study.spec))
     series_number = 2 * number + view + 1
     write_cine(

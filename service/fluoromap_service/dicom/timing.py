@@ -1,4 +1,4 @@
-"""When a run was acquired, and when each of its frames."""
+"""The times of a run and of its frames."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _CLOCK = re.compile(r"(\d{4})\.?(\d\d)\.?(\d\d)(\d\d)?:?(\d\d)?:?(\d\d)?(?:\.(\d
 
 
 def frame_times_ms(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[float, ...]:
-    """Time of each frame from the first on, in ms, never falling.
+    """Return the time of each frame from the first on, in ms, never falling.
 
-    FrameIncrementPointer (0028,0009) chooses between FrameTime (0018,1063) and FrameTimeVector (0018,1065), PS3.3 C.7.6.5;
-    after them come the frames' own clock times (Enhanced objects), CineRate and RecommendedDisplayFrameRate.
+    FrameIncrementPointer (0028,0009) chooses between FrameTime (0018,1063) and FrameTimeVector (0018,1065), PS3.3 C.7.6.5.
+    Without these the function takes, in this order: the frames' own clock times (Enhanced objects), CineRate,
+    RecommendedDisplayFrameRate.
     """
     if frames == 1:
         return (0.0,)
@@ -44,7 +45,7 @@ def _frame_time(header: Header, frames: int) -> tuple[float, ...] | None:
 
 
 def _frame_time_vector(header: Header, frames: int) -> tuple[float, ...] | None:
-    # One increment a frame, the first one 0; some writers leave the first one out.
+    # One increment a frame, of which the first is 0; some systems leave the first out.
     vector = header.numbers("FrameTimeVector")
     increments = vector[1:] if len(vector) == frames else vector
     if len(increments) != frames - 1 or not all(0 < value <= _LONGEST_INTERVAL_MS for value in increments):
@@ -73,8 +74,11 @@ def _frame_rate(header: Header, frames: int) -> tuple[float, ...] | None:
     return None
 
 
-def acquired(header: Header) -> datetime | None:
-    """Start of the run, UTC: the first of AcquisitionDateTime and the Acquisition, Content and Series date and time."""
+def acquisition_time(header: Header) -> datetime | None:
+    """Return the start of the run in UTC.
+
+    The first that exists of AcquisitionDateTime, and of the Acquisition, Content and Series date and time.
+    """
     zone = _zone(header.text("TimezoneOffsetFromUTC")) or UTC
     for text in _clock_texts(header):
         if clock := _clock(text, zone):

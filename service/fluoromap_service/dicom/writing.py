@@ -1,4 +1,4 @@
-"""Writing a run as a multi-frame X-Ray Angiographic Image, frame by frame."""
+"""Write a run as a multi-frame X-Ray Angiographic Image, frame by frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ _UNDEFINED_LENGTH = 0xFFFFFFFF
 
 
 def deterministic_uid(*names: str) -> str:
-    """The same UID for the same names, under the root 2.25 (PS3.5 annex B.2: a UUID as one number)."""
+    """Return a UID that depends on the names only.
+
+    It is under the root 2.25 (PS3.5 annex B.2: a UUID as one number).
+    """
     return f"2.25.{uuid.uuid5(uuid.NAMESPACE_URL, '/'.join(('urn:fluoromap', *names))).int}"
 
 
@@ -47,7 +50,7 @@ def write_cine(
     """Write a simulated cine run; memory does not grow with the number of frames.
 
     The object is a complete X-Ray Angiographic Image (PS3.3 A.14), Explicit VR Little Endian, with linear intensities and
-    a patient that is plainly none. The file appears under its name when it is whole.
+    a patient named SIMULATED^PHANTOM. The file gets its name when it is whole.
 
     Parameters
     ----------
@@ -55,16 +58,16 @@ def write_cine(
     frames : iterable of (rows, columns) uint16 arrays
         Stored pixels, each below ``2**bits_stored``.
     frame_count : int
-        Number of frames; it stands in the header before the first frame is asked for.
+        Number of frames; the header comes before the first frame.
     gantry : Gantry
-        Where the run was taken; gives Rows, Columns, PatientOrientation and all positioner attributes.
+        Gives Rows, Columns, PatientOrientation and all positioner attributes.
     frame_time_ms : float
     acquired : datetime
         Start of the run; with a time zone.
     study_instance_uid, sop_instance_uid : str
     series_number : int
     series_instance_uid : str, optional
-        By default made from the study's UID and the series number.
+        By default a UID of the study's UID and the series number.
     bits_stored : int
         9 to 16.
     plane : {"single", "A", "B"}
@@ -74,7 +77,7 @@ def write_cine(
     Raises
     ------
     ValueError
-        When a frame, or their number, is not what was announced.
+        When a frame, or the number of frames, differs from the announced one.
     """
     frame_bytes = gantry.rows * gantry.columns * 2
     if frame_count < 1 or frame_count * frame_bytes >= _UNDEFINED_LENGTH:
@@ -110,7 +113,7 @@ def write_cine(
                     break
                 file.write(np.ascontiguousarray(frame, dtype="<u2").data)
         if written != frame_count:
-            raise ValueError(f"{frame_count} frames were announced, but there are fewer or more")
+            raise ValueError(f"{frame_count} frames are announced, but there are fewer or more")
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -119,7 +122,7 @@ def write_cine(
 def _identify(
     dataset: Dataset, acquired: datetime, study_uid: str, series_uid: str, series_number: int, sop_uid: str
 ) -> None:
-    """Patient, study, series, equipment and SOP common modules."""
+    """Set the patient, study, series, equipment and SOP common modules."""
     date, time = acquired.strftime("%Y%m%d"), acquired.strftime("%H%M%S.%f")
     dataset.SpecificCharacterSet = "ISO_IR 192"
     dataset.SOPClassUID = XRayAngiographicImageStorage
@@ -152,7 +155,10 @@ def _identify(
 def _image_module(
     gantry: Gantry, frames: int, frame_time_ms: float, bits_stored: int, plane: Plane, r_wave_frames: tuple[int, ...]
 ) -> Dataset:
-    """Image pixel, multi-frame, cine and X-ray image and acquisition modules (PS3.3 C.7.6.3 to C.7.6.6, C.8.7.1, C.8.7.2)."""
+    """Return the pixel, multi-frame, cine, X-ray image and acquisition modules.
+
+    PS3.3 C.7.6.3 to C.7.6.6, C.8.7.1, C.8.7.2.
+    """
     dataset = Dataset()
     dataset.ImageType = ["ORIGINAL", "PRIMARY", _PLANES[plane]]
     dataset.SamplesPerPixel = 1
@@ -180,7 +186,7 @@ def _image_module(
 
 
 def _positioner(dataset: Dataset, gantry: Gantry) -> None:
-    """XA positioner and table modules and the field of view (PS3.3 C.8.7.5, C.8.7.6, C.8.11.4)."""
+    """Set the XA positioner and table modules and the field of view (PS3.3 C.8.7.5, C.8.7.6, C.8.11.4)."""
     rotation, flipped = field_of_view_of(gantry.image_axes)
     dataset.PatientOrientation = list(patient_orientation(gantry.primary_deg, gantry.secondary_deg, gantry.image_axes))
     dataset.PositionerMotion = "STATIC"

@@ -221,7 +221,8 @@ def cancel(session: Session, job_id: str) -> bool:
 def reap(session: Session) -> int:
     """Free the stages whose workers fell silent and return how many.
 
-    After its last attempt a stage fails.
+    This is the retry after a crash. A stage whose worker crashed becomes ready, so that a worker can try again. It fails after
+    its last attempt. It is cancelled when somebody has cancelled the job.
     """
     expired = session.execute(
         select(StageRow.id, StageRow.job_id)
@@ -229,7 +230,7 @@ def reap(session: Session) -> int:
         .order_by(StageRow.job_id, StageRow.id)
     ).all()
     for stage_id, job_id in expired:
-        # A transaction that holds the job now either renews the lease or is another reaper.
+        # A transaction that holds the job now renews the lease, or is another reaper. Skip the stage until the next sweep.
         free = session.scalar(select(Job.id).where(Job.id == job_id).with_for_update(skip_locked=True))
         if free is None:
             continue
@@ -311,7 +312,7 @@ def _settle(session: Session, job: Job) -> None:
     The caller holds the lock of the job's row.
     """
     rows = _stages(session, job.id)
-    broken = [row for row in rows if row.state == StageState.FAILED and STAGES[row.name].fails == "job"]
+    broken = _broken(rows)
     if broken:
         job.error = job.error or {"subject": broken[0].name, **(broken[0].error or {})}
         lost = {name for row in broken for name in after(STAGES[row.name].name)}
@@ -329,6 +330,16 @@ def _settle(session: Session, job: Job) -> None:
             job.state = JobState.FAILED if broken else JobState.SUCCEEDED
         job.finished = session.scalar(select(db_now()))
         _report_job(session, job)
+
+
+def _broken(rows: Sequence[StageRow]) -> list[StageRow]:
+    """Return the failed stages that fail the job: without their results nothing can follow."""
+    failed = [row for row in rows if row.state == StageState.FAILED]
+    alive = {row.name for row in rows if row.state != StageState.FAILED}
+    return [
+        row for row in failed
+        if STAGES[row.name].fails == "job" or (row.name not in alive and after(STAGES[row.name].name))
+    ]  # fmt: skip
 
 
 def _stages(session: Session, job_id: str) -> Sequence[StageRow]:

@@ -34,7 +34,8 @@ class Stage:
     title : str
         What a progress bar calls it.
     fails : "job" or "subject"
-        Whether its failure fails the whole job, or only the run or site that it is about.
+        Whether its failure fails the whole job, or only the run or site that it is about. When all stages of a row fail
+        that others depend on, the job fails too.
     """
 
     name: StageName
@@ -68,10 +69,10 @@ def plugin_of(stage: Stage, snapshot: Snapshot) -> PluginSnapshot:
 
 
 def subjects_of(stage: Stage, snapshot: Snapshot) -> list[str]:
-    """Return the runs, sites or study that a job has such stages for.
+    """Return the subjects of a stage, one for each of its rows.
 
-    They come in the order in which they begin. Runs with corrections come first: after a correction only they are
-    computed again, and everything waits for them.
+    A subject is a run, a site or the study. They come in the order in which their stages begin. Runs with corrections
+    come first: after a correction only they are computed again, and everything waits for them.
     """
     if stage.subject == "run":
         used = {uid for site in snapshot.sites for uid in (site.view_a, site.view_b)}

@@ -23,7 +23,11 @@ Dependencies = dict[str, Any]
 """JSON values."""
 
 _BY_HASH = frozenset({"facts", "chamber", "covariances_mm2"})
-"""Fields of a fusion that other values imply: the hash of the file, the hash of the map, and the look."""
+"""Fields of a fusion that other dependencies replace.
+
+The hash of the run's file replaces ``facts``, and the hash of the map replaces ``chamber``. The look says whether a picture
+shows ``covariances_mm2``; they are the same in all pictures of a job.
+"""
 
 
 def overlay_dependencies(fusion: Fusion, look: Look, *, moving: bool) -> Dependencies:
@@ -51,7 +55,9 @@ def mesh_dependencies(map_sha256: str, mesh_format: str, origin: Origin) -> Depe
     }
 
 
-def report_dependencies(template_sha256: str, job_version: int, label: str | None) -> Dependencies:
+def report_dependencies(
+    template_sha256: str, job_version: int, label: str | None, guessed_sites: tuple[str, ...]
+) -> Dependencies:
     """Return the dependencies of a job's report, which prints the version of the package."""
     return {
         "kind": "report",
@@ -60,6 +66,7 @@ def report_dependencies(template_sha256: str, job_version: int, label: str | Non
         "template": template_sha256,
         "job": job_version,
         "label": label,
+        "guessed_sites": list(guessed_sites),
     }
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
+from fluoromap_service.jobs.pipeline import StageName
 from fluoromap_service.jobs.stage_results import stage_of
 from fluoromap_service.problem import Problem, not_found
-from fluoromap_service.store.models import Job, StageRow, StageState
+from fluoromap_service.store.models import ENDED_JOB, Job, StageRow, StageState
 from fluoromap_service.study.snapshot import Snapshot
 
 RETRY_SECONDS = 2
@@ -26,12 +27,33 @@ def job_of(session: Session, job_id: str) -> Job:
     return job
 
 
+def ended_job_of(session: Session, job_id: str, result: str) -> Job:
+    """Return a job that has ended.
+
+    Parameters
+    ----------
+    session : Session
+    job_id : str
+    result : str
+        What the caller makes of the job, for the sentence of the problem: "report".
+
+    Raises
+    ------
+    Problem
+        404 when there is no such job; 409 ``not_ready`` while the job runs.
+    """
+    job = job_of(session, job_id)
+    if job.state not in ENDED_JOB:
+        raise _not_ready(f"The {result} is available when the job has ended; follow the job and ask again.", wait=True)
+    return job
+
+
 def snapshot_of(job: Job) -> Snapshot:
     """Return the frozen input of a job."""
     return Snapshot.model_validate(job.snapshot)
 
 
-def done_stage(session: Session, job: Job, name: str, subject: str | None = None) -> StageRow:
+def done_stage(session: Session, job: Job, name: StageName, subject: str | None = None) -> StageRow:
     """Return a stage that is done.
 
     Raises
@@ -42,14 +64,17 @@ def done_stage(session: Session, job: Job, name: str, subject: str | None = None
     stage = stage_of(session, job.id, name, subject)
     if stage is not None and stage.state == StageState.DONE and stage.result is not None:
         return stage
-    raise not_ready(job, name, stage)
+    raise stage_not_ready(job, name, stage)
 
 
-def not_ready(job: Job, name: str, stage: StageRow | None) -> Problem:
-    """Return the 409 for a result whose stage is not done yet, or will never be."""
+def stage_not_ready(job: Job, name: StageName, stage: StageRow | None) -> Problem:
+    """Return the 409 for a result whose stage is not done.
+
+    The stage is not done yet, or will never be.
+    """
     if stage is not None and stage.state in (StageState.PENDING, StageState.READY, StageState.RUNNING):
-        wait = f"The stage '{name}', which makes this result, is not done yet; follow the job and ask again."
-        return Problem(409, "not_ready", wait, headers={"Retry-After": str(RETRY_SECONDS)})
+        detail = f"The stage '{name}', which makes this result, is not done yet; follow the job and ask again."
+        return _not_ready(detail, wait=True)
     if stage is not None and stage.state == StageState.FAILED:
         cause = (stage.error or {}).get("detail", f"The stage '{name}' failed.")
     elif job.error is not None:
@@ -58,4 +83,10 @@ def not_ready(job: Job, name: str, stage: StageRow | None) -> Problem:
         cause = f"Somebody cancelled the job before its stage '{name}' was done."
     else:
         cause = f"The job has no result of the stage '{name}'."
-    return Problem(409, "not_ready", f"{cause} Start a new job to get this result.")
+    return _not_ready(f"{cause} Start a new job to get this result.", wait=False)
+
+
+def _not_ready(detail: str, *, wait: bool) -> Problem:
+    """Return the 409 ``not_ready``; ``Retry-After`` only where waiting helps."""
+    headers = {"Retry-After": str(RETRY_SECONDS)} if wait else {}
+    return Problem(409, "not_ready", detail, headers=headers)

@@ -137,7 +137,10 @@ def _located_views(triangulation: Triangulation, snapshot: Snapshot) -> list[Loc
 
 
 def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]:
-    """Return the covariance of each site's mapping tip, relative to the reference catheter where that is located."""
+    """Return the covariance of each site's mapping tip.
+
+    It is relative to the reference catheter where that is located.
+    """
     tips = {site.site: site.point(mapping, 1) for site in triangulation.sites}
     return {
         site: tip.covariance_mm2 if tip.relative_covariance_mm2 is None else tip.relative_covariance_mm2
@@ -149,7 +152,10 @@ def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]
 def _tracked_reference_mm(
     session: Session, job: Job, snapshot: Snapshot, site: LocatedSite, view: View, frame: int
 ) -> Array | None:
-    """Return the reference catheter's position (3,) by the view's track; None in frames that do not show it."""
+    """Return the reference catheter's position (3,) by the view's track.
+
+    None in frames that do not show it.
+    """
     stage = stage_of(session, job.id, "monoplane", site.site)
     if stage is None or stage.state != StageState.DONE:
         return None

@@ -8,10 +8,12 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Array, ChamberMap
+from fluoromap.reasons import Reason
 from fluoromap_service.jobs.stage_results import MapResult, load
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import done_stage
 from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.row_order import warnings_of
 from fluoromap_service.store.models import Job
 
 
@@ -21,15 +23,19 @@ class FinishedMap:
 
     chamber : relative to the reference catheter. reference_mm : (3,) mean position of that catheter over the sites, from the
     isocentre; None where no site has a located reference catheter, and then the map counts from the isocentre. sha256 : hash
-    of the stored result.
+    of the stored result. warnings : of the map and of the job.
     """
 
     chamber: ChamberMap
     reference_mm: Array | None
     sha256: str
+    warnings: tuple[Reason, ...]
 
     def shift_mm(self, origin: Origin) -> Array:
-        """Return the vector (3,) to add to the map's coordinates so that they count from ``origin``."""
+        """Return the vector (3,) to add to the map's coordinates.
+
+        The sums count from ``origin``.
+        """
         if origin is Origin.REFERENCE or self.reference_mm is None:
             return np.zeros(3)
         return self.reference_mm
@@ -49,4 +55,5 @@ def map_of(session: Session, job: Job) -> FinishedMap:
         reasons = {"reasons": [str(outcome.refused)]} if outcome.refused else {}
         raise Problem(409, "no_map", outcome.message or "The sites of this study support no map.", extra=reasons)
     reference_mm = None if outcome.reference_mm is None else np.array(outcome.reference_mm)
-    return FinishedMap(outcome.chamber, reference_mm, str(stage.result))
+    warnings = (*outcome.chamber.warnings, *warnings_of(session, job))
+    return FinishedMap(outcome.chamber, reference_mm, str(stage.result), warnings)

@@ -7,7 +7,7 @@ from enum import StrEnum
 from fluoromap_service.results.dependencies import mesh_dependencies
 from fluoromap_service.results.maps import FinishedMap
 from fluoromap_service.results.origins import Origin
-from fluoromap_service.store.renderings import Rendered, rendered
+from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
 
 class MeshFormat(StrEnum):
@@ -31,7 +31,7 @@ MESH_MEDIA_TYPES = {
 }
 
 
-def mesh_of(job_id: str, finished: FinishedMap, mesh_format: MeshFormat, origin: Origin) -> Rendered:
+def mesh_of(job_id: str, finished: FinishedMap, mesh_format: MeshFormat, origin: Origin) -> KeptFile:
     """Return the kept mesh file of a map; make it when there is none."""
 
     def make() -> bytes:
@@ -39,5 +39,4 @@ def mesh_of(job_id: str, finished: FinishedMap, mesh_format: MeshFormat, origin:
 
         return mesh_bytes(finished.chamber, mesh_format.value, finished.shift_mm(origin))
 
-    depends_on = mesh_dependencies(finished.sha256, mesh_format, origin)
-    return rendered(job_id, depends_on, MESH_MEDIA_TYPES[mesh_format], make)
+    return kept_rendering(job_id, mesh_dependencies(finished.sha256, mesh_format, origin), make)

@@ -54,7 +54,10 @@ def alternative_positions(
 
 
 def _alternative_reference_mm(site: LocatedSite, reference: str) -> Array | None:
-    """Return the mean (3,) of the reference catheter under the other pairing, which may move this catheter too."""
+    """Return the reference catheter's mean (3,) under the other pairing.
+
+    That pairing may move this catheter too.
+    """
     places = [
         point.position_mm if point.alternative_mm is None else point.alternative_mm
         for point in site.points

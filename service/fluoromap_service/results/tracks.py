@@ -14,7 +14,7 @@ from fluoromap.monoplane.track_samples import FrameOrigins, Sample, isocentre_or
 from fluoromap.reasons import Reason
 from fluoromap_service.jobs.stage_results import SiteTracks, load, stages_of
 from fluoromap_service.problem import not_found
-from fluoromap_service.results.finished import done_stage, not_ready, snapshot_of
+from fluoromap_service.results.finished import done_stage, snapshot_of, stage_not_ready
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.store.models import Job, StageRow, StageState
 
@@ -94,7 +94,7 @@ def _site(
         yield from (RejectedView(stage.subject, view, (Reason.PLUGIN_FAILED,), message) for view in views)
         return
     if stage.state != StageState.DONE:
-        raise not_ready(job, "monoplane", stage)
+        raise stage_not_ready(job, "monoplane", stage)
     site = next((entry for entry in triangulation.sites if entry.site == stage.subject), None)
     site_reasons = next((entry.reasons for entry in triangulation.rejected if entry.site == stage.subject), ())
     for result in load(SiteTracks, stage).views:

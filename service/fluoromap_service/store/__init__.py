@@ -1,1 +1,1 @@
-"""Everything that is kept: rows in SQL, bytes in content-addressed files."""
+"""The store: rows in SQL, bytes in content-addressed files."""

@@ -1,4 +1,4 @@
-"""The database's clock: hosts may disagree about the time, the database does not with itself."""
+"""The database's clock, because the clocks of hosts differ."""
 
 from __future__ import annotations
 
@@ -23,5 +23,5 @@ def _sqlite(element: db_now, compiler: Any, **options: Any) -> str:
 
 @compiles(db_now, "postgresql")
 def _postgresql(element: db_now, compiler: Any, **options: Any) -> str:
-    # now() would be the transaction's start; a transaction that waited for a lock must not read an old time.
+    # now() gives the start of the transaction: an old time after a long wait for a lock.
     return "EXTRACT(EPOCH FROM clock_timestamp())::double precision"

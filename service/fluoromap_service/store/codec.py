@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 T = typing.TypeVar("T")
-MEDIA_TYPE = "application/vnd.fluoromap.result"
 
 Encoder = Callable[[Any, "_Pools"], Any]
 Decoder = Callable[[Any, list[NDArray[Any]]], Any]

@@ -1,4 +1,4 @@
-"""Connections and transactions."""
+"""Connections to the database, and transactions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POSTGRESQL = {
     "tcp_user_timeout": 30_000,
     "options": "-c lock_timeout=10s -c idle_in_transaction_session_timeout=60s",
 }
-"""A host that vanished in the middle of a transaction must not hold its locks, nor everybody else, for hours."""
+"""Limits that free the locks of a host that vanished in the middle of a transaction."""
 
 
 @functools.cache
@@ -40,7 +40,7 @@ def _engine(url: str) -> Engine:
 
 
 def _on_sqlite_connect(connection: Any, record: Any) -> None:
-    connection.isolation_level = None  # the driver's own BEGIN comes too late to lock for writing
+    connection.isolation_level = None  # the driver's own BEGIN is too late to lock for writing
     for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", f"busy_timeout={BUSY_TIMEOUT_MS}"):
         connection.execute(f"PRAGMA {pragma}")
 
@@ -51,24 +51,30 @@ def _on_sqlite_begin(connection: Connection) -> None:
 
 
 def engine() -> Engine:
-    """The process's engine for the configured database."""
+    """Return the process's engine for the configured database."""
     return _engine(settings().effective_database_url)
 
 
 def forget_connections() -> None:
-    """Drop inherited connections after a fork without closing them on the parent's side."""
+    """Drop the connections that a fork inherited; the parent's side stays open."""
     engine().dispose(close=False)
 
 
 @contextmanager
 def reading() -> Iterator[Session]:
-    """A transaction that only reads; never write in it (SQLite could not upgrade its lock)."""
+    """Open a transaction that only reads.
+
+    Never write in it, because SQLite cannot upgrade its lock.
+    """
     with Session(engine(), expire_on_commit=False) as session:
         yield session
 
 
 @contextmanager
 def writing() -> Iterator[Session]:
-    """A transaction that writes: commits at the end, rolls back on any exception."""
+    """Open a transaction that writes.
+
+    It commits at the end and rolls back on any exception.
+    """
     with Session(engine().execution_options(writes=True), expire_on_commit=False) as session, session.begin():
         yield session

@@ -1,6 +1,7 @@
-"""Content-addressed files: written beside, flushed to disk, renamed to their hash, then committed as a row.
+"""Content-addressed files.
 
-Nothing half-written is ever visible. The one interface that a store on other media would have to offer.
+The store writes a file under a temporary name, flushes it to disk, renames it to its hash and commits its row. So nobody sees
+a half-written file. A store on other media would need this interface and no more.
 """
 
 from __future__ import annotations
@@ -19,17 +20,20 @@ from fluoromap_service.settings import settings
 from fluoromap_service.store.models import File, Instance, Rendering, StageResult, StageRow
 
 CHUNK_BYTES = 1 << 20
-_FILES_LOCK = 0x66696C65  # "file": any number that nobody else takes in this database
+_FILES_LOCK = 0x66696C65  # "file" in ASCII; any number that no other lock of this database uses
 
 
 def path_of(sha256: str) -> Path:
-    """Where the file of that content stands, whether or not it exists."""
+    """Return the path for the content with this hash; the file need not exist."""
     return settings().files_dir / sha256[:2] / sha256
 
 
 @contextmanager
 def incoming() -> Iterator[Path]:
-    """A path for a file that is still arriving, on the store's own disk; removed at the end if nobody kept it."""
+    """Give a path on the store's own disk for an arriving file.
+
+    The file is removed at the end unless it was kept.
+    """
     folder = settings().files_dir / "incoming"
     folder.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=folder)
@@ -42,6 +46,7 @@ def incoming() -> Iterator[Path]:
 
 
 def sha256_of(path: Path) -> str:
+    """Return the hash of a file's content."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(CHUNK_BYTES):
@@ -50,20 +55,23 @@ def sha256_of(path: Path) -> str:
 
 
 def lock(session: Session) -> None:
-    """Hold off others that add or remove files until this transaction ends; SQLite's writers are alone already."""
+    """Keep other transactions from adding and removing files until this one ends.
+
+    SQLite has only one writer at a time, so it needs no lock.
+    """
     if session.get_bind().dialect.name == "postgresql":
         session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _FILES_LOCK})
 
 
-def keep(session: Session, path: Path, media_type: str, sha256: str | None = None) -> str:
-    """Move an incoming file to its content address and add its row to the session. Returns the hash.
+def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
+    """Move an incoming file to its content address; return its hash.
 
-    A caller that knows the file's hash already gives it, so that a long file is not read again inside the transaction.
+    The file's row is added. A caller that knows the hash gives it. Then the transaction does not read a long file
+    again.
     """
     sha256 = sha256 or sha256_of(path)
     lock(session)
     target = path_of(sha256)
-    size = path.stat().st_size
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         with path.open("rb") as stream:
@@ -75,21 +83,27 @@ def keep(session: Session, path: Path, media_type: str, sha256: str | None = Non
         finally:
             os.close(folder)
     if session.get(File, sha256) is None:
-        session.add(File(sha256=sha256, size=size, media_type=media_type))
+        session.add(File(sha256=sha256))
         session.flush()
     return sha256
 
 
-def keep_bytes(session: Session, content: bytes, media_type: str) -> str:
-    """As :func:`keep`, for bytes in memory."""
+def keep_bytes(session: Session, content: bytes) -> str:
+    """Store bytes as :func:`keep` does a file."""
     with incoming() as path:
         path.write_bytes(content)
-        return keep(session, path, media_type)
+        return keep(session, path)
 
 
 def remove_unreferenced(session: Session, candidates: Iterable[str]) -> list[Path]:
-    """Delete the rows of those files that no other row refers to; the caller unlinks the paths after commit."""
-    gone: list[Path] = []
+    """Delete the rows of the files that no other row refers to.
+
+    Returns
+    -------
+    list of Path
+        The files without a row; the caller removes them after the commit.
+    """
+    unreferenced: list[Path] = []
     for sha256 in set(candidates):
         session.execute(
             delete(StageResult).where(
@@ -104,5 +118,5 @@ def remove_unreferenced(session: Session, candidates: Iterable[str]) -> list[Pat
         )
         if not any(session.execute(query.limit(1)).first() for query in used):
             session.execute(delete(File).where(File.sha256 == sha256))
-            gone.append(path_of(sha256))
-    return gone
+            unreferenced.append(path_of(sha256))
+    return unreferenced

@@ -1,4 +1,4 @@
-"""The tables. Times are seconds since 1970 UTC by the database's clock; frames in corrections are counted from 1."""
+"""The tables. Times are seconds since 1970 UTC by the database's clock; frames in corrections count from 1."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 from sqlalchemy import (
     JSON,
-    BigInteger,
     Boolean,
     Float,
     ForeignKey,
@@ -26,6 +25,8 @@ Json = dict[str, Any]
 
 
 class Base(DeclarativeBase):
+    """Base of all tables."""
+
     metadata = MetaData(
         naming_convention={
             "ix": "ix_%(column_0_label)s",
@@ -38,7 +39,7 @@ class Base(DeclarativeBase):
 
 
 class JobState(StrEnum):
-    """Where a job is."""
+    """The state of a job."""
 
     QUEUED = "queued"  # no stage has been claimed yet
     RUNNING = "running"
@@ -48,7 +49,7 @@ class JobState(StrEnum):
 
 
 class StageState(StrEnum):
-    """Where a stage is."""
+    """The state of a stage."""
 
     PENDING = "pending"  # waits for other stages
     READY = "ready"  # may be claimed; a committed ready row is the outbox
@@ -63,7 +64,7 @@ ENDED_STAGE = frozenset({StageState.DONE, StageState.FAILED, StageState.CANCELLE
 
 
 class Token(Base):
-    """An access token; only its hash is kept."""
+    """An access token; the table has only the hash of its text."""
 
     __tablename__ = "token"
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -76,13 +77,10 @@ class Token(Base):
 
 
 class File(Base):
-    """A file in the store, by its content."""
+    """A file in the store, by the hash of its content."""
 
     __tablename__ = "file"
     sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
-    size: Mapped[int] = mapped_column(BigInteger)
-    media_type: Mapped[str] = mapped_column(String(100))
-    created: Mapped[float] = mapped_column(default=db_now())
 
 
 class Study(Base):
@@ -101,21 +99,18 @@ class Study(Base):
 
 
 class Instance(Base):
-    """A stored DICOM instance: one run. Kept once, whatever number of studies refer to it."""
+    """A stored DICOM instance: one run, stored once for all studies that refer to it."""
 
     __tablename__ = "instance"
     sop_instance_uid: Mapped[str] = mapped_column(String(64), primary_key=True)
     sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
     study_instance_uid: Mapped[str] = mapped_column(String(64), index=True)
     series_instance_uid: Mapped[str] = mapped_column(String(64))
-    series_number: Mapped[int | None]
-    acquired: Mapped[str | None] = mapped_column(String(40))  # local time as the file tells it, ISO 8601
     facts: Mapped[Json]  # InstanceFacts.to_json()
-    created: Mapped[float] = mapped_column(default=db_now())
 
 
 class StudyInstance(Base):
-    """A study's reference to an instance, with what the study says of it."""
+    """A study's reference to an instance, with the study's own facts about it."""
 
     __tablename__ = "study_instance"
     __table_args__ = (UniqueConstraint("study_id", "sop_instance_uid", name="uq_study_instance"),)
@@ -125,13 +120,13 @@ class StudyInstance(Base):
     file_name: Mapped[str | None] = mapped_column(
         Text
     )  # as uploaded; may name the patient: never in a log, path or error
-    site: Mapped[str | None] = mapped_column(String(64))  # where upload or PATCH put it
+    site: Mapped[str | None] = mapped_column(String(64))  # given by upload or PATCH
     site_by: Mapped[str | None] = mapped_column(String(10))  # "upload" or "explicit"
-    gantry: Mapped[Json] = mapped_column(default=dict)  # completes or overrides what the header says
+    gantry: Mapped[Json] = mapped_column(default=dict)  # completes and overrides the header
 
 
 class Site(Base):
-    """A mapping site: its activation time, and the runs it was explicitly bound to."""
+    """A mapping site: its activation time, and the runs that PUT, the table or acquisition time gave it."""
 
     __tablename__ = "site"
     __table_args__ = (UniqueConstraint("study_id", "name", name="uq_site_name"),)
@@ -141,17 +136,20 @@ class Site(Base):
     lat_ms: Mapped[float | None]
     lat_sd_ms: Mapped[float | None]
     lat_by: Mapped[str | None] = mapped_column(String(12))  # "csv", "explicit" or "electrogram"
-    csv_row: Mapped[int | None]  # row of the last activation-time table that named it
+    csv_row: Mapped[int | None]  # row of the last activation-time table that names it
     explicit_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs set by PUT
     explicit_b: Mapped[str | None] = mapped_column(String(64))
-    csv_a: Mapped[str | None] = mapped_column(Text)  # UID, series number or file name as the table says
+    csv_a: Mapped[str | None] = mapped_column(Text)  # UID, series number or file name in the table
     csv_b: Mapped[str | None] = mapped_column(Text)
-    paired_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs that acquisition time joined, for good
-    paired_b: Mapped[str | None] = mapped_column(String(64))
+    ordered_a: Mapped[str | None] = mapped_column(String(64))  # SOP instance UIDs that acquisition time joined
+    ordered_b: Mapped[str | None] = mapped_column(String(64))
 
 
 class Correction(Base):
-    """The electrodes of one frame as set by hand; the newest version counts, ``electrodes`` null: back to automatic."""
+    """The electrodes of one frame set by hand; the newest version counts.
+
+    ``electrodes`` null returns the frame to automatic detection.
+    """
 
     __tablename__ = "correction"
     __table_args__ = (
@@ -174,7 +172,7 @@ class Job(Base):
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
     state: Mapped[str] = mapped_column(String(10), index=True)
-    version: Mapped[int] = mapped_column(default=0)  # raised by each change: ETag, and the row lock of every finish
+    version: Mapped[int] = mapped_column(default=0)  # every change raises it: ETag, and row lock at the end of a stage
     snapshot: Mapped[Json]
     cancel_requested: Mapped[bool] = mapped_column(Boolean, default=False)
     error: Mapped[Json | None]
@@ -211,12 +209,11 @@ class StageRow(Base):
 
 
 class StageResult(Base):
-    """A result kept under the hash of plugin, version, parameters and everything the stage reads."""
+    """A stored result, under the hash of plugin, version, parameters and all inputs of the stage."""
 
     __tablename__ = "stage_result"
     key: Mapped[str] = mapped_column(String(64), primary_key=True)
     sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
-    created: Mapped[float] = mapped_column(default=db_now())
 
 
 class Point(Base):
@@ -247,34 +244,33 @@ class Point(Base):
 
 
 class Event(Base):
-    """What happened to a job, in order; the source of the event stream."""
+    """An event of a job; the event stream sends them in the order of their ids."""
 
     __tablename__ = "event"
     id: Mapped[int] = mapped_column(primary_key=True)
     job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
     kind: Mapped[str] = mapped_column(String(10))  # "job" or "stage"
     data: Mapped[Json]
-    created: Mapped[float] = mapped_column(default=db_now())
 
 
 class Rendering(Base):
-    """A picture or mesh made of a job's results on request, kept."""
+    """A picture, mesh or page of a job's results, made on request and kept."""
 
     __tablename__ = "rendering"
     id: Mapped[int] = mapped_column(primary_key=True)
     job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
-    key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of job and everything asked for
+    key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of the job and of all dependencies
     sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
 
 
 class Idempotency(Base):
-    """An answer given to a request with an Idempotency-Key, for 24 hours."""
+    """The answer to a request with an Idempotency-Key, stored for 24 hours."""
 
     __tablename__ = "idempotency"
     id: Mapped[int] = mapped_column(primary_key=True)
     key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of token, method, path and the client's key
     request_sha256: Mapped[str] = mapped_column(String(64))
-    status: Mapped[int | None] = mapped_column(Integer)  # None while the first request is still being answered
+    status: Mapped[int | None] = mapped_column(Integer)  # None until the first request has its answer
     headers: Mapped[Json | None]
     body: Mapped[str | None] = mapped_column(Text)
     created: Mapped[float] = mapped_column(default=db_now(), index=True)

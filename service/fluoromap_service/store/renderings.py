@@ -18,14 +18,14 @@ from fluoromap_service.store.models import Rendering
 
 
 @dataclass(frozen=True, slots=True)
-class Rendered:
-    """A kept rendering: the hash of its content, and its file."""
+class KeptFile:
+    """The file of a kept rendering, and the hash of its content."""
 
     sha256: str
     path: Path
 
 
-def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Callable[[], bytes]) -> Rendered:
+def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], bytes]) -> KeptFile:
     """Return the kept rendering of a job; make it when there is none.
 
     Parameters
@@ -33,18 +33,17 @@ def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Cal
     job_id : str
     depends_on : dict
         JSON values: everything that changes the rendering.
-    media_type : str
     make : callable
         Makes the content. It is called outside any transaction.
     """
     key = hashlib.sha256(json.dumps([job_id, depends_on], sort_keys=True).encode()).hexdigest()
-    kept = _kept(key)
+    kept = _find(key)
     if kept is not None:
         return kept
     content = make()
     try:
         with writing() as session:
-            sha256 = files.keep_bytes(session, content, media_type)
+            sha256 = files.keep_bytes(session, content)
             row = session.scalar(select(Rendering).where(Rendering.key == key))
             if row is None:
                 session.add(Rendering(job_id=job_id, key=key, sha256=sha256))
@@ -52,16 +51,16 @@ def rendered(job_id: str, depends_on: dict[str, Any], media_type: str, make: Cal
                 row.sha256 = sha256
     except IntegrityError:
         # Another request made the same rendering meanwhile: take that one.
-        kept = _kept(key)
+        kept = _find(key)
         if kept is None:
             raise
         return kept
-    return Rendered(sha256, files.path_of(sha256))
+    return KeptFile(sha256, files.path_of(sha256))
 
 
-def _kept(key: str) -> Rendered | None:
+def _find(key: str) -> KeptFile | None:
     with reading() as session:
         sha256 = session.scalar(select(Rendering.sha256).where(Rendering.key == key))
     if sha256 is None or not files.path_of(sha256).exists():
         return None
-    return Rendered(sha256, files.path_of(sha256))
+    return KeptFile(sha256, files.path_of(sha256))

@@ -1,4 +1,4 @@
-"""Bring the database's schema up to date."""
+"""Migrate the database to the newest schema."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import engine
 
 MIGRATIONS = "fluoromap_migrations"
-"""The package that holds the migrations: found by name, because the store knows nothing of the floors above."""
+"""Package of the migrations; the store finds it by name, because it imports nothing from the floors above."""
 
-_POSTGRESQL_LOCK = 0x666C756F  # "fluo": any number that nobody else takes in this database
+_POSTGRESQL_LOCK = 0x666C756F  # "fluo" in ASCII; any number that no other lock of this database uses
 
 
 def configuration() -> Config:
-    """Alembic's configuration, for the migrations as they are installed."""
+    """Return Alembic's configuration for the installed migrations."""
     spec = importlib.util.find_spec(MIGRATIONS)
     if spec is None or not spec.submodule_search_locations:
-        raise RuntimeError(f"the package {MIGRATIONS} is not installed; install fluoromap again")
+        raise RuntimeError(f"The package {MIGRATIONS} is not installed; install fluoromap again.")
     config = Config()
-    # A percent sign in the path would be read as interpolation.
+    # Alembic would read a percent sign in the path as interpolation.
     config.set_main_option("script_location", next(iter(spec.submodule_search_locations)).replace("%", "%%"))
     return config
 
 
 def upgrade() -> None:
-    """Create or migrate the tables of the configured database to the newest revision, all or nothing.
+    """Create or migrate the tables of the configured database, all or nothing.
 
-    May be called by several processes at once: one does it, the others wait and find it done.
+    Several processes may call it at once: one migrates, the others wait for it.
     """
     config = configuration()
     with _alone() as connection:
@@ -44,7 +44,7 @@ def upgrade() -> None:
 
 @contextmanager
 def _alone() -> Iterator[Connection]:
-    """A connection in a transaction that nobody else can be migrating in."""
+    """Open a connection and keep all other processes from migrating meanwhile."""
     if engine().dialect.name == "sqlite":
         settings().data_dir.mkdir(parents=True, exist_ok=True)
         with (settings().data_dir / "migration.lock").open("w") as lock:
@@ -52,8 +52,8 @@ def _alone() -> Iterator[Connection]:
             with engine().connect() as plain:
                 raw = plain.connection.driver_connection
                 assert raw is not None
-                # Copying a table drops the old one, which would delete by cascade whatever refers to its rows; the
-                # setting can only be changed outside a transaction.
+                # A migration copies a table and drops the old one, which would delete by cascade all rows that refer
+                # to it. SQLite changes this setting outside transactions only.
                 raw.execute("PRAGMA foreign_keys=OFF")
                 try:
                     connection = plain.execution_options(writes=True)

@@ -1,4 +1,4 @@
-"""Electrodes set by hand, version by version; the newest version of a frame counts."""
+"""Electrodes set by hand, in versions; the newest version of a frame counts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from fluoromap_service.study.snapshot import CorrectedElectrode
 
 
 def newest(session: Session, study_id: str, uid: str, frame: int) -> Correction | None:
-    """The frame's newest version, which may be the return to automatic (``electrodes`` null); frames count from 1."""
+    """Return the newest version of a frame (counted from 1).
+
+    Its ``electrodes`` may be null: the return to automatic detection.
+    """
     return session.scalar(
         select(Correction)
         .where(Correction.study_id == study_id, Correction.sop_instance_uid == uid, Correction.frame == frame)
@@ -49,7 +52,7 @@ def put(
 
 
 def of_study(session: Session, study_id: str) -> dict[str, dict[int, tuple[CorrectedElectrode, ...]]]:
-    """All frames of a study set by hand: SOP Instance UID -> frame (from 1) -> electrodes."""
+    """Return all electrodes set by hand: SOP Instance UID -> frame (from 1) -> electrodes."""
     newest_rows: dict[tuple[str, int], list[Any] | None] = {}
     for correction in session.scalars(
         select(Correction).where(Correction.study_id == study_id).order_by(Correction.version)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -53,20 +54,25 @@ def freeze(
 ) -> Snapshot:
     """Freeze everything that a job reads.
 
-    It needs a writing transaction, because pairs by time get their names here.
+    It needs a writing transaction, so that nothing changes meanwhile.
 
     Raises
     ------
     Problem
-        422 ``unknown_plugin`` or ``invalid_parameter`` with the field; ``no_ready_site`` with the needs of each site.
+        422 ``unknown_plugin`` or ``invalid_parameter`` with the field; ``no_ready_site`` with the needs of each site;
+        ``rows_unmatched`` when rows of the table have no runs although runs without a site are there.
     """
     plugins = _plugin_snapshots(pipeline)
     study = lock(session, study.id)
-    sites.settle(session, study)
-    bound = sites.resolve(session, study)
-    ready = [site for site in bound if site.ready]
+    binding = sites.binding_of(session, study.id)
+    unmatched = [
+        site for site in binding.sites if site.view_a is None and site.view_b is None and site.lat_ms is not None
+    ]
+    if unmatched and binding.pairs:
+        raise _rows_unmatched(unmatched, binding.pairs)
+    ready = [site for site in binding.sites if site.ready]
     if not ready:
-        raise _no_ready_site(bound)
+        raise _no_ready_site((*binding.sites, *binding.pairs))
     runs = {run.uid: run for run in runs_of(session, study.id)}
     by_hand = corrections.of_study(session, study.id)
     used = sorted({uid for site in ready for uid in (site.view_a, site.view_b) if uid is not None})
@@ -83,8 +89,8 @@ def freeze(
             RejectedSiteSnapshot(
                 site=site.site, lat_ms=site.lat_ms, view_a=site.view_a, view_b=site.view_b, reasons=site.reasons
             )
-            for site in bound
-            if not site.ready
+            for site in binding.sites
+            if site.site is not None and not site.ready
         ),
     )
 
@@ -129,13 +135,18 @@ def _plugin_snapshot(
     return PluginSnapshot(name=name, version=found.version, params=checked.model_dump(mode="json"))
 
 
-def _no_ready_site(bound: list[BoundSite]) -> Problem:
+def _no_ready_site(bound: Sequence[BoundSite]) -> Problem:
     rows = [
-        {"site": site.site, "missing": list(site.missing), "reasons": [str(reason) for reason in site.reasons]}
+        {
+            "site": site.site,
+            "pair": site.pair,
+            "missing": list(site.missing),
+            "reasons": [str(reason) for reason in site.reasons],
+        }
         for site in bound
     ]
     errors = [
-        (f"sites.{site.site}", ", ".join([*site.missing, *([site.unusable.sentence] if site.unusable else [])]))
+        (_place(site), ", ".join([*site.missing, *([site.unusable.sentence] if site.unusable else [])]))
         for site in bound
     ]
     detail = (
@@ -146,6 +157,20 @@ def _no_ready_site(bound: list[BoundSite]) -> Problem:
     return Problem(422, "no_ready_site", detail, errors, extra={"sites": rows})
 
 
+def _rows_unmatched(unmatched: Sequence[BoundSite], pairs: Sequence[BoundSite]) -> Problem:
+    detail = (
+        f"{len(unmatched)} sites have an activation time but no run, and {len(pairs)} pairs of runs have no site. Say which "
+        "runs belong to which site: add the columns view_a and view_b to the table, or set the site of each run."
+    )
+    errors = [(_place(site), "has an activation time and no run") for site in unmatched]
+    errors += [(_place(pair), "has two runs and no site") for pair in pairs]
+    return Problem(422, "rows_unmatched", detail, errors)
+
+
+def _place(site: BoundSite) -> str:
+    return f"pairs.{site.pair}" if site.site is None else f"sites.{site.site}"
+
+
 def _run_snapshot(run: StudyRun, by_hand: dict[int, tuple[CorrectedElectrode, ...]]) -> RunSnapshot:
     gantry = effective_gantry(run.facts, run.link.gantry)
     assert gantry is not None, "a ready site's runs have their geometry"
@@ -153,8 +178,12 @@ def _run_snapshot(run: StudyRun, by_hand: dict[int, tuple[CorrectedElectrode, ..
 
 
 def _site_snapshot(site: BoundSite) -> SiteSnapshot:
+    assert site.site is not None
     assert site.lat_ms is not None
+    assert site.bound_by is not None
     assert site.view_a is not None
     assert site.view_b is not None
     sd = LAT_SD_MS if site.lat_sd_ms is None else site.lat_sd_ms
-    return SiteSnapshot(site=site.site, lat_ms=site.lat_ms, lat_sd_ms=sd, view_a=site.view_a, view_b=site.view_b)
+    return SiteSnapshot(
+        site=site.site, lat_ms=site.lat_ms, lat_sd_ms=sd, view_a=site.view_a, view_b=site.view_b, bound_by=site.bound_by
+    )

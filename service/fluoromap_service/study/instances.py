@@ -122,7 +122,9 @@ def add(
     file_name: str | None,
     site: str | None,
 ) -> bool:
-    """Store an incoming file and refer to it from the study; return False when both exist already.
+    """Store an incoming file and refer to it from the study.
+
+    Return False when both exist already.
 
     Raises
     ------
@@ -139,15 +141,13 @@ def add(
             [("SOPInstanceUID", "already stored with other content")],
         )
     if known is None:
-        files.keep(session, path, "application/dicom", sha256=sha256)
+        files.keep(session, path, sha256=sha256)
         session.add(
             Instance(
                 sop_instance_uid=facts.sop_instance_uid,
                 sha256=sha256,
                 study_instance_uid=facts.study_instance_uid,
                 series_instance_uid=facts.series_instance_uid,
-                series_number=facts.series_number,
-                acquired=facts.acquired.isoformat() if facts.acquired else None,
                 facts=facts.to_json(),
             )
         )
@@ -176,7 +176,9 @@ def add(
 
 
 def remove(session: Session, study_id: str, uid: str) -> list[str]:
-    """Take a run out of a study; delete the instance when no other study refers to it.
+    """Take a run out of a study.
+
+    The instance is deleted when no other study refers to it.
 
     Returns
     -------
@@ -197,8 +199,8 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
     for site in session.scalars(select(Site).where(Site.study_id == study_id)):
         site.explicit_a = None if site.explicit_a == uid else site.explicit_a
         site.explicit_b = None if site.explicit_b == uid else site.explicit_b
-        if uid in (site.paired_a, site.paired_b):
-            site.paired_a = site.paired_b = None
+        if uid in (site.ordered_a, site.ordered_b):
+            site.ordered_a = site.ordered_b = None
     # Kept pictures show the run itself: delete them with it.
     ended = select(Job.id).where(Job.study_id == study_id)
     kept = list(session.scalars(select(Rendering.sha256).where(Rendering.job_id.in_(ended))))

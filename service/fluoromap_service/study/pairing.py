@@ -1,8 +1,13 @@
 """The rules that join two runs to a mapping site, as pure functions on plain values.
 
-The rules apply in this order: runs set by PUT or PATCH, runs that the activation-time table names, the site given at upload,
-the row order of the table. Runs without any of these are paired when they follow each other in acquisition time and their
-views are 30 degrees or more apart.
+1. Runs set by PUT or PATCH.
+2. Runs that the activation-time table names.
+3. The site given at upload.
+4. Runs that follow each other in acquisition time, with views 30 degrees or more apart, make a pair without a name.
+5. Row order: when nobody has named a run or a pair, and the table has as many rows as there are pairs, the pairs in the
+   order of time take the rows in their order. The result says so (``bound_by`` is "order"), because it is a guess.
+
+A name comes from a person, an upload or a table. No rule invents one.
 """
 
 from __future__ import annotations
@@ -13,12 +18,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from fluoromap.geometry import view_axes
+from fluoromap.geometry import direction_angle_deg, view_axes
 
 PAIRING_ANGLE_DEG = 30.0
 """Smallest angle between the views of two runs that acquisition time pairs."""
-PARALLEL_ANGLE_DEG = 20.0
-"""Smallest angle between the views of a usable site."""
 ROUNDING_DEG = 1e-6
 """Tolerance of the comparison of angles, so that 30 degrees count as 30 degrees."""
 TABLE_STILL_MM = 1.0
@@ -26,8 +29,8 @@ TABLE_STILL_MM = 1.0
 
 Direction = tuple[float, float, float]
 """Unit vector from the isocentre to the detector in patient axes (LPS)."""
-Rule = Literal["explicit", "csv", "upload", "order", "time"]
-_STRENGTH: tuple[Rule, ...] = ("explicit", "csv", "upload", "order", "time")
+Rule = Literal["explicit", "csv", "upload", "order"]
+_STRENGTH: tuple[Rule, ...] = ("explicit", "csv", "upload", "order")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,27 +73,24 @@ class Site:
     Parameters
     ----------
     name : str
-    has_time : bool
-        Whether the site has an activation time.
     csv_row : int or None
         Row of the last activation-time table that named the site.
     explicit_a, explicit_b : str or None
         SOP Instance UIDs set by PUT.
     csv_a, csv_b : str or None
         Run that the table names: UID, series number or file name.
-    paired_a, paired_b : str or None
-        SOP Instance UIDs of an earlier pairing by acquisition time.
+    ordered_a, ordered_b : str or None
+        SOP Instance UIDs of a pairing by row order, stored when a person confirmed it for another site.
     """
 
     name: str
-    has_time: bool = False
     csv_row: int | None = None
     explicit_a: str | None = None
     explicit_b: str | None = None
     csv_a: str | None = None
     csv_b: str | None = None
-    paired_a: str | None = None
-    paired_b: str | None = None
+    ordered_a: str | None = None
+    ordered_b: str | None = None
 
 
 Pair = tuple[Run, Run]
@@ -107,7 +107,7 @@ class SiteRuns:
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
-    """The runs of all sites by the site's name, and the pairs by time that have no name yet."""
+    """The runs of all sites by the site's name, and the pairs without a name in the order of acquisition."""
 
     sites: Mapping[str, SiteRuns]
     unnamed: tuple[Pair, ...]
@@ -120,20 +120,23 @@ def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
     draft.take_members("explicit")
     draft.take_table_views()
     draft.take_members("upload")
-    earlier = draft.take_earlier_pairs()
+    draft.take_ordered_pairs()
     unnamed = pairs_by_time(list(draft.free.values()))
-    # A pair of an anonymous site has a name that the service invented: a row of the table may take it over.
-    anonymous = [(site, pair) for site, pair in earlier if site.csv_row is None and not site.has_time]
-    pairs = sorted([*(pair for _, pair in anonymous), *unnamed], key=lambda pair: _moment(pair[0]))
-    rows = draft.rows_without_runs([site for site, _ in earlier])
-    if rows and len(rows) == len(pairs):
-        for site, pair in zip(rows, pairs, strict=True):
+    rows = draft.rows_without_runs()
+    if rows and len(rows) == len(unnamed) and _nobody_named(sites, runs):
+        for site, pair in zip(rows, unnamed, strict=True):
             draft.slots[site.name] = _Slots(*pair, "order")
-        earlier = [entry for entry in earlier if entry not in anonymous]
         unnamed = []
-    for site, pair in earlier:
-        draft.slots[site.name] = _Slots(*pair, "time")
     return Pairing({name: slots.result() for name, slots in draft.slots.items()}, tuple(unnamed))
+
+
+def _nobody_named(sites: Sequence[Site], runs: Sequence[Run]) -> bool:
+    """Return whether the sites are only rows of a table without views."""
+    bare = [
+        site.csv_row is not None and not any((site.explicit_a, site.explicit_b, site.csv_a, site.csv_b))
+        for site in sites
+    ]
+    return all(bare) and all(run.site is None for run in runs)
 
 
 @dataclass(eq=False)
@@ -158,10 +161,7 @@ class _Slots:
         """Return the runs; view a is the one nearer to lateral unless somebody named the views."""
         if self.a is None or self.b is None or self.named:
             return SiteRuns(self.a, self.b, self.by)
-        share_a, share_b = _lateral_share(self.a), _lateral_share(self.b)
-        if min(share_a, share_b) >= 0 and share_b > share_a + 1e-9:
-            return SiteRuns(self.b, self.a, self.by)
-        return SiteRuns(self.a, self.b, self.by)
+        return SiteRuns(*lateral_first(self.a, self.b), self.by)
 
 
 class _Draft:
@@ -193,7 +193,10 @@ class _Draft:
             slots.put(view, self.free.pop(run.uid), by)
 
     def take_members(self, by: Rule) -> None:
-        """Fill the free views of each site with the runs put there, in order of arrival; a third run stays free."""
+        """Fill the free views of each site with its own runs.
+
+        The runs come in order of arrival; a third run stays free.
+        """
         for name, slots in self.slots.items():
             members = [run for run in self._runs if run.uid in self.free and run.site == name and run.site_by == by]
             while members and len(slots.runs) < 2:
@@ -204,23 +207,26 @@ class _Draft:
                 view = wanted if getattr(slots, wanted) is None else other
                 slots.put(view, self.free.pop(chosen.uid), by)
 
-    def take_earlier_pairs(self) -> list[tuple[Site, Pair]]:
-        """Take the pairs that acquisition time joined before, where both runs and the site are still free."""
-        earlier: list[tuple[Site, Pair]] = []
-        for site in self._sites:
-            first, second = self.free.get(site.paired_a or ""), self.free.get(site.paired_b or "")
-            if first is not None and second is not None and not self.slots[site.name].runs:
-                earlier.append((site, (self.free.pop(first.uid), self.free.pop(second.uid))))
-        return earlier
+    def take_ordered_pairs(self) -> None:
+        """Take the pairs by row order that a person confirmed.
 
-    def rows_without_runs(self, paired: Sequence[Site]) -> list[Site]:
-        """Return the table's sites that have no run, name no run and have no earlier pair, in row order."""
+        Both runs and the site must still be free.
+        """
+        for site in self._sites:
+            first, second = self.free.get(site.ordered_a or ""), self.free.get(site.ordered_b or "")
+            if first is not None and second is not None and not self.slots[site.name].runs:
+                self.slots[site.name] = _Slots(self.free.pop(first.uid), self.free.pop(second.uid), "order")
+
+    def rows_without_runs(self) -> list[Site]:
+        """Return the table's sites without runs, in row order.
+
+        They name no run either.
+        """
         rows = [
             site
             for site in self._sites
             if site.csv_row is not None
             and self.slots[site.name].by is None
-            and site not in paired
             and site.csv_a is None
             and site.csv_b is None
         ]
@@ -228,7 +234,10 @@ class _Draft:
 
 
 def named_run(text: str, runs: Sequence[Run]) -> Run | None:
-    """Return the run that a table names by SOP Instance UID, series number or file name; None unless it is just one."""
+    """Return the run that a table names.
+
+    The name is a SOP Instance UID, a series number or a file name. None unless it fits just one run.
+    """
     text = text.strip()
     tests: tuple[Callable[[Run], bool], ...] = (
         lambda run: run.uid == text,
@@ -248,10 +257,11 @@ def _base_name(path: str) -> str:
 
 
 def pairs_by_time(runs: Sequence[Run]) -> list[Pair]:
-    """Pair runs next in acquisition time, 30 degrees or more apart and with the table at rest.
+    """Pair runs that follow each other in acquisition time.
 
-    A run that repeats a direction stays alone. Of all ways to pair neighbours, the one with most pairs wins; then the one
-    with the least time between the runs of a pair; then the earliest.
+    Their views are 30 degrees or more apart, and the table is at rest. A run that repeats a direction stays alone. Of
+    all ways to pair neighbours, the one with most pairs wins; then the one with the least time between the runs of a
+    pair; then the earliest.
     """
     timed = sorted((run for run in runs if run.acquired is not None), key=_moment)
     Best = tuple[int, float, list[Pair]]
@@ -284,16 +294,18 @@ def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
     return x, y, z
 
 
-def ray_angle_deg(first: Run, second: Run) -> float | None:
-    """Return the angle between two runs' central rays, folded to 0..90 degrees; None while angles are missing."""
+def view_angle_deg(first: Run, second: Run) -> float | None:
+    """Return the angle between two runs' central rays, 0..90 degrees.
+
+    None while angles are missing.
+    """
     if first.direction is None or second.direction is None:
         return None
-    cosine = abs(sum(a * b for a, b in zip(first.direction, second.direction, strict=True)))
-    return math.degrees(math.acos(min(cosine, 1.0)))
+    return direction_angle_deg(first.direction, second.direction)
 
 
 def _apart(first: Run, second: Run) -> bool:
-    angle = ray_angle_deg(first, second)
+    angle = view_angle_deg(first, second)
     return angle is not None and angle >= PAIRING_ANGLE_DEG - ROUNDING_DEG
 
 
@@ -304,6 +316,18 @@ def table_moved(first: Run, second: Run) -> bool:
     return math.dist(first.table_mm, second.table_mm) > TABLE_STILL_MM
 
 
+def lateral_first(first: Run, second: Run) -> Pair:
+    """Return a pair with the run nearer to lateral first.
+
+    Where angles are missing, the given order stays.
+    """
+    shares = _lateral_share(first), _lateral_share(second)
+    return (second, first) if min(shares) >= 0 and shares[1] > shares[0] + 1e-9 else (first, second)
+
+
 def _lateral_share(run: Run) -> float:
-    """Return 1 for a lateral view, 0 for a frontal one, -1 where angles are missing."""
+    """Return 1 for a lateral view, 0 for a frontal one.
+
+    -1 where angles are missing.
+    """
     return -1.0 if run.direction is None else abs(run.direction[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +9,25 @@ from dataclasses import dataclass
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap_service.problem import Problem, not_found
-from fluoromap_service.store.models import Job, Site, Study
+from fluoromap_service.store.models import Site, Study
 from fluoromap_service.study import pairing
 from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
-from fluoromap_service.study.pairing import PARALLEL_ANGLE_DEG, ROUNDING_DEG, Pairing, SiteRuns
+from fluoromap_service.study.pairing import Pairing, SiteRuns
 
 
 @dataclass(frozen=True, slots=True)
 class BoundSite:
-    """A site as a job would take it.
+    """A site as a job would take it, or a pair of runs that nobody has named yet.
 
     Parameters
     ----------
-    site : str
+    site : str or None
+        None for a pair without a name.
+    pair : int or None
+        Number of such a pair, counted from 1 in the order of acquisition.
     lat_ms, lat_sd_ms : float or None
         Activation time and its standard deviation, where known.
     view_a, view_b : str or None
@@ -32,7 +35,7 @@ class BoundSite:
     bound_by : str or None
         "explicit", "csv", "upload", "order" or "time"; None without runs.
     missing : tuple of str
-        Of "lat_ms", "view_a", "view_b", "gantry:view_a", "gantry:view_b".
+        Of "site", "lat_ms", "view_a", "view_b", "gantry:view_a", "gantry:view_b".
     warnings : tuple of str
     unusable : Reason or None
         Why a job cannot use the pair although nothing is missing.
@@ -40,7 +43,7 @@ class BoundSite:
         Between the two views' rays, folded to 0..90.
     """
 
-    site: str
+    site: str | None
     lat_ms: float | None
     lat_sd_ms: float | None
     view_a: str | None
@@ -50,6 +53,7 @@ class BoundSite:
     warnings: tuple[str, ...] = ()
     unusable: Reason | None = None
     angle_deg: float | None = None
+    pair: int | None = None
 
     @property
     def ready(self) -> bool:
@@ -85,44 +89,34 @@ def rows_of(session: Session, study_id: str) -> list[Site]:
     return list(session.scalars(select(Site).where(Site.study_id == study_id).order_by(Site.id)))
 
 
-def resolve(session: Session, study: Study) -> list[BoundSite]:
-    """Return the study's sites with their runs, in the order of first mention.
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """A study's sites with their runs, in the order of first mention, and its pairs without a name by acquisition time."""
 
-    Pairs without a name yet, and empty rows, are left out.
+    sites: tuple[BoundSite, ...]
+    pairs: tuple[BoundSite, ...]
+
+    @property
+    def by_row_order(self) -> tuple[BoundSite, ...]:
+        """The sites whose runs are a guess by row order that nobody has confirmed."""
+        return tuple(site for site in self.sites if site.bound_by == "order")
+
+
+def binding_of(session: Session, study_id: str, *, also: str | None = None) -> Binding:
+    """Return which runs belong to which site of a study.
+
+    The rules are those of :mod:`pairing`. A site without runs and facts is left out, unless ``also`` is its name.
     """
-    rows, runs = rows_of(session, study.id), runs_of(session, study.id)
-    return _bound_sites(rows, runs)
-
-
-def settle(session: Session, study: Study) -> None:
-    """Pair runs by acquisition time and name the pairs.
-
-    Call it in every transaction that changes the study's runs. The first pairing of a run gives a name, which stays with this
-    run. The other run of the pair may still change while runs arrive out of order. The pair is final when the site has an
-    activation time, or when the study has a job.
-    """
-    rows, runs = rows_of(session, study.id), runs_of(session, study.id)
-    has_job = session.scalar(select(Job.id).where(Job.study_id == study.id).limit(1)) is not None
-    loose = [row for row in rows if row.paired_a and row.csv_row is None and row.lat_ms is None and not has_job]
-    before = {row: {row.paired_a, row.paired_b} for row in loose}
-    for row in loose:
-        row.paired_a = row.paired_b = None
-    used_names = {row.name for row in rows} | {run.link.site for run in runs}
-    numbers = itertools.count(1)
-    for first, second in _pairing(rows, runs).unnamed:
-        pair = {first.uid, second.uid}
-        owner = max(before, key=lambda row: len(before[row] & pair), default=None)
-        if owner is None or not before[owner] & pair:
-            name = next(name for number in numbers if (name := f"S{number:02d}") not in used_names)
-            owner = Site(study_id=study.id, name=name)
-            session.add(owner)
-        else:
-            del before[owner]
-        owner.paired_a, owner.paired_b = first.uid, second.uid
-    for row in before:
-        if row.explicit_a is None and row.explicit_b is None:
-            session.delete(row)
-    session.flush()
+    runs = runs_of(session, study_id)
+    with_runs = {run.link.site for run in runs} | {also}
+    rows = [row for row in rows_of(session, study_id) if row.name in with_runs or not _is_empty(row)]
+    paired, with_geometry = _pairing(rows, runs), _with_geometry(runs)
+    sites = tuple(_bound(row, paired.sites[row.name], with_geometry) for row in rows)
+    pairs = tuple(
+        _unnamed(number, pairing.lateral_first(*pair), with_geometry)
+        for number, pair in enumerate(paired.unnamed, start=1)
+    )
+    return Binding(sites, pairs)
 
 
 def _pairing(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Pairing:
@@ -133,14 +127,13 @@ def _pairing(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Pairing:
 def _site_value(row: Site) -> pairing.Site:
     return pairing.Site(
         name=row.name,
-        has_time=row.lat_ms is not None,
         csv_row=row.csv_row,
         explicit_a=row.explicit_a,
         explicit_b=row.explicit_b,
         csv_a=row.csv_a,
         csv_b=row.csv_b,
-        paired_a=row.paired_a,
-        paired_b=row.paired_b,
+        ordered_a=row.ordered_a,
+        ordered_b=row.ordered_b,
     )
 
 
@@ -159,29 +152,15 @@ def _run_value(run: StudyRun) -> pairing.Run:
     )
 
 
-def _bound_sites(rows: Sequence[Site], runs: Sequence[StudyRun]) -> list[BoundSite]:
-    paired = _pairing(rows, runs).sites
-    with_geometry = _with_geometry(runs)
-    return [_bound(row, paired[row.name], with_geometry) for row in rows if not _is_empty(row, paired[row.name])]
-
-
 def _with_geometry(runs: Sequence[StudyRun]) -> set[str]:
     return {run.uid for run in runs if effective_gantry(run.facts, run.link.gantry) is not None}
 
 
 def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
-    views = (("view_a", runs.a), ("view_b", runs.b))
-    missing = [] if row.lat_ms is not None else ["lat_ms"]
-    missing += [view for view, run in views if run is None]
-    missing += [f"gantry:{view}" for view, run in views if run is not None and run.uid not in with_geometry]
-    unusable: Reason | None = None
-    angle: float | None = None
-    if runs.a is not None and runs.b is not None:
-        angle = pairing.ray_angle_deg(runs.a, runs.b)
-        if pairing.table_moved(runs.a, runs.b):
-            unusable = Reason.TABLE_MOVED
-        elif angle is not None and angle < PARALLEL_ANGLE_DEG - ROUNDING_DEG:
-            unusable = Reason.VIEWS_PARALLEL
+    missing = () if row.lat_ms is not None else ("lat_ms",)
+    unusable, angle_deg = _pair_check(runs)
+    warnings = [str(Reason.PAIRED_BY_ORDER)] if runs.bound_by == "order" else []
+    warnings += [] if unusable is None else [str(unusable)]
     return BoundSite(
         site=row.name,
         lat_ms=row.lat_ms,
@@ -189,38 +168,71 @@ def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
         view_a=runs.a.uid if runs.a else None,
         view_b=runs.b.uid if runs.b else None,
         bound_by=runs.bound_by,
-        missing=tuple(missing),
-        warnings=() if unusable is None else (str(unusable),),
+        missing=(*missing, *_missing_runs(runs, with_geometry)),
+        warnings=tuple(warnings),
         unusable=unusable,
-        angle_deg=angle,
+        angle_deg=angle_deg,
     )
 
 
-def _is_empty(row: Site, runs: SiteRuns) -> bool:
-    """Return whether a site has neither runs nor facts: another site took over the pair that gave it its name."""
-    facts = (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b)
-    return runs.a is None and runs.b is None and all(fact is None for fact in facts)
+def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundSite:
+    runs = SiteRuns(*pair)
+    unusable, angle_deg = _pair_check(runs)
+    return BoundSite(
+        site=None,
+        lat_ms=None,
+        lat_sd_ms=None,
+        view_a=pair[0].uid,
+        view_b=pair[1].uid,
+        bound_by="time",
+        missing=("site", "lat_ms", *_missing_runs(runs, with_geometry)),
+        warnings=() if unusable is None else (str(unusable),),
+        unusable=unusable,
+        angle_deg=angle_deg,
+        pair=number,
+    )
 
 
-def one(session: Session, study: Study, name: str) -> BoundSite:
+def _is_empty(row: Site) -> bool:
+    """Return whether nothing is known of a site but its name.
+
+    Such a row stays when a table that named the site was replaced.
+    """
+    return all(fact is None for fact in (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b))
+
+
+def _missing_runs(runs: SiteRuns, with_geometry: set[str]) -> list[str]:
+    views = (("view_a", runs.a), ("view_b", runs.b))
+    missing = [view for view, run in views if run is None]
+    return missing + [f"gantry:{view}" for view, run in views if run is not None and run.uid not in with_geometry]
+
+
+def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
+    """Return why a job cannot use a pair, and the rays' angle."""
+    if runs.a is None or runs.b is None:
+        return None, None
+    angle_deg = pairing.view_angle_deg(runs.a, runs.b)
+    if pairing.table_moved(runs.a, runs.b):
+        return Reason.TABLE_MOVED, angle_deg
+    if angle_deg is not None and angle_deg < PARALLEL_BELOW_DEG:
+        return Reason.VIEWS_PARALLEL, angle_deg
+    return None, angle_deg
+
+
+def site_of(session: Session, study: Study, name: str, *, also_empty: bool = False) -> BoundSite:
     """Return one site of a study.
+
+    ``also_empty``: even when nothing is known of it but its name.
 
     Raises
     ------
     Problem
         404 when there is none of that name.
     """
-    for site in resolve(session, study):
+    for site in binding_of(session, study.id, also=name if also_empty else None).sites:
         if site.site == name:
             return site
     raise not_found("site in this study")
-
-
-def one_or_empty(session: Session, study: Study, name: str) -> BoundSite:
-    """Return one site as :func:`one` does, also when a change has just emptied it."""
-    row = mention(session, study.id, name)
-    runs = runs_of(session, study.id)
-    return _bound(row, _pairing(rows_of(session, study.id), runs).sites[name], _with_geometry(runs))
 
 
 def mention(session: Session, study_id: str, name: str) -> Site:
@@ -266,7 +278,7 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
         Sites of the table that have no run, or not the run that the table names.
     """
     for row in rows_of(session, study.id):
-        row.csv_row = row.csv_a = row.csv_b = None
+        row.csv_row = row.csv_a = row.csv_b = row.ordered_a = row.ordered_b = None
         if row.lat_by == "csv":
             row.lat_ms = row.lat_sd_ms = row.lat_by = None
     for entry in table:
@@ -274,19 +286,43 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
         row.csv_row, row.csv_a, row.csv_b = entry.row, entry.view_a, entry.view_b
         row.lat_ms, row.lat_sd_ms, row.lat_by = entry.lat_ms, None, "csv"
     session.flush()
-    bound = {site.site: site for site in resolve(session, study)}
+    bound = {site.site: site for site in binding_of(session, study.id).sites}
     return [entry.site for entry in table if not _has_its_runs(entry, bound[entry.site])]
 
 
 def _has_its_runs(entry: ActivationTime, site: BoundSite) -> bool:
-    """Return whether a row of the table has the runs that it names, or any run when it names none."""
+    """Return whether a row of the table has the runs it names.
+
+    A row that names none needs any run.
+    """
     if entry.view_a is None and entry.view_b is None:
         return site.view_a is not None or site.view_b is not None
     return (entry.view_a is None or site.view_a is not None) and (entry.view_b is None or site.view_b is not None)
 
 
+def confirm_order(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
+    """Bind a site by hand to the runs that row order gave it.
+
+    Nothing happens when ``views`` asks for other runs. The other sites keep their runs by row order, with the warning:
+    only this one was looked at.
+    """
+    guessed = {site.site: site for site in binding_of(session, study.id).by_row_order}
+    confirmed = guessed.get(name)
+    if confirmed is None or views.items() - {("view_a", confirmed.view_a), ("view_b", confirmed.view_b)}:
+        return
+    for row in rows_of(session, study.id):
+        if row.name == name:
+            row.explicit_a, row.explicit_b = confirmed.view_a, confirmed.view_b
+            row.ordered_a = row.ordered_b = None
+        elif row.name in guessed:
+            row.ordered_a, row.ordered_b = guessed[row.name].view_a, guessed[row.name].view_b
+    session.flush()
+
+
 def put_views(session: Session, study: Study, name: str, views: dict[str, str | None]) -> None:
-    """Bind runs to a site by hand; a run leaves the site that it was in.
+    """Bind runs to a site by hand.
+
+    A run leaves the site that it was in.
 
     Parameters
     ----------
@@ -320,7 +356,10 @@ def put_views(session: Session, study: Study, name: str, views: dict[str, str | 
 
 
 def move_run(session: Session, study: Study, run: StudyRun, site: str | None) -> None:
-    """Put a run into a site by hand; None takes it out of every site, and the rules apply again."""
+    """Put a run into a site by hand.
+
+    None takes it out of every site, and the rules apply again.
+    """
     for row in rows_of(session, study.id):
         row.explicit_a = None if row.explicit_a == run.uid else row.explicit_a
         row.explicit_b = None if row.explicit_b == run.uid else row.explicit_b
@@ -330,10 +369,13 @@ def move_run(session: Session, study: Study, run: StudyRun, site: str | None) ->
     session.flush()
 
 
-def views_of(bound: Sequence[BoundSite]) -> dict[str, tuple[BoundSite, str]]:
-    """Return site and view ("a" or "b") of each bound run, by SOP Instance UID."""
+def views_of(binding: Binding) -> dict[str, tuple[BoundSite, str]]:
+    """Return site and view of each bound run, by SOP Instance UID.
+
+    The view is "a" or "b". The site may be a pair without a name.
+    """
     found: dict[str, tuple[BoundSite, str]] = {}
-    for site in bound:
+    for site in (*binding.sites, *binding.pairs):
         for view, uid in (("a", site.view_a), ("b", site.view_b)):
             if uid is not None:
                 found[uid] = (site, view)

@@ -69,6 +69,7 @@ class SiteSnapshot(_Frozen):
     lat_sd_ms: float
     view_a: str
     view_b: str
+    bound_by: str = "explicit"
 
     def run(self, view: View) -> str:
         """Return the SOP Instance UID of a view."""

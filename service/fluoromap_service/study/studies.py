@@ -46,7 +46,10 @@ def get(session: Session, study_id: str) -> Study:
 
 
 def lock(session: Session, study_id: str) -> Study:
-    """Return a study as :func:`get` does, and keep other transactions from changing it until this one ends."""
+    """Return a study as :func:`get` does, and lock it.
+
+    Other transactions cannot change it until this one ends.
+    """
     query = select(Study).where(Study.id == study_id).with_for_update()
     # Read it again under the lock: it may have changed since this session read it.
     study = session.scalars(query.execution_options(populate_existing=True)).one_or_none()
@@ -56,7 +59,9 @@ def lock(session: Session, study_id: str) -> Study:
 
 
 def remove(session: Session, study_id: str) -> list[str]:
-    """Delete a study, its jobs, and the instances and files that nothing else refers to.
+    """Delete a study and its jobs.
+
+    The instances and files that nothing else refers to are deleted too.
 
     Returns
     -------

@@ -39,7 +39,7 @@ SITE = LocatedSite(
 
 
 def _shown(camera: Camera, displacement_mm: Array, electrodes: tuple[int, ...] = (1, 2)) -> NamedChain:
-    """The reference catheter as a camera shows it after a displacement."""
+    """Return the reference catheter as a camera shows it after a displacement."""
     rows = [number - 1 for number in electrodes]
     pixels = camera.project(REFERENCE_MM[rows] + displacement_mm)
     return NamedChain("reference", electrodes, pixels, np.tile(np.eye(2), (len(rows), 1, 1)))

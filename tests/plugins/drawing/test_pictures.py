@@ -12,9 +12,9 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOImage import vtkPNGReader
 
 from fluoromap.drawing.animation import PICTURES, draw_propagation
+from fluoromap.drawing.colour_bar import bar_box
 from fluoromap.drawing.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import bar_box
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.drawing.png import encode_png
@@ -155,7 +155,10 @@ def test_faces_side_by_side_share_no_pixel_and_miss_none(seed):
 
 
 def _bands_pixel_by_pixel(raster, chamber, times, until):
-    """What every pixel shows, from its own time; -9 where a vertex past the covered part has a say in it."""
+    """Return the content of every pixel by its own time.
+
+    -9 where a vertex past the covered part takes part.
+    """
     pixels = np.flatnonzero(raster.face >= 0)
     lat = raster.sample(pixels, chamber.lat_ms, chamber.cycle_length_ms)
     wanted = np.full(raster.face.size, NOTHING)
@@ -211,7 +214,10 @@ def test_the_rim_takes_the_times_of_its_neighbours(sparse_ball):
 
 
 def circling(cycle):
-    """Return a re-entry whose times go round once, and its vertices along the axis of the circuit: each its own angle."""
+    """Return a re-entry whose times go round once.
+
+    Also return its vertices along the axis of the circuit: each its own angle.
+    """
     chamber = fused(sphere(20, slope_ms_per_mm=1.0), edge_mm=4)
     middle = chamber.vertices_mm.mean(axis=0)
     turn = np.degrees(np.arctan2(*(chamber.vertices_mm - middle)[:, [1, 0]].T)) % 360 * cycle / 360

@@ -24,7 +24,10 @@ BLOCK_PX, STEP = 16, 4
 
 
 def octahedral_sphere(splits: int) -> tuple[Array, np.ndarray]:
-    """Return a unit sphere made of an octahedron's faces: vertices (n, 3) rounded to 1e-6, faces (f, 3) outward."""
+    """Return a unit sphere made of an octahedron's faces.
+
+    Vertices (n, 3) are rounded to 1e-6, faces (f, 3) are outward.
+    """
     faces: list[Array] = []
     for signs in itertools.product((1.0, -1.0), repeat=3):
         x, y, z = np.diag(signs)
@@ -44,7 +47,10 @@ def octahedral_sphere(splits: int) -> tuple[Array, np.ndarray]:
 
 
 def fixed_map() -> ChamberMap:
-    """Return a map from plain arithmetic, so that it is the same on every machine."""
+    """Return a map from plain arithmetic.
+
+    So it is the same on every machine.
+    """
     unit, faces = octahedral_sphere(8)
     wall = unit * [24.0, 22.0, 34.0]
     sites = tuple(
@@ -62,7 +68,10 @@ def fixed_map() -> ChamberMap:
 
 
 def coarse_sha256(picture: np.ndarray) -> str:
-    """Return the hash of block means in coarse steps: a pixel that differs between processors does not change it."""
+    """Return the hash of block means in coarse steps.
+
+    A pixel that differs between processors does not change it.
+    """
     rows, columns = (side // BLOCK_PX * BLOCK_PX for side in picture.shape[:2])
     blocks = picture[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX, 3)
     sums = blocks.sum(axis=(1, 3), dtype=np.int64)

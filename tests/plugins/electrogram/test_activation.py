@@ -9,7 +9,7 @@ TIMES = np.arange(0.0, 300.0)
 
 
 def deflection(at_ms, times=TIMES, width_ms=4.0, height=1.0):
-    """A biphasic unipolar electrogram whose steepest fall lies at ``at_ms``."""
+    """Return a biphasic unipolar electrogram that falls steepest at ``at_ms``."""
     x = (times - at_ms) / width_ms
     return -height * x * np.exp(-0.5 * x * x)
 
@@ -35,7 +35,10 @@ def test_uneven_samples():
 
 
 def filtered_noise(rng, sd):
-    """Noise as a 200 Hz amplifier leaves it: neighbouring samples err alike."""
+    """Return noise as a 200 Hz amplifier leaves it.
+
+    Neighbouring samples err alike.
+    """
     noise = np.convolve(rng.normal(size=320), np.exp(-0.5 * (np.arange(-6, 7) / 1.5) ** 2), "same")[10:310]
     return sd * noise / np.std(noise)
 
@@ -75,7 +78,7 @@ def test_a_sharp_near_field_wins_over_a_larger_far_field():
     assert found.lat_ms == pytest.approx(50, abs=1)
 
 
-def test_rivals_are_told():
+def test_rivals_are_reported():
     double = deflection(100) + 0.95 * deflection(180)
     warnings = activation_time(TIMES, deflection(90), double).warnings
     assert len(warnings) == 1

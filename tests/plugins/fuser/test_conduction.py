@@ -47,7 +47,7 @@ def test_a_curved_wall_is_unfolded():
     assert found.median_m_per_s == pytest.approx(0.7, rel=0.03)
 
 
-def test_few_far_or_simultaneous_sites_tell_nothing():
+def test_few_far_or_simultaneous_sites_give_nothing():
     places = grid()
     assert velocity(places[:3], places[:3, 0], 0.1) is None
     assert velocity(4 * places, places[:, 0], 0.1) is None

@@ -17,7 +17,10 @@ TETRAHEDRON = np.array([[0.0, 0, 0], [30, 0, 0], [0, 30, 0], [0, 0, 30]])
 
 
 def times_at_sites(chamber):
-    """Return map times at each site, from the nearest vertex; sites on the hull are vertices."""
+    """Return map times at each site, from the nearest vertex.
+
+    Sites on the hull are vertices.
+    """
     surface = np.array([site.surface_mm for site in chamber.sites])
     nearest = np.linalg.norm(chamber.vertices_mm[None] - surface[:, None], axis=2).argmin(axis=1)
     return chamber.lat_ms[nearest]

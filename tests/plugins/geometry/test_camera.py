@@ -24,7 +24,10 @@ def gantry(primary: float = 0.0, secondary: float = 0.0, **changes: object) -> G
 
 
 def pixel_by_hand(g: Gantry, point: np.ndarray) -> tuple[float, float]:
-    """Turn the patient under a frontal C-arm instead of the C-arm round the patient, then divide by the depth."""
+    """Turn the patient under a frontal C-arm, then divide by depth.
+
+    A real C-arm turns round the patient instead.
+    """
     a, b = math.radians(g.primary_deg), math.radians(g.secondary_deg)
     x, y, z = (float(value) for value in point)
     # Undo the primary turn about the patient's long axis, then the secondary about the patient's left-right axis.
@@ -73,7 +76,7 @@ def test_frontal_view_shows_the_left_on_the_right_and_the_head_at_the_top() -> N
         (0, -45, (0, -math.sqrt(0.5), -math.sqrt(0.5))),  # caudal: towards the feet
     ],
 )
-def test_the_detector_stands_where_the_angles_say(
+def test_the_detector_is_where_the_angles_say(
     primary: float, secondary: float, detector: tuple[float, float, float]
 ) -> None:
     camera = camera_from_gantry(gantry(primary, secondary))
@@ -167,6 +170,7 @@ def test_ray_angle_is_folded_to_ninety_degrees(a: float, b: float) -> None:
     [
         {"primary_deg": 181.0}, {"secondary_deg": float("nan")}, {"source_isocentre_mm": 1000.0},
         {"source_isocentre_mm": 50.0}, {"pixel_spacing_mm": (0.0, 0.3)}, {"rows": 0}, {"image_axes": ((1, 0), (1, 0))},
+        {"image_axes": ((1, 1), (0, 1))}, {"image_axes": ((2, 1), (1, 1))},
     ],
 )  # fmt: skip
 def test_impossible_gantries_are_refused(changes: dict[str, object]) -> None:

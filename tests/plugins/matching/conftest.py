@@ -21,7 +21,10 @@ def camera(primary: float, secondary: float = 0.0) -> Camera:
 
 
 def beat(phase: Array) -> Array:
-    """How far the heart is contracted: 0 through diastole, a sharp pulse from phase 0 to 0.45."""
+    """Return how far the heart is contracted.
+
+    It is 0 through diastole, and a sharp pulse from phase 0 to 0.45.
+    """
     phase = np.asarray(phase) % 1.0
     return np.where(phase < 0.45, np.sin(np.pi * phase / 0.45) ** 2, 0.0)
 
@@ -68,7 +71,10 @@ class Heart:
         return SiteRuns(name, camera(self.angles[0]), camera(self.angles[1]), runs[0], runs[1])
 
     def positions(self, points: dict[str, Array], phase: float) -> dict[str, Array]:
-        """Contraction lifts and turns the electrodes; the proximal ones move half as much as the tip."""
+        """Return the electrodes lifted and turned by the contraction.
+
+        The proximal ones move half as much as the tip.
+        """
         moved = {}
         for catheter, at in points.items():
             share = np.linspace(1.0, 0.5, len(at))[:, None]
@@ -123,7 +129,10 @@ class Heart:
 
 
 def named_by_hand(segmentation: Segmentation, pixels: Array, name: str, frame: int) -> Segmentation:
-    """The segmentation after a user has marked the catheter nearest to ``pixels`` (4, 2) in one frame as ``name``."""
+    """Return the segmentation after a user has marked a catheter.
+
+    The user marks the catheter nearest to ``pixels`` (4, 2) in one frame as ``name``.
+    """
     entry = segmentation.frames[frame]
     nearest = min(entry.chains, key=lambda chain: float(np.linalg.norm(chain.pixels_uv - pixels)))
     marked = replace(nearest, kinds=((name, 1.0),), manual=True)

@@ -12,7 +12,10 @@ STEP_MS = 1000 / 30
 
 
 def moving(starts_s: np.ndarray, n: int = 90, noise: float = 0.3, seed: int = 0) -> np.ndarray:
-    """Coordinates (n, 4) of two catheters pulled away for 300 ms from each of these times on."""
+    """Return coordinates (n, 4) of two catheters.
+
+    They are pulled away for 300 ms from each of these times on.
+    """
     times = np.arange(n) * STEP_MS / 1000
     into = (times[:, None] - starts_s) / 0.3
     pull = np.where((into > 0) & (into < 1), np.sin(np.pi * np.clip(into, 0, 1)) ** 2, 0.0).sum(axis=1)

@@ -1,4 +1,4 @@
-"""What cannot be ruled out is kept and told; what contradicts the views is refused."""
+"""Pairings that cannot be ruled out are reported; sites that contradict the geometry are rejected."""
 
 from dataclasses import replace
 
@@ -17,7 +17,10 @@ LOOK_ALIKES = {"reference", "pacing"}
 
 
 def level(study) -> None:  # type: ignore[no-untyped-def]
-    """The look-alikes at one height, side by side and moving alike: two views cannot tell which belongs to which."""
+    """Place the look-alikes side by side at one height, moving alike.
+
+    Two views cannot distinguish them.
+    """
     study.pacing_roams_mm = 0.0
     study.places = {"reference": np.array([20.0, -8.0, 0.0]), "pacing": np.array([6.0, -30.0, 0.0])}
     study.directions = dict.fromkeys(LOOK_ALIKES, np.array([0.1, 0.1, 1.0]))
@@ -53,7 +56,7 @@ def test_a_pairing_that_cannot_be_ruled_out_is_kept(heart, seed: int) -> None:  
     assert np.array_equal(*mapping)
 
 
-def test_the_other_sites_tell_what_one_cannot(heart) -> None:  # type: ignore[no-untyped-def]
+def test_the_other_sites_decide_what_one_cannot(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=4, breathing_mm=0.0)
     level(study)
     doubtful = study.site("S0")
@@ -114,7 +117,7 @@ def test_many_sites_say_together_what_one_does_not() -> None:
     assert mirrored_sites([]) == ([], [])
 
 
-def test_a_catheter_too_many_is_told_and_not_swapped_in(heart) -> None:  # type: ignore[no-untyped-def]
+def test_a_catheter_too_many_is_reported_and_not_swapped_in(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=7)
     two = Catalogue(
         (DEFAULT_CATALOGUE["reference"], DEFAULT_CATALOGUE["mapping"]), reference="reference", mapping="mapping"
@@ -151,7 +154,7 @@ def test_catheters_that_all_look_alike_are_matched_all_the_same(heart) -> None: 
     assert {reason for _, reason in site.notes} == {Reason.IDENTITY_UNCERTAIN}
 
 
-def test_views_that_disagree_beyond_the_tolerance_are_told(heart) -> None:  # type: ignore[no-untyped-def]
+def test_views_that_disagree_beyond_the_tolerance_are_reported(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=8, breathing_mm=2.0)
     sites = [study.site(f"S{i}") for i in range(6)]
     noted = {}
@@ -197,7 +200,7 @@ def test_chains_without_their_tip_are_paired_by_the_electrodes_they_have(heart) 
         assert apart.mean() == min(others)
 
 
-def test_an_irregular_rhythm_is_told(heart) -> None:  # type: ignore[no-untyped-def]
+def test_an_irregular_rhythm_is_reported(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=10)
     runs = study.site("S0")
     uneven = replace(runs.segmentation_a, r_wave_frames=(3, 30, 70))

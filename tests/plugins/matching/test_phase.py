@@ -17,7 +17,10 @@ def run(motion: np.ndarray, r_waves: tuple[int, ...] = (), frame_ms: float = 100
 
 
 def pulses(n: int, cycle_frames: float, start: float = 0.0) -> np.ndarray:
-    """Motion of a heart: fast at contraction, less fast at relaxation, still for the rest of the cycle."""
+    """Return the motion of a heart.
+
+    It is fast at contraction, less fast at relaxation, still for the rest of the cycle.
+    """
     phase = (np.arange(n) / cycle_frames + start) % 1.0
     return np.exp(-(((phase - 0.1) / 0.05) ** 2)) + 0.5 * np.exp(-(((phase - 0.35) / 0.06) ** 2))
 
@@ -42,13 +45,13 @@ def test_two_r_waves_are_enough_for_any_run() -> None:
 
 
 @pytest.mark.parametrize("cycle_frames", [27.3, 33.3, 50.0])
-def test_without_r_waves_the_motion_tells_cycle_and_start_of_systole(cycle_frames: float) -> None:
+def test_without_r_waves_the_motion_gives_cycle_and_start_of_systole(cycle_frames: float) -> None:
     rhythm = cardiac_phases(run(pulses(120, cycle_frames, 0.4)), ())
     assert rhythm is not None
     phases = rhythm.phases
     truth = (np.arange(120) / cycle_frames + 0.4) % 1.0
     assert phase_distance(phases, truth).max() < 0.12
-    # The same moment of every beat has the same phase, wherever zero lies.
+    # The same moment of every beat has the same phase; the position of zero does not matter.
     drift = np.unwrap(phases - truth, period=1.0)
     assert np.ptp(drift) < 0.06
 

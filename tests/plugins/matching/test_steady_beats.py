@@ -1,4 +1,4 @@
-"""R waves told to the frame, of hearts that beat steadily and of others."""
+"""R waves to the nearest frame, of hearts that beat steadily and of others."""
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,7 @@ def test_a_steady_rhythm_is_never_farther_than_a_frame_from_the_truth(cycle_ms: 
 
 
 @pytest.mark.parametrize("with_places", [False, True])
-def test_steady_beats_and_the_catheters_tell_r_waves_more_finely_than_frames_do(with_places: bool) -> None:
+def test_steady_beats_and_the_catheters_time_r_waves_more_finely_than_frames_do(with_places: bool) -> None:
     rng = np.random.default_rng(5)
     times = np.linspace(0, 14 * FRAME_MS, 15)
     told: list[float] = []
@@ -49,10 +49,10 @@ def test_steady_beats_and_the_catheters_tell_r_waves_more_finely_than_frames_do(
         finer.extend(found - beats)
         lengths.append(float(np.diff(found).mean()) - cycle_ms)
     assert np.std(finer) < np.std(told)
-    # Two frames' ends tell a length to 0.41 frames; catheters that come back tell it far better.
+    # The ends of two frames give a length to 0.41 frames; returning catheters give it far better.
     assert np.std(lengths) < (0.08 if with_places else 0.5) * FRAME_MS
 
 
-def test_beats_that_differ_by_more_than_frames_explain_stay_as_told() -> None:
+def test_beats_that_differ_by_more_than_frames_explain_stay_as_given() -> None:
     told = to_frames(np.array([100.0, 900.0, 1400.0, 2300.0]))
     assert (steady_beats_ms(told, FRAME_MS / 2, np.zeros(0), None) == told).all()

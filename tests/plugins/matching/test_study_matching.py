@@ -14,7 +14,10 @@ from fluoromap.reasons import Reason
 
 
 def named_right(site: MatchedSite, truth: dict[str, np.ndarray], names: tuple[str, ...]) -> bool:
-    """Whether every one of these catheters is where it belongs, to 15 mm: breathing moves, names exchange by more."""
+    """Return whether each of these catheters is within 15 mm of truth.
+
+    Breathing moves a catheter by less, an exchange of names by more.
+    """
     a = {chain.catheter: chain for chain in site.diastole.a.chains}
     b = {chain.catheter: chain for chain in site.diastole.b.chains}
     for name in names:
@@ -54,7 +57,7 @@ def test_sites_that_were_matched_before_get_the_same_answer_beside_others(heart)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_mapping_catheter_is_told_by_its_tip_in_every_site(heart, seed: int) -> None:  # type: ignore[no-untyped-def]
+def test_the_mapping_catheter_is_recognised_by_its_tip_in_every_site(heart, seed: int) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=seed, wrong_kinds=0.2, noise_px=1.0, breathing_mm=5.0)
     matching = match_study(tuple(study.site(f"S{i}") for i in range(3)), DEFAULT_CATALOGUE, Silent())
     assert len(matching.sites) == 3
@@ -71,7 +74,7 @@ def test_one_site_alone_leaves_look_alikes_uncertain_and_takes_the_stiller_one(h
 
 
 def test_a_name_by_hand_at_one_site_holds_for_the_study(heart, mark) -> None:  # type: ignore[no-untyped-def]
-    # The look-alikes are exchanged on purpose: the one that moves more is called the reference.
+    # The look-alikes are exchanged on purpose: the catheter that moves more is called the reference.
     study = heart(seed=3)
     sites = [study.site(f"S{i}") for i in range(4)]
     runs = sites[2]
@@ -132,7 +135,7 @@ def without_diastole(segmentation: Segmentation) -> Segmentation:
     return replace(segmentation, diastole=None, diastole_frames=())
 
 
-def test_without_a_diastolic_mean_the_quietest_frame_stands_for_it(heart) -> None:  # type: ignore[no-untyped-def]
+def test_without_a_diastolic_mean_the_quietest_frame_replaces_it(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=7)
     runs = study.site("S01")
     runs = replace(runs, segmentation_a=without_diastole(runs.segmentation_a))
@@ -157,7 +160,7 @@ def test_a_catheter_missing_in_the_diastolic_mean_is_taken_from_a_quiet_frame(he
 
 
 def keep(segmentation: Segmentation, wanted) -> Segmentation:  # type: ignore[no-untyped-def]
-    """Only the chains for which ``wanted(chain)``."""
+    """Keep only the chains for which ``wanted(chain)``."""
     frames = tuple(
         FrameChains(one.frame, tuple(chain for chain in one.chains if wanted(chain))) for one in segmentation.frames
     )
@@ -170,7 +173,7 @@ def track_of(segmentation: Segmentation, pixels: np.ndarray) -> int:
     return min(segmentation.diastole.chains, key=lambda one: float(np.linalg.norm(one.pixels_uv - pixels))).track
 
 
-def test_a_missing_reference_is_told_and_the_site_kept(heart) -> None:  # type: ignore[no-untyped-def]
+def test_a_missing_reference_is_reported_and_the_site_kept(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=9)
     sites = [study.site(f"S{i}") for i in range(5)]
     gone = track_of(sites[1].segmentation_b, sites[1].camera_b.project(study.truth["S1"]["reference"]))
@@ -266,7 +269,7 @@ def test_an_empty_study_is_empty() -> None:
     assert match_study((), DEFAULT_CATALOGUE, Silent()).sites == ()
 
 
-def test_a_mark_that_contradicts_everything_else_is_told_not_dropped_silently(heart) -> None:  # type: ignore[no-untyped-def]
+def test_a_mark_that_contradicts_everything_else_is_reported_not_dropped_silently(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=3)
     sites = [study.site(f"S{i:02d}") for i in range(4)]
     segmentation = sites[1].segmentation_a

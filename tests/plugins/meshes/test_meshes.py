@@ -3,6 +3,7 @@
 import base64
 import csv
 import io
+import json
 import struct
 from xml.etree import ElementTree
 
@@ -24,7 +25,7 @@ def test_same_map_same_bytes(sparse_ball, name):
     assert mesh_bytes(sparse_ball, name) == mesh_bytes(sparse_ball, name)
 
 
-@pytest.mark.parametrize("name", ["ply", "stl", "glb", "vtp", "mat"])
+@pytest.mark.parametrize("name", ["ply", "stl", "vtp", "mat"])
 def test_unit_and_axes_are_stated(sparse_ball, name):
     data = mesh_bytes(sparse_ball, name)
     codes = " ".join(str(code) for code in b"unit mm, axes LPS").encode()
@@ -36,14 +37,34 @@ def test_unknown_format_is_refused(ball):
         mesh_bytes(ball, "obj")  # type: ignore[arg-type]
 
 
+def in_mm_lps(points_m):
+    """Return points of a glTF viewer along the patient's axes, mm.
+
+    The viewer places them in metres with +Y up and +Z forward.
+    """
+    left, up, forward = np.transpose(points_m)
+    return 1e3 * np.stack([left, -forward, up], axis=1)
+
+
 @pytest.mark.parametrize("name", ["ply", "stl", "glb"])
-def test_trimesh_reads_a_closed_outward_surface_in_mm(sparse_ball, name):
+def test_trimesh_reads_a_closed_outward_surface(sparse_ball, name):
     read = trimesh.load(io.BytesIO(mesh_bytes(sparse_ball, name, SHIFT)), file_type=name, force="mesh")
     read.merge_vertices(merge_norm=True, merge_tex=True)
+    if name == "glb":
+        # A heart of 57 m would show here: glTF's unit is the metre.
+        assert read.extents.max() < 0.2
+        read.vertices = in_mm_lps(read.vertices)
     assert read.is_watertight
     assert read.is_winding_consistent
     assert read.volume == pytest.approx(sparse_ball.volume_ml * 1e3, rel=1e-4)
     np.testing.assert_allclose(read.bounds[0], sparse_ball.vertices_mm.min(axis=0) + SHIFT, atol=1e-4)
+
+
+def test_glb_says_its_unit_and_axes(sparse_ball):
+    data = mesh_bytes(sparse_ball, "glb")
+    (length,) = struct.unpack_from("<I", data, 12)
+    extras = json.loads(data[20 : 20 + length])["asset"]["extras"]
+    assert (extras["unit"], extras["axes"]) == ("m", ["left", "head", "front"])
 
 
 @pytest.mark.parametrize("name", ["ply", "stl"])
@@ -75,7 +96,7 @@ def test_glb_carries_colours_and_times(sparse_ball):
     (mesh,) = scene.geometry.values()
     np.testing.assert_array_equal(mesh.visual.vertex_attributes["color"][:, :3], vertex_colours(sparse_ball))
     np.testing.assert_array_equal(mesh.faces, sparse_ball.faces)
-    np.testing.assert_allclose(mesh.vertices, sparse_ball.vertices_mm, atol=1e-4)
+    np.testing.assert_allclose(in_mm_lps(mesh.vertices), sparse_ball.vertices_mm, atol=1e-4)
     np.testing.assert_allclose(np.ravel(mesh.vertex_attributes["_LAT_MS"]), sparse_ball.lat_ms, atol=1e-4)
     np.testing.assert_array_equal(np.ravel(mesh.vertex_attributes["_COVERED"]) > 0.5, sparse_ball.covered)
 
@@ -163,6 +184,28 @@ def test_openep_reads_shape_times_and_sites(sparse_ball):
     assert (annotations["mapAnnot"] <= electric["egm"].shape[1]).all()
     outward = ((surface["normals"] * (sparse_ball.vertices_mm - sparse_ball.vertices_mm.mean(axis=0))).sum(axis=1)) > 0
     assert outward.all()
+
+
+def test_openep_has_every_field_that_its_python_reader_asks_for(sparse_ball):
+    """openep-py reads these fields without a default, and drops mapping points whose signals are NaN or missing."""
+    content = io.BytesIO(mesh_bytes(sparse_ball, "mat", SHIFT))
+    read = scipy.io.loadmat(content, squeeze_me=True, simplify_cells=True, struct_as_record=False)["userdata"]
+    original = read["rf"]["originaldata"]
+    for name in ("time", "power", "impedance", "distaltemp"):
+        assert np.size(original["ablparams"][name]) == 0
+    for name in ("time", "force", "axialangle", "lateralangle", "position"):
+        assert np.size(original["force"][name]) == 0
+    electric, sites = read["electric"], len(sparse_ball.sites)
+    for name in ("egm", "egmUni", "egmRef", "ecg"):
+        assert len(electric[name]) == sites
+        assert np.isfinite(electric[name]).all()
+        assert (electric[name] == 0).all()
+    np.testing.assert_allclose(electric["egmUniX"][:, :, 0], electric["egmX"])
+    for name in ("electrodeNames_bip", "electrodeNames_uni", "names", "tags", "include"):
+        assert len(electric[name]) == sites
+    assert electric["voltages"]["unipolar"].shape == (sites, 2)
+    assert electric["annotations"]["mapAnnot"].astype(int).tolist() == electric["annotations"]["mapAnnot"].tolist()
+    assert any("electrograms are 0" in note for note in read["notes"])
 
 
 def test_csv_has_a_line_a_vertex(sparse_ball):

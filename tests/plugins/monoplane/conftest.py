@@ -30,7 +30,10 @@ def _rotation(axis: int, degrees: float) -> Array:
 
 
 def helix(radius: float, length: float, axis: int, centre: tuple[float, float, float]) -> Array:
-    """Return 30 points over 2 right-handed turns from phase 0, both ends included."""
+    """Return 30 points over 2 right-handed turns.
+
+    They begin at phase 0 and include both ends.
+    """
     t = np.linspace(0, 1, 30)
     points = np.empty((30, 3))
     points[:, (axis + 1) % 3] = radius * np.cos(4 * np.pi * t)

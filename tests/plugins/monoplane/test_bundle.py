@@ -13,7 +13,10 @@ FRAMES, POINTS, START = 5, 6, 1
 
 
 def small_view(acceleration_sd: tuple[float, float] | None, seed: int = 5) -> tuple[BodyView, Array]:
-    """Return five frames of a C-arm view of six points, one hidden once, with unequal noise; and the truth."""
+    """Return five frames of a C-arm view, and the truth.
+
+    There are six points, one hidden once, with unequal noise.
+    """
     rng = np.random.default_rng(seed)
     camera = camera_from_gantry(Gantry(30.0, 15.0, 1000.0, 500.0, (0.35, 0.35), 512, 512))
     body = rng.uniform(-25, 25, (POINTS, 3))
@@ -38,7 +41,10 @@ def adjusted(view: BodyView) -> AdjustedBody:
 
 
 def dense_residuals(view: BodyView, unknowns: Array) -> Array:
-    """Return all minimised residuals as one vector: the a-priori frame only shifts, the others turn and shift."""
+    """Return all minimised residuals as one vector.
+
+    The a-priori frame only shifts, the others turn and shift.
+    """
     points, shifts = unknowns[: 3 * POINTS].reshape(-1, 3), unknowns[3 * POINTS : 3 * (POINTS + FRAMES)].reshape(-1, 3)
     turns = np.insert(unknowns[3 * (POINTS + FRAMES) :].reshape(-1, 3), START, 0.0, axis=0)
     rotations = rotation_of(turns)

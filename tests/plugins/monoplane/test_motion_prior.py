@@ -40,7 +40,10 @@ SITES = 12
 def _study(
     seed: int, rate_hz: float = 30.0
 ) -> tuple[tuple[MonoplaneView, ...], tuple[Array, ...], tuple[SiteCycle, ...]]:
-    """Return view a and b of the first site with its cycle, true points (n, m, 3), other cycles; breath held."""
+    """Return views, true points (n, m, 3) and cycles; breath held.
+
+    They are views a and b of the first site with its cycle, and the other sites' cycles.
+    """
     frames = int(1.6 * rate_hz)
     study = simulate_study(
         StudySpec(seed, sites=SITES, frames=frames, frame_rate_hz=rate_hz, heart="dog", breathing_mm=0.0)
@@ -88,7 +91,10 @@ def _without(observation: Observation, *catheters: str) -> Observation:
 
 
 def _at_other_pixels(view: MonoplaneView, catheter: str, shift: Array) -> MonoplaneView:
-    """Return the view with one catheter displaced in the image, frame by frame, by (n, 2) pixels."""
+    """Return the view with one catheter displaced in the image.
+
+    It is displaced frame by frame by (n, 2) pixels.
+    """
     changed = tuple(
         replace(visible, chains=tuple(
             replace(chain, pixels_uv=chain.pixels_uv + shift[row]) if chain.catheter == catheter else chain
@@ -112,7 +118,7 @@ def test_a_sites_own_cycle_gives_depth_in_every_frame(seed: int, number: int) ->
     _whole(track)
 
 
-def test_the_other_sites_motion_stands_in_for_an_unknown_cycle() -> None:
+def test_the_other_sites_motion_replaces_an_unknown_cycle() -> None:
     errors = []
     for seed in (1, 2, 3):
         views, truths, others = _study(seed)

@@ -18,7 +18,10 @@ LAT, PA = APPEARANCES["LAT"], APPEARANCES["PA"]
 
 
 def _straight(name: str, tilt_deg: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)) -> tuple[Shaft, np.ndarray]:  # type: ignore[type-arg]
-    """Return a straight catheter in the isocentre plane of the frontal view, tip to the patient's feet."""
+    """Return a straight catheter in the frontal view's isocentre plane.
+
+    The tip points to the patient's feet.
+    """
     tilt = np.radians(tilt_deg)
     heading = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     tip = np.array([centre[0], 0.0, centre[1]])

@@ -41,7 +41,7 @@ def beating(request):
 
 
 def located(chains, truth_uv, within_px=5.0):
-    """Catheter -> the chain whose electrodes all lie on its true ones."""
+    """Return each catheter's chain whose electrodes all lie on true ones."""
     return {
         name: chain
         for name, points in truth_uv.items()
@@ -182,7 +182,7 @@ def test_a_catalogue_that_does_not_fit_gets_no_electrodes_that_are_not_there(bea
         assert len(located(entry.chains, uv)) == len(entry.chains)
 
 
-def test_a_catheter_more_than_the_study_has_is_told_and_swaps_with_none(beating):
+def test_a_catheter_more_than_the_study_has_is_reported_and_swaps_with_none(beating):
     frames, truth, plain = beating
     assert plain.diastole.manual_needed is None
     two = Catalogue(DEFAULT_CATALOGUE.catheters[1:], "pacing", "mapping")
@@ -197,7 +197,7 @@ def test_a_catheter_more_than_the_study_has_is_told_and_swaps_with_none(beating)
     assert all(len(names) == 1 for names in followed.values())
 
 
-def test_a_catheter_that_leaves_the_field_is_missing_and_told(beating):
+def test_a_catheter_that_leaves_the_field_is_missing_and_reported(beating):
     frames, truth, _ = beating
     uv = {name: points[0] for name, points in truth.pixels_uv.items()}
     by_side = min(uv, key=lambda name: uv[name][:, 0].min())

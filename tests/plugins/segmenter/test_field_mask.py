@@ -81,7 +81,10 @@ def test_outside_is_filled_from_the_nearest_inside(patient):
 
 
 def _polygon(*sides):
-    """Pixels of 512 x 512 inside all blades (angle of the outward normal in degrees, distance from the middle)."""
+    """Return the pixels of 512 x 512 inside all blades.
+
+    A blade is (angle of the outward normal in degrees, distance from the middle).
+    """
     v, u = np.mgrid[0:512, 0:512] - 255.5
     return np.logical_and.reduce(
         [u * np.cos(np.radians(angle)) + v * np.sin(np.radians(angle)) < distance for angle, distance in sides]

@@ -19,7 +19,7 @@ def simulated(study):
 
 
 def located(chains, truth_uv, within_px=4.0):
-    """Catheter -> the chain whose electrodes all lie on its true ones."""
+    """Return each catheter's chain whose electrodes all lie on true ones."""
     return {
         name: chain
         for name, points in truth_uv.items()

@@ -4,12 +4,16 @@ import pytest
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.linking import ShaftImage, catheter_families, evidence, kind_probabilities, link_candidates
+from fluoromap.segmenter.proposals import probability_of_contrast
 
 PX = 5.75
 
 
 def drawn(curves, noise=0.02, size=320):
-    """A log image with dark spots at the electrodes and a fainter shaft behind; curves: list of (points, shaft end)."""
+    """Draw a log image with dark spots at the electrodes.
+
+    A fainter shaft follows behind. curves: list of (points, shaft end).
+    """
     v, u = np.mgrid[0:size, 0:size].astype(float)
     x = np.random.default_rng(3).normal(6, noise, (size, size))
     for points, end in curves:
@@ -30,7 +34,8 @@ def straight(catheter, tip, angle, foreshortening=0.9):
 
 
 def linked(points, image, catalogue=DEFAULT_CATALOGUE):
-    weights = evidence(Contrast.of_frame(image, np.ones(image.shape, bool), PX).of(points))
+    contrast = Contrast.of_frame(image, np.ones(image.shape, bool), PX).of(points)
+    weights = evidence(probability_of_contrast(contrast))
     return link_candidates(
         points, weights, np.zeros(len(points)), ShaftImage(image, 1, 0.05, PX), catheter_families(catalogue)
     )

@@ -6,7 +6,10 @@ from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, quie
 
 
 def cycle(rate_hz, beat_s, beats, noise=0.0):
-    """Motion of a heart: a systolic pulse out and back in the first 45 % of the beat, a short rest between, then quiet."""
+    """Return the motion of a heart.
+
+    It has a systolic pulse out and back in the first 45 % of the beat, a short rest between, then quiet.
+    """
     times = np.arange(int(rate_hz * beat_s * beats)) / rate_hz
 
     def place(t):
@@ -41,7 +44,7 @@ def test_where_hardly_anything_rests_the_two_frames_of_the_least_difference_are_
     assert diastolic_frames(motion, np.arange(10) * 66.0) == (4, 5)
 
 
-def test_where_nothing_rests_late_in_the_cycle_the_quietest_late_frame_stands_alone():
+def test_where_nothing_rests_late_in_the_cycle_the_quietest_late_frame_is_used_alone():
     motion = np.array([1, 1, 1, 9, 9, 9, 9, 6, 9, 9.0])
     assert diastolic_frames(motion, np.arange(10) * 66.0, r_wave_frames=(0, 9)) == (7,)
 

@@ -70,7 +70,7 @@ def test_what_is_not_sure_continues_a_track_but_begins_none():
     assert all(entry.chains == () and entry.manual_needed == Reason.MANUAL_NEEDED for entry in nothing)
 
 
-def test_what_stands_in_single_frames_only_is_dropped():
+def test_a_track_of_single_frames_is_dropped():
     found = [two_beating(frame) for frame in range(30)]
     found[7].append(chain(POINTS + np.array([250, 30])))
     assert all(len(entry.chains) == 2 for entry in track_chains(run(found), times(30), 3))

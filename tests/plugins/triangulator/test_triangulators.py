@@ -226,7 +226,10 @@ def test_the_cycle_follows_the_beating_heart(plugin: type) -> None:
 
 
 def beating_site(rng: np.random.Generator) -> MatchedSite:
-    """Return a site with a pulse of 5 mm in systole and rest in diastole."""
+    """Return a site with a pulse of 5 mm in systole.
+
+    It rests in diastole.
+    """
     points = heart(rng)
     pairs = []
     for phase in np.arange(0, 1, 0.05):

@@ -32,7 +32,10 @@ Points = dict[str, Array]
 
 
 def turn(angle_deg: float, offset_mm: float, seed: int) -> Array:
-    """Return the displacement (4, 4) of the world by a wrong header, of given size and random direction."""
+    """Return the displacement (4, 4) of the world by a wrong header.
+
+    It has the given size and a random direction.
+    """
     rng = np.random.default_rng(seed)
     axis, along = rng.normal(size=3), rng.normal(size=3)
     displaced = np.eye(4)

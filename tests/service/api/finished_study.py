@@ -35,7 +35,7 @@ from fluoromap_service.dicom import InstanceFacts, deterministic_uid, read_insta
 from fluoromap_service.jobs import job_life
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import MEDIA_TYPE, encode
+from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
 from fluoromap_service.study.catheters import StudyCatheter
@@ -58,7 +58,7 @@ REFERENCE_MM = np.array([5.0, -4.0, 3.0])
 STEP_MM = np.array([1.0, 0.0, 0.0])
 TIP_MM = np.array([12.0, 6.0, 9.0])
 BREATH_MM = {"a": np.array([0.0, 0.0, 3.0]), "b": np.array([0.0, 0.0, -3.0])}
-"""How much higher the heart stands in each run than where two views locate it."""
+"""How much higher the heart lies in each run than where two views locate it."""
 REFERENCE_ELECTRODES_MM = REFERENCE_MM + np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 2.0]])
 DIASTOLE = 1
 """Index of the diastolic frame in every run."""
@@ -66,7 +66,7 @@ TIP_PIXEL = {"a": (70.0, 20.0), "b": (25.0, 30.0)}
 COVARIANCE_A = np.diag([4.0, 0.01, 0.01])
 """Of view a's track: the ray of a lateral view is the patient's left-right axis."""
 RELATIVE_COVARIANCE_A = np.diag([0.49, 0.01, 0.01])
-"""The same less the reference of the same frame, by solvers that tell it."""
+"""The same less the reference of the same frame, by solvers that state it."""
 
 
 @dataclass
@@ -94,12 +94,12 @@ class FinishedStudy:
 
     def end(self, name: str, subject: str | None, result: Any, rows: list[Base] | None = None) -> None:
         with self.claimed(name, subject) as (session, held):
-            sha256 = files.keep_bytes(session, encode(result), MEDIA_TYPE)
+            sha256 = files.keep_bytes(session, encode(result))
             stored = job_life.StoredResult(sha256, tuple(rows or ()))
             assert job_life.finish(session, held, stored, reused=False)
 
-    def fail(self, name: str, subject: str | None = None) -> None:
-        error = {"code": "plugin_failed", "detail": f"The stage {name!r} failed: it broke."}
+    def fail(self, name: str, subject: str | None = None, code: str = "plugin_failed") -> None:
+        error = {"code": code, "detail": f"The stage {name!r} failed: it broke."}
         with self.claimed(name, subject) as (session, held):
             assert job_life.fail(session, held, error)
 
@@ -159,7 +159,10 @@ class FinishedStudy:
 
 
 def make_study() -> FinishedStudy:
-    """Store two sites' runs as DICOM files and a job whose first stages are ready."""
+    """Store two sites' runs, and a job.
+
+    The runs are DICOM files, and the job's first stages are ready.
+    """
     uids = {(site, view): deterministic_uid("output", site, view) for site in ("S01", "S02") for view in ("a", "b")}
     with writing() as session:
         study = Study(
@@ -220,11 +223,11 @@ def _cine(uid: str, view: str) -> tuple[bytes, InstanceFacts]:
 def _stored_run(session: Session, uid: str, view: str) -> RunSnapshot:
     gantry = GANTRIES[view]
     content, facts = _cine(uid, view)
-    sha256 = files.keep_bytes(session, content, "application/dicom")
+    sha256 = files.keep_bytes(session, content)
     session.add(
         Instance(
             sop_instance_uid=uid, sha256=sha256, study_instance_uid=facts.study_instance_uid,
-            series_instance_uid=facts.series_instance_uid, series_number=1, acquired=None, facts=facts.to_json(),
+            series_instance_uid=facts.series_instance_uid, facts=facts.to_json(),
         )
     )  # fmt: skip
     plan = GantrySnapshot(
@@ -281,8 +284,9 @@ def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:
 
 
 def followed_site(relative: bool = False) -> SiteTracks:
-    """Reference electrodes 1 and 2, and the tip; the reference moves by 1 mm in frame 1 and is lost in frame 3; the tip
-    is not seen in frame 2.
+    """Return the tracks of reference electrodes 1 and 2 and of the tip.
+
+    The reference moves by 1 mm in frame 1. Frame 3 does not show the reference, frame 2 does not show the tip.
     """
     labels = (("reference", 1), ("reference", 2), ("mapping", 1))
     half = np.array([0.0, 0.0, 2.0])
@@ -307,7 +311,10 @@ def followed_site(relative: bool = False) -> SiteTracks:
 
 
 def map_result() -> MapResult:
-    """An octahedron of 10 mm about the reference, one vertex without a time."""
+    """Return an octahedron of 10 mm about the reference.
+
+    One vertex has no time.
+    """
     vertices = 10.0 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     covered = np.array([True, True, True, True, True, False])

@@ -25,7 +25,7 @@ from fluoromap_service.settings import Settings, settings
 @pytest.mark.parametrize("name", app.COMMANDS)
 def test_every_command_has_its_module_and_the_help_of_the_table(name: str) -> None:
     assert cli.__file__ is not None
-    assert (Path(cli.__file__).parent / f"{name.replace('-', '_')}.py").exists()
+    assert (Path(cli.__file__).parent / "commands" / f"{name.replace('-', '_')}.py").exists()
     assert app.load(name).help.splitlines()[0] == app.COMMANDS[name]
 
 
@@ -44,7 +44,7 @@ def test_the_program_starts_without_the_packages_that_load_slowly() -> None:
 
 @pytest.mark.parametrize("command", ["api", "worker"])
 def test_numba_is_imported_after_the_folder_of_its_kernels_is_set(command: str) -> None:
-    assert "numba" not in _loaded_by(f"fluoromap_service.cli.{command}")
+    assert "numba" not in _loaded_by(f"fluoromap_service.cli.commands.{command}")
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def _made(seed: int, context: Context) -> PaperFigures:
 
 @pytest.fixture
 def call(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int | str | None]:
-    monkeypatch.setattr("fluoromap_service.cli.figures.paper_figures", _made)
+    monkeypatch.setattr("fluoromap_service.cli.commands.figures.paper_figures", _made)
 
     def run(*arguments: str) -> int | str | None:
         monkeypatch.setattr(sys, "argv", ["fluoromap", "figures", *arguments])
@@ -75,7 +75,7 @@ def test_a_refusal_is_reported_in_a_sentence(
     def refuse(seed: int, context: Context) -> PaperFigures:
         raise Refusal(Reason.TOO_FEW_SITES)
 
-    monkeypatch.setattr("fluoromap_service.cli.figures.paper_figures", refuse)
+    monkeypatch.setattr("fluoromap_service.cli.commands.figures.paper_figures", refuse)
     assert call(str(tmp_path), "--seed", "8") == 1
     shown = capsys.readouterr().err.splitlines()[-1]
     assert shown.startswith("fluoromap: ")

@@ -85,7 +85,7 @@ def test_figures_go_to_output_and_progress_to_the_other_stream(
     option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "fluoromap_service.cli.tables.one_view_tables", lambda context: (context.progress(1.0), TABLES)[1]
+        "fluoromap_service.cli.commands.tables.one_view_tables", lambda context: (context.progress(1.0), TABLES)[1]
     )
     assert _call(monkeypatch, *([option] if option else [])) in (None, 0)
     written = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Small DICOM files made for each test, and the real ones where they are at hand."""
+"""Small DICOM files made for each test, and the real ones where they exist."""
 
 from __future__ import annotations
 

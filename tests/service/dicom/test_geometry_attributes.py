@@ -1,4 +1,4 @@
-"""Gantry, orientation and table as headers tell them: legacy and Enhanced XA, substitutes, and nonsense."""
+"""Gantry, orientation and table as headers state them: legacy and Enhanced XA, substitutes, and nonsense."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_clockwise_turn() -> None:
 
 
 @given(angles, st.sampled_from(ALL_AXES))
-def test_orientation_tells_every_flip_and_turn(pose: tuple[float, float], axes: ImageAxes) -> None:
+def test_orientation_gives_every_flip_and_turn(pose: tuple[float, float], axes: ImageAxes) -> None:
     letters = patient_orientation(*pose, axes)
     assert image_axes_from_orientation(letters, *pose) == axes
     assert image_axes_from_field_of_view(*field_of_view_of(axes)) == axes

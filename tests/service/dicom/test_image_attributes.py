@@ -1,4 +1,4 @@
-"""Timing, intensities, shutters and display as headers tell them."""
+"""Timing, intensities, shutters and display as headers state them."""
 
 from __future__ import annotations
 

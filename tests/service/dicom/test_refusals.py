@@ -36,7 +36,7 @@ FRAMES = np.arange(3 * 8 * 10, dtype=np.uint16).reshape(3, 8, 10)
 
 
 def _where(problem: Problem) -> str:
-    """The one place that a problem names."""
+    """Return the one place that a problem names."""
     ((where, _),) = problem.errors
     return where
 
@@ -161,7 +161,7 @@ def test_impossible_images(make_xa: MakeXa, changes: dict[str, Any], code: Dicom
 
 
 def with_syntax(path: Path, old: str, new: str) -> Path:
-    """The same file with another TransferSyntaxUID in its meta information."""
+    """Write the file with another TransferSyntaxUID in its meta information."""
 
     def element(uid: str) -> bytes:
         value = uid.encode() + b"\0" * (len(uid) % 2)

@@ -59,7 +59,7 @@ def test_table_names_the_files_of_each_site(files: SimulatedFiles) -> None:
     assert names == [path.name for path in files.runs]
 
 
-def test_truth_is_the_phantoms_and_stands_apart(files: SimulatedFiles) -> None:
+def test_truth_is_the_phantoms_and_is_apart(files: SimulatedFiles) -> None:
     truth = json.loads(files.truth.read_text())
     site = simulate_study(SPEC).sites[1]
     assert truth["sites"][1]["relative_mm"]["mapping"] == pytest.approx(site.truth.relative_mm["mapping"], abs=1e-4)

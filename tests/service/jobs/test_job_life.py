@@ -84,7 +84,7 @@ def _claim(stage_id: int, worker: str = "w") -> job_life.Claim | None:
 
 def _finish(held: job_life.Claim) -> bool:
     with writing() as session:
-        sha256 = files.keep_bytes(session, b"{}", "application/octet-stream")
+        sha256 = files.keep_bytes(session, b"{}")
         return job_life.finish(session, held, job_life.StoredResult(sha256), reused=False)
 
 
@@ -102,7 +102,7 @@ def _job(job_id: str) -> Job:
 
 
 def _silence(stage_id: int) -> None:
-    """As if the stage's worker had died long ago."""
+    """Set the stage's heartbeat as if its worker had died long ago."""
     with writing() as session:
         session.execute(update(StageRow).where(StageRow.id == stage_id).values(lease_until=db_now() - 1))
 
@@ -217,6 +217,21 @@ def test_a_stage_the_study_needs_fails_the_job(job: str, broken: str) -> None:
     with reading() as session:
         states = session.scalars(select(StageRow.state).where(StageRow.name == "monoplane")).all()
     assert set(states) == monoplane
+
+
+def test_a_job_fails_when_all_its_runs_failed(job: str) -> None:
+    def end(held: job_life.Claim) -> None:
+        with writing() as session:
+            assert job_life.fail(session, held, {"code": "worker_lost", "detail": "the worker died"})
+
+    _work(job, end, "segment")
+    with reading() as session:
+        ended = session.get_one(Job, job)
+        states = {row.name: row.state for row in session.scalars(select(StageRow).where(StageRow.job_id == job))}
+    assert ended.state == JobState.FAILED
+    assert ended.error is not None
+    assert ended.error["code"] == "worker_lost"
+    assert set(states.values()) == {StageState.FAILED, StageState.CANCELLED}
 
 
 def test_a_failed_single_view_fails_its_site_only(job: str) -> None:

@@ -8,16 +8,27 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, text
+from sqlalchemy import inspect, select, text
 
 from fluoromap_service.settings import settings
 from fluoromap_service.store import engine as store_engine
 from fluoromap_service.store import schema
 from fluoromap_service.store.engine import engine, reading, writing
-from fluoromap_service.store.models import Base, Study, StudyInstance
+from fluoromap_service.store.models import Base, Correction, File, Instance, Study, StudyInstance
+
+FIRST_ROWS = (
+    f"INSERT INTO file VALUES ('{'f' * 64}', 10, 'application/dicom', 1.0)",
+    "INSERT INTO study VALUES ('s1', 'label', NULL, NULL, '[]', 'reference', 'mapping', '2.25.1', 1.0, 1.0)",
+    f"INSERT INTO instance VALUES ('1.2.3', '{'f' * 64}', '1.2', '1.3', 7, NULL, '{{\"frames\": 3}}', 1.0)",
+    "INSERT INTO study_instance (study_id, sop_instance_uid, gantry, added) VALUES ('s1', '1.2.3', '{}', 1.0)",
+    "INSERT INTO mark (study_id, sop_instance_uid, frame, version, author, created)"
+    " VALUES ('s1', '1.2.3', 4, 1, 'tester', 1.0)",
+)
+"""Rows of the first schema: a run in a study, with a corrected frame."""
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -70,3 +81,19 @@ def test_processes_that_migrate_at_once_all_succeed() -> None:
 
 def test_history_is_one_line() -> None:
     assert len(ScriptDirectory.from_config(schema.configuration()).get_heads()) == 1
+
+
+def test_rows_of_the_first_schema_stay(database: str) -> None:
+    config = schema.configuration()
+    with schema._alone() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+        for statement in FIRST_ROWS:
+            connection.execute(text(statement))
+    schema.upgrade()
+    with reading() as session:
+        instance = session.get_one(Instance, "1.2.3")
+        assert (instance.sha256, instance.facts) == ("f" * 64, {"frames": 3})
+        assert session.get_one(File, "f" * 64)
+        assert session.scalars(select(StudyInstance.sop_instance_uid)).all() == ["1.2.3"]
+        assert session.scalars(select(Correction.frame)).all() == [4]

@@ -7,6 +7,8 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fluoromap_service.study.pairing import (
     Pairing,
@@ -16,8 +18,8 @@ from fluoromap_service.study.pairing import (
     named_run,
     pair_runs,
     pairs_by_time,
-    ray_angle_deg,
     table_moved,
+    view_angle_deg,
 )
 
 START = datetime(2026, 3, 1, 9, 30, tzinfo=UTC)
@@ -25,7 +27,10 @@ LAT, PA = -90.0, 0.0
 
 
 def run(number: int, primary_deg: float | None, seconds: float | None = -1.0, **facts: Any) -> Run:
-    """Run ``number``; it begins 20 s after the run before unless ``seconds`` says otherwise, None: unknown."""
+    """Return run ``number``.
+
+    It begins 20 s after the run before unless ``seconds`` says otherwise. None: unknown.
+    """
     moment = None if seconds is None else START + timedelta(seconds=20.0 * number if seconds < 0 else seconds)
     direction = None if primary_deg is None else central_ray(primary_deg, 0.0)
     return Run(f"1.2.{number}", number, direction, moment, **facts)
@@ -62,7 +67,7 @@ def test_most_pairs_win_then_the_shortest_time_within_pairs_then_the_earliest() 
 def test_runs_without_time_or_angles_stay_alone() -> None:
     assert pairs_by_time([run(1, LAT, None), run(2, PA)]) == []
     assert pairs_by_time([run(1, None), run(2, PA)]) == []
-    assert ray_angle_deg(run(1, None), run(2, PA)) is None
+    assert view_angle_deg(run(1, None), run(2, PA)) is None
 
 
 def test_a_table_that_moved_prevents_pairing_by_time() -> None:
@@ -88,7 +93,17 @@ OTHER = run(2, PA)
     [
         ([Site("put", explicit_a="1.2.1"), Site("table", csv_row=2, csv_a="1.2.1"), Site("upload")], "put", "explicit"),
         ([Site("table", csv_row=2, csv_a="1.2.1"), Site("upload")], "table", "csv"),
-        ([Site("row", csv_row=2, has_time=True), Site("upload")], "upload", "upload"),
+        (
+            [
+                Site(
+                    "row",
+                    csv_row=2,
+                ),
+                Site("upload"),
+            ],
+            "upload",
+            "upload",
+        ),
     ],
 )
 def test_the_stronger_rule_takes_the_run(sites: list[Site], site: str, rule: str) -> None:
@@ -111,37 +126,77 @@ def test_a_site_takes_two_runs_that_are_apart_and_leaves_the_third() -> None:
 
 def test_rows_take_the_pairs_in_order_when_the_counts_agree() -> None:
     runs = [run(3, LAT), run(4, PA), run(1, LAT), run(2, PA)]
-    rows = [Site("zeta", has_time=True, csv_row=2), Site("alpha", has_time=True, csv_row=3)]
+    rows = [Site("zeta", csv_row=2), Site("alpha", csv_row=3)]
     pairing = pair_runs(rows, runs)
     assert uids(pairing, "zeta") == ("1.2.1", "1.2.2", "order")
     assert uids(pairing, "alpha") == ("1.2.3", "1.2.4", "order")
     assert unnamed(pairing) == []
-    one_more = pair_runs([*rows, Site("third", has_time=True, csv_row=4)], runs)
+    one_more = pair_runs([*rows, Site("third", csv_row=4)], runs)
     assert uids(one_more, "zeta") == (None, None, None)
     assert len(one_more.unnamed) == 2
 
 
 def test_rows_that_name_runs_take_no_pair_by_order() -> None:
-    row = Site("zeta", has_time=True, csv_row=2, csv_a="missing.dcm")
+    row = Site("zeta", csv_row=2, csv_a="missing.dcm")
     assert uids(pair_runs([row], [run(1, LAT), run(2, PA)]), "zeta") == (None, None, None)
 
 
-EARLIER = Site("S01", paired_a="1.2.1", paired_b="1.2.2")
+def test_an_order_that_a_person_confirmed_elsewhere_stays() -> None:
+    confirmed = Site("alpha", csv_row=2, explicit_a="1.2.1", explicit_b="1.2.2")
+    ordered = Site("beta", csv_row=3, ordered_a="1.2.3", ordered_b="1.2.4")
+    runs = [run(1, LAT), run(2, PA), run(3, LAT), run(4, PA)]
+    pairing = pair_runs([confirmed, ordered], runs)
+    assert uids(pairing, "alpha") == ("1.2.1", "1.2.2", "explicit")
+    assert uids(pairing, "beta") == ("1.2.3", "1.2.4", "order")
+    assert uids(pair_runs([ordered], runs[3:]), "beta") == (None, None, None)
 
 
-def test_an_earlier_pair_stays_together() -> None:
-    runs = [run(1, LAT), run(2, PA), run(3, LAT, 41)]
-    assert uids(pair_runs([EARLIER], runs), "S01") == ("1.2.1", "1.2.2", "time")
-    assert uids(pair_runs([EARLIER], runs[1:]), "S01") == (None, None, None)
+@pytest.mark.parametrize(
+    "sites",
+    [
+        [Site("S01", csv_row=2), Site("S02", csv_row=3), Site("apex")],
+        [Site("S01", csv_row=2), Site("S02", csv_row=3, explicit_a="1.2.9")],
+        [Site("S01", csv_row=2), Site("S02", csv_row=3), Site("x", csv_row=4, csv_a="nowhere.dcm")],
+    ],
+)
+def test_rows_take_no_pair_by_order_when_anything_has_a_name(sites: list[Site]) -> None:
+    pairing = pair_runs(sites, [run(1, LAT), run(2, PA), run(3, LAT), run(4, PA)])
+    assert len(pairing.unnamed) == 2
+    assert all(runs.bound_by != "order" for runs in pairing.sites.values())
 
 
-def test_a_row_takes_over_a_pair_whose_name_the_service_invented() -> None:
-    row = Site("apex", has_time=True, csv_row=2)
-    pairing = pair_runs([EARLIER, row], [run(1, LAT), run(2, PA)])
-    assert uids(pairing, "apex") == ("1.2.1", "1.2.2", "order")
+def test_a_run_that_was_named_at_the_upload_ends_the_order() -> None:
+    runs = [run(1, LAT), run(2, PA), run(3, LAT, site="apex", site_by="upload"), run(4, PA)]
+    pairing = pair_runs([Site("S01", csv_row=2), Site("apex")], runs)
     assert uids(pairing, "S01") == (None, None, None)
-    timed = replace(EARLIER, has_time=True)
-    assert uids(pair_runs([timed, row], [run(1, LAT), run(2, PA)]), "S01") == ("1.2.1", "1.2.2", "time")
+
+
+@given(st.data())
+def test_a_site_never_gets_the_runs_of_another_without_a_warning(data: st.DataObject) -> None:
+    """Pairs in any order of arrival, rows in any order, any names, some runs named: right, unmatched, or warned."""
+    count = data.draw(st.integers(1, 5))
+    named = data.draw(st.sets(st.integers(0, count - 1)))
+    rows = data.draw(st.permutations(range(count)))[: data.draw(st.integers(0, count))]
+    names = data.draw(st.permutations([f"S{k + 1:02d}" for k in range(count)]))
+    numbers = data.draw(st.permutations(range(2 * count)))
+    runs = []
+    for arrival, number in enumerate(numbers):
+        given_site = names[number // 2] if number // 2 in named else None
+        angle = PA if number % 2 else LAT
+        made = run(number, angle, site=given_site, site_by=None if given_site is None else "upload")
+        runs.append(replace(made, arrival=arrival))
+    sites = [Site(names[k], csv_row=row + 2) for row, k in enumerate(rows)]
+    sites += [Site(names[k]) for k in sorted(named) if k not in rows]
+    pairing = pair_runs(sites, runs)
+    for k, name in enumerate(names):
+        found = pairing.sites.get(name)
+        if found is None or found.a is None or found.b is None:
+            continue
+        right = {found.a.uid, found.b.uid} == {f"1.2.{2 * k}", f"1.2.{2 * k + 1}"}
+        assert right or found.bound_by == "order"
+        if found.bound_by == "order":
+            assert not named
+            assert len(rows) == count
 
 
 def test_a_table_names_runs_by_uid_series_number_or_file_name() -> None:

@@ -1,4 +1,4 @@
-"""The paper's Figures 3, 4 and 5 on a simulated study: the map from exact depth and from single-view depth."""
+"""The paper's Figures 3, 4 and 5: maps of a simulated study from exact and single-view depth."""
 
 from fluoromap.paper.figures.paper_figures import PaperFigures, paper_figures
 

@@ -1,4 +1,4 @@
-"""One moment of the cardiac cycle in one view of a simulated study: exact and single-view positions of the sites.
+"""One moment of the cycle in one view of a simulated study: exact and single-view positions.
 
 The electrodes' pixels are the true ones with noise, so that the figures show depth alone. Names and the gantry are correct.
 Everything else is as in a study: the two runs of a site are taken one after the other, frames are matched by cardiac phase,
@@ -62,7 +62,7 @@ class SiteAtMoment:
 
 @dataclass(frozen=True, eq=False)
 class MomentInView:
-    """All located sites of a study at one moment of the cycle, from runs of one view, and the maps of both depths."""
+    """One moment in runs of one view: all located sites, and the maps of exact and single-view depth."""
 
     view: PhantomView
     sites: tuple[SiteAtMoment, ...]
@@ -75,7 +75,10 @@ class MomentInView:
 
 
 def farthest_phase(study: SimulatedStudy) -> float:
-    """Return the phase at which the tips are farthest from their diastolic places, averaged over sites and runs."""
+    """Return the phase at which the tips are farthest from diastole.
+
+    The distances from the diastolic places are averaged over sites and runs.
+    """
     phases = np.concatenate([run.truth.phases for site in study.sites for run in site.runs])
     moved = np.concatenate([_moved_mm(study.catalogue, site, run) for site in study.sites for run in site.runs])
     part = np.minimum((phases * _PHASES).astype(np.int64), _PHASES - 1)
@@ -85,7 +88,9 @@ def farthest_phase(study: SimulatedStudy) -> float:
 
 
 def moment_in_views(study: SimulatedStudy, phase: float, context: Context) -> dict[PhantomView, MomentInView]:
-    """Return both views at a phase of the cycle; the default solver tracks every site in one view at a time.
+    """Return both views at a phase of the cycle.
+
+    The default solver tracks every site in one view at a time.
 
     Raises
     ------
@@ -185,7 +190,10 @@ def _mapped_site(
 
 
 def _moved_mm(catalogue: Catalogue, site: SimulatedSite, run: SimulatedRun) -> Array:
-    """Return the distance (n,) of the true tip from its place at diastole, both minus the reference catheter's mean."""
+    """Return the distance (n,) of the true tip from diastole.
+
+    Both positions are minus the reference catheter's mean.
+    """
     points = run.truth.points_mm
     tip = points[catalogue.mapping][:, 0] - points[catalogue.reference].mean(axis=1)
     moved: Array = np.linalg.norm(tip - site.truth.relative_mm[catalogue.mapping][0], axis=1)

@@ -63,7 +63,10 @@ class PaperFigures:
     numbers: FigureNumbers
 
     def files(self) -> dict[str, bytes]:
-        """Return name and content of every file: a PNG for each figure, and ``figures.json``."""
+        """Return the content of every file by its name.
+
+        The files are a PNG for each figure, and ``figures.json``.
+        """
         content = {f"figure{number}.png": encode_png(picture) for number, picture in self.pictures.items()}
         text = json.dumps(asdict(self.numbers), indent=2, allow_nan=False)
         return {**content, "figures.json": f"{text}\n".encode()}
@@ -163,5 +166,5 @@ def _caption(shown: ViewNumbers, numbers: FigureNumbers) -> tuple[str, ...]:
         f"other sites instead, as for a site with one usable view: RMS {of.other_cycles_rms_mm:.2f} mm, largest "
         f"{of.other_cycles_largest_mm:.2f} mm.",
         f"Simulated dog's heart, seed {numbers.seed}; {len(shown.sites)} of {numbers.simulated_sites} sites; electrodes at "
-        f"their true pixels with {numbers.noise_px:g} px noise an axis (not segmented).",
+        f"their true pixels with {numbers.noise_px:g} px noise per axis (not segmented).",
     )

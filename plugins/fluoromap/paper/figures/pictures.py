@@ -40,7 +40,10 @@ def in_space(moment: MomentInView) -> tuple[Picture, Picture]:
 
 
 def on_frame(moment: MomentInView, site: str, stored: NDArray[np.uint16]) -> tuple[Picture, Picture]:
-    """Draw both maps on the frame of one site: exact depth, single-view depth; ``stored`` are the frame's pixels."""
+    """Draw both maps on the frame of one site: exact depth, single-view depth.
+
+    ``stored`` are the frame's pixels.
+    """
     shown = moment.site(site)
     low, high = np.percentile(stored, [0.5, 99.5])
     frame = np.clip((stored - low) / (high - low) * 255, 0, 255).round().astype(np.uint8)
@@ -53,7 +56,7 @@ def on_frame(moment: MomentInView, site: str, stored: NDArray[np.uint16]) -> tup
 
 
 def figure(title: str, parts: Sequence[tuple[str, Picture]], caption: Sequence[str]) -> Picture:
-    """Draw pictures one above the other, each under its heading, with a title on top and a caption below.
+    """Draw pictures one above the other with title, headings and caption.
 
     Returns
     -------

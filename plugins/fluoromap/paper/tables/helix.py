@@ -1,4 +1,4 @@
-"""The paper's simulation: a helix of 30 points that rotates and moves a little from image to image."""
+"""The paper's simulation: a helix of 30 points that rotates and moves between images."""
 
 from __future__ import annotations
 

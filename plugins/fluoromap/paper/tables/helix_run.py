@@ -1,4 +1,4 @@
-"""A moving helix as a solver's input: every point is an electrode with a known position in the first image."""
+"""A moving helix as a solver's input: every point is an electrode."""
 
 from __future__ import annotations
 

@@ -81,7 +81,10 @@ class PhantomRun:
         return replace(self, solver_input=replace(self.solver_input, a_priori=a_priori), truth_mm=self.truth_mm[:, own])
 
     def without_own_cycle(self, others: tuple[PhantomRun, ...]) -> PhantomRun:
-        """Return the same run with the cycles of the heart's other sites instead of the site's own."""
+        """Return the run with the cycles of the heart's other sites.
+
+        The site's own cycle is left out.
+        """
         cycles = {run.solver_input.site: run.solver_input.cycle for run in others if run.heart == self.heart}
         known = tuple(cycle for site, cycle in cycles.items() if site != self.solver_input.site and cycle is not None)
         return replace(self, solver_input=replace(self.solver_input, cycle=None, others=known))

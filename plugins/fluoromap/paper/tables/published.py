@@ -47,5 +47,8 @@ def table_1(view: HelixView, dz_mm: int, images: int) -> DepthFigures:
 
 
 def table_2_rms_over_mean(view: str, dz_mm: int, images: int) -> float | None:
-    """Return 3D RMS over mean of the paper's Table 2; None where it is not known."""
+    """Return 3D RMS over mean of the paper's Table 2.
+
+    The result is None where it is not known.
+    """
     return _TABLE_2_RATIOS[view].get(images) if dz_mm == 5 else None

@@ -72,7 +72,10 @@ def _positions_mm(run: MonoplaneView, dz_mm: int) -> Array:
 
 
 def _bound_mm(camera: Camera, truth_mm: Array, noise_px: float) -> float:
-    """Return the RMS Cramer-Rao bound over points and images; it is proportional to the noise."""
+    """Return the RMS Cramer-Rao bound over points and images.
+
+    It is proportional to the noise.
+    """
     m = truth_mm.shape[1]
     one_px = np.broadcast_to(np.eye(2), (m, 2, 2))
     visible = np.ones(m, dtype=np.bool_)

@@ -18,7 +18,10 @@ _VIEWS: tuple[HelixView, ...] = ("LAT", "AP")
 
 @dataclass(frozen=True, slots=True)
 class Table1Row:
-    """A row of Table 1. fitted : for H77 in the lateral view, with added depths that were fitted to the paper's figures."""
+    """A row of Table 1.
+
+    fitted : for H77 in the lateral view, with added depths that were fitted to the paper's figures.
+    """
 
     view: HelixView
     helix: HelixName
@@ -30,7 +33,10 @@ class Table1Row:
 
 
 def table1() -> tuple[Table1Row, ...]:
-    """Return Table 1 on both helices, without pixel noise; in the paper's order, helix by helix."""
+    """Return Table 1 on both helices, without pixel noise.
+
+    Rows are in the paper's order, helix by helix.
+    """
     rows = []
     for name, helix in HELICES.items():
         for view in _VIEWS:

@@ -21,8 +21,9 @@ _GOOD_MM = 2.0
 
 @dataclass(frozen=True, slots=True)
 class WholeCycleRow:
-    """3D RMS from the image after the a-priori image to the end of the cycle, and its parts along and across the rays.
+    """3D RMS over a cycle, and its parts along and across the rays.
 
+    The images are those after the a-priori image to the end of the cycle.
     refused : number of refused runs. They count in none of the figures, which are None where all runs are refused.
     relative_rms_mm : of positions minus the reference catheter's mean, without the reference catheter itself.
     largest_heart_rms_mm : of the worst heart. images_below_2_mm : number of the cycle's images with an RMS below 2 mm over

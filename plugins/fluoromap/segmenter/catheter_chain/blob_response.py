@@ -12,22 +12,25 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
+from fluoromap.segmenter.proposals import Likeness, Proposals, probability_of_contrast
 
 _SCALES_MM = 0.52, 0.73, 1.04
 _LEAST_RING_PX = 5.0
 _CLEAR_SNR = 4.0
 _APART_MM = 0.57
 _MOST = 60
+_BLUR_MM = 1.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlobResponse:
     """Response of one log image to dark blobs.
 
-    stack : (3, rows, columns) float32, scale-normalised half Laplacian in log units, positive where dark; image size over
-    ``reduction``. best : (rows, columns), the largest of the three scales, each over its noise. noise : (3,) robust
-    standard
-    deviation of ``stack`` inside the field. smooth : (rows, columns) the reduced log image at the smallest scale.
+    stack : (3, rows, columns) float32, scale-normalised half Laplacian in log units, positive where dark; image size
+    over ``reduction``.
+    best : (rows, columns), the largest of the three scales, each over its noise.
+    noise : (3,) robust standard deviation of ``stack`` inside the field.
+    smooth : (rows, columns) the reduced log image at the smallest scale.
     pixel_noise : standard deviation of a pixel of the reduced log image.
     """
 
@@ -68,19 +71,16 @@ class BlobResponse:
             stack, best, noise, smooth, pixel_noise(small, inside[::reduction, ::reduction]), reduction, px_per_mm
         )
 
-    def candidates(self, allowed: BoolArray, expected: int) -> tuple[Array, Array]:
-        """Return the maxima over u, v and scale above 4 robust standard deviations.
+    @property
+    def likeness(self) -> Likeness:
+        """Response over noise."""
+        return Likeness(self.best, self.reduction, 0.5 * (self.reduction - 1))
 
-        Scales compete by response. With response over noise, a long tip would split in two. Candidates weaker than a fifth
-        of the
-        ``expected``-th best are dropped.
+    def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
+        """Return the maxima over u, v and scale, strongest response first.
 
-        Returns
-        -------
-        points_uv : (n, 2)
-            Pixels of the frame, sub-pixel.
-        snr : (n,)
-            Response over noise, strongest response first.
+        They are above 4 robust standard deviations. Scales compete by response. With response over noise, a long tip
+        would split in two. Candidates weaker than a fifth of the ``expected``-th best are dropped.
         """
         scale, v, u = self._maxima(allowed[:: self.reduction, :: self.reduction])
         strongest = np.argsort(-self.stack[scale, v, u], kind="stable")[:300]
@@ -93,12 +93,16 @@ class BlobResponse:
             keep = snr >= 0.2 * np.sort(snr)[-expected]
             places, snr = places[keep], snr[keep]
         shift = 0.5 * (self.reduction - 1)
-        return places * self.reduction + shift, snr
+        variance = self._variance(snr)
+        return Proposals(
+            places * self.reduction + shift, probability_of_contrast(snr), variance[:, None, None] * np.eye(2)
+        )
 
     def _maxima(self, allowed: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Return (scale, v, u) of the maxima over place and scale.
+        """Return scale, v and u of the maxima.
 
-        ``allowed`` is False at the border. skimage.feature.peak_local_max takes 10 to 50 times as long.
+        A maximum is over place and scale. ``allowed`` is False at the border. skimage.feature.peak_local_max takes 10
+        to 50 times as long.
         """
         first, second, third = self.stack
         top = np.maximum(np.maximum(first, second), third).reshape(-1)
@@ -128,7 +132,24 @@ class BlobResponse:
         tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
         return tops
 
-    def at(self, points_uv: Array) -> Array:
+    def probability_at(self, points_uv: Array) -> Array:
+        """Return the probability of electrodes at points of the frame, (n,)."""
+        return probability_of_contrast(self.scores_at(points_uv))
+
+    unseen_probability_at = probability_at
+
+    def variance_at(self, points_uv: Array) -> Array:
+        """Return the variance of places at these points, (n,) pixels squared.
+
+        It is that of maxima as strong as the response there.
+        """
+        return self._variance(self.scores_at(points_uv))
+
+    def _variance(self, snr: Array) -> Array:
+        variance: Array = (_BLUR_MM * self.px_per_mm / np.maximum(snr, 1.0)) ** 2
+        return variance
+
+    def scores_at(self, points_uv: Array) -> Array:
         """Return the response over noise at points of the frame, (n,).
 
         Each point has the response of its best scale.

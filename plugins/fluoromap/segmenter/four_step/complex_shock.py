@@ -14,9 +14,8 @@ from fluoromap.segmenter.log_image import Image, central_range
 def to_grey_range(x: Image, inside: BoolArray) -> Image:
     """Map the 0.5th to 99.5th percentile inside the mask linearly to 0..255.
 
-    This is the scale of :func:`complex_shock`: the gain ``feedback`` of equation (7) depends on the scale. Values beyond
-    the
-    percentiles are not clipped.
+    This is the scale of :func:`complex_shock`: the gain ``feedback`` of equation (7) depends on the scale. Values
+    beyond the percentiles are not clipped.
     """
     ends = central_range(x, inside)
     low, high = ends if ends is not None else (0.0, 255.0)
@@ -41,14 +40,11 @@ def complex_shock(
         J_t = r cos(theta) J_nn + (r sin(theta) / theta) R_nn + lt J_ee
 
     n is the direction along the gradient, e across it. The minus sign makes the dark side of an edge darker; a plus would
-    blur.
-    |grad R| uses minmod differences, all other terms central differences. The border values are repeated.
+    blur. |grad R| uses minmod differences, all other terms central differences. The border values are repeated.
 
-    The paper's lambda tilde equals r, and theta is small. Two simplifications follow. r cos(theta) is taken as r, so that
-    the
-    diffusion of R and of J is r times their Laplacians. The feedback of J_nn on R is left out. For theta up to 0.01 both
-    are less
-    than 1e-4 of the remaining terms, and change the result by less than 1e-4 of its range.
+    The paper's lambda tilde equals r, and theta is small. Two simplifications follow. r cos(theta) is taken as r, so
+    that the diffusion of R and of J is r times their Laplacians. The feedback of J_nn on R is left out. For theta up to
+    0.01 both are less than 1e-4 of the remaining terms, and change the result by less than 1e-4 of its range.
 
     Parameters
     ----------
@@ -90,12 +86,10 @@ def _minmod(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
 def _sharpen_row(r, r_north, r_south, j, j_north, j_south, real, imaginary, step, flow, drive):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do one sweep over one row.
 
-    The arguments are R and a J in it and in its neighbours.
-    All rows have one extra pixel at both ends. (2/pi) atan(x) is computed as x P(|x|) / Q(|x|) to 1e-4, with quadratic P
-    and cubic
-    Q of the same limit. It shares one division with the second derivative along the gradient. Gradients are twice as large
-    here,
-    which cancels.
+    ``r`` is R and ``j`` is a times J, a being the feedback coefficient of equation (7). Both are given in this row and in
+    its neighbours. All rows have one extra pixel at both ends. (2/pi) atan(x) is computed as x P(|x|) / Q(|x|) to 1e-4,
+    with quadratic P and cubic Q of the same limit. It shares one division with the second derivative along the gradient.
+    Gradients are twice as large here, which cancels.
     """
     n = r.size - 2
     r_west, r_here, r_east = r[:n], r[1:-1], r[2:]
@@ -130,8 +124,7 @@ def _sharpen(real, imaginary, sweeps, step, flow, drive):  # type: ignore[no-unt
     """Do all sweeps as one wavefront.
 
     A sweep moves each row two rows up in the buffer, where no values are needed any more. So neighbours still hold the
-    values from
-    before the sweep, and no row is copied.
+    values from before the sweep, and no row is copied.
     """
     rows = real.shape[0] - 2 * sweeps
     n = real.shape[1] - 2

@@ -77,11 +77,10 @@ def _radii(px_per_mm: float) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _local_maxima(x, found):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write (u, v, value) of each positive maximum; return their number.
+    """Write each positive maximum as (u, v, value); return their number.
 
-    No pixel within two of a maximum exceeds it. skimage.feature.peak_local_max takes 35 times as long, and SciPy's maximum
-    filter
-    three times.
+    No pixel within two of a maximum exceeds it. skimage.feature.peak_local_max takes 35 times as long, and SciPy's
+    maximum filter three times.
     """
     rows, columns = x.shape
     count = 0

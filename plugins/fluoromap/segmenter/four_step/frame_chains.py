@@ -22,6 +22,7 @@ from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.gaussian_blur import reduce_by
 from fluoromap.segmenter.linking import ShaftImage, catheter_families, evidence, link_candidates
 from fluoromap.segmenter.log_image import Image, pixel_noise
+from fluoromap.segmenter.proposals import probability_of_contrast
 
 MOST_BLOBS = 40
 """With more blobs than this the threshold has separated noise from the rest, not electrodes."""
@@ -109,7 +110,12 @@ class FourStepDetector:
         families = catheter_families(self.catalogue)
         points = _add_peaks(blobs.centroids_uv, contrast.peaks(self.field.candidates), self.px_per_mm)
         linked = link_candidates(
-            points, evidence(contrast.of(points)), np.zeros(len(points)), shaft_image, families, sure=len(blobs)
+            points,
+            evidence(probability_of_contrast(contrast.of(points))),
+            np.zeros(len(points)),
+            shaft_image,
+            families,
+            sure=len(blobs),
         )
         if not linked:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
@@ -129,9 +135,8 @@ class FourStepDetector:
 def _add_peaks(blobs_uv: Array, peaks_uv: Array, px_per_mm: float) -> Array:
     """Return the blobs, then the peaks that are not one of them.
 
-    The blobs lack two kinds of electrodes: steeply foreshortened rings are narrower than the opening disk, and electrodes
-    of
-    crossing catheters merge into one component.
+    The blobs lack two kinds of electrodes: steeply foreshortened rings are narrower than the opening disk, and
+    electrodes of crossing catheters merge into one component.
     """
     if not len(peaks_uv):
         return blobs_uv

@@ -13,12 +13,11 @@ from fluoromap.segmenter.log_image import Image
 def homomorphic(x: Image, low: float = 0.5, high: float = 2.0, slope: float = 1.0, cutoff: float = 8.0) -> Image:
     """Filter a log image by eq. (4) of the paper.
 
-    The filter reduces slow shading and raises detail.
-    The transfer function H(D) = (high - low)(1 - exp(-slope D^2 / cutoff^2)) + low, with D in cycles per image width, is
-    ``high`` minus a Gaussian, so that no Fourier transform is needed:
-    H applied to x is ``high x - (high - low) G * x`` with the width of :func:`equivalent_sigma`.
-    Edges are reflected. (1 - low) times the mean is added, so that H(0) = 1 and the mean level stays.
-    The exponential that ends a textbook homomorphic filter is monotone and left out.
+    The filter reduces slow shading and raises detail. The transfer function H(D) = (high - low)(1 - exp(-slope D^2 /
+    cutoff^2)) + low, with D in cycles per image width, is ``high`` minus a Gaussian, so that no Fourier transform is
+    needed: H applied to x is ``high x - (high - low) G * x`` with the width of :func:`equivalent_sigma`. Edges are
+    reflected. (1 - low) times the mean is added, so that H(0) = 1 and the mean level stays. The exponential that ends a
+    textbook homomorphic filter is monotone and left out.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
 """Step 4 of the four-step filter: grey-level morphology with disks.
 
-scikit-image's closing with a disk of 14 px takes 260 times as long (40 times with a decomposed disk), its opening with 2 px
-16
-times.
+scikit-image's closing with a disk of 14 px takes 260 times as long (40 times with a decomposed disk), its opening with
+2 px 16 times.
 """
 
 from __future__ import annotations
@@ -24,11 +23,9 @@ _LEVELS = 65536
 def disk_morphology(x: Image, background_px: int = 14, opening_px: int = 2) -> Image:
     """Return dark things between the two disk sizes as bright ones.
 
-    The closing by the large disk minus the image (black top-hat) keeps dark things that the large disk does not fit into.
-    The
-    opening by the small disk removes those that it does not fit into. Radii are in pixels at the heart: the large one must
-    exceed
-    half an electrode's length, the small one must be at most half a ring's length.
+    The closing by the large disk minus the image (black top-hat) keeps dark things that the large disk does not fit
+    into. The opening by the small disk removes those that it does not fit into. Radii are in pixels at the heart: the
+    large one must exceed half an electrode's length, the small one must be at most half a ring's length.
 
     The image is mapped to 65536 grey levels between its extremes: rank filters are several times faster on short integers.
     """
@@ -85,8 +82,7 @@ def _raise(out, rows, first, second, outer_rows, outer_first, outer_second):  # 
     """Raise a row to two windows each of four other rows.
 
     These are the windows that begin at ``first`` and ``second`` in the row above and the row below, and likewise in an
-    outer pair
-    of rows. Four rows at once: each call costs as much as a row.
+    outer pair of rows. Four rows at once: each call costs as much as a row.
     """
     above, below = rows
     outer_above, outer_below = outer_rows
@@ -104,10 +100,8 @@ def _raise(out, rows, first, second, outer_rows, outer_first, outer_second):  # 
 def _dilate(x, half_widths, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Dilate by a disk, row by row.
 
-    Each row is widened once by windows of 1, 2, 4, ... pixels and stored while it is in reach.
-    A row of the result is the largest of the rows round it, each widened to its row of the disk by two overlapping windows
-    of one
-    size.
+    Each row is widened once by windows of 1, 2, 4, ... pixels and stored while it is in reach. A row of the result is
+    the largest of the rows round it, each widened to its row of the disk by two overlapping windows of one size.
     """
     rows, columns = x.shape
     radius = half_widths.size - 1

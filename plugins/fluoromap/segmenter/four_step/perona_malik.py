@@ -20,9 +20,8 @@ _GAUSSIAN_SD = 1.4826
 def edge_scale(x: Image, inside: BoolArray, factor: float = 2.0) -> float | None:
     """Return K of equation (6) from the noise, or None for a flat frame.
 
-    K is ``factor`` x 1.4826 x the median |horizontal difference| inside the mask. On coarsely quantised frames the median
-    is 0. K
-    is therefore at least a thousandth of the spread of x.
+    K is ``factor`` x 1.4826 x the median |horizontal difference| inside the mask. On coarsely quantised frames the
+    median is 0. K is therefore at least a thousandth of the spread of x.
     """
     ends = central_range(x, inside)
     if ends is None:
@@ -38,8 +37,7 @@ def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Ima
     """Apply Perona-Malik diffusion, eq. (5) of the paper, with the conduction of :func:`_flux`.
 
     Four neighbours, explicit steps, no flux through the image border. All sweeps run as one wavefront over the rows, in
-    place:
-    sweep n + 1 visits a row as soon as sweep n has left the row below, while both are in the cache.
+    place: sweep n + 1 visits a row as soon as sweep n has left the row below, while both are in the cache.
 
     Parameters
     ----------
@@ -69,9 +67,9 @@ def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Ima
 def _flux(d):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return d times the conduction exp(-(d/K)^2), eq. (6) of the paper.
 
-    d is in the unit in which the product is d exp(-8 d^2). The error is 1e-4 of the largest value. The exponential is the
-    eighth
-    power of a cubic in d^2, best over 0 <= 8 d^2 <= 10; beyond, the flux is 0. Library calls would break vectorisation.
+    d is in the unit in which the product is d exp(-8 d^2). The error is 1e-4 of the largest value. The exponential is
+    the eighth power of a cubic in d^2, best over 0 <= 8 d^2 <= 10; beyond, the flux is 0. Library calls would break
+    vectorisation.
     """
     y = min(d * d, np.float32(1.3))
     series = np.float32(0.49140077) - np.float32(0.13123593) * y
@@ -86,8 +84,7 @@ def _diffuse_row(row, below, north, flow, step):  # type: ignore[no-untyped-def]
     """Do one sweep over one row.
 
     ``north`` holds the flux from above and, afterwards, the flux below. ``flow`` holds the fluxes through the vertical
-    pixel faces;
-    its ends stay 0.
+    pixel faces; its ends stay 0.
     """
     n = row.size
     right, west, east = row[1:], flow[:n], flow[1:]

@@ -16,12 +16,11 @@ class FourStep:
     """The paper's segmenter: equations (4) to (7), disks, Otsu, components; then linking.
 
     Every frame is filtered and linked on its own. So is the mean of the quiet frames round diastole: steeply angulated,
-    noisy views
-    succeed there that fail frame by frame.
+    noisy views succeed there that fail frame by frame.
     """
 
     name: ClassVar[str] = "four-step"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
     Params: ClassVar[type[BaseModel]] = FourStepParams
 
     def __init__(self, params: FourStepParams | None = None) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import Request, Response
 
 MEDIA_TYPE = "text/csv"
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def wants_csv(request: Request) -> bool:
@@ -30,12 +31,23 @@ def _number(text: str) -> float:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return CSV with a header line; None becomes an empty field. Lines end in CRLF (RFC 4180)."""
+    """Return CSV with a header line.
+
+    None becomes an empty field. Lines end in CRLF (RFC 4180).
+    """
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(columns)
-    writer.writerows(rows)
+    writer.writerows([_plain_text(value) for value in row] for row in rows)
     return stream.getvalue()
+
+
+def _plain_text(value: Any) -> Any:
+    """Return a cell's value that a spreadsheet shows as text.
+
+    The spreadsheet never runs it as a formula (OWASP, CSV injection).
+    """
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
 
 
 def csv_response(text: str, file_name: str) -> Response:

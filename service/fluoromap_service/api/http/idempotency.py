@@ -55,9 +55,9 @@ class Once:
         self.content = content
 
     def answer(self, act: Callable[[Session], Response]) -> Response:
-        """Run ``act`` in a writing transaction and store its answer, or repeat the stored answer.
+        """Run ``act`` and store its answer, or repeat the stored answer.
 
-        When ``act`` raises, nothing is stored and the key stays free.
+        ``act`` runs in a writing transaction. When ``act`` raises, nothing is stored and the key stays free.
 
         Raises
         ------
@@ -91,7 +91,10 @@ class Once:
 
 
 def _reserve(session: Session, key: str, content: str) -> bool:
-    """Add the key's row; return False when there is one. PostgreSQL waits here for another request with this key."""
+    """Add the key's row; return False when there is one.
+
+    PostgreSQL waits here for another request with this key.
+    """
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     added = session.execute(
         insert(Idempotency)

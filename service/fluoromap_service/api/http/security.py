@@ -68,9 +68,10 @@ def _unauthorised(detail: str, challenge: str = "") -> Problem:
 
 
 def _check_local(connection: HTTPConnection) -> None:
-    """Check that a request to an open service comes from this machine and from the service's own pages.
+    """Check that a request to an open service is local.
 
-    Any web page in the user's browser can reach an open service.
+    The request must come from this machine and from the service's own pages, because any web page in the user's browser
+    can reach an open service.
     """
     server = connection.scope.get("server")
     if server is None or not auth.is_loopback(str(server[0])):

@@ -1,4 +1,4 @@
-"""What happens to a job, as it happens."""
+"""The route of a job's event stream."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import asyncio
 from collections.abc import AsyncIterable
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Path
+from fastapi import APIRouter, Depends, Header
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
 
+from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
@@ -20,9 +21,9 @@ from fluoromap_service.store.models import ENDED_JOB, Event
 
 router = APIRouter(tags=["jobs"])
 
-LOOK_SECONDS = 0.25
+POLL_SECONDS = 0.25
 OVERLAP = 100
-"""Ids are given before they are committed: one this much lower than the newest may still appear after it."""
+"""Events get their ids before their commit, so an id lower than the newest by up to this number may still appear."""
 
 _EXAMPLE = (
     'event: stage\ndata: {"name": "segment", "subject": "1.2.826.0.1.3680043.8.498.1", "state": "running", "attempt": 1, '
@@ -30,21 +31,20 @@ _EXAMPLE = (
     'event: job\ndata: {"state": "succeeded", "error": null}\nid: 18\n\n'
 )
 
-LastEventId = Annotated[str | None, Header(alias="Last-Event-ID", description="The last id that was received.")]
+LastEventId = Annotated[str | None, Header(alias="Last-Event-ID", description="The last id that the client received.")]
 
 
 def _resume_after(last_event_id: LastEventId = None) -> int:
     if not last_event_id:
         return 0
     if not (last_event_id.isascii() and last_event_id.isdigit() and len(last_event_id) <= 18):
-        raise Problem(
-            400, "malformed", "Last-Event-ID is not an id of this stream.", [("Last-Event-ID", "not a number")]
-        )  # fmt: skip
+        detail = "Last-Event-ID is not an id of this stream; send the last id that you received."
+        raise Problem(400, "malformed", detail, [("Last-Event-ID", "not a number")])
     return int(last_event_id)
 
 
-def _existing(job_id: Annotated[str, Path(description="The job's id.")]) -> str:
-    # A dependency, because the stream's own status is sent before its first line runs.
+def _existing(job_id: JobId) -> str:
+    # A dependency, because the stream sends its status before its first line runs.
     with reading() as session:
         return job_of(session, job_id).id
 
@@ -64,15 +64,15 @@ def _existing(job_id: Annotated[str, Path(description="The job's id.")]) -> str:
 async def follow_job(
     job_id: Annotated[str, Depends(_existing)], caller: Reader, after: Annotated[int, Depends(_resume_after)]
 ) -> AsyncIterable[ServerSentEvent]:
-    """Server-sent events `job` (state, error) and `stage` (name, subject, state, attempt, progress, reused).
+    """Send the events `job` (state, error) and `stage` (name, subject, state, attempt, progress, reused).
 
-    Begins with everything that happened so far, or after `Last-Event-ID`; comments keep the line open; ends after the
-    job has ended.
+    The stream begins with the first event of the job, or after `Last-Event-ID`. Comments keep the connection open. The stream
+    ends after the job.
     """
     sent: set[int] = set()
     newest = after
     while True:
-        ended, found = await run_in_threadpool(_news, job_id, max(after, newest - OVERLAP))
+        ended, found = await run_in_threadpool(_new_events, job_id, max(after, newest - OVERLAP))
         for event in found:
             if event.id not in sent:
                 sent.add(event.id)
@@ -80,12 +80,12 @@ async def follow_job(
                 yield ServerSentEvent(data=event.data, event=event.kind, id=str(event.id))
         if ended:
             return
-        await asyncio.sleep(LOOK_SECONDS)
+        await asyncio.sleep(POLL_SECONDS)
 
 
-def _news(job_id: str, after: int) -> tuple[bool, list[Event]]:
+def _new_events(job_id: str, after: int) -> tuple[bool, list[Event]]:
     with reading() as session:
-        # The state first: what is committed later than it is found by the second query, or by the next look.
+        # The state first: the query below, or the next round, finds every event that is committed after it.
         ended = job_of(session, job_id).state in ENDED_JOB
         query = select(Event).where(Event.job_id == job_id, Event.id > after).order_by(Event.id)
         return ended, list(session.scalars(query))

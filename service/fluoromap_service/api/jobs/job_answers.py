@@ -1,40 +1,43 @@
-"""Jobs as clients see them."""
+"""Jobs in the shape of the answers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from http import HTTPStatus
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from fluoromap.reasons import Reason
 from fluoromap_service.api.http.problems import ProblemDocument
 from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
+from fluoromap_service.jobs.pipeline import StageName
 from fluoromap_service.jobs.stage_results import stages_of
+from fluoromap_service.results.row_order import warnings_of
 from fluoromap_service.store.models import ENDED_JOB, ENDED_STAGE, Event, Job, JobState, StageRow, StageState
 
-_FAULTS = frozenset({"plugin_failed", "worker_lost"})
-"""Codes of errors that are nobody's data's fault: status 500; all others: 422."""
+_STATUS = HTTPStatus.INTERNAL_SERVER_ERROR
+"""Status of every stage's error. The plugin, the worker or the service caused it: data that a plugin refuses fail no stage."""
 
 
 class StageAnswer(BaseModel):
-    """One stage of a job for one run, site or study."""
+    """One stage of a job, for one run, one site or the study."""
 
-    name: Literal["segment", "match", "triangulate", "monoplane", "fuse"]
-    subject: str = Field(description="SOPInstanceUID, site or study that the stage is about.")
+    name: StageName
+    subject: str = Field(description="SOP Instance UID, site or study of the stage.")
     plugin: str
     version: str
     state: StageState
-    attempt: int = Field(description="How often it was begun; more than 1 after a worker died.")
+    attempt: int = Field(description="Number of times that the stage began; more than 1 after a worker died.")
     progress: float = Field(ge=0, le=1)
-    reused: bool = Field(description="The result of the same work in an earlier job was taken.")
+    reused: bool = Field(description="Whether the result comes from an earlier job with the same inputs.")
     error: ProblemDocument | None
 
 
 class Links(BaseModel):
-    """Where the results are, each as soon as its stage is done."""
+    """Addresses of the results; each is available as soon as its stage is done."""
 
     points: str
     tracks: str
@@ -58,7 +61,7 @@ class JobAnswer(BaseModel):
                             "version": "1", "state": "done", "attempt": 1, "progress": 1.0, "reused": False, "error": None,
                         }
                     ],
-                    "error": None, "created": "2026-03-01T09:30:00.000Z", "started": "2026-03-01T09:30:00.210Z",
+                    "error": None, "warnings": [], "created": "2026-03-01T09:30:00.000Z", "started": "2026-03-01T09:30:00.210Z",
                     "finished": None,
                     "links": {
                         "points": "/v1/jobs/7f0c5b1e9a3d4c27b4a1f1f5d6e7a809/points",
@@ -78,13 +81,15 @@ class JobAnswer(BaseModel):
     progress: float = Field(ge=0, le=1, description="Mean over the stages; 1 when the job has ended.")
     stages: list[StageAnswer]
     error: ProblemDocument | None
+    warnings: list[Reason] = Field(description="Doubts about all results: paired_by_order until it is confirmed.")
     created: str
     started: str | None
     finished: str | None
     links: Links
 
 
-def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
+def job_answer(job: Job, stages: Sequence[StageRow], warnings: Sequence[Reason] = ()) -> JobAnswer:
+    """Return a job with its stages in the shape of the answer."""
     root = f"/v1/jobs/{job.id}"
     return JobAnswer(
         id=job.id,
@@ -93,6 +98,7 @@ def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
         progress=_progress(job, stages),
         stages=[_stage(row) for row in stages],
         error=_problem(job.error),
+        warnings=list(warnings),
         created=rfc3339(job.created),
         started=rfc3339_or_none(job.started),
         finished=rfc3339_or_none(job.finished),
@@ -107,22 +113,29 @@ def job_answer(job: Job, stages: Sequence[StageRow]) -> JobAnswer:
 
 
 def read_job(session: Session, job: Job) -> JobAnswer:
-    return job_answer(job, stages_of(session, job.id))
+    """Return the answer of one job."""
+    return job_answer(job, stages_of(session, job.id), warnings_of(session, job))
 
 
 def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
-    """The answers of several jobs by their ids, with one query for all stages."""
+    """Return the answers of several jobs by their ids.
+
+    One query reads all stages.
+    """
     ids = [job.id for job in jobs]
     stages: dict[str, list[StageRow]] = {job_id: [] for job_id in ids}
     for row in session.scalars(select(StageRow).where(StageRow.job_id.in_(ids)).order_by(StageRow.id)):
         stages[row.job_id].append(row)
-    return {job.id: job_answer(job, stages[job.id]) for job in jobs}
+    return {job.id: job_answer(job, stages[job.id], warnings_of(session, job)) for job in jobs}
 
 
 def etag_of(session: Session, job: Job) -> str:
-    """Changes with every claim, beat that tells progress, end and request to cancel."""
+    """Return the job's entity tag.
+
+    It changes with every event and every change of the job.
+    """
     last = session.scalar(select(func.max(Event.id)).where(Event.job_id == job.id))
-    return f'"{job.id}-{job.version}-{last or 0}"'
+    return f'"{job.id}-{job.version}-{last or 0}-{len(warnings_of(session, job))}"'
 
 
 def _progress(job: Job, stages: Sequence[StageRow]) -> float:
@@ -149,10 +162,9 @@ def _stage(row: StageRow) -> StageAnswer:
 
 
 def _problem(error: dict[str, Any] | None) -> ProblemDocument | None:
-    """What a stage stored of its failure as a problem document."""
+    """Return the stored error of a stage or job as a problem document."""
     if error is None:
         return None
     code = str(error.get("code", "plugin_failed"))
-    status = 500 if code in _FAULTS else 422
     detail = str(error.get("detail", "The stage failed."))
-    return ProblemDocument(type="about:blank", title=HTTPStatus(status).phrase, status=status, detail=detail, code=code)
+    return ProblemDocument(type="about:blank", title=_STATUS.phrase, status=_STATUS, detail=detail, code=code)

@@ -1,4 +1,4 @@
-"""Jobs: starting, watching and stopping them."""
+"""The routes of jobs: start, list, read and stop them."""
 
 from __future__ import annotations
 
@@ -28,13 +28,15 @@ from fluoromap_service.study.freeze import PipelineRequest, freeze
 
 router = APIRouter(tags=["jobs"])
 
-LOOK_SECONDS = 0.25
-"""Time between two looks at the database while a client waits."""
+POLL_SECONDS = 0.25
+"""Time between two queries of the database while a client waits."""
 
 RETRY_SECONDS = 2
 
 
 class JobRequest(BaseModel):
+    """The plugins and views of a new job."""
+
     model_config = ConfigDict(
         extra="forbid",
         json_schema_extra={
@@ -43,9 +45,9 @@ class JobRequest(BaseModel):
     )
 
     pipeline: PipelineRequest = Field(
-        default_factory=PipelineRequest, description="The plugins to use; stages left out take the defaults."
+        default_factory=PipelineRequest, description="The plugins of the job; every stage has a default plugin."
     )
-    view: Literal["a", "b", "both"] = Field("both", description="The views to follow frame by frame.")
+    view: Literal["a", "b", "both"] = Field("both", description="The views that the job tracks frame by frame.")
 
 
 @router.post(
@@ -58,7 +60,10 @@ class JobRequest(BaseModel):
             "description": "Accepted; follow it at Location.",
             "headers": {
                 "Location": {"schema": {"type": "string"}, "description": "The job."},
-                "Retry-After": {"schema": {"type": "integer"}, "description": "Seconds to wait before looking."},
+                "Retry-After": {
+                    "schema": {"type": "integer"},
+                    "description": "Seconds to wait before the next request.",
+                },
             },
         },
         **responses(400, 401, 403, 404, 422),
@@ -70,17 +75,18 @@ def create_job(
     once: OnceJson,
     body: JobRequest | None = None,
 ) -> Response:
-    """Freeze the study as it stands and run the pipeline over it; work that an earlier job did already is taken over.
+    """Freeze the study and run the pipeline over it.
 
-    At least one site needs both views, their geometry and an activation time; else 422 lists what each site misses.
+    The job reuses the results of earlier jobs. At least one site needs both views, their geometry and an activation
+    time. Otherwise 422 lists the missing values of each site.
     """
-    asked = body or JobRequest()
+    wanted = body or JobRequest()
 
     def start(session: Session) -> Response:
         study = session.get(Study, study_id)
         if study is None:
             raise not_found("study")
-        snapshot = freeze(session, study, asked.pipeline, asked.view)
+        snapshot = freeze(session, study, wanted.pipeline, wanted.view)
         job = job_life.create(session, study.id, snapshot)
         session.flush()
         answer = read_job(session, job)
@@ -96,9 +102,9 @@ def create_job(
     "/v1/jobs", summary="List jobs", response_model=Page[JobAnswer], responses=responses(400, 401, 403, 422)
 )  # fmt: skip
 def list_jobs(
-    caller: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only this study's.")] = None
+    caller: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only the jobs of this study.")] = None
 ) -> Page[JobAnswer]:
-    """All jobs, the newest first."""
+    """List all jobs, the newest first."""
     with reading() as session:
         found = pages.newest_first(session, Job, *([] if study is None else [Job.study_id == study]))
         answers = read_jobs(session, found)
@@ -107,7 +113,7 @@ def list_jobs(
 
 @router.get(
     "/v1/jobs/{job_id}",
-    summary="Look at a job",
+    summary="Read a job",
     response_model=JobAnswer,
     responses={304: {"description": "Unchanged since the ETag sent."}, **responses(401, 403, 404, 422)},
 )
@@ -116,21 +122,21 @@ async def get_job(
     request: Request,
     response: Response,
     caller: Reader,
-    wait: Annotated[float, Query(ge=0, le=60, description="Longest time in seconds to wait for a change.")] = 0.0,
+    wait: Annotated[float, Query(ge=0, le=60, description="Longest time to wait for a change, in seconds.")] = 0.0,
 ) -> JobAnswer | Response:
-    """State, progress, stages and links of a job.
+    """Return state, progress, stages and links of a job.
 
-    With `wait` the answer comes when the job's state changes (with `If-None-Match`: when anything about it changes), when
-    the job has ended, or when the time is over.
+    With `wait` the answer comes when the job's state changes, when the job has ended, or when the time is over. With `wait` and
+    `If-None-Match` it comes at any change of the job.
     """
-    state, etag = first_state, _ = await run_in_threadpool(_look, job_id)
+    state, etag = first_state, _ = await run_in_threadpool(_state, job_id)
     conditional = "if-none-match" in request.headers
     end = time.monotonic() + wait
     while state not in ENDED_JOB and time.monotonic() < end:
         if (not is_known(request, etag)) if conditional else (state != first_state):
             break
-        await asyncio.sleep(min(LOOK_SECONDS, max(end - time.monotonic(), 0.0)))
-        state, etag = await run_in_threadpool(_look, job_id)
+        await asyncio.sleep(min(POLL_SECONDS, max(end - time.monotonic(), 0.0)))
+        state, etag = await run_in_threadpool(_state, job_id)
     answer, etag = await run_in_threadpool(_answer, job_id)
     if is_known(request, etag):
         return not_modified(etag)
@@ -147,11 +153,16 @@ async def get_job(
     responses=responses(401, 403, 404, 409),
 )
 def cancel_job(job_id: JobId, caller: Writer) -> JobAnswer:
-    """What has not begun never will; what runs stops at its next check. Results already made stay readable."""
+    """Stop a job.
+
+    Stages that have not begun do not begin; a stage that runs stops at its next check. Finished results stay readable.
+    """
     with writing() as session:
         job = job_of(session, job_id)
         if not job_life.cancel(session, job.id):
-            raise Problem(409, "job_ended", f"This job has ended already: it {_ENDS[job.state]}.")
+            raise Problem(
+                409, "job_ended", f"This job has ended already: it {_ENDS[job.state]}. Start a new job instead."
+            )
         session.flush()
         return read_job(session, job)
 
@@ -159,7 +170,7 @@ def cancel_job(job_id: JobId, caller: Writer) -> JobAnswer:
 _ENDS = {"succeeded": "succeeded", "failed": "failed", "cancelled": "was cancelled"}
 
 
-def _look(job_id: str) -> tuple[str, str]:
+def _state(job_id: str) -> tuple[str, str]:
     with reading() as session:
         job = job_of(session, job_id)
         return job.state, etag_of(session, job)

@@ -1,1 +1,1 @@
-"""Routes on the results of jobs."""
+"""Routes of the results of jobs."""

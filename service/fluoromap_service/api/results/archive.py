@@ -37,11 +37,11 @@ _DATE = (1980, 1, 1, 0, 0, 0)
     },
 )
 def get_archive(job_id: JobId, caller: Reader) -> StreamingResponse:
-    """Return all results of a job in one zip; 409 until the job has ended.
+    """Return all results of a job in one zip.
 
-    The zip contains `job.json`, `parameters.json`, `points.csv`, `tracks.csv`, `report.html`, `map.json`, `map.png`, the mesh
-    in all formats and an overlay of each view of each site, as far as the job has these results. Coordinates count from the
-    reference catheter.
+    The answer is 409 until the job has ended. The zip contains `job.json`, `parameters.json`, `points.csv`,
+    `tracks.csv`, `report.html`, `map.json`, `map.png`, the mesh in all formats and an overlay of each view of each
+    site, as far as the job has these results. Coordinates count from the reference catheter.
     """
     folder = settings().files_dir / "incoming"
     folder.mkdir(parents=True, exist_ok=True)

@@ -20,13 +20,13 @@ from fluoromap_service.api.results.points import points_csv, points_of
 from fluoromap_service.api.results.report_page import report_page
 from fluoromap_service.api.results.tracks import read_tracks, tracks_csv
 from fluoromap_service.problem import Problem
-from fluoromap_service.results.finished import job_of, snapshot_of
+from fluoromap_service.results.finished import ended_job_of, job_of, snapshot_of
 from fluoromap_service.results.fusion import Fusion, LocatedView, fusion_of, located_views
 from fluoromap_service.results.maps import map_of
 from fluoromap_service.results.mesh_files import MeshFormat, mesh_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import ENDED_JOB, Job
+from fluoromap_service.store.models import Job
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +47,7 @@ def archive_files(job_id: str) -> Iterator[ArchiveFile]:
         404 when there is no such job; 409 ``not_ready`` while the job runs.
     """
     with reading() as session:
-        job = job_of(session, job_id)
-        if job.state not in ENDED_JOB:
-            detail = "The archive is available when the job has ended; follow the job and ask again."
-            raise Problem(409, "not_ready", detail)
+        job = ended_job_of(session, job_id, "archive")
         yield ArchiveFile("job.json", _json(read_job(session, job).model_dump(mode="json")))
         yield ArchiveFile("parameters.json", _json(_parameters(job)))
         tables = list(_tables(session, job))

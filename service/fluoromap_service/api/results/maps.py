@@ -125,7 +125,7 @@ def activation_map(finished: FinishedMap, origin: Origin) -> ActivationMap:
         volume_ml=chamber.volume_ml,
         area_cm2=chamber.area_cm2,
         coverage=chamber.coverage,
-        warnings=list(chamber.warnings),
+        warnings=list(finished.warnings),
         conduction_velocity=_velocity(chamber),
         cycle_length_ms=chamber.cycle_length_ms,
     )
@@ -175,7 +175,7 @@ def get_map(
     """
     with reading() as session:
         finished = map_of(session, job_of(session, job_id))
-    etag = f'"{finished.sha256}-{origin}"'
+    etag = f'"{finished.sha256}-{origin}-{len(finished.warnings)}"'
     if is_known(request, etag):
         return not_modified(etag)
     response.headers["ETag"] = etag

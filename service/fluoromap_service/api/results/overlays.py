@@ -23,7 +23,7 @@ from fluoromap_service.results.finished import job_of
 from fluoromap_service.results.fusion import Fusion, LocatedView, draw_fusion, fusion_of, located_views
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.renderings import Rendered, rendered
+from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
 router = APIRouter(tags=["results"])
 
@@ -59,8 +59,11 @@ class Overlays(BaseModel):
     overlays: list[Overlay]
 
 
-def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> Rendered:
-    """Return the kept PNG of an overlay, or the GIF of its propagation; draw it when there is none."""
+def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> KeptFile:
+    """Return the kept PNG or GIF of an overlay.
+
+    The GIF shows the propagation. The picture is drawn when none is kept.
+    """
 
     def make() -> bytes:
         path = files.path_of(fusion.sha256)
@@ -69,8 +72,7 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
             raise Problem(409, "run_deleted", detail)
         return run_in_pool(Task.DRAW_PICTURE, draw_fusion, path, fusion, look, moving)
 
-    depends_on = overlay_dependencies(fusion, look, moving=moving)
-    return rendered(job_id, depends_on, "image/gif" if moving else "image/png", make)
+    return kept_rendering(job_id, overlay_dependencies(fusion, look, moving=moving), make)
 
 
 @router.get(
@@ -153,9 +155,10 @@ def get_overlay(
         ),
     ] = None,
 ) -> Response:
-    """Return a frame with the map: isochrones, hull outline, sites with times in ms, star at the tip, colour bar in ms.
+    """Return a frame with the map.
 
-    The picture is in stored pixels.
+    The picture has isochrones, hull outline, sites with times in ms, a star at the tip and a colour bar in ms. The
+    picture is in stored pixels.
     """
     with reading() as session:
         fusion = fusion_of(session, job_of(session, job_id), uid, frame)

@@ -21,6 +21,7 @@ from fluoromap_service.jobs.stage_results import load
 from fluoromap_service.results.finished import done_stage, job_of, snapshot_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.results.points import point_rows
+from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 from fluoromap_service.store.models import Point as PointRow
@@ -124,10 +125,11 @@ def points_of(session: Session, job: Job, origin: Origin) -> list[Point]:
     Problem
         409 ``not_ready`` before the stage ``triangulate`` is done.
     """
-    return [_point(row, origin) for row in point_rows(session, job)]
+    guessed = sites_by_row_order(session, job)
+    return [_point(row, origin, row.site in guessed) for row in point_rows(session, job)]
 
 
-def _point(row: PointRow, origin: Origin) -> Point:
+def _point(row: PointRow, origin: Origin, guessed: bool) -> Point:
     relative = origin is Origin.REFERENCE
     position: Any = row.relative_mm if relative else row.position_mm
     covariance: Any = row.relative_covariance_mm2 if relative else row.covariance_mm2
@@ -145,7 +147,7 @@ def _point(row: PointRow, origin: Origin) -> Point:
         ray_angle_deg=row.ray_angle_deg,
         lat_ms=row.lat_ms,
         grade=Grade(row.relative_grade if relative else row.grade),
-        reasons=row.reasons,
+        reasons=[*row.reasons, *([Reason.PAIRED_BY_ORDER] if guessed else [])],
     )
 
 

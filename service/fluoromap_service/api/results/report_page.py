@@ -10,7 +10,7 @@ import io
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -22,6 +22,7 @@ from fluoromap.drawing.colours import vertex_colours
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
 from fluoromap.drawing.png import encode_png
+from fluoromap.registry import Kind
 from fluoromap_service.api.jobs.job_answers import read_job
 from fluoromap_service.api.results.overlays import picture_of
 from fluoromap_service.api.results.points import points_of
@@ -40,11 +41,19 @@ from fluoromap_service.results.finished import job_of, snapshot_of
 from fluoromap_service.results.fusion import fusion_of, located_views
 from fluoromap_service.results.maps import map_of
 from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
 
 WEB = Path(__file__).parents[2] / "web"
 SCRIPTS = {"core": "three.core.js", "three": "three.module.js", "controls": "OrbitControls.js"}
+BINDINGS = {
+    "explicit": "set by hand",
+    "csv": "named in the table of activation times",
+    "upload": "named at the upload",
+    "order": "row order: a guess until somebody confirms it",
+}
+"""Rule that bound a site's runs -> its words in the report."""
 JPEG_QUALITY = 88
 """Fluoroscopy is noise: with JPEG a page of 40 overlays has a few MB."""
 
@@ -71,7 +80,8 @@ def _values(job_id: str) -> dict[str, Any]:
         snapshot = snapshot_of(job)
         chamber, no_map = None, ""
         try:
-            chamber = map_of(session, job).chamber
+            finished = map_of(session, job)
+            chamber = finished.chamber
         except Problem as problem:
             no_map = str(problem.detail)
         triangulated = stage_of(session, job_id, "triangulate")
@@ -98,9 +108,9 @@ def _values(job_id: str) -> dict[str, Any]:
             "budget": budget_rows(triangulation.budget) if triangulation else [],
             "calibration": calibration_line(triangulation.calibration) if triangulation else None,
             "notes": triangulation.notes if triangulation else (),
-            "plugins": [
-                (stage, getattr(snapshot, stage)) for stage in ("segmenter", "triangulator", "monoplane", "fuser")
-            ],
+            "bindings": [(site.site, BINDINGS[site.bound_by]) for site in snapshot.sites],
+            "guessed": sites_by_row_order(session, job),
+            "plugins": [(kind, getattr(snapshot, kind)) for kind in get_args(Kind)],
             "catheters": snapshot.catheters,
             "runs": sorted(snapshot.runs.items()),
         }
@@ -160,7 +170,10 @@ def _inline(content: bytes, media_type: str) -> str:
 
 
 def _json(value: Any) -> Markup:
-    """Return JSON for a script element, which would end at the first "</" even inside a text."""
+    """Return JSON for a script element.
+
+    The element would end at the first "</" even inside a text.
+    """
     return Markup(json.dumps(value, separators=(",", ":")).replace("<", "\\u003c"))
 
 

@@ -16,7 +16,10 @@ Row = dict[str, Any]
 
 
 def tips(points: Sequence[Point], mapping: str, chamber: ChamberMap | None) -> list[Row]:
-    """Return a row for the mapping tip of every site, with its place on the map."""
+    """Return a row for the mapping tip of every site.
+
+    It includes the tip's place on the map.
+    """
     on_map = {site.site: site for site in chamber.sites} if chamber else {}
     rows = []
     for point in points:
@@ -52,7 +55,9 @@ def electrodes(points: Sequence[Point]) -> list[Row]:
 
 
 def tracks(answer: Row, mapping: str) -> list[Row]:
-    """Return a row for every view: the track of its mapping tip, or the reasons why it has none.
+    """Return a row for every view.
+
+    It is the track of its mapping tip, or the reasons why it has none.
 
     Parameters
     ----------

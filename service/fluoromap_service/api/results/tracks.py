@@ -98,7 +98,7 @@ class Tracks(BaseModel):
                     "rejected": [
                         {
                             "site": "S07", "view": "b", "reasons": ["no_a_priori"],
-                            "message": "No biplane position is known here; a single view alone cannot tell depth.",
+                            "message": "This site has no biplane position, and a single view does not show depth.",
                         }
                     ],
                 }
@@ -216,11 +216,12 @@ def get_tracks(
     view: ViewQuery = None,
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
-    """Return every electrode in every frame of the tracked views, as JSON or CSV.
+    """Return every electrode in every frame of the tracked views.
 
-    Origin `reference` subtracts the reference catheter's mean of the same frame. Frames that do not locate this catheter
-    subtract the site's diastolic mean. `rejected` lists the views without a track, with their reasons. The answer is 409
-    `not_ready` until the stage `monoplane` of the site (without `site`: of all sites) is done.
+    The format is JSON or CSV. Origin `reference` subtracts the reference catheter's mean of the same frame. Frames that
+    do not locate this catheter subtract the site's diastolic mean. `rejected` lists the views without a track, with
+    their reasons. The answer is 409 `not_ready` until the stage `monoplane` of the site (without `site`: of all sites)
+    is done.
     """
     answer = _read(job_id, origin, site, view)
     if wants_csv(request):

@@ -1,1 +1,1 @@
-"""Routes on the service itself."""
+"""Routes of the service itself."""

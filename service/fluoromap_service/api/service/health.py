@@ -1,4 +1,4 @@
-"""Whether the service is alive, and whether it can do its work."""
+"""The routes that say whether the service is alive, and whether it can work."""
 
 from __future__ import annotations
 
@@ -20,24 +20,28 @@ from fluoromap_service.store.models import Job, WorkerSeen
 router = APIRouter(tags=["service"])
 
 WORKER_SECONDS = 30.0
-"""A worker that was silent for longer does not count."""
+"""A worker that is silent for longer counts as dead."""
 
 log = structlog.get_logger(__name__)
 
 
 class Health(BaseModel):
+    """The sign that the process answers."""
+
     status: Literal["alive"] = "alive"
 
 
 class Check(BaseModel):
-    """One thing the service needs."""
+    """One part that the service needs."""
 
     name: Literal["database", "broker", "files", "worker"]
     ok: bool
-    detail: str = Field(description="What to do where it is not ok.")
+    detail: str = Field(description="The next step when it is not ok.")
 
 
 class Readiness(BaseModel):
+    """The state of all parts that the service needs."""
+
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"ready": True, "checks": [{"name": "database", "ok": True, "detail": ""}]}]}
     )
@@ -69,10 +73,10 @@ def _worker() -> str:
     if settings().eager:
         return ""
     with reading() as session:
-        seen = session.scalar(
+        alive = session.scalar(
             select(func.count()).select_from(WorkerSeen).where(WorkerSeen.seen > db_now() - WORKER_SECONDS)
         )
-    return "" if seen else "No worker gave a sign of life lately; start one with 'fluoromap worker'."
+    return "" if alive else "No worker gave a sign of life in the last 30 s; start one with 'fluoromap worker'."
 
 
 _CHECKS: dict[Literal["database", "broker", "files", "worker"], tuple[Callable[[], str], str]] = {
@@ -82,13 +86,16 @@ _CHECKS: dict[Literal["database", "broker", "files", "worker"], tuple[Callable[[
     ),
     "broker": (_broker, "The message broker does not answer; check its URL."),
     "files": (_files, "The files cannot be written; check the data folder's permissions and free space."),
-    "worker": (_worker, "Nothing is known of workers while the database does not answer."),
+    "worker": (_worker, "The state of the workers is unknown while the database does not answer; see its check."),
 }
 
 
 @router.get("/v1/health", summary="Alive", response_model=Health)
 async def health() -> Health:
-    """The process answers, however busy its threads are; open to all."""
+    """Answer as long as the process lives; open to all.
+
+    It answers also when all threads are busy.
+    """
     return Health()
 
 
@@ -96,16 +103,16 @@ async def health() -> Health:
     "/v1/ready",
     summary="Ready",
     response_model=Readiness,
-    responses={503: {"model": Readiness, "description": "Something is missing; the checks say what."}},
+    responses={503: {"model": Readiness, "description": "A part is missing; the checks name it."}},
 )
 def ready(response: Response) -> Readiness:
-    """Whether database, broker and files can be used and a worker was seen lately; open to all."""
+    """Report whether database, broker, files and a worker are ready; open to all."""
     checks = []
     for name, (check, failure) in _CHECKS.items():
         try:
             detail = check()
         except Exception as error:
-            # Whatever a driver raises means the same here, and may hold an address or a password.
+            # Every error means the same here, and its text may contain an address or a password.
             log.warning("not_ready", check=name, error=type(error).__name__)
             detail = failure
         checks.append(Check(name=name, ok=not detail, detail=detail))

@@ -1,8 +1,8 @@
-"""The installed stage plugins."""
+"""The route of the installed plugins."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
@@ -15,7 +15,7 @@ router = APIRouter(tags=["plugins"])
 
 
 class Plugin(BaseModel):
-    """An installed plugin, or one that did not load with the reason."""
+    """An installed plugin; a broken plugin has the reason why it did not load."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -29,18 +29,23 @@ class Plugin(BaseModel):
         }
     )  # fmt: skip
 
-    kind: Literal["segmenter", "triangulator", "monoplane", "fuser"]
+    kind: registry.Kind
     name: str
     version: str | None = Field(description="Null where the plugin did not load.")
-    distribution: str | None = Field(description="The installed package it comes from.")
-    default: bool = Field(description="Stands in where a job names no plugin of this kind.")
-    parameters: dict[str, Any] | None = Field(description="JSON schema of its parameters; null where it did not load.")
-    error: str | None = Field(description="Why it did not load.")
+    distribution: str | None = Field(description="The installed package of the plugin.")
+    default: bool = Field(description="Whether a job that names no plugin of this kind uses it.")
+    parameters: dict[str, Any] | None = Field(
+        description="JSON schema of its parameters; null where the plugin did not load."
+    )
+    error: str | None = Field(description="Why the plugin did not load.")
 
 
 @router.get("/v1/plugins", summary="Installed plugins", response_model=list[Plugin], responses=responses(401, 403))
 def list_plugins(caller: Reader) -> list[Plugin]:
-    """All installed segmenters, triangulators, monoplane solvers and fusers, the broken ones with their error."""
+    """List all installed segmenters, triangulators, monoplane solvers and fusers.
+
+    A broken plugin is listed with its error.
+    """
     return [
         Plugin(
             kind=row.kind,

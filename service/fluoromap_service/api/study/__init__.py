@@ -1,1 +1,1 @@
-"""Routes on studies, their runs and their sites."""
+"""Routes of studies, their runs and their sites."""

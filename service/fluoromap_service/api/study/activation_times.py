@@ -1,4 +1,4 @@
-"""The table of activation times."""
+"""The route of the activation-time table."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ router = APIRouter(prefix="/v1/studies/{study_id}", tags=["sites"])
 
 
 class TableOut(BaseModel):
-    """What the table did."""
+    """The effect of a table."""
 
     sites: int = Field(description="Sites in the table.", examples=[12])
-    unmatched: list[str] = Field(description="Those no run is bound to (yet).", examples=[["S12"]])
+    unmatched: list[str] = Field(
+        description="Sites of the table without runs, until the runs come.", examples=[["S12"]]
+    )
 
 
 @router.put(
@@ -36,9 +38,9 @@ class TableOut(BaseModel):
     },
 )
 async def put_activation_times(study_id: StudyId, request: Request, caller: Writer) -> TableOut:
-    """Replace the activation-time table: ``site,lat_ms`` and optionally ``view_a,view_b``; all or nothing.
+    """Replace the activation-time table: `site,lat_ms` and optionally `view_a,view_b`; all or nothing.
 
-    A time is that of the mapping catheter minus that of the reference. It may come before the runs.
+    An activation time is the mapping catheter's time minus the reference's. The table may come before the runs.
     """
     text = await csv_text(request)
 

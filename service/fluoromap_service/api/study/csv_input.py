@@ -1,4 +1,4 @@
-"""CSV tables as clients and spreadsheets write them, checked as a whole: one wrong cell refuses the table."""
+"""CSV tables of clients and spreadsheets; one wrong cell rejects the whole table."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Rows = list[tuple[int, dict[str, str]]]
 
 
 async def csv_text(request: Request) -> str:
-    """The body of a request as text.
+    """Return the body of a request as text.
 
     Raises
     ------
     Problem
-        415 for another content type, 400 when it is not UTF-8.
+        415 for another content type, 400 when the text is not UTF-8.
     """
     kind, options = parse_options_header(request.headers.get("content-type"))
     charset = options.get(b"charset", b"utf-8").lower()
@@ -42,12 +42,12 @@ async def csv_text(request: Request) -> str:
 
 
 def activation_times(text: str) -> list[ActivationTime]:
-    """Rows of ``site,lat_ms`` and optionally ``view_a,view_b``.
+    """Return the rows of ``site,lat_ms`` and optionally ``view_a,view_b``.
 
     Raises
     ------
     Problem
-        422 naming rows and columns.
+        422 with the wrong rows and columns.
     """
     errors: Errors = []
     table: list[ActivationTime] = []
@@ -57,7 +57,7 @@ def activation_times(text: str) -> list[ActivationTime]:
         if not is_site_name(site):
             errors.append((f"row {row}, column site", "not usable as a site's name (1 to 64 characters, no slash)"))
         elif site in first_rows:
-            errors.append((f"row {row}, column site", f"the site stands in row {first_rows[site]} already"))
+            errors.append((f"row {row}, column site", f"row {first_rows[site]} has the same site"))
         first_rows.setdefault(site, row)
         lat_ms = _number(cells["lat_ms"], f"row {row}, column lat_ms", errors)
         if lat_ms is not None and abs(lat_ms) > LARGEST_LAT_MS:
@@ -66,17 +66,17 @@ def activation_times(text: str) -> list[ActivationTime]:
         if view_a is not None and view_a == view_b:
             errors.append((f"row {row}, column view_b", "the two views must be two different runs"))
         table.append(ActivationTime(row, site, lat_ms or 0.0, view_a, view_b))
-    _refuse_if_wrong(errors)
+    _raise_if_wrong(errors)
     return table
 
 
 def electrogram(text: str) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Columns ``time_ms,reference,mapping``, each of shape (samples,).
+    """Return the columns ``time_ms,reference,mapping``, each (samples,).
 
     Raises
     ------
     Problem
-        422 naming rows and columns.
+        422 with the wrong rows and columns.
     """
     errors: Errors = []
     names = ("time_ms", "reference", "mapping")
@@ -84,7 +84,7 @@ def electrogram(text: str) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
         [_number(cells[name], f"row {row}, column {name}", errors) for name in names]
         for row, cells in _rows(text, names, (), errors)
     ]
-    _refuse_if_wrong(errors)
+    _raise_if_wrong(errors)
     columns = np.array(samples, dtype=np.float64).reshape(-1, 3).T
     return columns[0], columns[1], columns[2]
 
@@ -95,7 +95,7 @@ def _rows(text: str, required: Sequence[str], optional: Sequence[str], errors: E
     try:
         records = list(csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True))
     except csv.Error:
-        raise Problem(400, "malformed", "The table is not CSV; check its quotes.") from None
+        raise Problem(400, "malformed", "The table is not valid CSV; check its quotes.") from None
     numbered = [
         (row, [cell.strip() for cell in record])
         for row, record in enumerate(records, start=1)
@@ -122,8 +122,8 @@ def _check_header(header: list[str], row: int, required: Sequence[str], optional
         if name not in (*required, *optional):
             errors.append((f"row {row}", f"column {number} is unknown; known are {', '.join((*required, *optional))}"))
         elif name in header[: number - 1]:
-            errors.append((f"row {row}", f"column {name} stands there twice"))
-    _refuse_if_wrong(errors)
+            errors.append((f"row {row}", f"column {name} appears twice"))
+    _raise_if_wrong(errors)
 
 
 def _number(text: str, where: str, errors: Errors) -> float | None:
@@ -134,11 +134,8 @@ def _number(text: str, where: str, errors: Errors) -> float | None:
     return value
 
 
-def _refuse_if_wrong(errors: Errors) -> None:
+def _raise_if_wrong(errors: Errors) -> None:
     if errors:
-        raise Problem(
-            422,
-            "invalid_table",
-            f"The table has {len(errors)} mistake{'s' if len(errors) > 1 else ''}; nothing of it was taken.",
-            errors[:_MOST_ERRORS],
-        )
+        mistakes = f"{len(errors)} mistake{'s' if len(errors) > 1 else ''}"
+        detail = f"The table has {mistakes}, so the service stored nothing of it; correct it and send it again."
+        raise Problem(422, "invalid_table", detail, errors[:_MOST_ERRORS])

@@ -73,7 +73,10 @@ def put_electrodes(
     response: Response,
     caller: Writer,
 ) -> list[ElectrodeOut]:
-    """Set this frame's electrodes by hand; the next job tracks the run again from this frame."""
+    """Set this frame's electrodes by hand.
+
+    The next job tracks the run again from this frame.
+    """
     with writing() as session:
         study = studies.lock(session, study_id)
         run = _run_with_frame(session, study_id, uid, n)

@@ -1,15 +1,13 @@
-"""Activation times from electrograms."""
+"""The route of electrograms, which give activation times."""
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import APIRouter, Path, Request
+from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from fluoromap.electrogram import UnusableElectrogram, activation_time
-from fluoromap_service.api.http.paths import StudyId
+from fluoromap_service.api.http.paths import SiteName, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.csv_input import csv_text, electrogram
@@ -21,7 +19,7 @@ router = APIRouter(prefix="/v1/studies/{study_id}", tags=["sites"])
 
 
 class ElectrogramOut(BaseModel):
-    """The activation time of a site as its electrograms tell it."""
+    """The activation time of a site by its electrograms."""
 
     lat_ms: float = Field(description="Mapping minus reference.", examples=[41.0])
     sd_ms: float = Field(description="Its standard deviation.", examples=[1.2])
@@ -47,11 +45,11 @@ class ElectrogramOut(BaseModel):
 )
 async def put_electrogram(
     study_id: StudyId,
-    site: Annotated[str, Path(description="The site's name.", max_length=64)],
+    site: SiteName,
     request: Request,
     caller: Writer,
 ) -> ElectrogramOut:
-    """Take a site's activation time from its electrograms: ``time_ms,reference,mapping``."""
+    """Compute a site's activation time from its electrograms: `time_ms,reference,mapping`."""
     text = await csv_text(request)
 
     def act() -> ElectrogramOut:

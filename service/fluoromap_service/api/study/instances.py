@@ -1,4 +1,4 @@
-"""The runs of a study: DICOM in, what the service knows of them out."""
+"""The routes of a study's runs: DICOM in, facts out."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from fluoromap_service.study.sites import BoundSite
 router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
 
 Spacing = Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)]
-SITE = "Mapping site that all runs of the request belong to."
+SITE = "Mapping site of all runs of the request."
 
 
 class GantryOut(BaseModel):
-    """Effective gantry: the header's values, completed and overridden by PATCH; null where unknown."""
+    """Effective gantry: the header's values, which PATCH completes and overrides; null where unknown."""
 
     primary_deg: float | None = Field(description="LAO positive, RAO negative.", examples=[-90.0])
     secondary_deg: float | None = Field(description="Cranial positive, caudal negative.", examples=[0.0])
@@ -50,7 +50,7 @@ class InstanceOut(BaseModel):
     """One run."""
 
     sop_instance_uid: str = Field(examples=["1.2.826.0.1.3680043.8.498.1"])
-    site: str | None = Field(description="Mapping site it is bound to.", examples=["S03"])
+    site: str | None = Field(description="Mapping site of the run.", examples=["S03"])
     view: Literal["a", "b"] | None = Field(examples=["a"])
     frames: int = Field(examples=[120])
     rows: int = Field(examples=[512])
@@ -63,19 +63,21 @@ class InstanceOut(BaseModel):
         description="DICOM keywords to complete by PATCH.", examples=[["DistanceSourceToDetector"]]
     )
     warnings: list[str] = Field(
-        description="Codes of what is odd; 'unbound': no site uses this run.", examples=[["table_moved"]]
+        description="Codes of oddities; 'unbound': no site has this run.", examples=[["table_moved"]]
     )
 
 
 class UploadOut(BaseModel):
-    """What became of each file."""
+    """The result of an upload: stored runs, and a problem for each other file."""
 
     instances: list[InstanceOut]
-    rejected: list[ProblemDocument] = Field(description="Each tells its `part`, counted from 1.")
+    rejected: list[ProblemDocument] = Field(
+        description="`part` is the number of the file in the request, counted from 1."
+    )
 
 
 class GantryPatch(BaseModel):
-    """Gantry values that complete or override the header's; null returns to the header's."""
+    """Gantry values that complete or override the header's; null returns to the header's value."""
 
     model_config = ConfigDict(extra="forbid")
     primary_deg: float | None = Field(None, ge=-180, le=180, allow_inf_nan=False)
@@ -86,17 +88,20 @@ class GantryPatch(BaseModel):
 
 
 class InstancePatch(BaseModel):
-    """What to change; members left out stay."""
+    """Changes of a run; a member that is left out stays."""
 
     model_config = ConfigDict(
         extra="forbid",
         json_schema_extra={"examples": [{"site": "S03", "gantry": {"source_detector_mm": 1000.0}}]},
     )
-    site: str | None = Field(None, description="Moves the run to this site; null takes it out again.", max_length=64)
+    site: str | None = Field(
+        None, description="Moves the run to this site; null takes the run out of every site.", max_length=64
+    )
     gantry: GantryPatch | None = None
 
 
 def instance_shape(run: StudyRun, views: dict[str, tuple[BoundSite, str]]) -> InstanceOut:
+    """Return a run in the shape of the answer."""
     bound = views.get(run.uid)
     warnings = [str(warning) for warning in run.facts.warnings]
     warnings += bound[0].warnings if bound else ["unbound"]
@@ -152,15 +157,24 @@ async def upload_instances(
     caller: Writer,
     site: Annotated[str | None, Query(description=SITE, examples=["S03"])] = None,
 ) -> Response:
-    """Send X-ray runs, one or many. Each file is checked by itself; what is wrong with one does not hold up the others."""
+    """Send X-ray runs, one or many.
+
+    A problem of one file does not affect the others.
+    """
     await run_in_threadpool(_check_study, study_id)
     with ExitStack() as stack:
-        parts, told = await receive(request, stack)
-        site = told if told is not None else site
+        parts, site_field = await receive(request, stack)
+        site = site if site_field is None else site_field
         if site is not None and not sites.is_site_name(site):
-            raise Problem(422, "invalid_site", "This cannot be the name of a site.", [("site", "not usable as a name")])
+            detail = "This text cannot name a site; use 1 to 64 characters without slashes."
+            raise Problem(422, "invalid_site", detail, [("site", "not usable as a name")])
         if not parts:
-            raise Problem(422, "no_file", "The request has no part named 'file'.", [("file", "missing")])
+            raise Problem(
+                422,
+                "no_file",
+                "The request has no part named 'file'; send each run as such a part.",
+                [("file", "missing")],
+            )
         return await run_in_threadpool(_store, study_id, parts, site, once)
 
 
@@ -194,7 +208,6 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
             raise Problem(first.status, first.code, first.detail, first.errors, extra={"rejected": documents})
         if site is not None:
             sites.mention(session, study_id, site)
-        sites.settle(session, study)
         body = {"instances": _shapes(session, study, stored), "rejected": documents}
         return JSONResponse(body, 201 if new else 200)
 
@@ -202,7 +215,7 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
 
 
 def _read(part: Part) -> InstanceFacts | Problem:
-    # In a process of its own: a hostile file can crash a decoder.
+    # A hostile file can crash a decoder, so another process reads it.
     try:
         return run_in_pool(Task.READ_FILE, read_instance, part.path)
     except Problem as problem:
@@ -217,36 +230,36 @@ def _of_part(problem: Problem, number: int) -> Problem:
 
 
 def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, Any]]:
-    views = sites.views_of(sites.resolve(session, study))
+    views = sites.views_of(sites.binding_of(session, study.id))
     runs = {run.uid: run for run in instances.runs_of(session, study.id)}
     return [instance_shape(runs[uid], views).model_dump() for uid in dict.fromkeys(uids)]
 
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
 def list_instances(study_id: StudyId, pages: Pages, caller: Reader) -> Page[InstanceOut]:
-    """The study's runs in the order of arrival."""
+    """List the study's runs in the order of arrival."""
     with reading() as session:
         study = studies.get(session, study_id)
-        views = sites.views_of(sites.resolve(session, study))
+        views = sites.views_of(sites.binding_of(session, study.id))
         runs = instances.runs_of(session, study_id)
         return pages.page_of_all(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
 
 
 def _one(session: Session, study: Study, uid: str) -> InstanceOut:
     run = instances.run_of(session, study.id, uid)
-    return instance_shape(run, sites.views_of(sites.resolve(session, study)))
+    return instance_shape(run, sites.views_of(sites.binding_of(session, study.id)))
 
 
 @router.get("/{uid}", responses=responses(401, 403, 404, 422))
 def get_instance(study_id: StudyId, uid: InstanceUid, caller: Reader) -> InstanceOut:
-    """One run."""
+    """Return one run."""
     with reading() as session:
         return _one(session, studies.get(session, study_id), uid)
 
 
 @router.patch("/{uid}", responses=responses(400, 401, 403, 404, 422))
 def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, caller: Writer) -> InstanceOut:
-    """Complete or override what the header says, or move the run to another site."""
+    """Complete or override the gantry of the header, or move the run to another site."""
     with writing() as session:
         study = studies.lock(session, study_id)
         run = instances.run_of(session, study_id, uid)
@@ -254,11 +267,10 @@ def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, ca
             sites.move_run(session, study, run, body.site)
         if "gantry" in body.model_fields_set:
             changes = {} if body.gantry is None else body.gantry.model_dump(mode="json", exclude_unset=True)
-            kept = {} if body.gantry is None else run.link.gantry
-            run.link.gantry = {name: value for name, value in {**kept, **changes}.items() if value is not None}
+            before = {} if body.gantry is None else run.link.gantry
+            run.link.gantry = {name: value for name, value in {**before, **changes}.items() if value is not None}
             _check_gantry(run)
         session.flush()
-        sites.settle(session, study)
         return _one(session, study, uid)
 
 
@@ -266,23 +278,28 @@ def _check_gantry(run: StudyRun) -> None:
     detector, isocentre = run.gantry["source_detector_mm"], run.gantry["source_isocentre_mm"]
     if detector is not None and isocentre is not None and isocentre >= detector:
         places = [("body.gantry.source_isocentre_mm", "the isocentre lies between source and detector")]
-        raise Problem(422, "invalid_gantry", "These gantry values do not fit together.", places)
-    plan = instances.effective_gantry(run.facts, run.link.gantry)
-    if plan is None:
+        raise Problem(422, "invalid_gantry", "These gantry values contradict each other; see 'errors'.", places)
+    gantry = instances.effective_gantry(run.facts, run.link.gantry)
+    if gantry is None:
         return
     try:
-        Gantry(**plan.model_dump())
+        Gantry(**gantry.model_dump())
     except ValueError as error:
         raise Problem(
-            422, "invalid_gantry", "These gantry values do not fit together.", [("body.gantry", str(error))]
+            422,
+            "invalid_gantry",
+            "These gantry values contradict each other; see 'errors'.",
+            [("body.gantry", str(error))],
         ) from None
 
 
 @router.delete("/{uid}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409, 422))
 def delete_instance(study_id: StudyId, uid: InstanceUid, caller: Writer) -> None:
-    """Take a run out of the study; its file goes when no other study refers to it. 409 while a job works on it."""
+    """Take a run out of the study; 409 while a job works on it.
+
+    The service deletes the file when no other study refers to it.
+    """
     with writing() as session:
-        study = studies.lock(session, study_id)
-        gone = instances.remove(session, study_id, uid)
-        sites.settle(session, study)
-    instances.unlink_unreferenced(gone)
+        studies.lock(session, study_id)
+        unreferenced = instances.remove(session, study_id, uid)
+    instances.unlink_unreferenced(unreferenced)

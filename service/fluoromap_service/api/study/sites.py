@@ -1,4 +1,4 @@
-"""Mapping sites: their activation times and the runs bound to them."""
+"""The routes of mapping sites: their activation times and their runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,12 @@ router = APIRouter(prefix="/v1/studies/{study_id}/sites", tags=["sites"])
 class SiteOut(BaseModel):
     """A mapping site."""
 
-    site: str = Field(examples=["S03"])
+    site: str | None = Field(
+        description="Null for a pair of runs that nobody has named; name it by PUT with its views.", examples=["S03"]
+    )
+    pair: int | None = Field(
+        description="Number of a pair without a name, in the order of acquisition.", examples=[None]
+    )
     lat_ms: float | None = Field(description="Activation time, mapping minus reference.", examples=[41.0])
     view_a: str | None = Field(
         description="SOP Instance UID of the run nearer to lateral.", examples=["1.2.826.0.1.3680043.8.498.1"]
@@ -30,13 +35,16 @@ class SiteOut(BaseModel):
     view_b: str | None = Field(examples=[None])
     bound_by: Literal["explicit", "csv", "upload", "order", "time"] | None = Field(examples=["time"])
     missing: list[str] = Field(
-        description="Of lat_ms, view_a, view_b, gantry:view_a, gantry:view_b.", examples=[["view_b"]]
+        description="The values that a job still needs: site, lat_ms, view_a, view_b, gantry:view_a, gantry:view_b.",
+        examples=[["view_b"]],
     )
-    warnings: list[str] = Field(description="Why the pair is doubtful or will be rejected.", examples=[["table_moved"]])
+    warnings: list[str] = Field(
+        description="Reasons why the pair is doubtful or a job will reject it.", examples=[["table_moved"]]
+    )
 
 
 class SitePut(BaseModel):
-    """What to set; members left out stay, null sets free."""
+    """Changes of a site; a member that is left out stays, null removes the value."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"lat_ms": 41.0}]})
     lat_ms: float | None = Field(None, ge=-LARGEST_LAT_MS, le=LARGEST_LAT_MS, allow_inf_nan=False)
@@ -48,6 +56,7 @@ def _shape(site: BoundSite) -> SiteOut:
     return SiteOut.model_validate(
         {
             "site": site.site,
+            "pair": site.pair,
             "lat_ms": site.lat_ms,
             "view_a": site.view_a,
             "view_b": site.view_b,
@@ -60,33 +69,39 @@ def _shape(site: BoundSite) -> SiteOut:
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
 def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]:
-    """The study's sites in the order of first mention."""
+    """List the study's sites in the order of first mention.
+
+    The pairs of runs that have no name yet follow.
+    """
     with reading() as session:
-        bound = sites.resolve(session, studies.get(session, study_id))
-        return pages.page_of_all(bound, _shape, lambda site: site.site)
+        binding = sites.binding_of(session, studies.get(session, study_id).id)
+        return pages.page_of_all((*binding.sites, *binding.pairs), _shape, lambda site: site.site or f"/{site.pair}")
 
 
 @router.get("/{site}", responses=responses(401, 403, 404, 422))
 def get_site(study_id: StudyId, site: SiteName, caller: Reader) -> SiteOut:
-    """One site."""
+    """Return one site."""
     with reading() as session:
-        return _shape(sites.one(session, studies.get(session, study_id), site))
+        return _shape(sites.site_of(session, studies.get(session, study_id), site))
 
 
 @router.put("/{site}", responses=responses(400, 401, 403, 404, 422))
 def put_site(study_id: StudyId, site: SiteName, body: SitePut, caller: Writer) -> SiteOut:
-    """Set a site's activation time, or the runs that show it; what is set here comes before every other rule.
+    """Set a site's activation time or its runs.
 
-    A pair between 20 and 30 degrees is computed, its covariance tells how well; under 20 it is rejected.
+    A site whose runs are a guess by row order (`paired_by_order`) keeps them, and the request confirms the guess for this
+    site, unless the request names other runs.
+
+    A job computes a pair between 20 and 30 degrees, and its covariance shows the uncertainty. A job rejects a pair under 20
+    degrees.
     """
-    told = body.model_fields_set
     with writing() as session:
         study = studies.lock(session, study_id)
-        sites.settle(session, study)
+        views = body.model_dump(include={"view_a", "view_b"}, exclude_unset=True)
+        sites.confirm_order(session, study, site, views)
         row = sites.mention(session, study_id, site)
-        if "lat_ms" in told:
+        if "lat_ms" in body.model_fields_set:
             row.lat_ms, row.lat_sd_ms = body.lat_ms, None
             row.lat_by = None if body.lat_ms is None else "explicit"
-        views = body.model_dump(include={"view_a", "view_b"}, exclude_unset=True)
         sites.put_views(session, study, site, views)
-        return _shape(sites.one_or_empty(session, study, site))
+        return _shape(sites.site_of(session, study, site, also_empty=True))

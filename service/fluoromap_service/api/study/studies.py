@@ -118,7 +118,10 @@ def get_study(study_id: StudyId, caller: Reader) -> StudyOut:
 
 @router.patch("/{study_id}", responses=responses(400, 401, 403, 404, 409, 422))
 def change_study(study_id: StudyId, body: StudyPatch, caller: Writer) -> StudyOut:
-    """Change a study; jobs that run keep the study as it was at their start."""
+    """Change a study.
+
+    Jobs that run keep the study of their start.
+    """
     changes = body.model_dump(exclude_unset=True)
     with writing() as session:
         study = studies.lock(session, study_id)
@@ -162,7 +165,10 @@ def _check_corrections(session: Session, study: Study, catalogue: Catalogue) -> 
 
 @router.delete("/{study_id}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409))
 def delete_study(study_id: StudyId, caller: Writer) -> None:
-    """Delete a study with its jobs, and the files that nothing else refers to; 409 while a job runs."""
+    """Delete a study with its jobs.
+
+    The files that nothing else refers to are deleted too. The answer is 409 while a job runs.
+    """
     with writing() as session:
         unreferenced = studies.remove(session, study_id)
     unlink_unreferenced(unreferenced)

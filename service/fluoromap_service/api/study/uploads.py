@@ -1,4 +1,4 @@
-"""Files arriving over HTTP, written to the store's disk as they come."""
+"""Uploaded files, written to the store's disk while they arrive."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LONGEST_FIELD = 1024
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One file that has arrived whole. ``file_name`` may name the patient: never in a log, path or error."""
+    """One complete uploaded file. ``file_name`` may name the patient: never use it in a log, path or error."""
 
     path: Path
     sha256: str
@@ -43,7 +43,7 @@ class _Arriving:
         self.digest.update(data)
 
     def finish(self) -> Part:
-        # On disk now, so that the transaction which keeps the file need not wait for it.
+        # Flush it now, so that the transaction that keeps the file need not wait for the disk.
         self.stream.flush()
         os.fsync(self.stream.fileno())
         self.stream.close()
@@ -87,7 +87,7 @@ class _Form:
         self._parts += 1
         if self._parts > MOST_PARTS:
             raise Problem(
-                413, "too_many_parts", f"A request may have {MOST_PARTS} parts; send the rest in another one."
+                413, "too_many_parts", f"A request may have {MOST_PARTS} parts; send the rest in another request."
             )
         self._header, self._disposition = (b"", b""), b""
 
@@ -106,14 +106,14 @@ class _Form:
         _, options = parse_options_header(self._disposition)
         name = options.get(b"name", b"").decode("utf-8", "replace")
         if name == "file":
-            told = options.get(b"filename")
-            file_name = None if told is None else told.decode("utf-8", "replace")
+            sent_name = options.get(b"filename")
+            file_name = None if sent_name is None else sent_name.decode("utf-8", "replace")
             self._arriving = _arriving(self._stack, file_name)
         elif name == "site":
             self._text = bytearray()
         else:
             raise Problem(
-                422, "unknown_part", "A request has parts named 'file' and may have a field named 'site'.",
+                422, "unknown_part", "Only parts named 'file' and one field named 'site' are allowed; rename the other parts.",
                 [("multipart/form-data", "a part with another name, or without one")],
             )  # fmt: skip
 
@@ -123,7 +123,12 @@ class _Form:
         elif self._text is not None:
             self._text += data[start:end]
             if len(self._text) > _LONGEST_FIELD:
-                raise Problem(422, "invalid_site", "The field 'site' is too long.", [("site", "too long")])
+                raise Problem(
+                    422,
+                    "invalid_site",
+                    "The field 'site' is too long; a name has at most 64 characters.",
+                    [("site", "too long")],
+                )
 
     def _on_part_end(self) -> None:
         if self._arriving is not None:
@@ -132,7 +137,9 @@ class _Form:
             try:
                 self.site = self._text.decode()
             except UnicodeDecodeError:
-                raise Problem(400, "malformed", "The field 'site' is not UTF-8.", [("site", "not UTF-8")]) from None
+                raise Problem(
+                    400, "malformed", "The field 'site' is not UTF-8; send it in UTF-8.", [("site", "not UTF-8")]
+                ) from None
         self._arriving = self._text = None
 
     def _on_end(self) -> None:
@@ -145,11 +152,13 @@ def _arriving(stack: ExitStack, file_name: str | None) -> _Arriving:
 
 
 def _malformed() -> Problem:
-    return Problem(400, "malformed", "The multipart body is malformed or ends too early; send it again.")
+    return Problem(400, "malformed", "The multipart body is malformed or ends too early; send the request again.")
 
 
 async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str | None]:
-    """Take in the files of a request and the field ``site``; ``stack`` removes at its end what nobody kept.
+    """Receive the files of a request and its field ``site``.
+
+    At its end ``stack`` removes the files that the store did not keep.
 
     Raises
     ------
@@ -171,7 +180,7 @@ async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str |
                 raise _malformed()
             return form.files, form.site
     except ClientDisconnect:
-        raise Problem(400, "truncated", "The connection ended before the body did; send it again.") from None
+        raise Problem(400, "truncated", "The connection ended before the body; send the request again.") from None
     raise Problem(415, "unsupported_media_type", "Send DICOM files as multipart/form-data or application/dicom.")
 
 

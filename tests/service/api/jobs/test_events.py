@@ -55,14 +55,14 @@ def test_the_stream_follows_a_running_job(
     client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked = threading.Event()
-    news = event_routes._news
+    news = event_routes._new_events
 
     def noticed(job_id: str, after: int) -> Any:
         found = news(job_id, after)
         looked.set()
         return found
 
-    monkeypatch.setattr(event_routes, "_news", noticed)
+    monkeypatch.setattr(event_routes, "_new_events", noticed)
     received: list[list[dict[str, Any]]] = []
     following = threading.Thread(target=lambda: received.append(_stream(client, study)))
     following.start()
@@ -79,7 +79,7 @@ def test_what_is_committed_late_is_not_lost(
 ) -> None:
     """A lower id that appears after a higher one was sent, as two PostgreSQL transactions can make it."""
     study.finish()
-    news = event_routes._news
+    news = event_routes._new_events
     looks: list[int] = []
 
     def delayed(job_id: str, after: int) -> Any:
@@ -88,7 +88,7 @@ def test_what_is_committed_late_is_not_lost(
         return (False, found[1:]) if len(looks) == 1 else (ended, found)
 
     expected = {event["id"] for event in _stream(client, study)}
-    monkeypatch.setattr(event_routes, "_news", delayed)
+    monkeypatch.setattr(event_routes, "_new_events", delayed)
     assert {event["id"] for event in _stream(client, study)} == expected
 
 

@@ -23,7 +23,7 @@ def _path(study: FinishedStudy) -> str:
 def test_a_job_has_exactly_the_promised_members(client: TestClient, study: FinishedStudy) -> None:
     job = client.get(_path(study)).json()
     assert set(job) == {
-        "id", "study", "state", "progress", "stages", "error", "created", "started", "finished", "links",
+        "id", "study", "state", "progress", "stages", "error", "warnings", "created", "started", "finished", "links",
     }  # fmt: skip
     assert set(job["stages"][0]) == {
         "name", "subject", "plugin", "version", "state", "attempt", "progress", "reused", "error",
@@ -54,6 +54,15 @@ def test_a_failed_stage_is_a_problem_in_its_stage_and_in_the_job(client: TestCli
     assert (job["state"], job["progress"]) == ("failed", 1.0)
 
 
+@pytest.mark.parametrize("code", ["internal", "plugin_failed", "worker_lost"])
+def test_a_failed_stage_is_no_fault_of_the_data(client: TestClient, study: FinishedStudy, code: str) -> None:
+    study.segmented()
+    study.fail("match", code=code)
+    job = client.get(_path(study)).json()
+    match = next(stage for stage in job["stages"] if stage["name"] == "match")
+    assert [(error["code"], error["status"]) for error in (job["error"], match["error"])] == [(code, 500)] * 2
+
+
 def test_unchanged_jobs_are_not_sent_again(client: TestClient, study: FinishedStudy) -> None:
     etag = client.get(_path(study)).headers["etag"]
     again = client.get(_path(study), headers={"If-None-Match": etag})
@@ -78,14 +87,14 @@ def test_waiting_ends_when_the_state_changes(
     client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked = threading.Event()
-    look = job_routes._look
+    look = job_routes._state
 
     def noticed(job_id: str) -> tuple[str, str]:
         seen = look(job_id)
         looked.set()
         return seen
 
-    monkeypatch.setattr(job_routes, "_look", noticed)
+    monkeypatch.setattr(job_routes, "_state", noticed)
     answers: list[dict[str, Any]] = []
     waiting = threading.Thread(target=lambda: answers.append(client.get(f"{_path(study)}?wait=60").json()))
     waiting.start()
@@ -144,7 +153,7 @@ def test_jobs_are_listed_newest_first_a_page_at_a_time(client: TestClient, study
 
 @pytest.fixture
 def published(monkeypatch: pytest.MonkeyPatch, study: FinishedStudy) -> list[int]:
-    """Starts jobs on the finished study's own snapshot; notes how many jobs stood committed at each announcement."""
+    """Starts jobs on the finished study's own snapshot; counts the committed jobs at each announcement."""
     counts: list[int] = []
 
     def announce() -> int:

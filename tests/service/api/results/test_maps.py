@@ -35,7 +35,7 @@ def test_the_map_is_relative_to_the_reference(client: TestClient, study: Finishe
     assert (answer["conduction_velocity"], answer["cycle_length_ms"]) == (None, None)
 
 
-def test_the_map_tells_conduction_velocity_and_cycle(client: TestClient, study: FinishedStudy) -> None:
+def test_the_map_shows_conduction_velocity_and_cycle(client: TestClient, study: FinishedStudy) -> None:
     outcome = map_result()
     assert outcome.chamber is not None
     chamber = replace(outcome.chamber, conduction_velocity=ConductionVelocity(0.8, 0.7, 0.9), cycle_length_ms=240.0)
@@ -104,6 +104,10 @@ def test_meshes_are_read_by_others(
     assert answer.headers["content-disposition"] == f'attachment; filename="chamber-{origin}.{file_type}"'
     mesh = trimesh.load(io.BytesIO(answer.content), file_type=file_type, force="mesh")
     assert mesh.is_watertight
+    if file_type == "glb":
+        # glTF: metres, +Y up (head), +Z forward (front).
+        left, head, front = 1e3 * mesh.vertices.T
+        mesh.vertices = np.stack([left, -front, head], axis=1)
     np.testing.assert_allclose(mesh.bounds, [shift - 10, shift + 10], atol=1e-5)
     assert mesh.volume == pytest.approx(4 / 3 * 10**3, rel=1e-5)
 

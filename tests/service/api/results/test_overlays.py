@@ -77,7 +77,7 @@ def test_size_and_cache(client: TestClient, study: FinishedStudy, monkeypatch: p
         assert len(session.scalars(select(Rendering)).all()) == 2
 
 
-def test_the_file_name_tells_site_and_frame_only(client: TestClient, study: FinishedStudy) -> None:
+def test_the_file_name_has_site_and_frame_only(client: TestClient, study: FinishedStudy) -> None:
     study.mapped()
     answer = client.get(f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'b']}.png?frame=1")
     assert answer.headers["content-disposition"] == 'inline; filename="overlay-S01-1.png"'
@@ -126,24 +126,24 @@ def test_runs_without_overlay(client: TestClient, study: FinishedStudy) -> None:
         assert client.get(f"/v1/jobs/{study.job_id}/overlays/{uid}.png").status_code == 404
 
 
-def _stands_at(fusion: Fusion, view: str, place_mm: NDArray[np.float64]) -> None:
-    """The map hangs on a place that this view shows where it shows ``place_mm``, at its depth."""
+def _is_at(fusion: Fusion, view: str, place_mm: NDArray[np.float64]) -> None:
+    """Check that the map lies where this view shows ``place_mm``, at its depth."""
     np.testing.assert_allclose(fusion.camera.project(fusion.shift_mm), camera(view).project(place_mm), atol=0.01)
     assert abs(fusion.camera.depth_mm(fusion.shift_mm) - camera(view).depth_mm(place_mm)) < 0.1
 
 
-def test_the_map_hangs_on_the_reference_as_the_frame_shows_it(client: TestClient, study: FinishedStudy) -> None:
+def test_the_map_follows_the_reference_as_the_frame_shows_it(client: TestClient, study: FinishedStudy) -> None:
     study.mapped()
     for view in ("a", "b"):
         for frame in (None, 1):
-            _stands_at(_fusion(study, view, frame), view, REFERENCE_MM + BREATH_MM[view])
+            _is_at(_fusion(study, view, frame), view, REFERENCE_MM + BREATH_MM[view])
     # Frame 3 does not show the reference.
     np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
     study.followed()
     np.testing.assert_allclose(_fusion(study, "a", 1).shift_mm, REFERENCE_MM + STEP_MM)
-    _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + BREATH_MM["a"])
+    _is_at(_fusion(study, "a", None), "a", REFERENCE_MM + BREATH_MM["a"])
     np.testing.assert_allclose(_fusion(study, "a", 3).shift_mm, REFERENCE_MM)
-    _stands_at(_fusion(study, "b", 1), "b", REFERENCE_MM + BREATH_MM["b"])
+    _is_at(_fusion(study, "b", 1), "b", REFERENCE_MM + BREATH_MM["b"])
 
 
 @pytest.mark.parametrize("shown", [(1,), (2,), (1, 2, 3), (3,)])
@@ -159,12 +159,12 @@ def test_the_reference_may_be_shown_in_part(study: FinishedStudy, shown: tuple[i
     study.end("match", None, replace(whole, sites=(replace(site, diastole=diastole),)))
     study.end("triangulate", None, triangulation())
     study.end("fuse", None, map_result())
-    # The third was not located: it tells nothing of where the catheter is.
+    # The third was not located: it does not show where the catheter is.
     breath = BREATH_MM["a"] if shown != (3,) else 0.0
-    _stands_at(_fusion(study, "a", None), "a", REFERENCE_MM + breath)
+    _is_at(_fusion(study, "a", None), "a", REFERENCE_MM + breath)
 
 
-def test_the_star_stands_where_the_tip_was_seen(client: TestClient, study: FinishedStudy) -> None:
+def test_the_star_is_where_the_tip_was_seen(client: TestClient, study: FinishedStudy) -> None:
     study.finish()
     np.testing.assert_array_equal(_fusion(study, "a", 1).tip_uv, TIP_PIXEL["a"])
     np.testing.assert_array_equal(_fusion(study, "b", None).tip_uv, TIP_PIXEL["b"])

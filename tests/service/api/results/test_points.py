@@ -47,7 +47,10 @@ OTHER_TIP_MM = TIP_MM + np.array([10.0, 0.0, 0.0])
 
 
 def self_calibrated() -> Any:
-    """S01 with a calibrated gantry, and a tip that could be 10 mm farther to the left."""
+    """Return S01 with a calibrated gantry and a doubtful tip.
+
+    The tip could be 10 mm farther to the left.
+    """
     plain = triangulation()
     (site,) = plain.sites
     tip = replace(site.points[0], alternative_mm=OTHER_TIP_MM, alternative_probability=0.25)
@@ -62,7 +65,7 @@ def self_calibrated() -> Any:
 
 
 @pytest.mark.parametrize(("origin", "zero"), [("reference", REFERENCE_MM), ("isocentre", np.zeros(3))])
-def test_points_tell_what_the_study_says_as_a_whole(
+def test_points_show_the_results_of_the_whole_study(
     client: TestClient, study: FinishedStudy, origin: str, zero: np.ndarray
 ) -> None:
     study.matched()

@@ -38,10 +38,12 @@ def _page(client: TestClient, study: FinishedStudy) -> str:
     return answer.text
 
 
-def test_the_report_waits_for_the_end(client: TestClient, study: FinishedStudy) -> None:
+@pytest.mark.parametrize("path", ["report.html", "archive.zip"])
+def test_report_and_archive_wait_for_the_end(client: TestClient, study: FinishedStudy, path: str) -> None:
     study.mapped()
-    answer = client.get(f"/v1/jobs/{study.job_id}/report.html")
+    answer = client.get(f"/v1/jobs/{study.job_id}/{path}")
     assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
+    assert int(answer.headers["retry-after"]) > 0
 
 
 def test_the_job_links_to_it(client: TestClient, study: FinishedStudy) -> None:
@@ -52,7 +54,7 @@ def test_the_job_links_to_it(client: TestClient, study: FinishedStudy) -> None:
     assert client.get(link, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
 
 
-def test_it_tells_every_site_reason_plugin_and_input(client: TestClient, study: FinishedStudy) -> None:
+def test_it_shows_every_site_reason_plugin_and_input(client: TestClient, study: FinishedStudy) -> None:
     study.finish()
     page = _page(client, study)
     for site in ("S01", "S03"):

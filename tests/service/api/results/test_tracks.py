@@ -74,7 +74,7 @@ def test_tracks_from_the_isocentre(client: TestClient, study: FinishedStudy) -> 
     np.testing.assert_allclose(_position(_tip(client, study, "&origin=isocentre")[0]), TIP_MM)
 
 
-def test_accuracy_is_told_along_and_across_the_ray(client: TestClient, study: FinishedStudy) -> None:
+def test_accuracy_is_stated_along_and_across_the_ray(client: TestClient, study: FinishedStudy) -> None:
     study.finish()
     sample = _tip(client, study)[0]
     # The tip lies within 2 degrees of the central ray, which is the x axis in a lateral view.
@@ -114,7 +114,7 @@ def test_views_that_could_not_be_followed_say_why(client: TestClient, study: Fin
     assert all(entry["message"] and entry["view"] == "a" for entry in rejected)
 
 
-def test_a_failed_solver_is_told_as_a_rejection(client: TestClient, study: FinishedStudy) -> None:
+def test_a_failed_solver_is_reported_as_a_rejection(client: TestClient, study: FinishedStudy) -> None:
     study.mapped()
     study.fail("monoplane", "S01")
     answer = client.get(f"/v1/jobs/{study.job_id}/tracks?site=S01").json()

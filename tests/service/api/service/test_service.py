@@ -1,7 +1,8 @@
-"""Plugins, health, readiness, and what the OpenAPI document tells of the output half."""
+"""Plugins, health, readiness, and the OpenAPI document of the results."""
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from fastapi.testclient import TestClient
 from finished_study import FinishedStudy
 
 from fluoromap import registry
-from fluoromap_service.jobs import job_life
+from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import WorkerSeen
@@ -50,6 +51,8 @@ def _checks(client: TestClient) -> tuple[int, dict[str, bool]]:
 
 def test_not_ready_without_a_worker(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLUOROMAP_BROKER_URL", "")
+    # The process keeps its Celery application: this test gets another one, so that later tests keep theirs.
+    monkeypatch.setattr(queue, "celery_app", functools.cache(queue.celery_app.__wrapped__))
     settings.cache_clear()
     assert _checks(client) == (503, {"database": True, "broker": True, "files": True, "worker": False})
     with writing() as session:

@@ -69,7 +69,7 @@ def test_a_wrong_table_is_refused_as_a_whole(service: TestClient, study_path: st
     assert _times(service, study_path) == {"kept": 7}
 
 
-def test_every_mistake_is_told_at_once() -> None:
+def test_every_mistake_is_reported_at_once() -> None:
     from fluoromap_service.api.http.problems import Problem
 
     with pytest.raises(Problem) as caught:
@@ -79,8 +79,8 @@ def test_every_mistake_is_told_at_once() -> None:
         "row 3, column site",
         "row 3, column lat_ms",
     ]
-    assert caught.value.detail.startswith("The table has 3 mistakes;")
-    with pytest.raises(Problem, match="has 1 mistake;"):
+    assert caught.value.detail.startswith("The table has 3 mistakes,")
+    with pytest.raises(Problem, match="has 1 mistake,"):
         activation_times("site,lat_ms\nA,x\n")
 
 
@@ -139,7 +139,9 @@ def test_an_electrogram_gives_the_activation_time(service: TestClient, study_pat
         ("time_ms,reference\n0,0\n", "invalid_table"),
     ],
 )
-def test_an_electrogram_that_tells_nothing(service: TestClient, study_path: str, content: str, code: str) -> None:
+def test_an_electrogram_without_an_activation_time(
+    service: TestClient, study_path: str, content: str, code: str
+) -> None:
     answer = service.put(f"{study_path}/electrograms/X", content=content, headers={"Content-Type": "text/csv"})
     assert (answer.status_code, answer.json()["code"]) == (422, code)
     assert _times(service, study_path) == {}

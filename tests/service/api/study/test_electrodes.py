@@ -48,7 +48,7 @@ def _segmented(frame: str, u_px: float) -> None:
         job = Job(id=f"job{u_px}", study_id=frame.split("/")[3], state="succeeded", snapshot={"runs": {}}, created=u_px)
         session.add(job)
         session.flush()
-        sha256 = files.keep_bytes(session, encode(found), "application/json")
+        sha256 = files.keep_bytes(session, encode(found))
         session.add(
             StageRow(
                 job_id=job.id, name="segment", subject=run_uid(1), plugin="p", plugin_version="1", depends_on=[],
@@ -112,7 +112,7 @@ def test_electrodes_that_cannot_be(service: TestClient, frame: str, change: dict
     assert service.get(frame).json() == []
 
 
-def test_an_electrode_stands_once(service: TestClient, frame: str) -> None:
+def test_an_electrode_occurs_once(service: TestClient, frame: str) -> None:
     answer = service.put(frame, json=[TIP, TIP])
     assert [error["where"] for error in answer.json()["errors"]] == ["body.1.electrode"]
 

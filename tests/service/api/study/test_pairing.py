@@ -25,7 +25,7 @@ def site_list(service: TestClient, study_path: str) -> Callable[[], dict[str, An
     def ask() -> dict[str, Any]:
         answer = service.get(f"{study_path}/sites")
         assert answer.status_code == 200
-        return {site["site"]: site for site in answer.json()["items"]}
+        return {site["site"] or f"pair {site['pair']}": site for site in answer.json()["items"]}
 
     return ask
 
@@ -38,16 +38,17 @@ def _csv(service: TestClient, study_path: str, text: str) -> Any:
     return service.put(f"{study_path}/activation-times", content=text, headers={"Content-Type": "text/csv"})
 
 
-def test_neighbours_in_time_are_paired_and_named_for_good(
+def test_neighbours_in_time_are_pairs_without_a_name(
     service: TestClient, study_path: str, upload: Upload, site_list: Any
 ) -> None:
     upload((4, PA), (2, PA), (1, LAT), (3, LAT))
     assert {name: _views(site) for name, site in site_list().items()} == {
-        "S01": (run_uid(1), run_uid(2), "time"),
-        "S02": (run_uid(3), run_uid(4), "time"),
+        "pair 1": (run_uid(1), run_uid(2), "time"),
+        "pair 2": (run_uid(3), run_uid(4), "time"),
     }
+    assert {(site["site"], *site["missing"]) for site in site_list().values()} == {(None, "site", "lat_ms")}
     upload((0, LAT), (5, LAT))
-    assert _views(site_list()["S01"]) == (run_uid(1), run_uid(2), "time")
+    assert _views(site_list()["pair 1"]) == (run_uid(1), run_uid(2), "time")
     assert len(site_list()) == 2
     late = service.get(f"{study_path}/instances/{run_uid(5)}").json()
     assert late["site"] is late["view"] is None
@@ -59,12 +60,12 @@ def test_runs_that_arrive_one_by_one_in_any_order_pair_by_acquisition(upload: Up
         upload((number, angle))
     found = site_list()
     assert {_views(site)[:2] for site in found.values()} == {(run_uid(1), run_uid(2)), (run_uid(3), run_uid(4))}
-    assert set(found) == {"S01", "S02"}
+    assert set(found) == {"pair 1", "pair 2"}
 
 
 def test_view_a_is_nearer_to_lateral(upload: Upload, site_list: Any) -> None:
     upload((1, 10.0), (2, 70.0))
-    assert _views(site_list()["S01"])[:2] == (run_uid(2), run_uid(1))
+    assert _views(site_list()["pair 1"])[:2] == (run_uid(2), run_uid(1))
 
 
 def test_a_third_run_stays_unbound_and_the_shorter_gap_wins(
@@ -85,7 +86,7 @@ def test_the_site_given_at_upload_binds(upload: Upload, site_list: Any) -> None:
     upload((1, LAT), (4, PA), site="apex")
     upload((2, PA), (3, LAT))
     assert _views(site_list()["apex"]) == (run_uid(1), run_uid(4), "upload")
-    assert _views(site_list()["S01"]) == (run_uid(3), run_uid(2), "time")
+    assert _views(site_list()["pair 1"]) == (run_uid(3), run_uid(2), "time")
 
 
 def test_the_table_binds_by_uid_series_number_and_file_name(
@@ -120,15 +121,53 @@ def test_row_order_binds_when_the_counts_agree(
     assert answer.json()["unmatched"] == ["zeta", "alpha", "third"]
 
 
-def test_a_table_that_uses_the_permanent_names_keeps_them(
+@pytest.mark.parametrize("table_first", [True, False])
+def test_a_name_that_looks_invented_matches_no_row(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any, table_first: bool
+) -> None:
+    """Files that arrive in another order than they were acquired, then a table with names like S01."""
+    table = "site,lat_ms\nS01,10\nS02,20\nS03,30\n"
+    if table_first:
+        _csv(service, study_path, table)
+    for number, angle in ((6, PA), (3, LAT), (1, LAT), (4, PA), (5, LAT), (2, PA)):
+        upload((number, angle))
+    if not table_first:
+        assert {site["site"] for site in site_list().values()} == {None}
+        _csv(service, study_path, table)
+    found = site_list()
+    for row, name in enumerate(("S01", "S02", "S03")):
+        assert _views(found[name]) == (run_uid(2 * row + 1), run_uid(2 * row + 2), "order")
+        assert found[name]["warnings"] == ["paired_by_order"]
+
+
+def test_put_confirms_a_guess_and_leaves_the_others_as_they_are(
     service: TestClient, study_path: str, upload: Upload, site_list: Any
 ) -> None:
     upload((1, LAT), (2, PA), (3, LAT), (4, PA))
-    assert list(site_list()) == ["S01", "S02"]
-    assert _csv(service, study_path, "site,lat_ms\nS02,5\nS01,7\n").json()["unmatched"] == []
+    _csv(service, study_path, "site,lat_ms\nalpha,10\nbeta,20\n")
+    job = service.post(f"{study_path}/jobs", json={}).json()
+    assert job["warnings"] == ["paired_by_order"]
+    confirmed = service.put(f"{study_path}/sites/alpha", json={}).json()
+    assert (*_views(confirmed), confirmed["warnings"]) == (run_uid(1), run_uid(2), "explicit", [])
+    assert _views(site_list()["beta"]) == (run_uid(3), run_uid(4), "order")
+    assert service.get(f"/v1/jobs/{job['id']}").json()["warnings"] == ["paired_by_order"]
+    views = {"view_a": run_uid(3), "view_b": run_uid(4)}
+    assert service.put(f"{study_path}/sites/beta", json=views).json()["bound_by"] == "explicit"
+    assert service.get(f"/v1/jobs/{job['id']}").json()["warnings"] == []
+
+
+def test_other_runs_in_a_put_end_the_guess(
+    service: TestClient, study_path: str, upload: Upload, site_list: Any
+) -> None:
+    upload((1, LAT), (2, PA), (3, LAT), (4, PA))
+    _csv(service, study_path, "site,lat_ms\nalpha,10\nbeta,20\n")
+    service.put(f"{study_path}/sites/alpha", json={"view_a": run_uid(3), "view_b": run_uid(4)})
     found = site_list()
-    assert _views(found["S02"]) == (run_uid(3), run_uid(4), "time")
-    assert found["S02"]["lat_ms"] == 5
+    assert _views(found["alpha"]) == (run_uid(3), run_uid(4), "explicit")
+    assert _views(found["beta"]) == (None, None, None)
+    answer = service.post(f"{study_path}/jobs", json={})
+    assert (answer.status_code, answer.json()["code"]) == (422, "rows_unmatched")
+    assert [place["where"] for place in answer.json()["errors"]] == ["sites.beta", "pairs.1"]
 
 
 def test_put_comes_before_every_other_rule(
@@ -172,7 +211,7 @@ def test_a_binding_that_cannot_be(service: TestClient, study_path: str, upload: 
 
 def _reasons(study_path: str, site: str) -> tuple[Reason, ...]:
     with reading() as session:
-        return sites.one(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
+        return sites.site_of(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
 
 
 def test_what_makes_a_site_unusable(service: TestClient, study_path: str, upload: Upload, tmp_path: Path) -> None:
@@ -215,7 +254,7 @@ def test_a_pair_between_20_and_30_degrees_is_computed(service: TestClient, study
     assert _reasons(study_path, "X") == ()
 
 
-def test_a_table_that_moved_is_not_paired_and_refused_when_told(
+def test_a_table_that_moved_is_not_paired_and_refused_when_named(
     service: TestClient, study_path: str, upload: Upload, tmp_path: Path, site_list: Any
 ) -> None:
     upload((1, LAT))
@@ -248,7 +287,9 @@ def test_no_ready_site_lists_what_each_misses(service: TestClient, study_path: s
     upload((1, LAT), (2, PA))
     answer = service.post(f"{study_path}/jobs", json={})
     assert (answer.status_code, answer.json()["code"]) == (422, "no_ready_site")
-    assert answer.json()["sites"] == [{"site": "S01", "missing": ["lat_ms"], "reasons": ["no_activation_time"]}]
+    assert answer.json()["sites"] == [
+        {"site": None, "pair": 1, "missing": ["site", "lat_ms"], "reasons": ["no_activation_time"]}
+    ]
     assert service.get("/v1/jobs").json()["items"] == []
 
 

@@ -65,7 +65,7 @@ def test_studies_that_cannot_be(service: TestClient, body: dict[str, Any], where
     assert service.get("/v1/studies").json() == {"items": [], "next": None}
 
 
-def test_a_mistake_is_told_in_plain_words(service: TestClient) -> None:
+def test_a_mistake_is_explained_in_plain_words(service: TestClient) -> None:
     catheter = {"name": "mapping", "electrodes": 4, "spacing_mm": [4.65, 6.3], "tip_mm": 4, "ring_mm": 1.3}
     answer = service.post("/v1/studies", json={"label": "one spacing short", "catheters": [catheter]})
     assert answer.status_code == 422
@@ -117,7 +117,7 @@ def test_pages(service: TestClient) -> None:
 
 def test_pages_of_a_study(service: TestClient, study_path: str, upload: Upload) -> None:
     upload((1, -90.0), (2, 0.0), (3, -90.0), (4, 0.0))
-    for what, key, expected in (("instances", "sop_instance_uid", 4), ("sites", "site", 2)):
+    for what, key, expected in (("instances", "sop_instance_uid", 4), ("sites", "pair", 2)):
         first = service.get(f"{study_path}/{what}?limit=1").json()
         rest = service.get(f"{study_path}/{what}", params={"cursor": first["next"]}).json()
         assert len({item[key] for item in [*first["items"], *rest["items"]]}) == expected

@@ -22,7 +22,7 @@ Upload = Callable[..., Any]
 
 
 def _stored(data_dir: Path) -> tuple[int, int, int, int]:
-    """Rows of File, Instance and StudyInstance, and files on the disk."""
+    """Count rows of File, Instance and StudyInstance, and the disk's files."""
     with reading() as session:
         rows = [
             session.scalar(select(func.count()).select_from(table)) or 0 for table in (File, Instance, StudyInstance)
@@ -170,7 +170,7 @@ def test_a_syntax_no_decoder_reads_is_refused(
     assert _stored(data_dir) == (0, 0, 0, 0)
 
 
-def test_a_real_cine_tells_what_it_lacks(service: TestClient, study_path: str, sample_data: Path) -> None:
+def test_a_real_cine_reports_what_it_lacks(service: TestClient, study_path: str, sample_data: Path) -> None:
     answer = _raw(service, study_path, (sample_data / "xa_512x512x96_jpeg_baseline.dcm").read_bytes())
     assert answer.status_code == 201
     run = answer.json()["instances"][0]

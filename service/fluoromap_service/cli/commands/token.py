@@ -97,5 +97,8 @@ def _seconds(lifetime: str) -> float:
 
 
 def _minute(seconds: float | None) -> str:
-    """Return a time in seconds since 1970 as a UTC date and minute; empty for None."""
+    """Return a time as a UTC date and minute.
+
+    The time is in seconds since 1970. None gives an empty text.
+    """
     return "" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")

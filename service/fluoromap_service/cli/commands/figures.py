@@ -39,7 +39,10 @@ def figures(
 
 
 def _check_writable(folder: Path) -> None:
-    """Make the folder and write to it, so that a failure comes before the long computation."""
+    """Make the folder and write to it.
+
+    So a failure comes before the long computation.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass

@@ -8,30 +8,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.proposals import Likeness
 
 _TURNS_RAD = np.deg2rad([0.0, -4.0, 4.0, -8.0, 8.0])
-_MOST_SNR = 12.0
-_TAKEN_SNR = 2.0
+_MOST = 12.0
+_TAKEN = 2.0
 _TAKEN_MM = 0.9
 _FAR_WEIGHT = 1.2
 _OUTSIDE = -5.0
 
 
 def rigid_search(
-    response: BlobResponse, points_uv: Array, shift: Array, reach_px: float, taken: Sequence[Chain]
+    likeness: Likeness, points_uv: Array, shift: Array, reach_px: float, taken: Sequence[Chain], px_per_mm: float
 ) -> Array:
-    """Move the points to where the summed response over noise is highest.
+    """Move the points to where the summed likeness to electrodes is highest.
 
     The points (n, 2), pixels, move by about ``shift``, at most ``reach_px`` farther, and turn by up to 8 degrees. Near
-    electrodes of
-    the chains ``taken`` the response counts little: a catheter does not jump onto another.
+    electrodes of the chains ``taken`` it counts little: a catheter does not jump onto another.
     """
-    best = response.best.copy()
-    offset, factor = 0.5 * (response.reduction - 1), 1.0 / response.reduction
+    best = likeness.values.copy()
+    offset, factor = likeness.first_px, 1.0 / likeness.cell_px
     for chain in taken:
-        _dim(best, (chain.pixels_uv - offset) * factor, _TAKEN_MM * response.px_per_mm * factor)
+        _dim(best, (chain.pixels_uv - offset) * factor, _TAKEN_MM * px_per_mm * factor)
     middle = points_uv.mean(axis=0)
     reach = int(reach_px * factor)
     steps = np.arange(-reach, reach + 1)
@@ -55,22 +54,22 @@ def rigid_search(
         if total.flat[place] > highest:
             highest = float(total.flat[place])
             row, column = divmod(place, len(steps))
-            found = turned + np.array([steps[column], steps[row]]) * response.reduction
+            found = turned + np.array([steps[column], steps[row]]) * likeness.cell_px
     return found
 
 
 def _cut_out(best: Image, left: int, right: int, top: int, bottom: int) -> Image:
-    """Return the response in a rectangle, limited to 12, and -5 outside the image."""
+    """Return the likeness in a rectangle, limited to 12, and -5 outside the image."""
     cut: Image = np.full((bottom - top, right - left), _OUTSIDE, np.float32)
     rows, columns = best.shape
     u0, u1, v0, v1 = max(left, 0), min(right, columns), max(top, 0), min(bottom, rows)
     if u0 < u1 and v0 < v1:
-        cut[v0 - top : v1 - top, u0 - left : u1 - left] = np.minimum(best[v0:v1, u0:u1], np.float32(_MOST_SNR))
+        cut[v0 - top : v1 - top, u0 - left : u1 - left] = np.minimum(best[v0:v1, u0:u1], np.float32(_MOST))
     return cut
 
 
 def _dim(best: Image, places: Array, radius: float) -> None:
-    """Lower the response within ``radius`` of the places, (n, 2), in place.
+    """Lower the likeness within ``radius`` of the places, (n, 2), in place.
 
     One call of skimage.draw.disk for each place gives the same result in nine times the time.
     """
@@ -82,4 +81,4 @@ def _dim(best: Image, places: Array, radius: float) -> None:
     near = (u - places[:, 0, None, None]) ** 2 + (v - places[:, 1, None, None]) ** 2 <= radius * radius
     near = near & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
     u, v = (np.broadcast_to(axis, near.shape)[near] for axis in (u, v))
-    best[v, u] = np.minimum(best[v, u], np.float32(_TAKEN_SNR))
+    best[v, u] = np.minimum(best[v, u], np.float32(_TAKEN))

@@ -19,9 +19,9 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
-    """Run the API and a worker; by default they use SQLite and files, no server.
+    """Run the API and a worker.
 
-    A worker that dies is started again.
+    By default they use SQLite and files, no server. A worker that dies is started again.
     """
     apply_options(host, port, data_dir)
     host, port = settings().host, settings().port

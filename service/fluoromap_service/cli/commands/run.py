@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from fluoromap.reasons import Reason
 from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.progress import progress_bars
 from fluoromap_service.cli.submission import find_files, run_job, upload
@@ -42,5 +43,7 @@ def run(
             for note in notes:
                 console.print(f"note: {note}", highlight=False)
             job = run_job(client, study, progress)
+            for warning in job["warnings"]:
+                console.print(f"warning: {Reason(warning).sentence} ({warning})", highlight=False)
         client.fetch(job["id"], out)
     console.print(f"Results: {out.resolve()}", highlight=False, soft_wrap=True)

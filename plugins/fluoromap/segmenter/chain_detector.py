@@ -1,0 +1,272 @@
+"""Chains of one image: proposals, linking, fit; and chains of other frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
+from fluoromap.reasons import Reason
+from fluoromap.segmenter.chain_fitting import fit_chains, widen_covariance
+from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.linking import (
+    ONE_BY_ONE,
+    CandidateChain,
+    CatheterFamily,
+    ShaftImage,
+    Trust,
+    catheter_families,
+    chain_score,
+    evidence,
+    link_candidates,
+)
+from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.missing_electrodes import complete_chains
+from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
+from fluoromap.segmenter.refinement import refine
+from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.unlisted import SURE, continues, not_on, shows_row, unexplained_between
+
+_LEAST_LINE, _LINE_NOISE = 0.03, 0.6
+_COMPANION_SLACK = 2.5
+_AGAIN_SLACK = 2.5
+_STRAY_PX = 5.0
+_HIDING_MM, _LEAST_FREE = 1.2, 2
+_WORST_FIT = 2.0
+_BENDING = 0.12
+_BESIDE_MM = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """How sure chains have to be, in the measures of one proposer.
+
+    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.refinement.Refined.clearness`, of a chain found in its
+    image and of one of another frame. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter
+    beside those of the catalogue is reported from here on. least_score : of the median of a chain's scores. seen_score,
+    least_seen : at least this share of a chain's electrodes has this score. unseen_evidence : an electrode that was not
+    proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
+    not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
+    trust : see :class:`~fluoromap.segmenter.linking.Trust`.
+    """
+
+    least_clearness: float
+    again_clearness: float
+    sure_clearness: float
+    extra_clearness: float
+    least_score: float
+    seen_score: float = -np.inf
+    least_seen: float = 0.0
+    unseen_evidence: float = 0.0
+    strict: bool = False
+    trust: Trust = ONE_BY_ONE
+
+    def accepts(self, scores: Array) -> bool:
+        """Return whether a chain's scores (electrodes,) are enough."""
+        return bool(np.median(scores) >= self.least_score and np.mean(scores >= self.seen_score) >= self.least_seen)
+
+
+@dataclass(slots=True, eq=False)
+class ChainDetector:
+    """Detector of chains among the proposals of one proposer, for one run.
+
+    It stores what the proposer said about the latest image.
+    """
+
+    catalogue: Catalogue
+    field: FieldMask
+    px_per_mm: float
+    proposer: Proposer
+    acceptance: Acceptance
+    _latest: tuple[Image, ImageEvidence] | None = dataclasses.field(default=None, init=False, repr=False)
+
+    def image_evidence(self, x: Image) -> ImageEvidence:
+        """Return what the proposer says about a log image."""
+        if self._latest is None or self._latest[0] is not x:
+            self._latest = x, self.proposer(x)
+        return self._latest[1]
+
+    def _evidence(self, probability: Array) -> Array:
+        return evidence(probability, self.acceptance.trust)
+
+    def find_chains(self, x: Image, frame: int) -> FrameChains:
+        """Return the chains of one log image, or the reason why there are none.
+
+        One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
+        accepted too. Weaker chains alone come with ``manual_needed``.
+        """
+        if min(x.shape) < 16:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        seen = self.image_evidence(x)
+        electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
+        proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
+        families = catheter_families(self.catalogue)
+        shaft_image = self._shafts(seen)
+        points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
+        sure_candidates = len(points)
+        linked = link_candidates(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
+        if not self._is_complete(linked, weights):
+
+            def dark(places: Array) -> Array:
+                probability = seen.unseen_probability_at(places)
+                possible = self._in_field(places) & (probability > 0)
+                return np.where(possible, self._evidence(probability), -np.inf)
+
+            completed = complete_chains(
+                points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm
+            )
+            linked = link_candidates(
+                completed.points_uv,
+                completed.weights,
+                completed.variance_px2,
+                shaft_image,
+                families,
+                len(points),
+                _COMPANION_SLACK,
+                completed.rows,
+            )
+            points = completed.points_uv
+        if not linked:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        fitted = [
+            one
+            for one in fit_chains(x, points, linked, shaft_image, families, seen.pixel_noise, sure_candidates)
+            if one.clearness >= self.acceptance.least_clearness
+        ]
+        floor = min(family.floor for family in families)
+        sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for one in fitted)
+        found = [one.chain for one in fitted]
+        chains = tuple(
+            replace(
+                chain,
+                covariance_px2=widen_covariance(
+                    chain, [other for other in found if other is not chain], self.px_per_mm
+                ),
+                scores=seen.scores_at(chain.pixels_uv),
+            )
+            for chain in found
+        )
+        chains = tuple(chain for chain in chains if self.acceptance.accepts(chain.scores))
+        if self.acceptance.strict:
+            chains = self._of_catalogue(chains, proposed)
+        return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
+
+    def _of_catalogue(self, chains: tuple[Chain, ...], proposed: Proposals) -> tuple[Chain, ...]:
+        """Return the chains that can be catheters of the catalogue.
+
+        A chain that is part of a catheter with more electrodes than the catalogue has is dropped.
+        """
+        sure = proposed.points_uv[proposed.probability >= SURE]
+        free = not_on(sure, chains, self.px_per_mm)
+        kept = []
+        for chain in chains:
+            family = self._family(chain)
+            if family is None or unexplained_between(chain, free, family.catheter, self.px_per_mm):
+                continue
+            if not continues(chain, sure, family.catheter, self.px_per_mm):
+                kept.append(chain)
+        return tuple(kept)
+
+    def _is_complete(self, linked: Sequence[CandidateChain], weights: Array) -> bool:
+        """Return whether each catheter has a well-fitting chain.
+
+        The chain scores nearly as much as its candidates.
+        """
+        if len(linked) < len(self.catalogue.catheters):
+            return False
+        return all(chain.score >= weights[list(chain.candidates)].sum() - _WORST_FIT for chain in linked)
+
+    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+        """Return another frame's chain at its place in this image.
+
+        None when the image does not show it. A rigid search gives a first guess, which is refined. The refined
+        positions are weighed against the guess:
+
+        - An electrode that the refinement moves by more than 5 px stays at the guess with a larger covariance.
+        - An electrode behind another catheter is predicted from the others, of which there must be two.
+
+        None means that the image does not support the chain.
+        """
+        family = self._family(chain)
+        if family is None:
+            return None
+        seen = self.image_evidence(x)
+        guess = rigid_search(seen.likeness, chain.pixels_uv, shift, reach_px, taken, self.px_per_mm)
+        hidden = np.zeros(len(guess), np.bool_)
+        for other in taken:
+            near = np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
+            hidden |= near < _HIDING_MM * self.px_per_mm
+        if np.count_nonzero(~hidden) < _LEAST_FREE:
+            return None
+        place = refine(
+            x,
+            guess[None],
+            family.catheter,
+            self.px_per_mm,
+            seen.pixel_noise,
+            hidden[None],
+            np.zeros((1, len(guess)), np.bool_),
+        )
+        found = place.points_uv[0]
+        is_stray = np.linalg.norm(found - guess, axis=1) > _STRAY_PX
+        covariance = np.where(is_stray[:, None, None], (4 * _STRAY_PX) ** 2 * np.eye(2), place.covariance_px2[0])
+        expected = chain.covariance_px2 + (_BENDING * reach_px) ** 2 * np.eye(2)
+        gain = expected @ np.linalg.inv(expected + covariance)
+        points = guess + np.einsum("nij,nj->ni", gain, found - guess)
+        covariance = gain @ covariance
+        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+        if not self._in_field(points).all():
+            return None
+        scores, variance = seen.scores_at(points), seen.variance_at(points)
+        weights = self._evidence(seen.probability_at(points))
+        for values in (scores, weights, variance) if hidden.any() else ():
+            values[hidden] = np.median(values[~hidden])
+        score = chain_score(points, weights, variance, self._shafts(seen), family)
+        if score < family.floor - _AGAIN_SLACK or place.clearness[0] < self.acceptance.again_clearness:
+            return None
+        again = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False)
+        return replace(again, covariance_px2=widen_covariance(again, taken, self.px_per_mm))
+
+    def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
+        """Return whether the image clearly shows a catheter besides these chains."""
+        seen = self.image_evidence(x)
+        proposed = seen.proposals(self.field.candidates, 2)
+        if self.acceptance.strict:
+            sure = proposed.points_uv[proposed.probability >= SURE]
+            return shows_row(not_on(sure, chains, self.px_per_mm), self.px_per_mm)
+        if len(chains) < len(self.catalogue.catheters):
+            return False
+        taken = np.concatenate([chain.pixels_uv for chain in chains])
+        away = np.linalg.norm(proposed.points_uv[:, None] - taken[None], axis=2).min(axis=1)
+        free = away > _BESIDE_MM * self.px_per_mm
+        points, weights = proposed.points_uv[free], self._evidence(proposed.probability[free])
+        families = catheter_families(self.catalogue)
+        shaft_image = self._shafts(seen)
+        linked = link_candidates(points, weights, proposed.variance_px2[free], shaft_image, families)
+        fitted = fit_chains(x, points, linked, shaft_image, families, seen.pixel_noise)
+        return any(one.clearness >= self.acceptance.extra_clearness for one in fitted)
+
+    def _in_field(self, points_uv: Array) -> BoolArray:
+        """Return which points lie where electrodes may be, (n,)."""
+        rows, columns = self.field.candidates.shape
+        u, v = np.rint(points_uv).astype(np.int64).T
+        within = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+        inside: BoolArray = within & self.field.candidates[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
+        return inside
+
+    def _family(self, chain: Chain) -> CatheterFamily | None:
+        """Return the most probable family whose catheters have exactly this chain's electrodes."""
+        whole = [
+            family
+            for family in catheter_families(self.catalogue)
+            if chain.electrodes == tuple(range(1, family.catheter.electrodes + 1))
+        ]
+        return max(whole, key=lambda family: sum(chain.probability(name) for name in family.names), default=None)
+
+    def _shafts(self, seen: ImageEvidence) -> ShaftImage:
+        clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
+        return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)

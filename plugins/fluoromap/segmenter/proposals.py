@@ -1,0 +1,122 @@
+"""The seam between finding single electrodes and making chains of them: what a proposer says about one image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fluoromap.contracts import Array, BoolArray, frozen
+from fluoromap.segmenter.log_image import Image
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Electrodes that one image may show, best first.
+
+    points_uv : (n, 2) pixels of the frame. probability : (n,) that an electrode is there, 0 to 1.
+    covariance_px2 : (n, 2, 2) of its place, pixels squared.
+    """
+
+    points_uv: Array
+    probability: Array
+    covariance_px2: Array
+
+    def __post_init__(self) -> None:
+        count = len(self.points_uv)
+        object.__setattr__(self, "points_uv", frozen(self.points_uv, (None, 2), "points_uv"))
+        object.__setattr__(self, "probability", frozen(self.probability, (count,), "probability"))
+        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (count, 2, 2), "covariance_px2"))
+
+    def __len__(self) -> int:
+        return len(self.points_uv)
+
+    @property
+    def variance_px2(self) -> Array:
+        """Mean variance of a coordinate, (n,) pixels squared."""
+        variance: Array = 0.5 * (self.covariance_px2[:, 0, 0] + self.covariance_px2[:, 1, 1])
+        return variance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likeness:
+    """How much each place of an image looks like an electrode, for the search of a catheter that was seen before.
+
+    values : (rows, columns) float32; about 0 where nothing is, 12 for a clear electrode. cell_px : pixels of the frame from
+    value to value. first_px : where the first value lies in the frame, u and v alike.
+    """
+
+    values: Image
+    cell_px: float
+    first_px: float
+
+
+class ImageEvidence(Protocol):
+    """What a proposer knows about one log image."""
+
+    @property
+    def smooth(self) -> Image:
+        """The log image without most of its noise, ``reduction`` times smaller: shafts are looked for in it."""
+
+    @property
+    def reduction(self) -> int: ...
+
+    @property
+    def pixel_noise(self) -> float:
+        """Standard deviation of a pixel of the log image at half its size, from noise."""
+
+    @property
+    def likeness(self) -> Likeness: ...
+
+    def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
+        """Return the electrodes where ``allowed`` (rows, columns).
+
+        Electrodes much weaker than the ``expected``-th best may be left out.
+        """
+
+    def probability_at(self, points_uv: Array) -> Array:
+        """Return the probability that electrodes are at points, (n,)."""
+
+    def unseen_probability_at(self, points_uv: Array) -> Array:
+        """Return the probability of electrodes that were not proposed, (n,).
+
+        It is 0 where an electrode would have the place of a proposed one.
+        """
+
+    def variance_at(self, points_uv: Array) -> Array:
+        """Return the variance of each coordinate, (n,) pixels squared.
+
+        It is that of electrodes that are proposed at these points.
+        """
+
+    def scores_at(self, points_uv: Array) -> Array:
+        """Return how clearly the electrodes of one chain show, (n,).
+
+        It is the proposer's own measure: ``Chain.scores``.
+        """
+
+
+Proposer = Callable[[Image], ImageEvidence]
+"""Looks at one log image, (rows, columns) float32."""
+
+
+_EVEN_CONTRAST = 4.0
+
+
+def probability_of_contrast(contrast_over_noise: Array) -> Array:
+    """Return the probability of an electrode by its contrast alone.
+
+    Its odds are the contrast over 4 sigma.
+    """
+    contrast = np.maximum(contrast_over_noise, 1e-3)
+    probability: Array = contrast / (contrast + _EVEN_CONTRAST)
+    return probability
+
+
+def log_odds(probability: Array) -> Array:
+    """Return ln(p / (1 - p)) of probabilities, finite for 0 and 1."""
+    inside = np.clip(probability, 1e-9, 1.0 - 1e-9)
+    odds: Array = np.log(inside / (1.0 - inside))
+    return odds

@@ -1,0 +1,124 @@
+"""Rows of electrodes that the catalogue does not explain: a longer catheter must not pass for a shorter one of the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fluoromap.catheters import Catheter
+from fluoromap.contracts import Array, BoolArray, Chain
+
+SURE = 0.5
+"""Proposals of this probability have to be explained."""
+
+_OWN_MM = 1.2
+_BESIDE_MM = 1.0
+_ROW_CONTINUES = 3
+_LEAST_COSINE = 0.88
+_LONGEST_STEP = 1.25
+_ROW, _ROW_STEP_MM = 4, 10.0
+
+
+def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> int:
+    """Count points within the chain that are none of its electrodes.
+
+    They lie on the way from its first electrode to its last.
+
+    Parameters
+    ----------
+    chain : Chain
+    points_uv : (n, 2)
+        Sure proposals that no other chain has, pixels. Those on the tip electrode are parts of it.
+    catheter : Catheter
+    """
+    free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
+    free = free[_apart(free, chain.pixels_uv[:1], (0.5 * catheter.tip_mm + _BESIDE_MM) * px_per_mm)]
+    count = 0
+    for point in free:
+        for start, end in zip(chain.pixels_uv[:-1], chain.pixels_uv[1:], strict=True):
+            way = end - start
+            length = max(float(np.linalg.norm(way)), 1e-9)
+            along = float((point - start) @ way) / length
+            beside = abs(float(way[0] * (point - start)[1] - way[1] * (point - start)[0])) / length
+            if 0.0 < along < length and beside < _BESIDE_MM * px_per_mm:
+                count += 1
+                break
+    return count
+
+
+def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
+    """Return whether points go on in the chain's line beyond an end.
+
+    Three or more points are needed, no farther apart than the chain's electrodes are.
+
+    Parameters
+    ----------
+    chain : Chain
+        All electrodes of the catheter.
+    points_uv : (n, 2)
+        Sure proposals of the image, pixels; its own electrodes and those of other chains may be among them.
+    catheter : Catheter
+    """
+    free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
+    seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1)
+    step = _LONGEST_STEP * float(np.max(catheter.spacing_mm)) * float(seen.sum()) / float(np.sum(catheter.spacing_mm))
+    for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
+        before = row[-3] if len(row) > 2 else row[-2]
+        count = _count_onwards(row[-1], before, free, step)
+        if count >= _ROW_CONTINUES:
+            return True
+    return False
+
+
+def shows_row(points_uv: Array, px_per_mm: float) -> bool:
+    """Return whether four or more points (n, 2) lie in a row.
+
+    The points are sure proposals, and the row is like the electrodes of a catheter.
+    """
+    reach = _ROW_STEP_MM * px_per_mm
+    for first in range(len(points_uv)):
+        for second in range(len(points_uv)):
+            way = points_uv[second] - points_uv[first]
+            if first == second or np.linalg.norm(way) > reach:
+                continue
+            left = np.delete(points_uv, [first, second], axis=0)
+            if 2 + _count_onwards(points_uv[second], points_uv[first], left, reach) >= _ROW:
+                return True
+    return False
+
+
+def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
+    """Count the points that go on in a line past ``at``.
+
+    The line comes from ``before``. Each point is at most ``reach`` from the last.
+    """
+    count = 0
+    while len(left):
+        way = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)
+        moves = left - at
+        lengths = np.maximum(np.linalg.norm(moves, axis=1), 1e-9)
+        fits = (lengths <= reach) & (moves @ way >= _LEAST_COSINE * lengths)
+        if not fits.any():
+            break
+        nearest = int(np.argmin(np.where(fits, lengths, np.inf)))
+        before, at = at, left[nearest]
+        left = np.delete(left, nearest, axis=0)
+        count += 1
+    return count
+
+
+def not_on(points_uv: Array, chains: Sequence[Chain], px_per_mm: float) -> Array:
+    """Return the points that are no electrode of these chains, (k, 2)."""
+    if not chains:
+        return points_uv
+    taken = np.concatenate([chain.pixels_uv for chain in chains])
+    free: Array = points_uv[_apart(points_uv, taken, _OWN_MM * px_per_mm)]
+    return free
+
+
+def _apart(points_uv: Array, taken_uv: Array, distance: float) -> BoolArray:
+    if not len(points_uv):
+        return np.zeros(0, np.bool_)
+    away: BoolArray = np.linalg.norm(points_uv[:, None] - taken_uv[None], axis=2).min(axis=1) > distance
+    return away

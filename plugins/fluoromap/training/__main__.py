@@ -1,0 +1,101 @@
+"""Make a weights file: ``python -m fluoromap.training --help``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fluoromap.catheters import Catheter, catheter_type
+from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
+from fluoromap.segmenter.learned_chain.weights import SHIPPED
+from fluoromap.training.anatomy import read_backgrounds
+from fluoromap.training.export import halved, write_weights
+from fluoromap.training.fitting import BATCH, STEPS_A_SHARD, Progress, fit
+from fluoromap.training.scenes import make_scene
+from fluoromap.training.shards import SCENES_A_SHARD, shards
+from fluoromap.training.validation import validate
+
+SHARDS = 90
+VALIDATION_SCENES = 160
+_VALIDATION_PX = 320
+_VALIDATION_KEY = 9_999_999
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Train and calibrate, then write the weights and their facts.
+
+    The calibration uses scenes that the training did not see.
+    """
+    given = _parser().parse_args(arguments)
+    catalogue = tuple(_catheter(entry) for entry in json.loads(given.catalogue.read_text())) if given.catalogue else ()
+    backgrounds = read_backgrounds(given.backgrounds) if given.backgrounds else ()
+    scenes = shards(given.seed, given.shards, given.workers, catalogue, backgrounds)
+    trained = fit(scenes, given.shards, given.seed, given.threads, _show)
+    weights = halved(trained)
+    network = ElectrodeNetwork.of_weights({name: value.astype(np.float32) for name, value in weights.items()})
+    fresh = [
+        make_scene(np.random.default_rng([given.seed, _VALIDATION_KEY, k]), _VALIDATION_PX, catalogue, backgrounds)
+        for k in range(VALIDATION_SCENES)
+    ]
+    validated = validate(network, fresh)
+    facts = {
+        "command": shlex.join(["python", "-m", "fluoromap.training", *arguments]),
+        "seed": given.seed,
+        "scenes": given.shards * SCENES_A_SHARD,
+        "samples": given.shards * STEPS_A_SHARD * BATCH,
+        "parameters": sum(parameter.numel() for parameter in trained.parameters()),
+        "pictures": f"synthetic scenes and {len(backgrounds)} frames of a lab"
+        if backgrounds
+        else "synthetic scenes only",
+        "validation": validated.figures(),
+    }
+    write_weights(given.out, weights, validated.calibration(), facts)
+    print(f"{given.out}: {facts['validation']}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m fluoromap.training", description=__doc__)
+    parser.add_argument("--out", type=Path, default=SHIPPED, help="weights file to write; the package's own by default")
+    parser.add_argument("--seed", type=int, default=1, help="same seed, same weights on the same kind of processor")
+    parser.add_argument("--shards", type=int, default=SHARDS, help=f"lists of {SCENES_A_SHARD} scenes to train on")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="of the fit; another number gives slightly other weights"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="processes that draw scenes"
+    )
+    parser.add_argument(
+        "--backgrounds", type=Path, help="folder of a lab's own frames without catheters, PNG, TIFF or JPEG"
+    )
+    parser.add_argument("--catalogue", type=Path, help="JSON list of a lab's own catheters, as in a study's catheters")
+    return parser
+
+
+def _catheter(entry: dict[str, object]) -> Catheter:
+    """Build a catheter by its type, or by its measures.
+
+    The measures are electrodes, spacing_mm, tip_mm and ring_mm.
+    """
+    if "type" in entry:
+        return catheter_type(str(entry["type"]), str(entry.get("name", entry["type"])))
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
+    return Catheter(**values)  # type: ignore[arg-type]
+
+
+def _show(progress: Progress) -> None:
+    heat, place, spread, tip = progress.losses
+    print(
+        f"shard {progress.shard}: heat {heat:.3f} place {place:.3f} spread {spread:.3f} tip {tip:.3f}, {progress.seconds:.0f} s",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

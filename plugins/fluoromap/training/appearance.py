@@ -1,0 +1,110 @@
+"""From attenuation to the picture that a lab stores: X-ray physics, detector, grey levels, vendor's processing, compression."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+from PIL import ImageDraw
+
+from fluoromap.segmenter.gaussian_blur import gaussian
+from fluoromap.training.drawing import Image
+from fluoromap.training.randomness import between, chance, scaled, smooth_field
+
+_LETTERS = "ABLRAO0123456789.mmsTIHx+-:/"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """One picture and what its noise hides.
+
+    pixels : (size, size) uint8. noise : standard deviation over intensity at a place of mean brightness.
+    transmitted : (size, size) slow part of the intensity over its mean.
+    """
+
+    pixels: NDArray[np.uint8]
+    noise: float
+    transmitted: Image
+
+
+def take_picture(random: Generator, things: Image, body: Image) -> Picture:
+    """Make the picture of a body with things in it.
+
+    Both are attenuations, (size, size) log units.
+    """
+    size = len(things)
+    focus = between(random, 0.25, 0.9) if chance(random, 0.8) else between(random, 0.9, 1.6)
+    attenuation = body + np.maximum(gaussian(things, focus), 0.0) * np.float32(between(random, 0.75, 1.0))
+    attenuation -= attenuation.mean()
+    if chance(random, 0.1):
+        attenuation += _collimator(random, size)
+    intensity = np.exp(-np.clip(attenuation, -3.0, 6.0))
+    scatter = np.float32(between(random, 0.0, 1.2) ** 2)
+    intensity = (intensity + scatter * gaussian(intensity, 15.0)) / (1.0 + scatter)
+    intensity /= intensity.mean()
+    noise = _noise(random, intensity)
+    seen = np.maximum(intensity + noise, 1e-3)
+    grey = _grey_levels(random, seen)
+    if chance(random, 0.5):
+        grey += np.float32(between(random, 0.2, 2.5)) * (grey - gaussian(grey, between(random, 0.8, 6.0)))
+    if chance(random, 0.15):
+        grey = gaussian(grey, between(random, 0.5, 1.3))
+    return Picture(_stored(random, grey), float(noise.std()), gaussian(intensity, 4.0))
+
+
+def _collimator(random: Generator, size: int) -> Image:
+    v, u = np.mgrid[:size, :size].astype(np.float32) - 0.5 * size
+    angle = between(random, 0.0, 2.0 * math.pi)
+    beyond = u * math.cos(angle) + v * math.sin(angle) - between(random, 0.2, 0.6) * size
+    edge: Image = between(random, 0.8, 4.0) / (1.0 + np.exp(-np.clip(beyond / between(random, 0.5, 4.0), -40.0, 40.0)))
+    return edge
+
+
+def _noise(random: Generator, intensity: Image) -> Image:
+    """Draw quantum noise of 60 to 10000 photons per pixel.
+
+    It is grainy where detector or processing blur it.
+    """
+    noise = random.standard_normal(intensity.shape, dtype=np.float32)
+    noise *= np.sqrt(np.maximum(intensity, 1e-3) / np.float32(scaled(random, 60.0, 10000.0)))
+    grain = between(random, 0.0, 1.2)
+    return gaussian(noise, grain) * np.float32(between(random, 0.8, 2.0)) if grain > 0.35 else noise
+
+
+def _grey_levels(random: Generator, intensity: Image) -> Image:
+    kind = random.random()
+    if kind < 0.4:
+        return intensity
+    if kind < 0.75:
+        logarithm: Image = np.log(intensity + np.float32(scaled(random, 0.01, 0.3)))
+        return logarithm
+    power: Image = intensity ** np.float32(between(random, 0.35, 1.6))
+    return power
+
+
+def _stored(random: Generator, grey: Image) -> NDArray[np.uint8]:
+    """Convert grey values to a stored picture.
+
+    The steps are window, local vendor contrast, burnt-in text, 8 bit, and JPEG or a codec's blocks.
+    """
+    if chance(random, 0.1):
+        grey = grey * (1.0 + between(random, 0.0, 0.3) * smooth_field(random, len(grey), 40.0))
+    low, high = np.percentile(grey[::2, ::2], [between(random, 0.0, 2.0), between(random, 98.0, 100.0)])
+    width = (high - low) * (between(random, 1.0, 3.0) if chance(random, 0.6) else 1.0) + 1e-9
+    start = between(random, 0.0, 1.0) * (width - (high - low))
+    levels = np.clip((grey - low + start) / width, 0.0, 1.0) * 255.0
+    picture = PillowImage.fromarray(levels.astype(np.uint8))
+    if chance(random, 0.1):
+        text = "".join(random.choice(list(_LETTERS), int(random.integers(2, 9))))
+        u, v = random.integers(-10, len(grey), 2)
+        ImageDraw.Draw(picture).text((float(u), float(v)), text, fill=int(random.choice([0, 230, 255])))
+    if chance(random, 0.5):
+        stored = io.BytesIO()
+        picture.save(stored, "JPEG", quality=int(between(random, 30.0, 96.0)))
+        picture = PillowImage.open(stored)
+    return np.asarray(picture, dtype=np.uint8)

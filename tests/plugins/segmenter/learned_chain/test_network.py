@@ -1,0 +1,145 @@
+"""The network's forward pass, what it sees, and its weights file."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
+from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS, HEADS
+from fluoromap.segmenter.learned_chain.network_response import NETWORK_PX_PER_MM, answer, network_scale
+from fluoromap.segmenter.learned_chain.normalisation import normalise
+from fluoromap.segmenter.learned_chain.resampling import resampled
+from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+
+
+@pytest.fixture(scope="module")
+def weights():
+    random = np.random.default_rng(0)
+    stored = {}
+    for name, layer in CONVOLUTIONS.items():
+        shape = (layer.width, layer.width, layer.inputs, layer.outputs)
+        stored[f"{name}.taps"] = (random.normal(size=shape) / np.sqrt(np.prod(shape[:3]))).astype(np.float32)
+        stored[f"{name}.bias"] = random.normal(size=layer.outputs).astype(np.float32)
+    return stored
+
+
+def plain_convolution(x, taps, bias, layer):
+    """Compute one layer in double precision, window by window.
+
+    x is (rows, columns, channels).
+    """
+    reach = layer.width // 2 * layer.dilation
+    padded = np.pad(x.astype(np.float64), ((reach, reach), (reach, reach), (0, 0)))
+    rows, columns = x.shape[0] // layer.stride, x.shape[1] // layer.stride
+    out = np.zeros((rows, columns, layer.outputs)) + bias
+    for i in range(layer.width):
+        for j in range(layer.width):
+            v, u = i * layer.dilation, j * layer.dilation
+            window = padded[v : v + x.shape[0] : layer.stride, u : u + x.shape[1] : layer.stride]
+            out += window @ taps[i, j].astype(np.float64)
+    return np.maximum(out, 0.0) if layer.rectified else out
+
+
+@pytest.mark.parametrize("name", CONVOLUTIONS)
+@pytest.mark.parametrize("size", [(8, 8), (24, 40), (72, 16)])
+def test_each_layer_equals_a_plain_convolution(weights, name, size):
+    layer = CONVOLUTIONS[name]
+    x = np.random.default_rng(1).normal(size=(*size, layer.inputs)).astype(np.float32)
+    fast = ElectrodeNetwork.of_weights(weights).layers[name](x)
+    plain = plain_convolution(x, weights[f"{name}.taps"], weights[f"{name}.bias"], layer)
+    np.testing.assert_allclose(fast, plain, atol=2e-5, rtol=2e-5)
+
+
+def test_the_whole_network_is_its_layers_in_a_row(weights):
+    picture = np.random.default_rng(2).normal(size=(64, 48)).astype(np.float32)
+
+    def apply(name, x):
+        return plain_convolution(x, weights[f"{name}.taps"], weights[f"{name}.bias"], CONVOLUTIONS[name])
+
+    quarter = apply("at_quarter_again", apply("at_quarter", apply("at_half", picture[..., None])))
+    eighth = apply("at_eighth", quarter)
+    for name in ("around_1", "around_2", "around_3"):
+        eighth = eighth + apply(name, eighth)
+    heads = apply("heads", apply("merged", quarter + apply("back", eighth).repeat(2, 0).repeat(2, 1)))
+    answers = ElectrodeNetwork.of_weights(weights)(picture)
+    assert answers.shape == (32, 24, len(HEADS))
+    for head in range(len(HEADS)):
+        for down in range(2):
+            for right in range(2):
+                np.testing.assert_allclose(
+                    answers[down::2, right::2, head], heads[..., 4 * head + 2 * down + right], atol=1e-4
+                )
+
+
+def test_it_equals_the_network_that_is_trained(weights):
+    torch = pytest.importorskip("torch", reason="the optional extra 'training' is not installed")
+    from fluoromap.training.export import folded
+    from fluoromap.training.network import ElectrodeNetwork as TrainedNetwork
+
+    torch.manual_seed(0)
+    trained = TrainedNetwork().eval()
+    picture = np.random.default_rng(3).normal(size=(80, 64)).astype(np.float32)
+    with torch.no_grad():
+        expected = trained(torch.from_numpy(picture[None, None]))[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(ElectrodeNetwork.of_weights(folded(trained))(picture), expected, atol=1e-4)
+
+
+def test_pictures_of_any_size_get_answers_for_all_their_cells():
+    trained = read_weights(SHIPPED)
+    for shape in ((16, 16), (17, 33), (101, 64)):
+        answers = answer(trained, np.zeros(shape, np.float32))
+        assert answers.shape == (-(-shape[0] // 2), -(-shape[1] // 2), len(HEADS))
+
+
+def test_grey_levels_and_their_range_do_not_matter():
+    picture = np.random.default_rng(0).normal(size=(96, 128)).astype(np.float32)
+    seen = normalise(picture)
+    np.testing.assert_allclose(normalise(40.0 * picture + 900.0), seen, atol=2e-3)
+    assert 0.5 < seen.std() < 1.2
+    np.testing.assert_allclose(normalise(np.full((64, 64), 7.0, np.float32)), 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [0.31, 0.5565, 0.8, 1.0, 1.3])
+def test_reduced_pictures_keep_places_and_levels(scale):
+    v, u = np.mgrid[:90, :120].astype(np.float32)
+    small = resampled(2.0 * u + 0.5 * v, scale)
+    rows, columns = np.mgrid[: small.shape[0], : small.shape[1]]
+    expected = 2.0 * ((columns + 0.5) / scale - 0.5) + 0.5 * ((rows + 0.5) / scale - 0.5)
+    inside = (slice(3, -3), slice(3, -3))
+    np.testing.assert_allclose(small[inside], expected[inside], atol=0.2)
+    np.testing.assert_allclose(resampled(np.ones((50, 61), np.float32), scale), 1.0, atol=1e-5)
+
+
+def test_frames_near_the_network_s_scale_are_taken_as_they_are():
+    assert network_scale(3.1) == 1.0
+    assert network_scale(5.75) == pytest.approx(NETWORK_PX_PER_MM / 5.75)
+
+
+def test_the_shipped_weights_are_small_and_their_origin_is_known():
+    described = json.loads(SHIPPED.with_suffix(".json").read_text())
+    assert described["sha256"] == hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
+    assert described["pictures"] == "synthetic scenes only"
+    assert described["command"].startswith("python -m fluoromap.training")
+    assert isinstance(described["seed"], int)
+    assert SHIPPED.stat().st_size <= 1_000_000
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no archive", b"\x93NUMPY"])
+def test_a_file_that_holds_no_weights_is_refused_by_name(tmp_path, content):
+    path = tmp_path / "mine.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"mine\.npz"):
+        read_weights(path)
+
+
+def test_weights_of_another_network_are_refused(tmp_path, weights):
+    path = tmp_path / "other.npz"
+    calibration = np.array([1, 0, 1], np.float32)
+    np.savez(path, **{**weights, "heads.bias": np.zeros(3, np.float32)}, calibration=calibration)
+    with pytest.raises(ValueError, match="heads"):
+        read_weights(path)
+    np.savez(path, **weights)
+    with pytest.raises(ValueError, match="calibration"):
+        read_weights(path)
