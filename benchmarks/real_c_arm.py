@@ -1,10 +1,10 @@
 """The cameras against a real C-arm: ``python benchmarks/real_c_arm.py DIR``.
 
-DIR holds the eight runs of a static phantom of Vukicevic et al. (see ``tests/plugins/geometry/real_c_arm.json`` for the source)
-and ``landmarks.json`` with ten points marked by hand. The table shows the reprojection error of one set of static points over
+DIR holds the eight runs of a static phantom of Vukicevic et al. and ``landmarks.json`` with ten points marked by hand; the source
+is named in ``tests/plugins/geometry/real_c_arm.json``. The table shows the reprojection error of one set of static points over
 four and over eight runs, with the table's position and without it, and with every other convention of signs and flips. Below are
-the distances between landmarks from every pair of runs at least 30 degrees apart against those from the other runs: their error, the
-ratio of error to stated standard deviation (z), and the same after self-calibration.
+the distances between landmarks from every pair of runs at least 30 degrees apart against those from the other runs. It shows
+their error and the ratio of error to stated standard deviation (z): with the stated gantry, and after self-calibration.
 """
 
 from __future__ import annotations

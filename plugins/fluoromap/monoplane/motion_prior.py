@@ -165,9 +165,9 @@ class MotionPrior:
         blocks = np.einsum("nmimj->nmij", joint.reshape(n, m, 3, m, 3))
         across = np.eye(3) - run.rays[..., :, None] * run.rays[..., None, :]
         # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
-        own, isocentre = self._params.of_study(run.view.variation), run.view.camera.isocentre_world_mm
-        gantry = gantry_angle_covariance_mm2(positions - isocentre, own.gantry_angle_sd_deg)
-        gantry = gantry + own.isocentre_sd_mm**2 * np.eye(3)
+        study, isocentre = self._params.of_study(run.view.variation), run.view.camera.isocentre_world_mm
+        gantry = gantry_angle_covariance_mm2(positions - isocentre, study.gantry_angle_sd_deg)
+        gantry = gantry + study.isocentre_sd_mm**2 * np.eye(3)
         if any(Reason.TABLE_MOVED in point.reasons for point in electrodes.a_priori):
             # Nothing shows whether this view or the other one has the table's true place.
             gantry = gantry + run.common_mm2

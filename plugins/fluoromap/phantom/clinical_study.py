@@ -13,6 +13,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, camera_from_gantry
 from fluoromap.matching import SiteRuns
+from fluoromap.phantom.anatomy import RADIUS_6F_MM, Anatomy, Resident, draw_anatomy
 from fluoromap.phantom.conditions import Conditions, GantryError
 from fluoromap.phantom.motion import (
     BEAT_AMPLITUDE,
@@ -23,7 +24,6 @@ from fluoromap.phantom.motion import (
     Breathing,
     wall_vectors,
 )
-from fluoromap.phantom.anatomy import RADIUS_6F_MM, Anatomy, Resident, draw_anatomy
 from fluoromap.phantom.shaft import Shaft, arc_lengths_mm
 from fluoromap.phantom.simulated_study import FRONTAL, LATERAL
 from fluoromap.segmenter.quiet_frames import diastolic_frames

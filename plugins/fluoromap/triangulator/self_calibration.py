@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Calibration, StudyVariation

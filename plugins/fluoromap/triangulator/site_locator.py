@@ -23,7 +23,6 @@ from fluoromap.triangulator.uncertainty import (
     ErrorSource,
     UncertaintyParams,
     error_sources,
-    jacobians,
     pixel_noise_px2,
     relative_covariance_mm2,
     visible_breathing,

@@ -184,10 +184,8 @@ def _site_jump(
         alike = all(_exceeds_breathing(shared * one, None, params) for one in along)
         if alike or all(strange) or not any(strange):
             return None
-    if strange[0] != strange[1]:
-        view = strange.index(True)
-    else:
-        view = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
+    farther = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
+    view = farther if strange[0] == strange[1] else strange.index(True)
     return Jump("b" if view else "a", moved[view])
 
 
