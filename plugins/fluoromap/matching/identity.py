@@ -173,6 +173,17 @@ def stiller(first_mm: Array, second_mm: Array) -> float:
     return float(best[less].max() - best.T[less].max())
 
 
+def _exchanged(first_mm: Array, second_mm: Array) -> bool:
+    """Return whether two catheters seem exchanged at some of the sites (s, 3) against the others.
+
+    Their places follow from site to site by nearness. A table that moved far breaks that, but keeps the catheters apart by the
+    same vector.
+    """
+    apart = first_mm - second_mm
+    usual = np.median(apart, axis=0)
+    return bool((np.linalg.norm(apart + usual, axis=1) < np.linalg.norm(apart - usual, axis=1)).any())
+
+
 def _stillest(
     sites: Sequence[Sequence[PairedCatheter]], places: list[list[int]], free: list[int]
 ) -> tuple[int, Reason]:
@@ -183,6 +194,8 @@ def _stillest(
         positions = np.array([[_positions_at(sites, places, place)[s] for s in together] for place in free])
         for index, place in enumerate(free):
             others = np.delete(positions, index, axis=0)
+            if any(_exchanged(positions[index], other) for other in others):
+                continue
             if all(stiller(positions[index], other) > CLEARLY_STILLER for other in others):
                 return place, Reason.IDENTITY_BY_MOTION
     motion = [
