@@ -51,7 +51,10 @@ class StaticRun:
     landmarks: dict[str, Array]
 
     def camera(self, origin_mm: Array | None) -> Camera:
-        """Return the camera in the patient's frame at table position ``origin_mm``; with None the table is ignored."""
+        """Return the camera in the patient's frame.
+
+        Its origin is the isocentre at table position ``origin_mm``; with None the table is ignored.
+        """
         camera = camera_from_gantry(self.gantry)
         return camera if origin_mm is None else camera.translated(self.table_mm - origin_mm)
 
@@ -101,7 +104,10 @@ def _field_mm(header: Any) -> float:
 
 
 def static_points(cameras: Sequence[Camera], runs: Sequence[StaticRun]) -> tuple[dict[str, Array], float]:
-    """Return the landmarks of least reprojection error that two or more runs show, and the error, RMS in px."""
+    """Return landmarks of least reprojection error, and the error, RMS in px.
+
+    Landmarks that fewer than two runs show are left out.
+    """
     points, squares = {}, []
     for name in sorted({name for run in runs for name in run.landmarks}):
         shown = [(c, run.landmarks[name]) for c, run in zip(cameras, runs, strict=True) if name in run.landmarks]
@@ -124,7 +130,7 @@ def reprojection_px(runs: Sequence[StaticRun], with_table: bool) -> float:
 
 
 def conventions(runs: Sequence[StaticRun]) -> dict[str, float]:
-    """Return the reprojection error for each choice of signs of angles and flips of the image."""
+    """Return the reprojection error for each choice of signs and flips."""
     found = {}
     for primary, secondary, u, v in itertools.product((1, -1), repeat=4):
         cameras = []
@@ -152,7 +158,9 @@ class PairDistances:
 
 
 def pair_distances(runs: Sequence[StaticRun], belief: Belief) -> list[PairDistances]:
-    """Return the distances from every pair of runs at least 30 degrees apart against those from the other runs.
+    """Compare the distances from pairs of runs with those from other runs.
+
+    The two runs of a pair are at least 30 degrees apart.
 
     The standard deviations contain pixel noise and the gantry's errors: "stated" takes those of the parameters, "study" those
     that self-calibration leaves, with its cameras.
@@ -199,7 +207,7 @@ def _pixels(a: StaticRun, b: StaticRun, names: Sequence[str]) -> TwoViewPixels:
 def _calibrate(
     cameras: tuple[Camera, Camera], a: StaticRun, b: StaticRun, names: Sequence[str]
 ) -> tuple[Calibration | None, StudyBelief]:
-    """Calibrate a pair of runs from its landmarks, each of which counts as a site."""
+    """Calibrate a pair of runs; each landmark counts as a site."""
     sites = [(cameras, _pixels(a, b, [name])) for name in names]
     return calibrate(sites, DEFAULT_CATALOGUE, frozenset(), PARAMS)
 

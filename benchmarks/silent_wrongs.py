@@ -242,7 +242,7 @@ def monoplane_view(
 
 
 def interval(numerators: Sequence[float], denominators: Sequence[float]) -> str:
-    """Return a ratio of sums over studies in percent, with its 95 % bootstrap interval."""
+    """Return a ratio of sums over studies in percent, with its interval."""
     top, bottom = np.array(numerators, dtype=float), np.array(denominators, dtype=float)
     if not bottom.sum():
         return f"{'-':>17}"
@@ -278,7 +278,7 @@ def rows(name: str, scores: Sequence[StudyScore]) -> list[str]:
 
 
 def main(first_seed: int, studies: int, each: int) -> None:
-    """Print the table; work runs in as many processes as there are cores, at most two."""
+    """Print the table; two processes share the work."""
     print(f"{studies} studies with everything drawn, {each} a stratum, from seed {first_seed}")
     print(
         f"{'stratum':12}{'':7}{'RMS':>6}{'base':>6}{'ratio':>6}{'rel.':>6} {'inside, absolute':>18} {'relative':>17}"

@@ -150,7 +150,9 @@ def _positions_at(sites: Sequence[Sequence[PairedCatheter]], places: list[list[i
 
 
 def stiller(first_mm: Array, second_mm: Array) -> float:
-    """Return the log likelihood ratio that the first catheter moves less by itself than the second.
+    """Return the log likelihood ratio for the first catheter being stiller.
+
+    It compares the motion of each catheter by itself.
 
     Breathing and the table displace both alike between the sites, by different amounts along each axis. A large common
     displacement hides which of the two moves by itself.

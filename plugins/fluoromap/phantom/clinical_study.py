@@ -126,7 +126,10 @@ def _residents(conditions: Conditions, anatomy: Anatomy, site: int) -> tuple[Res
 
 
 def _bent(rest_mm: Array, angle_deg: float, rng: np.random.Generator) -> Array:
-    """Return a centre line with a local bend 3 to 12 mm behind the tip's end; its arc lengths stay."""
+    """Return a centre line with a local bend.
+
+    The bend is 3 to 12 mm behind the tip's end. Arc lengths stay.
+    """
     steps = np.diff(rest_mm, axis=0)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
     place = rng.uniform(3.0, 12.0)
@@ -225,7 +228,10 @@ def _table_frame_mm(conditions: Conditions, site: int) -> Array:
 
 
 def _times(conditions: Conditions, rate_hz: float, catheters: int, site: int, view: int) -> _Times:
-    """Draw beats and breathing of a run; both runs of a simultaneous pair share them."""
+    """Draw beats and breathing of a run.
+
+    Both runs of a simultaneous pair share them.
+    """
     view = 0 if conditions.simultaneous else view
     rng = np.random.default_rng([conditions.seed, _RUN, site, view])
     frames = max(round(conditions.seconds * conditions.frame_rate_hz), 5)

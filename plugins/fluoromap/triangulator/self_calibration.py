@@ -227,7 +227,10 @@ def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
 
 
 def _misfit(rows: Sequence[SiteEquations]) -> float:
-    """Return the mean squared misfit an equation; 1 where pixels, breathing and beats explain it."""
+    """Return the mean squared misfit an equation.
+
+    It is 1 where pixels, breathing and beats explain the residuals.
+    """
     total = sum(float(one.residual @ np.linalg.solve(one.covariance(HeartScale()), one.residual)) for one in rows)
     return total / sum(len(one.residual) for one in rows)
 

@@ -125,9 +125,9 @@ def _usual_places(
 def _displacements(
     cameras: Cameras, pixels: TwoViewPixels, usual: dict[tuple[str, int], Array]
 ) -> tuple[Array, Array] | None:
-    """Return the displacement (3,) of the resting catheters from their usual places, across the rays of view a and b.
+    """Return the displacements of the resting catheters in view a and b.
 
-    None where the site shows no resting catheter.
+    Each is (3,), from their usual places and across the view's rays. None where the site shows no resting catheter.
     """
     found: list[Array] = []
     for camera, uv in zip(cameras, pixels.pixels, strict=True):
@@ -154,9 +154,10 @@ def _breathing_scale(
     found: Sequence[tuple[Array, Array] | None],
     params: UncertaintyParams,
 ) -> tuple[float, float]:
-    """Return this heart's breathing as a share of the assumed one, at most 1, and the median difference of the views, mm.
+    """Return this heart's breathing and the median difference of its views.
 
-    Breathing displaces the views against each other. A moved table is rare, so that the median deviation ignores it.
+    The breathing is a share of the assumed one, at most 1; the difference is in mm. Breathing displaces the views against each
+    other. A moved table is rare, so that the median deviation ignores it.
     """
     apart, sd = [], []
     for (cameras, *_), moved in zip(sites, found, strict=True):
@@ -174,7 +175,10 @@ def _breathing_scale(
 def _site_jump(
     cameras: Cameras, moved: tuple[Array, Array], common_mm: float, params: UncertaintyParams, limit_sd: float
 ) -> Jump | None:
-    """Return the jump of a site, given its displacements in both views and the views' usual difference."""
+    """Return the jump of a site, or None.
+
+    ``moved`` are its displacements in both views; ``common_mm`` is the views' usual difference.
+    """
     shared = _shared_axis(cameras)
     along = [float(shared @ one) for one in moved]
     disagree = _exceeds_breathing(shared * (along[0] - along[1] - common_mm) / np.sqrt(2), None, params, limit_sd)

@@ -113,13 +113,16 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         return np.diag([*views, *np.full(2, self.magnification_sd**2)])
 
     def header_covariance(self) -> Array:
-        """Return the covariance (14, 14) of the gantry's errors over all gantries, where no data show them."""
+        """Return the covariance (14, 14) of errors that no data show.
+
+        It is the second moment over all kinds of gantry.
+        """
         shares = sum((kind.share * kind.multiples**2 for kind in GANTRY_KINDS), np.zeros(14))
         covariance: Array = self.gantry_covariance() * shares
         return covariance
 
     def scaled(self, breathing: float, beats: float) -> UncertaintyParams:
-        """Return the parameters of a heart whose breathing and beats vary by these multiples of the assumed variation."""
+        """Return the parameters with these multiples of breathing and beats."""
         return self.model_copy(
             update={
                 "respiration_head_feet_sd_mm": breathing * self.respiration_head_feet_sd_mm,
@@ -198,7 +201,10 @@ def gantry_effect_px(cameras: Cameras, jacobian: Array, points_world_mm: Array) 
 
 
 def _turned_and_shifted(points_mm: Array) -> Array:
-    """Return the displacement (..., N, 3, 6) of points by a small rotation vector about the origin, then by an offset."""
+    """Return the displacement (..., N, 3, 6) by a rotation and an offset.
+
+    The first three columns are a small rotation vector about the origin.
+    """
     x, y, z = np.moveaxis(points_mm, -1, 0)
     zero = np.zeros_like(x)
     cross_product = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), (0, 1), (-2, -1))
@@ -286,7 +292,10 @@ def error_sources(
 
 
 def _tip_along_shaft(points_world_mm: Array, labels: Sequence[tuple[str, int]], catheter: str) -> Array | None:
-    """Return the displacement (..., N, 3, 1) of a catheter's tip along its shaft; None where two electrodes are missing."""
+    """Return the displacement (..., N, 3, 1) of a tip along its shaft.
+
+    None where electrode 1 or 2 is missing.
+    """
     if (catheter, 1) not in labels or (catheter, 2) not in labels:
         return None
     tip, second = labels.index((catheter, 1)), labels.index((catheter, 2))
