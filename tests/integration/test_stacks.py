@@ -27,7 +27,8 @@ def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any],
     with Client(url) as client:
         study = client.make_study("stack")
         inputs = find_files(folder)
-        assert [client.upload(study, path) for path in inputs.runs] == [[]] * len(inputs.runs)
+        assert not any(client.upload(study, path).objections for path in inputs.runs)
+        assert inputs.activation_times is not None
         assert client.put_activation_times(study, inputs.activation_times) == []
         job: dict[str, Any] = {}
         for job in client.follow(client.start_job(study)):

@@ -6,16 +6,34 @@ import json
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import quote
 
 import httpx
 
 from fluoromap_service.cli.failures import CommandFailed
 
 POLL_SECONDS = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """The service's answer to one DICOM file.
+
+    Parameters
+    ----------
+    uid : str or None
+        SOP Instance UID; None when the service rejected the file.
+    objections : tuple of str
+        Empty when the service accepted the file.
+    """
+
+    uid: str | None
+    objections: tuple[str, ...] = ()
 
 
 class Client:
@@ -42,24 +60,40 @@ class Client:
     ) -> None:
         self._http.close()
 
-    def make_study(self, label: str) -> str:
-        """Make a mapping study and return its id."""
-        study: str = self._json("POST", "/v1/studies", json={"label": label})["id"]
+    def make_study(self, label: str, **more: Any) -> str:
+        """Make a mapping study and return its id.
+
+        ``more`` are further members of the request.
+        """
+        study: str = self._json("POST", "/v1/studies", json={"label": label, **more})["id"]
         return study
 
-    def upload(self, study: str, path: Path) -> list[str]:
-        """Send one DICOM file and return the service's objections.
-
-        They are empty when it accepts the file.
-        """
+    def upload(self, study: str, path: Path, name: str | None = None) -> Upload:
+        """Send one DICOM file under a name, by default its own."""
         with path.open("rb") as stream:
-            part = {"file": (path.name, stream, "application/dicom")}
+            part = {"file": (name or path.name, stream, "application/dicom")}
             answer = self._http.post(f"/v1/studies/{study}/instances", files=part)
         if answer.is_server_error:
             raise CommandFailed(_sentence(answer))
         if answer.is_error:
-            return [_sentence(answer)]
-        return [problem["detail"] for problem in answer.json()["rejected"]]
+            return Upload(None, (_sentence(answer),))
+        return Upload(answer.json()["instances"][0]["sop_instance_uid"])
+
+    def instances(self, study: str) -> list[dict[str, Any]]:
+        """Return the runs of a study in the order of arrival."""
+        return self._all(f"/v1/studies/{study}/instances")
+
+    def sites(self, study: str) -> list[dict[str, Any]]:
+        """Return the sites of a study, then its pairs of runs without a name."""
+        return self._all(f"/v1/studies/{study}/sites")
+
+    def complete_gantry(self, study: str, uid: str, gantry: Mapping[str, Any]) -> None:
+        """Set gantry values of a run."""
+        self._json("PATCH", f"/v1/studies/{study}/instances/{uid}", json={"gantry": gantry})
+
+    def put_site(self, study: str, site: str, change: Mapping[str, Any]) -> None:
+        """Set the activation time or the runs of a site."""
+        self._json("PUT", f"/v1/studies/{study}/sites/{quote(site, safe='')}", json=change)
 
     def put_activation_times(self, study: str, table: Path) -> list[str]:
         """Send the activation-time table and return its sites without runs."""
@@ -72,9 +106,9 @@ class Client:
         unmatched: list[str] = answer["unmatched"]
         return unmatched
 
-    def start_job(self, study: str) -> str:
-        """Start the pipeline with its defaults and return the job's id."""
-        job: str = self._json("POST", f"/v1/studies/{study}/jobs", json={})["id"]
+    def start_job(self, study: str, request: Mapping[str, Any] | None = None) -> str:
+        """Start a job and return its id; without a request it has the default plugins."""
+        job: str = self._json("POST", f"/v1/studies/{study}/jobs", json=request or {})["id"]
         return job
 
     def follow(self, job: str) -> Iterator[dict[str, Any]]:
@@ -119,6 +153,17 @@ class Client:
                     return None
         chamber: dict[str, Any] = json.loads((out / "map.json").read_text())
         return chamber
+
+    def _all(self, path: str) -> list[dict[str, Any]]:
+        """Return the items of all pages of a list."""
+        items: list[dict[str, Any]] = []
+        cursor: str | None = None
+        while True:
+            page = self._json("GET", path, params={"limit": 500} | ({"cursor": cursor} if cursor else {}))
+            items += page["items"]
+            cursor = page["next"]
+            if cursor is None:
+                return items
 
     def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
         answer = self._http.request(method, path, **request)

@@ -45,7 +45,7 @@ class _Pools:
 
     def add(self, array: NDArray[Any]) -> tuple[int, int]:
         """Add an array; return the number of its pool and its place there."""
-        key = array.dtype.str, array.shape
+        key = array.dtype.char, array.shape
         if key not in self._pools:
             if array.dtype.kind not in "biuf":
                 raise TypeError(f"a result holds an array of {array.dtype}, which is never stored")
@@ -55,7 +55,7 @@ class _Pools:
 
     def described(self) -> list[tuple[str, tuple[int, ...], int]]:
         """Return type, shape and length of each pool."""
-        return [(dtype, shape, len(places)) for (dtype, shape), (_, places) in self._pools.items()]
+        return [(np.dtype(char).str, shape, len(places)) for (char, shape), (_, places) in self._pools.items()]
 
     def numbers(self) -> bytes:
         """Return the numbers of all pools, each pool padded to whole words.
@@ -66,9 +66,9 @@ class _Pools:
             When one of them is not finite.
         """
         parts = []
-        for (dtype, _), (_, places) in self._pools.items():
+        for (char, _), (_, places) in self._pools.items():
             content = b"".join(places)
-            if np.dtype(dtype).kind == "f" and not np.isfinite(np.frombuffer(content, dtype)).all():
+            if np.dtype(char).kind == "f" and not np.isfinite(np.frombuffer(content, char)).all():
                 raise ValueError("the result holds a number that is not finite")
             parts.append(_padded(content))
         return b"".join(parts)

@@ -2,65 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-
-from fluoromap_service.cli import app
-from fluoromap_service.settings import settings
-
-
-@dataclass(frozen=True)
-class Answer:
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-Program = Callable[..., Answer]
-
-
-@pytest.fixture
-def fluoromap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Program]:
-    """Yield a function that calls the program's entry point on an empty data folder."""
-    for name in [name for name in os.environ if name.startswith("FLUOROMAP_") and "BROKER" not in name]:
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(tmp_path / "data"))
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str, **more: str) -> Answer:
-        code: object = 0
-        with monkeypatch.context() as patched:
-            patched.setattr(sys, "argv", ["fluoromap", *arguments])
-            for name, value in more.items():
-                patched.setenv(name, value)
-            settings.cache_clear()
-            try:
-                app.main()
-            except SystemExit as end:
-                code = end.code or 0
-        written = capsys.readouterr()
-        assert isinstance(code, int)
-        return Answer(code, written.out, written.err)
-
-    before = dict(os.environ)
-    yield run
-    # Commands store their options in the environment.
-    os.environ.clear()
-    os.environ.update(before)
-    settings.cache_clear()
-
-
-def _one_sentence(answer: Answer, code: int = 1) -> str:
-    assert answer.returncode == code, answer.stderr
-    assert answer.stderr.startswith("fluoromap: ")
-    assert answer.stderr.count("\n") == 1
-    return answer.stderr
+from program import Program, one_sentence
 
 
 def test_token_is_shown_once_and_never_listed(fluoromap: Program) -> None:
@@ -75,9 +20,9 @@ def test_token_is_shown_once_and_never_listed(fluoromap: Program) -> None:
 
 def test_a_token_of_that_name_cannot_be_made_twice_and_can_be_revoked(fluoromap: Program) -> None:
     assert fluoromap("token", "create", "--name", "n", "--scope", "read").returncode == 0
-    assert "'n'" in _one_sentence(fluoromap("token", "create", "--name", "n", "--scope", "read"))
+    assert "'n'" in one_sentence(fluoromap("token", "create", "--name", "n", "--scope", "read"))
     assert fluoromap("token", "revoke", "n").returncode == 0
-    assert "'other'" in _one_sentence(fluoromap("token", "revoke", "other"))
+    assert "'other'" in one_sentence(fluoromap("token", "revoke", "other"))
 
 
 def test_given_token_is_made_once_and_known_afterwards(fluoromap: Program, tmp_path: Path) -> None:
@@ -88,8 +33,8 @@ def test_given_token_is_made_once_and_known_afterwards(fluoromap: Program, tmp_p
         answer = fluoromap(*arguments)
         assert (answer.returncode, answer.stdout) == (0, "")
     secret.write_text("short")
-    _one_sentence(fluoromap(*arguments))
-    assert "nowhere" in _one_sentence(fluoromap(*arguments[:-1], "nowhere"))
+    one_sentence(fluoromap(*arguments))
+    assert "nowhere" in one_sentence(fluoromap(*arguments[:-1], "nowhere"))
 
 
 @pytest.mark.parametrize(
@@ -106,25 +51,25 @@ def test_wrong_usage_ends_with_2(fluoromap: Program, arguments: tuple[str, ...])
     assert fluoromap(*arguments).returncode == 2
 
 
-def test_wrong_setting_is_one_sentence(fluoromap: Program) -> None:
-    assert "FLUOROMAP_PORT" in _one_sentence(fluoromap("token", "list", FLUOROMAP_PORT="many"))
+def test_wrong_setting_isone_sentence(fluoromap: Program) -> None:
+    assert "FLUOROMAP_PORT" in one_sentence(fluoromap("token", "list", FLUOROMAP_PORT="many"))
 
 
-def test_unreachable_database_is_one_sentence(fluoromap: Program) -> None:
+def test_unreachable_database_isone_sentence(fluoromap: Program) -> None:
     url = "postgresql+psycopg://nobody@127.0.0.1:1/none"
-    assert "FLUOROMAP_DATABASE_URL" in _one_sentence(fluoromap("db", "upgrade", FLUOROMAP_DATABASE_URL=url))
+    assert "FLUOROMAP_DATABASE_URL" in one_sentence(fluoromap("db", "upgrade", FLUOROMAP_DATABASE_URL=url))
 
 
 @pytest.mark.parametrize("command", ["up", "api"])
 def test_no_service_for_others_without_a_token(fluoromap: Program, command: str) -> None:
     assert fluoromap("db", "upgrade").returncode == 0
-    assert "token create" in _one_sentence(fluoromap(command, "--host", "0.0.0.0", "--port", "0"))
+    assert "token create" in one_sentence(fluoromap(command, "--host", "0.0.0.0", "--port", "0"))
 
 
 def test_run_says_what_is_missing(fluoromap: Program, tmp_path: Path) -> None:
-    assert "not a folder" in _one_sentence(fluoromap("run", "nowhere"))
+    assert "not a folder" in one_sentence(fluoromap("run", "nowhere"))
     (tmp_path / "empty").mkdir()
-    assert "no DICOM" in _one_sentence(fluoromap("run", "empty"))
+    assert "no DICOM" in one_sentence(fluoromap("run", "empty"))
 
 
 def test_plugins_are_listed(fluoromap: Program) -> None:

@@ -41,6 +41,10 @@ class SiteOut(BaseModel):
     warnings: list[str] = Field(
         description="Reasons why the pair is doubtful or a job will reject it.", examples=[["table_moved"]]
     )
+    angle_deg: float | None = Field(
+        description="Angle between the central rays of the two views, 0 to 90 degrees.", examples=[90.0]
+    )
+    ready: bool = Field(description="Whether a job can use the site.", examples=[False])
 
 
 class SitePut(BaseModel):
@@ -63,6 +67,8 @@ def _shape(site: BoundSite) -> SiteOut:
             "bound_by": site.bound_by,
             "missing": list(site.missing),
             "warnings": list(site.warnings),
+            "angle_deg": site.angle_deg,
+            "ready": site.ready,
         }
     )
 

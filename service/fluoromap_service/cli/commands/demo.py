@@ -45,18 +45,19 @@ def _demonstrate(folder: Path, out: Path, console: Console, keep: bool) -> None:
         service_bar = progress.add_task("start service", total=None)
         with private_service(folder / "service") as url, Client(url) as client:
             progress.update(service_bar, total=1, completed=1)
-            study, notes = upload(client, StudyFiles(files.runs, files.activation_times), "Demonstration", progress)
-            job = run_job(client, study, progress)
+            inputs = StudyFiles(folder / "simulated", files.runs, files.activation_times)
+            sent = upload(client, inputs, "Demonstration", progress)
+            job = run_job(client, sent.study, progress)
             points, chamber = client.points(job["id"]), client.fetch(job["id"], out)
             progress.stop()
-            for note in notes:
+            for note in sent.notes:
                 console.print(f"note: {note}", highlight=False)
             _print_accuracy(console, accuracy(points, json.loads(files.truth.read_text())))
             if chamber is not None:
                 _print_map(console, chamber)
             _print_line(console, f"Results: {out.resolve()} (report.html, points.csv, map.png, mesh/, overlays/)")
             if keep:
-                console.print(f"The service runs at {url} (study {study}); Ctrl-C ends it.", highlight=False)
+                console.print(f"The service runs at {url} (study {sent.study}); Ctrl-C ends it.", highlight=False)
                 stop_on_signals().wait()
 
 
