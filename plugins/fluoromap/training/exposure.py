@@ -53,7 +53,10 @@ class Exposure:
 
 
 def random_exposure(random: Generator) -> Exposure:
-    """Draw an exposure: a clear one of any kind, or the poor one of a thick body seen from the front."""
+    """Draw an exposure, any clear one or a poor one.
+
+    A poor one is that of a thick body: few photons, much scatter.
+    """
     if chance(random, _POOR):
         plain = chance(random, _STORED_PLAIN)
         return Exposure(

@@ -54,13 +54,16 @@ class JointEvidence:
         return self.blobs.likeness
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
-        """Return blobs that the network does not exclude, and its own proposals away from these.
+        """Return possible blobs, and the network's proposals away from them.
 
-        A blob's place is more exact, and it resolves electrodes that are one for the network.
+        Blobs that the network excludes are left out. A blob's place is more exact, and it resolves electrodes that are one for the network. Places that the network proposed in
+        another frame are not used.
         """
         blobs = self.blobs.proposals(allowed, expected)
         blobs = _taken(blobs, self.scores_at(blobs.points_uv) >= _LEAST_PROBABILITY)
         blobs = Proposals(blobs.points_uv, self.probability_at(blobs.points_uv), blobs.covariance_px2)
+        if self.reach_cells > 1:
+            return _taken(blobs, np.argsort(-blobs.probability, kind="stable"))
         proposed = self.network.proposals(allowed, expected)
         if len(blobs) and len(proposed):
             away = np.linalg.norm(proposed.points_uv[:, None] - blobs.points_uv[None], axis=2).min(axis=1)

@@ -7,16 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
-from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
-from fluoromap.segmenter.run_segmentation import segment_run
+from fluoromap.segmenter.run_segmentation import Detector, segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
 
@@ -70,7 +70,9 @@ class LearnedChain:
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
         alone = len(run.frames) == 1
 
-        def detector_of(field: FieldMask) -> ChainDetector:
-            return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone)
+        frame_ms = float(np.diff(run.frame_times_ms).max(initial=0.0))
+
+        def detector_of(field: FieldMask) -> Detector:
+            return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
 
         return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True), _DIM_BELOW)
