@@ -21,13 +21,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from decapolar_runs import CATALOGUE as DECAPOLAR_CATALOGUE
+from decapolar_runs import RenderedRun, decapolar_run
 from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import linear_sum_assignment
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap.contracts import Chain, PixelFacts, Run, Segmentation, Segmenter, Silent
 from fluoromap.geometry import Gantry
 from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, Contrast, SimulatedRun, StudySpec, simulate_study
@@ -133,6 +135,10 @@ def main(first: int, seeds: int, frames: int) -> None:
                 _score_run(
                     table, None, f"{view} {1024 / width_mm:.2f} px/mm, 8 bit JPEG", simulated, CHAINS, displayed=True
                 )
+        for view, gantry in zip(VIEWS, _gantries(292.0), strict=True):
+            for cables in (False, True):
+                rendered = decapolar_run(seed, view, gantry, frames, cables)
+                _score_rendered(table, f"{view} decapolar, 3.5 px/mm" + (", cables" if cables else ""), rendered)
     print(f"seeds {first} to {first + seeds - 1}, {frames} frames a run; mean and 95 % bootstrap interval over runs")
     table.show()
     for name, (seconds, count) in spent.items():
@@ -244,7 +250,23 @@ def _score_run(
             table.add(f"{name} {view} diastolic mean", counts)
 
 
-def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -> None:
+def _score_rendered(table: Table, view: str, rendered: RenderedRun) -> None:
+    """Score a decapolar and an ablation catheter, as 8 bit JPEG."""
+    in_memory = MemoryFrames([_as_jpeg(frame) for frame in rendered.frames])
+    run = Run(in_memory, rendered.times_ms, rendered.px_per_mm, DISPLAYED)
+    for name in CHAINS:
+        found = SEGMENTERS[name]().segment(run, DECAPOLAR_CATALOGUE, {}, Silent())
+        counts = Counts()
+        for entry in found.frames:
+            truth = {key: uv[entry.frame] for key, uv in rendered.truth.items()}
+            _count(counts, entry.chains, truth, DECAPOLAR_CATALOGUE)
+        _count_tracks(counts, found, rendered.truth, np.arange(len(in_memory)))
+        table.add(f"{name} {view}", counts)
+
+
+def _count(
+    counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array], catalogue: Catalogue = DEFAULT_CATALOGUE
+) -> None:
     points = np.concatenate([chain.pixels_uv for chain in chains]) if chains else np.zeros((0, 2))
     everything = np.concatenate(list(truth.values()))
     distances = _matched(points, everything)
@@ -252,11 +274,13 @@ def _count(counts: Counts, chains: tuple[Chain, ...], truth: dict[str, Array]) -
     counts.there += len(everything)
     counts.found += len(points)
     counts.squares += float((distances**2).sum())
-    wanted = np.concatenate([truth[DEFAULT_CATALOGUE.reference], truth[DEFAULT_CATALOGUE.mapping]])
+    wanted = np.concatenate([truth[catalogue.reference], truth[catalogue.mapping]])
     counts.complete += len(_matched(points, wanted)) == len(wanted)
     counts.frames += 1
     for chain in chains:
         for uv in truth.values():
+            if chain.electrodes[-1] > len(uv):
+                continue
             error = chain.pixels_uv - uv[[number - 1 for number in chain.electrodes]]
             if np.linalg.norm(error, axis=1).max() < TRACK_PX:
                 squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(chain.covariance_px2), error)
@@ -284,6 +308,8 @@ def _count_tracks(counts: Counts, found: Segmentation, truth: Mapping[str, Array
     for entry in found.frames:
         for chain in entry.chains:
             for name, uv in truth.items():
+                if chain.electrodes[-1] > uv.shape[1]:
+                    continue
                 error = chain.pixels_uv - uv[entry.frame][[number - 1 for number in chain.electrodes]]
                 if np.linalg.norm(error, axis=1).max() < TRACK_PX:
                     of_track.setdefault(chain.track, {}).setdefault(name, []).append(entry.frame)

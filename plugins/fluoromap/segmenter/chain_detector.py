@@ -90,6 +90,10 @@ class ChainDetector:
             self._latest = x, self.proposer(x)
         return self._latest[1]
 
+    def forget_image(self) -> None:
+        """Ask the proposer again when the latest image comes back."""
+        self._latest = None
+
     def _evidence(self, probability: Array) -> Array:
         return evidence(probability, self.acceptance.trust)
 

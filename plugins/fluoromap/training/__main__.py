@@ -16,13 +16,13 @@ from fluoromap.catheters import Catheter, catheter_type
 from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
 from fluoromap.segmenter.learned_chain.weights import SHIPPED
 from fluoromap.training.anatomy import read_backgrounds
-from fluoromap.training.export import halved, write_weights
+from fluoromap.training.export import check_folded, halved, write_reference, write_weights
 from fluoromap.training.fitting import BATCH, STEPS_A_SHARD, Progress, fit
 from fluoromap.training.scenes import make_scene
 from fluoromap.training.shards import SCENES_A_SHARD, shards
 from fluoromap.training.validation import validate
 
-SHARDS = 90
+SHARDS = 50
 VALIDATION_SCENES = 160
 _VALIDATION_PX = 320
 _VALIDATION_KEY = 9_999_999
@@ -34,10 +34,14 @@ def main(arguments: Sequence[str]) -> None:
     The calibration uses scenes that the training did not see.
     """
     given = _parser().parse_args(arguments)
+    if given.reference:
+        write_reference(given.reference, given.out)
+        return
     catalogue = tuple(_catheter(entry) for entry in json.loads(given.catalogue.read_text())) if given.catalogue else ()
     backgrounds = read_backgrounds(given.backgrounds) if given.backgrounds else ()
     scenes = shards(given.seed, given.shards, given.workers, catalogue, backgrounds)
     trained = fit(scenes, given.shards, given.seed, given.threads, _show)
+    check_folded(trained)
     weights = halved(trained)
     network = ElectrodeNetwork.of_weights({name: value.astype(np.float32) for name, value in weights.items()})
     fresh = [
@@ -63,6 +67,9 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m fluoromap.training", description=__doc__)
     parser.add_argument("--out", type=Path, default=SHIPPED, help="weights file to write; the package's own by default")
+    parser.add_argument(
+        "--reference", type=Path, help="train nothing; write PyTorch's answers with the weights of --out to this file"
+    )
     parser.add_argument("--seed", type=int, default=1, help="same seed, same weights on the same kind of processor")
     parser.add_argument("--shards", type=int, default=SHARDS, help=f"lists of {SCENES_A_SHARD} scenes to train on")
     parser.add_argument(

@@ -18,17 +18,20 @@ from fluoromap.training.randomness import between, chance, random_curve, scaled,
 _DARKEST = 0.04
 
 
-def anatomy(random: Generator, size: int, px_per_mm: float) -> Image:
-    """Draw a body in attenuation, (size, size) log units, at a random contrast."""
+def anatomy(random: Generator, size: int, px_per_mm: float, frontal: bool) -> Image:
+    """Draw a body in attenuation, (size, size) log units, at a random contrast.
+
+    A ``frontal`` view always has bones, mostly ribs and the spine.
+    """
     body = between(random, 0.0, 0.45) * smooth_field(random, size, between(random, 35.0, 110.0))
     body += between(random, 0.0, 0.12) * smooth_field(random, size, between(random, 9.0, 28.0))
     body += scaled(random, 0.002, 0.05) * smooth_field(random, size, between(random, 3.5, 9.0))
     body += scaled(random, 0.002, 0.035) * smooth_field(random, size, between(random, 1.8, 3.5))
-    if chance(random, 0.6):
+    if frontal or chance(random, 0.6):
         bones = Canvas.empty(size)
-        if chance(random, 0.45):
+        if chance(random, 0.8 if frontal else 0.45):
             _draw_ribs(random, bones, px_per_mm)
-        if chance(random, 0.35):
+        if chance(random, 0.75 if frontal else 0.35):
             _draw_spine(random, bones, px_per_mm)
         if chance(random, 0.5):
             _draw_borders(random, bones, px_per_mm)

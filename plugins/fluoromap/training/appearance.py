@@ -14,6 +14,7 @@ from PIL import ImageDraw
 
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.training.drawing import Image
+from fluoromap.training.exposure import Exposure
 from fluoromap.training.randomness import between, chance, scaled, smooth_field
 
 _LETTERS = "ABLRAO0123456789.mmsTIHx+-:/"
@@ -32,7 +33,7 @@ class Picture:
     transmitted: Image
 
 
-def take_picture(random: Generator, things: Image, body: Image) -> Picture:
+def take_picture(random: Generator, things: Image, body: Image, exposure: Exposure) -> Picture:
     """Make the picture of a body with things in it.
 
     Both are attenuations, (size, size) log units.
@@ -44,11 +45,13 @@ def take_picture(random: Generator, things: Image, body: Image) -> Picture:
     if chance(random, 0.1):
         attenuation += _collimator(random, size)
     intensity = np.exp(-np.clip(attenuation, -3.0, 6.0))
-    scatter = np.float32(between(random, 0.0, 1.2) ** 2)
+    scatter = np.float32(exposure.scatter)
     intensity = (intensity + scatter * gaussian(intensity, 15.0)) / (1.0 + scatter)
     intensity /= intensity.mean()
-    noise = _noise(random, intensity)
+    noise = exposure.noise(random, intensity)
     seen = np.maximum(intensity + noise, 1e-3)
+    if exposure.plain:
+        return Picture(_scaled_to_8_bits(np.log(seen)), float(noise.std()), gaussian(intensity, 4.0))
     grey = _grey_levels(random, seen)
     if chance(random, 0.5):
         grey += np.float32(between(random, 0.2, 2.5)) * (grey - gaussian(grey, between(random, 0.8, 6.0)))
@@ -65,15 +68,14 @@ def _collimator(random: Generator, size: int) -> Image:
     return edge
 
 
-def _noise(random: Generator, intensity: Image) -> Image:
-    """Draw quantum noise of 60 to 10000 photons per pixel.
+def _scaled_to_8_bits(logarithm: Image) -> NDArray[np.uint8]:
+    """Convert a 12 bit picture's logarithm to the scene's 8 bits.
 
-    It is grainy where detector or processing blur it.
+    Noise of an exposure that is stored so is many levels wide: nothing is lost.
     """
-    noise = random.standard_normal(intensity.shape, dtype=np.float32)
-    noise *= np.sqrt(np.maximum(intensity, 1e-3) / np.float32(scaled(random, 60.0, 10000.0)))
-    grain = between(random, 0.0, 1.2)
-    return gaussian(noise, grain) * np.float32(between(random, 0.8, 2.0)) if grain > 0.35 else noise
+    low, high = np.percentile(logarithm[::2, ::2], [0.05, 99.95])
+    levels = np.clip((logarithm - low) / (high - low + 1e-9), 0.0, 1.0) * 255.0
+    return np.asarray(np.rint(levels), dtype=np.uint8)
 
 
 def _grey_levels(random: Generator, intensity: Image) -> Image:

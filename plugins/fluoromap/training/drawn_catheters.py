@@ -18,6 +18,7 @@ LABEL_COLUMNS = 6
 """u, v (pixels), 1 for a tip, attenuation, half length seen and radius (pixels) of an electrode."""
 
 _STEP_MM = 0.5
+_DARKEST_SHAFT = 1.5
 _FRENCH_RADII_MM = 0.67, 0.83, 1.0, 1.0, 1.0, 1.17, 1.17, 1.33
 
 
@@ -90,8 +91,10 @@ def _design(gaps_mm: Array, ring_mm: float, tip_mm: float, loop: bool = False) -
     return Design(starts + 0.5 * lengths, lengths, loop)
 
 
-def draw_catheter(random: Generator, canvas: Canvas, px_per_mm: float, design: Design) -> Array:
-    """Draw one catheter somewhere in the scene.
+def draw_catheter(
+    random: Generator, canvas: Canvas, px_per_mm: float, design: Design, metal_between: tuple[float, float]
+) -> Array:
+    """Draw one catheter somewhere in the scene, its electrodes of an attenuation in ``metal_between``.
 
     Returns
     -------
@@ -103,7 +106,7 @@ def draw_catheter(random: Generator, canvas: Canvas, px_per_mm: float, design: D
     origin = random.uniform(0.05, 0.95, 2) * canvas.size - centres[anchor] * px_per_mm
     line, places = curve.points_mm * px_per_mm + origin, centres * px_per_mm + origin
     radius = float(random.choice(_FRENCH_RADII_MM)) * px_per_mm
-    metal = scaled(random, 0.2, 2.3)
+    metal = scaled(random, *metal_between)
     _draw_shaft(random, canvas, line, radius, metal, px_per_mm)
     labels = _draw_electrodes(random, canvas, design, places, headings, shortenings, radius, metal, px_per_mm)
     behind = float(design.centres_mm[-1]) + between(random, 3.0, 45.0)
@@ -128,7 +131,7 @@ def _draw_shaft(random: Generator, canvas: Canvas, line: Array, radius: float, m
     if kind < 0.1:
         strength = 0.0
     elif kind < 0.82:
-        strength = min(metal * between(random, 0.04, 0.7), 0.8)
+        strength = min(min(metal, _DARKEST_SHAFT) * between(random, 0.04, 0.7), 0.8)
     else:
         strength = between(random, 0.02, 0.3)
     if strength > 0:

@@ -11,8 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork as SegmentersNetwork
 from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS
-from fluoromap.training.network import ElectrodeNetwork
+from fluoromap.training.network import EPSILON, ElectrodeNetwork
+
+REFERENCE_SHAPE = 32, 40
+
+_ROUNDING = 2e-3
 
 
 def folded(network: ElectrodeNetwork) -> dict[str, NDArray[np.float32]]:
@@ -27,7 +32,7 @@ def folded(network: ElectrodeNetwork) -> dict[str, NDArray[np.float32]]:
     for name, layer in CONVOLUTIONS.items():
         taps = state[f"{name}.weight"]
         if layer.rectified:
-            gain = state[f"{name}_norm.weight"] / np.sqrt(state[f"{name}_norm.running_var"] + 1e-5)
+            gain = state[f"{name}_norm.weight"] / np.sqrt(state[f"{name}_norm.running_var"] + EPSILON)
             bias = state[f"{name}_norm.bias"] - state[f"{name}_norm.running_mean"] * gain
             taps = taps * gain[:, None, None, None]
         else:
@@ -40,6 +45,52 @@ def folded(network: ElectrodeNetwork) -> dict[str, NDArray[np.float32]]:
 def halved(network: ElectrodeNetwork) -> dict[str, NDArray[np.float16]]:
     """Return the folded weights in half precision, as they are stored."""
     return {name: value.astype(np.float16) for name, value in folded(network).items()}
+
+
+def check_folded(trained: ElectrodeNetwork) -> None:
+    """Check that the segmenter's network with folded weights answers as the trained one does.
+
+    Raises
+    ------
+    ArithmeticError
+        Where the two differ by more than rounding.
+    """
+    picture = np.random.default_rng(1).normal(size=REFERENCE_SHAPE).astype(np.float32)
+    with torch.no_grad():
+        expected = trained(torch.from_numpy(picture[None, None]))[0].permute(1, 2, 0).numpy()
+    worst = float(np.abs(SegmentersNetwork.of_weights(folded(trained))(picture) - expected).max())
+    if worst > _ROUNDING:
+        raise ArithmeticError(f"the folded network differs from the trained one by {worst:.3g}: compare their layers")
+
+
+def of_file(path: Path) -> ElectrodeNetwork:
+    """Return the PyTorch network of a weights file, its normalisation folded into the taps."""
+    network: ElectrodeNetwork = ElectrodeNetwork().eval()
+    with np.load(path) as stored, torch.no_grad():
+        for name, layer in CONVOLUTIONS.items():
+            convolution = network.get_submodule(name)
+            taps = torch.from_numpy(stored[f"{name}.taps"].astype(np.float32).transpose(3, 2, 0, 1).copy())
+            bias = torch.from_numpy(stored[f"{name}.bias"].astype(np.float32))
+            convolution.get_parameter("weight").copy_(taps)
+            if layer.rectified:
+                normalisation = network.get_submodule(f"{name}_norm")
+                normalisation.get_buffer("running_var").fill_(1.0 - EPSILON)
+                normalisation.get_parameter("bias").copy_(bias)
+            else:
+                convolution.get_parameter("bias").copy_(bias)
+    return network
+
+
+def write_reference(path: Path, weights: Path) -> None:
+    """Write what PyTorch answers to a small picture with the weights of a file.
+
+    The arrays are ``picture`` (rows, columns), ``answers`` (rows / 2, columns / 2, heads) and ``sha256`` of the weights.
+    """
+    picture = np.random.default_rng(0).normal(size=REFERENCE_SHAPE).astype(np.float16)
+    with torch.no_grad():
+        answers = of_file(weights)(torch.from_numpy(picture.astype(np.float32)[None, None]))[0]
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    np.savez(path, picture=picture, answers=answers.permute(1, 2, 0).numpy(), sha256=np.array(digest))
 
 
 def write_weights(

@@ -16,9 +16,9 @@ from fluoromap.training.network import ElectrodeNetwork, losses
 from fluoromap.training.targets import Prepared, training_pair
 
 BATCH = 16
-STEPS_A_SHARD = 60
+STEPS_A_SHARD = 120
 
-_SHARDS_KEPT = 6
+_SHARDS_KEPT = 8
 _RATE, _LAST_RATE = 3e-3, 1e-5
 _WARM_UP_STEPS = 100
 _DECAY = 1e-4

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS, HEADS
 
-_EPSILON = 1e-5
+EPSILON = 1e-5
 
 
 class ElectrodeNetwork(nn.Module):
@@ -32,7 +32,7 @@ class ElectrodeNetwork(nn.Module):
             )  # fmt: skip
             self.add_module(name, convolution)
             if layer.rectified:
-                self.add_module(f"{name}_norm", nn.BatchNorm2d(layer.outputs, eps=_EPSILON))
+                self.add_module(f"{name}_norm", nn.BatchNorm2d(layer.outputs, eps=EPSILON))
         bias = self.get_submodule("heads").bias
         assert isinstance(bias, Tensor)
         with torch.no_grad():

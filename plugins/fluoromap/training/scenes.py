@@ -16,11 +16,12 @@ from fluoromap.training.appearance import Picture, take_picture
 from fluoromap.training.distractors import draw_distractors
 from fluoromap.training.drawing import Canvas, Image
 from fluoromap.training.drawn_catheters import LABEL_COLUMNS, draw_catheter, random_design
+from fluoromap.training.exposure import random_exposure
 from fluoromap.training.randomness import between, chance, scaled
 
 SCALES_PX_PER_MM = 2.3, 4.6
 """Of the pictures; the network sees frames of 3.0 to 6.5 px/mm reduced to its own scale, and that scale is often misjudged."""
-CLEAR = 14.0
+CLEAR = 6.5
 """Contrast over noise, summed over an electrode, from which on the network has to find it."""
 
 _WITHOUT_CATHETER = 0.28
@@ -58,6 +59,7 @@ def make_scene(
         A lab's own electrode-free frames, used for 6 scenes of 10.
     """
     px_per_mm = scaled(random, *SCALES_PX_PER_MM)
+    exposure = random_exposure(random)
     canvas = Canvas.empty(size)
     in_front = chance(random, 0.5)
     if in_front:
@@ -65,20 +67,20 @@ def make_scene(
     labels = [np.zeros((0, LABEL_COLUMNS))]
     if not chance(random, _WITHOUT_CATHETER):
         for _ in range(int(random.choice([1, 1, 2, 2, 3]))):
-            labels.append(draw_catheter(random, canvas, px_per_mm, random_design(random, catalogue)))
+            labels.append(draw_catheter(random, canvas, px_per_mm, random_design(random, catalogue), exposure.metal))
     if not in_front:
         draw_distractors(random, canvas, px_per_mm)
     if backgrounds and chance(random, _OWN_BACKGROUND):
         body = from_backgrounds(random, size, backgrounds) + between(random, 0.0, 0.6) * anatomy(
-            random, size, px_per_mm
+            random, size, px_per_mm, exposure.frontal
         )
     else:
-        body = anatomy(random, size, px_per_mm)
-    picture = take_picture(random, canvas.depth, body)
+        body = anatomy(random, size, px_per_mm, exposure.frontal)
+    picture = take_picture(random, canvas.depth, body, exposure)
     drawn = np.concatenate(labels)
     inside = ((drawn[:, :2] > -8.0) & (drawn[:, :2] < size + 8.0)).all(axis=1)
     drawn = drawn[inside]
-    return Scene(picture.pixels, drawn[:, :2], drawn[:, 2] > 0, _clearness(picture, drawn))
+    return Scene(picture.pixels, drawn[:, :2], drawn[:, 2] > 0, _clearness(picture, drawn) / (1.0 + exposure.scatter))
 
 
 def _clearness(picture: Picture, drawn: Array) -> Array:

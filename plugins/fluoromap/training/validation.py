@@ -73,7 +73,7 @@ def validate(network: ElectrodeNetwork, scenes: Sequence[Scene]) -> Validation:
     for scene in scenes:
         everywhere = np.ones(scene.pixels.shape, np.bool_)
         x = scene.pixels.astype(np.float32)
-        proposed = NetworkResponse.of_image(x, everywhere, trained, _NETWORK_PX_PER_MM, 0.0).proposals(everywhere, 1)
+        proposed = NetworkResponse.of_image(x, trained, _NETWORK_PX_PER_MM).proposals(everywhere, 1)
         within = ((scene.electrodes_uv >= 0) & (scene.electrodes_uv <= len(x) - 1)).all(axis=1)
         clear = (scene.clearness >= CLEAR) & within
         electrodes += int(clear.sum())

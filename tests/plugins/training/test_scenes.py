@@ -24,7 +24,7 @@ def test_labels_lie_on_drawn_electrodes():
     for seed in range(12):
         random = np.random.default_rng(seed)
         canvas = Canvas.empty(160)
-        labels = draw_catheter(random, canvas, 3.2, random_design(random))
+        labels = draw_catheter(random, canvas, 3.2, random_design(random), (0.2, 2.3))
         for u, v in np.rint(labels[:, :2]).astype(int):
             if 2 <= u < 158 and 2 <= v < 158:
                 assert canvas.depth[v - 1 : v + 2, u - 1 : u + 2].max() > 0.03
@@ -40,7 +40,7 @@ def test_distractors_darken_scenes_and_have_no_labels():
 def test_a_lab_s_catheter_has_its_own_spacings():
     deca = catheter_type("decapolar-2-5-2", "cs")
     np.testing.assert_allclose(np.diff(design_of(deca).centres_mm), deca.spacing_mm)
-    labels = draw_catheter(np.random.default_rng(0), Canvas.empty(200), 3.0, design_of(deca))
+    labels = draw_catheter(np.random.default_rng(0), Canvas.empty(200), 3.0, design_of(deca), (0.2, 2.3))
     seen = np.linalg.norm(np.diff(labels[:, :2], axis=0), axis=1) / 3.0
     assert (seen <= np.asarray(deca.spacing_mm) * 1.02).all()
 

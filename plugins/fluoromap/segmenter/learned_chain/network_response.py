@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.learned_chain.layers import CELL_PX, HEADS, STRIDE_PX
 from fluoromap.segmenter.learned_chain.normalisation import normalise
 from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
-from fluoromap.segmenter.log_image import Image, pixel_noise
-from fluoromap.segmenter.proposals import Likeness, Proposals
+from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.proposals import Proposals
 
 NETWORK_PX_PER_MM = 3.2
 """The scale in the middle of those the network is trained on."""
@@ -23,11 +21,8 @@ NETWORK_PX_PER_MM = 3.2
 _TAKEN_AS_IS = 0.8, 1.2
 _LEAST_PROBABILITY = 0.03
 _APART_CELLS = 1.2
-_OWN_CELLS = 2.0
 _FLOOR_CELLS = 0.4
 _MOST = 120
-_SMOOTH_MM = 0.52
-_CLEAR_LIKENESS = 12.0
 _MOST_OFFSET_CELLS = 1.5
 _HEAT, _OFFSET_U, _OFFSET_V, _LOG_VARIANCE = (
     HEADS.index(name) for name in ("heat", "offset_u", "offset_v", "log_variance")
@@ -40,9 +35,7 @@ class NetworkResponse:
 
     probability : (rows, columns) float32 of an electrode's centre in each cell. answers : (rows, columns, heads) float32.
     found : electrodes in the whole image. cell_px, first_px : frame pixels from cell to cell, and where the first lies.
-    variance_gain : see
-    :class:`~fluoromap.segmenter.learned_chain.weights.Trained`. smooth, reduction, pixel_noise : see
-    :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
+    variance_gain : see :class:`~fluoromap.segmenter.learned_chain.weights.Trained`.
     """
 
     probability: Image
@@ -51,42 +44,18 @@ class NetworkResponse:
     cell_px: float
     first_px: float
     variance_gain: float
-    smooth: Image
-    reduction: int
-    pixel_noise: float
 
     @classmethod
-    def of_image(
-        cls, x: Image, inside: BoolArray, trained: Trained, px_per_mm: float, least_noise: float
-    ) -> NetworkResponse:
+    def of_image(cls, x: Image, trained: Trained, px_per_mm: float) -> NetworkResponse:
         """Ask the network about a log image, reduced to the network's scale."""
         scale = network_scale(px_per_mm)
         picture = normalise(resampled(x, scale))
         answers = answer(trained, picture)
         odds = trained.odds_gain * answers[..., _HEAT] + trained.odds_offset
         probability = 1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))
-        reduction = 2 if min(x.shape) >= 64 else 1
-        small = reduce_by(x, reduction) if reduction > 1 else x
-        smooth = gaussian(small, max(_SMOOTH_MM * px_per_mm / reduction, 0.7))
-        noise = pixel_noise(small, inside[::reduction, ::reduction])
         cell_px, first_px = CELL_PX / scale, 0.5 / scale - 0.5
         found = _peaks(probability, answers, cell_px, first_px, trained.variance_gain)
-        return cls(
-            probability,
-            answers,
-            found,
-            cell_px,
-            first_px,
-            trained.variance_gain,
-            smooth,
-            reduction,
-            max(noise, least_noise),
-        )
-
-    @property
-    def likeness(self) -> Likeness:
-        """The probability of an electrode in a cell or beside it, 12 where it is sure."""
-        return Likeness(np.float32(_CLEAR_LIKENESS) * _highest_near(self.probability), self.cell_px, self.first_px)
+        return cls(probability, answers, found, cell_px, first_px, trained.variance_gain)
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
         """Return the electrodes found where ``allowed``, most probable first."""
@@ -97,55 +66,15 @@ class NetworkResponse:
         kept = np.flatnonzero(within)[:_MOST]
         return Proposals(self.found.points_uv[kept], self.found.probability[kept], self.found.covariance_px2[kept])
 
-    def probability_at(self, points_uv: Array) -> Array:
-        """Return the highest probability of the cell of each point and its eight neighbours, (n,)."""
-        v, u = self._best_cells(points_uv)
-        near: Array = self.probability[v, u].astype(np.float64)
-        return near
-
-    def unseen_probability_at(self, points_uv: Array) -> Array:
-        """Return the same, but 0 within two cells of an electrode that was found."""
-        probability = self.probability_at(points_uv)
-        if len(self.found) and len(points_uv):
-            away, _ = cKDTree(self.found.points_uv).query(points_uv)
-            probability[away < _OWN_CELLS * self.cell_px] = 0.0
-        return probability
-
-    def scores_at(self, points_uv: Array) -> Array:
-        """Return the probability of the electrode nearest to each point, (n,).
-
-        Each electrode counts for one point only. Points without one have the probability of their own cell.
-        """
-        rows, columns = self.probability.shape
-        u, v = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64).T
-        scores: Array = self.probability[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)].astype(np.float64)
-        if not len(self.found):
-            return scores
-        away = np.linalg.norm(points_uv[:, None] - self.found.points_uv[None], axis=2)
-        near = np.flatnonzero(away.min(axis=0) < _OWN_CELLS * self.cell_px)
-        points, found = linear_sum_assignment(np.minimum(away[:, near], _OWN_CELLS * self.cell_px))
-        matched = away[points, near[found]] < _OWN_CELLS * self.cell_px
-        taken = np.zeros(len(scores), np.bool_)
-        taken[points[matched]] = True
-        shared = ~taken & (away[:, near].min(axis=1, initial=np.inf) < _OWN_CELLS * self.cell_px)
-        scores[shared] = 0.0
-        scores[points[matched]] = self.found.probability[near[found[matched]]]
-        return scores
-
-    def variance_at(self, points_uv: Array) -> Array:
-        """Return the variance of electrodes' places at points, (n,) pixels squared."""
-        v, u = self._best_cells(points_uv)
-        return _variance_px2(self.answers[v, u, _LOG_VARIANCE].astype(np.float64), self.variance_gain, self.cell_px)
-
-    def _best_cells(self, points_uv: Array) -> tuple[Array, Array]:
+    def probability_at(self, points_uv: Array, reach_cells: int = 1) -> Array:
+        """Return the highest probability of the cells within reach of each point, (n,)."""
         rows, columns = self.probability.shape
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
-        steps = np.arange(-1, 2)
-        v = np.clip(middle[:, 1, None, None] + steps[:, None], 0, rows - 1) + np.zeros(3, np.int64)
-        u = np.clip(middle[:, 0, None, None] + steps, 0, columns - 1) + np.zeros((3, 1), np.int64)
-        best = self.probability[v, u].reshape(len(middle), 9).argmax(axis=1)
-        one = np.arange(len(middle))
-        return v.reshape(-1, 9)[one, best], u.reshape(-1, 9)[one, best]
+        steps = np.arange(-reach_cells, reach_cells + 1)
+        v = np.clip(middle[:, 1, None, None] + steps[:, None], 0, rows - 1)
+        u = np.clip(middle[:, 0, None, None] + steps, 0, columns - 1)
+        highest: Array = self.probability[v, u].max(axis=(1, 2), initial=0.0).astype(np.float64)
+        return highest
 
 
 def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, variance_gain: float) -> Proposals:

@@ -2,44 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
-from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.learned_chain.detector import electrode_chains
+from fluoromap.segmenter.learned_chain.explanation import is_inverted
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
-from fluoromap.segmenter.linking import Trust
-from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.run_segmentation import segment_run
+from fluoromap.segmenter.run_segmentation import Detector, segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
 
-_TRUST = Trust(share=0.25, chain=0.7)
-_IN_A_RUN = Acceptance(
-    least_clearness=0.1,
-    again_clearness=0.1,
-    sure_clearness=0.1,
-    extra_clearness=0.3,
-    least_score=0.4,
-    seen_score=0.15,
-    least_seen=0.85,
-    unseen_evidence=-1.5,
-    strict=True,
-    trust=_TRUST,
-)
-_ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)
-"""Scores are probabilities. In a single frame no other frame confirms a chain."""
-
 _DIM_BELOW = 0.02
 """Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""
-_COARSE_BITS = 8
-_COARSE_NOISE = 0.004
+
+_log = logging.getLogger(__name__)
 
 
 class LearnedChainParams(BaseModel, extra="forbid"):
@@ -53,7 +37,7 @@ class LearnedChainParams(BaseModel, extra="forbid"):
 
 
 class LearnedChain:
-    """Electrodes that a small network proposes, catheters as chains of them that fit the catalogue, the best set of chains.
+    """Electrodes that a small network and blobs propose, chains of them that fit the catalogue, the best set of chains.
 
     The network was trained on synthetic fluoroscopy with cables, wires, probes and contrast-filled vessels. Everything after it
     is shared with ``catheter-chain``.
@@ -73,14 +57,22 @@ class LearnedChain:
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
+        found = self._segment(run, catalogue, marks, context)
+        if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue):
+            _log.warning(
+                "The electrodes are bright: the grey levels were inverted although the header does not say so."
+            )
+            inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
+            found = self._segment(replace(run, pixels=inverted), catalogue, marks, context)
+        return found
+
+    def _segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
-        acceptance = _IN_A_RUN if len(run.frames) > 1 else _ALONE
-        least_noise = _COARSE_NOISE if run.pixels.bits_stored <= _COARSE_BITS else 0.0
+        alone = len(run.frames) == 1
 
-        def detector_of(field: FieldMask) -> ChainDetector:
-            def ask(x: Image) -> NetworkResponse:
-                return NetworkResponse.of_image(x, field.inside, trained, run.px_per_mm, least_noise)
+        frame_ms = float(np.diff(run.frame_times_ms).max(initial=0.0))
 
-            return ChainDetector(catalogue, field, run.px_per_mm, ask, acceptance)
+        def detector_of(field: FieldMask) -> Detector:
+            return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
 
         return visible_part(segment_run(run, catalogue, marks, context, detector_of, search_again=True), _DIM_BELOW)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from fluoromap.segmenter.learned_chain.network_response import NETWORK_PX_PER_MM
 from fluoromap.segmenter.learned_chain.normalisation import normalise
 from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+
+REFERENCE = Path(__file__).with_name("pytorch_answers.npz")
+"""Made by ``python -m fluoromap.training --reference``."""
 
 
 @pytest.fixture(scope="module")
@@ -73,17 +77,13 @@ def test_the_whole_network_is_its_layers_in_a_row(weights):
                 )
 
 
-def test_it_equals_the_network_that_is_trained(weights):
-    torch = pytest.importorskip("torch", reason="the optional extra 'training' is not installed")
-    from fluoromap.training.export import folded
-    from fluoromap.training.network import ElectrodeNetwork as TrainedNetwork
-
-    torch.manual_seed(0)
-    trained = TrainedNetwork().eval()
-    picture = np.random.default_rng(3).normal(size=(80, 64)).astype(np.float32)
-    with torch.no_grad():
-        expected = trained(torch.from_numpy(picture[None, None]))[0].permute(1, 2, 0).numpy()
-    np.testing.assert_allclose(ElectrodeNetwork.of_weights(folded(trained))(picture), expected, atol=1e-4)
+def test_it_answers_as_pytorch_does_with_the_shipped_weights():
+    with np.load(REFERENCE) as stored:
+        picture, expected, digest = stored["picture"].astype(np.float32), stored["answers"], str(stored["sha256"])
+    assert digest == hashlib.sha256(SHIPPED.read_bytes()).hexdigest(), (
+        f"write {REFERENCE.name} again: python -m fluoromap.training --reference {REFERENCE}"
+    )
+    np.testing.assert_allclose(read_weights(SHIPPED).network(picture), expected, atol=1e-4, rtol=1e-4)
 
 
 def test_pictures_of_any_size_get_answers_for_all_their_cells():

@@ -1,0 +1,66 @@
+"""Chains of the electrodes that network and blobs find."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import PixelFacts
+from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
+from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.learned_chain.alternating import LONGEST_MS, AlternatingDetector, LatestNetwork
+from fluoromap.segmenter.learned_chain.joint_evidence import JointEvidence
+from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.linking import Trust
+from fluoromap.segmenter.log_image import Image
+
+_TRUST = Trust(share=0.25, chain=0.7)
+_IN_A_RUN = Acceptance(
+    least_clearness=0.1,
+    again_clearness=0.1,
+    sure_clearness=0.1,
+    extra_clearness=0.3,
+    least_score=0.4,
+    seen_score=0.15,
+    least_seen=0.85,
+    unseen_evidence=-1.5,
+    strict=True,
+    trust=_TRUST,
+)
+_ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)
+"""Scores are probabilities. In a single frame no other frame confirms a chain."""
+
+_NEXT_FRAME_CELLS = 3
+"""A catheter moves so far in a frame of a fast run, 2 mm."""
+_COARSE_BITS = 8
+_COARSE_NOISE = 0.004
+
+
+def electrode_chains(
+    catalogue: Catalogue,
+    field: FieldMask,
+    pixels: PixelFacts,
+    px_per_mm: float,
+    trained: Trained,
+    alone: bool,
+    frame_ms: float = math.inf,
+) -> ChainDetector | AlternatingDetector:
+    """Return the detector of one run.
+
+    It finds electrodes by network and blobs, and the chains of them. ``alone`` : no other frame confirms a chain. ``frame_ms`` :
+    longest time between frames.
+    """
+    ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
+    least_noise = _COARSE_NOISE if pixels.bits_stored <= _COARSE_BITS else 0.0
+
+    network = LatestNetwork(lambda x: NetworkResponse.of_image(x, trained, px_per_mm))
+
+    def ask(x: Image) -> JointEvidence:
+        blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
+        return JointEvidence(network(x), blobs, px_per_mm, least_noise, _NEXT_FRAME_CELLS if network.borrowed else 1)
+
+    detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else _IN_A_RUN)
+    return AlternatingDetector(detector, network) if frame_ms <= LONGEST_MS else detector

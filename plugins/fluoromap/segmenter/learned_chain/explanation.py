@@ -1,0 +1,107 @@
+"""Scale and polarity of pictures whose header says nothing of them: those at which the catalogue explains the pictures best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import PixelFacts, Run
+from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
+from fluoromap.segmenter.learned_chain.detector import electrode_chains
+from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
+from fluoromap.segmenter.log_image import Image, LogTransform
+
+SCALES_PX_PER_MM = 2.7, 3.1, 3.6, 4.1, 4.7, 5.4, 6.2
+"""Scales of fluoroscopy at the isocentre, each 15 % above the one before."""
+
+_FRAMES = 3
+_LEAST_ELECTRODES = 3.0
+_NEARLY_ALL = 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """How well the catalogue explains pictures at one scale and polarity.
+
+    px_per_mm : at the isocentre. monochrome1 : whether high values are dark. electrodes : expected number of the catalogue's
+    electrodes in a frame, the sum of their probabilities. sure : whether every frame that was tried shows a clear chain.
+    """
+
+    px_per_mm: float
+    monochrome1: bool
+    electrodes: float
+    sure: bool
+
+
+def find_scale(
+    run: Run, catalogue: Catalogue, scales_px_per_mm: Sequence[float] = SCALES_PX_PER_MM
+) -> Explanation | None:
+    """Return the scale and the polarity at which the catalogue explains a run best.
+
+    ``run.px_per_mm`` and ``run.pixels.monochrome1`` are not used. A larger scale explains the same pictures by stronger
+    foreshortening, so the smallest scale that explains nearly as much as the best is returned. It is right to about 20 %: enough
+    to find electrodes and to show them, not to locate them.
+
+    Returns
+    -------
+    Explanation or None
+        None where no scale explains three frames.
+    """
+    tried = [
+        one
+        for inverted in (False, True)
+        for one in _explanations(run, replace(run.pixels, monochrome1=inverted), catalogue, scales_px_per_mm)
+    ]
+    return _smallest_of_the_best(tried)
+
+
+def is_inverted(run: Run, catalogue: Catalogue) -> bool:
+    """Return whether the catalogue explains the run only with its grey levels inverted."""
+    inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
+    of_inverted = _smallest_of_the_best(_explanations(run, inverted, catalogue, (run.px_per_mm,)))
+    if of_inverted is None:
+        return False
+    (as_it_says,) = _explanations(run, run.pixels, catalogue, (run.px_per_mm,))
+    return of_inverted.electrodes > as_it_says.electrodes
+
+
+def _smallest_of_the_best(tried: Sequence[Explanation]) -> Explanation | None:
+    """Return the smallest scale of the polarity that explains most."""
+    possible = [one for one in tried if one.sure and one.electrodes >= _LEAST_ELECTRODES]
+    if not possible:
+        return None
+    best = max(possible, key=lambda one: one.electrodes)
+    return min(
+        (
+            one
+            for one in possible
+            if one.monochrome1 == best.monochrome1 and one.electrodes >= _NEARLY_ALL * best.electrodes
+        ),
+        key=lambda one: one.px_per_mm,
+    )
+
+
+def _explanations(
+    run: Run, pixels: PixelFacts, catalogue: Catalogue, scales_px_per_mm: Sequence[float]
+) -> list[Explanation]:
+    """Explain a few frames of a run at each scale."""
+    field = find_field(run.frames, pixels)
+    transform = LogTransform.of_run(pixels, field.mean_level)
+    frames = list(evenly_spaced_frames(len(run.frames)))
+    images = [field.fill(transform(run.frames[frame])) for frame in frames[:: max(1, len(frames) // _FRAMES)][:_FRAMES]]
+    trained = read_weights(SHIPPED)
+    return [_explained(images, field, pixels, catalogue, scale, trained) for scale in scales_px_per_mm]
+
+
+def _explained(
+    images: Sequence[Image], field: FieldMask, pixels: PixelFacts, catalogue: Catalogue, px_per_mm: float, trained: Trained
+) -> Explanation:  # fmt: skip
+    detector = electrode_chains(catalogue, field, pixels, px_per_mm, trained, alone=len(images) == 1)
+    entries = [detector.find_chains(x, number) for number, x in enumerate(images)]
+    return Explanation(
+        px_per_mm,
+        pixels.monochrome1,
+        sum(float(chain.scores.sum()) for entry in entries for chain in entry.chains) / len(entries),
+        all(entry.manual_needed is None for entry in entries),
+    )

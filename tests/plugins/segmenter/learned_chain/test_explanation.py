@@ -1,0 +1,80 @@
+"""Scale and polarity found without the header: the phantom at two scales, inverted, and pictures without catheters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.contracts import PixelFacts, Run, Silent
+from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.learned_chain.explanation import find_scale, is_inverted
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
+
+PX_PER_MM = 512 / 178 * 2
+HIGHEST = 4095
+
+
+class Frames:
+    def __init__(self, frames):
+        self._frames = [np.asarray(frame) for frame in frames]
+        self.shape = self._frames[0].shape
+
+    def __len__(self):
+        return len(self._frames)
+
+    def __getitem__(self, index):
+        return self._frames[index]
+
+    def __iter__(self):
+        return iter(self._frames)
+
+
+def run_of(frames):
+    source = Frames(frames)
+    return Run(source, np.arange(len(source)) * 1000 / 60, 1.0, PixelFacts(False, 12, False))
+
+
+@pytest.fixture(scope="module")
+def frames():
+    spec = StudySpec(313, sites=1, frames=4, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA"))
+    return list(simulate_study(spec).sites[0].runs[0].frames)
+
+
+def test_the_scale_is_found_from_the_catalogue(frames):
+    found = find_scale(run_of(frames), DEFAULT_CATALOGUE)
+    assert found is not None
+    assert 0.78 * PX_PER_MM <= found.px_per_mm <= 1.2 * PX_PER_MM
+    assert not found.monochrome1
+    assert found.electrodes >= 6.0
+
+
+def test_half_the_picture_has_half_the_scale(frames):
+    halved = [(frame[::2, ::2] // 2 + frame[1::2, 1::2] // 2).astype(np.uint16) for frame in frames]
+    found = find_scale(run_of(halved), DEFAULT_CATALOGUE)
+    assert found is not None
+    assert 0.78 * PX_PER_MM <= 2.0 * found.px_per_mm <= 1.35 * PX_PER_MM
+
+
+def test_bright_electrodes_are_recognised(frames):
+    inverted = [np.uint16(HIGHEST) - frame for frame in frames]
+    found = find_scale(run_of(inverted), DEFAULT_CATALOGUE)
+    assert found is not None
+    assert found.monochrome1
+    run = replace(run_of(inverted), px_per_mm=PX_PER_MM)
+    assert is_inverted(run, DEFAULT_CATALOGUE)
+    assert not is_inverted(replace(run_of(frames), px_per_mm=PX_PER_MM), DEFAULT_CATALOGUE)
+
+
+def test_an_inverted_run_is_segmented_all_the_same(frames, caplog):
+    inverted = replace(run_of([np.uint16(HIGHEST) - frame for frame in frames]), px_per_mm=PX_PER_MM)
+    found = LearnedChain().segment(inverted, DEFAULT_CATALOGUE, {}, Silent())
+    assert sum(len(chain.electrodes) for chain in found.frames[2].chains) >= 8
+    assert "inverted" in caplog.text
+
+
+@pytest.mark.parametrize("level", [20, 600])
+def test_noise_has_no_scale(level):
+    random = np.random.default_rng(0)
+    noise = [random.poisson(level, (256, 256)).astype(np.uint16) for _ in range(3)]
+    assert find_scale(run_of(noise), DEFAULT_CATALOGUE) is None
