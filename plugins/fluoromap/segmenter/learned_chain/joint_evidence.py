@@ -56,8 +56,8 @@ class JointEvidence:
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
         """Return possible blobs, and the network's proposals away from them.
 
-        Blobs that the network excludes are left out. A blob's place is more exact, and it resolves electrodes that are one for the network. Places that the network proposed in
-        another frame are not used.
+        Blobs that the network excludes are left out. A blob's place is more exact, and it resolves electrodes that are one
+        for the network. Places that the network proposed in another frame are not used.
         """
         blobs = self.blobs.proposals(allowed, expected)
         blobs = _taken(blobs, self.scores_at(blobs.points_uv) >= _LEAST_PROBABILITY)
