@@ -254,7 +254,6 @@ def _monoplane_view(
         a_priori_frame=located.frame_a if first else located.frame_b,
         cycle=located.cycle,
         others=others,
-        variation=located.variation,
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -37,7 +36,7 @@ def mirror(camera: Camera) -> Camera:
     """
     matrix = camera.matrix.copy()
     matrix[0] = (camera.columns - 1) * matrix[2] - matrix[0]
-    return replace(camera, matrix=matrix)
+    return Camera(matrix, camera.rows, camera.columns)
 
 
 def mirrored_gain(original: Hypotheses, mirrored: Sequence[Hypotheses]) -> float:

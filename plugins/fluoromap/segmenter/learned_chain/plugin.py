@@ -44,7 +44,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "1"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
