@@ -4,7 +4,7 @@ All times are processor time of one thread, so that a busy machine gives nearly 
 
 1. each filter of the four steps on one simulated 512x512 frame a view, beside its plain NumPy/SciPy/scikit-image twin (the
    oracle of the tests) and beside SimpleITK, OpenCV and medpy where installed (the same sweeps or radii on the same input);
-2. both segmenters on runs of several lengths, everything included, in ms a frame;
+2. the segmenters on runs of several lengths, everything included, in ms a frame;
 3. decoding of real compressed frames, where FLUOROMAP_SAMPLE_DATA names a folder of them;
 4. the start of a worker process before it takes work, with an empty and with a full folder of compiled kernels;
 5. a study of ``sites`` x 2 views x ``frames`` uncompressed frames (20 x 2 x 120) from the files to chains and tracks, without
@@ -31,6 +31,7 @@ from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
 from skimage.measure import label, regionprops
+from skimage.morphology import disk
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
@@ -42,16 +43,17 @@ from fluoromap.segmenter.four_step.blobs import find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.four_step.frame_chains import FourStepDetector, FourStepParams
 from fluoromap.segmenter.four_step.homomorphic import homomorphic
-from fluoromap.segmenter.four_step.morphology import disk, disk_morphology
+from fluoromap.segmenter.four_step.morphology import disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.four_step.plugin import FourStep
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap_service.dicom import deterministic_uid, open_frames, read_instance, write_cine
 
 Work = Callable[[], object]
 
 VIEWS: tuple[Contrast, Contrast] = ("LAT", "PA")
-LENGTHS = 30, 120, 240
+LENGTHS = 30, 60, 120, 240
 FACTS = PixelFacts(logarithmic=False, bits_stored=12, monochrome1=False)
 GOAL_MS = 12.5
 REAL = {
@@ -150,6 +152,7 @@ def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
 def lengths(runs: tuple[SimulatedRun, SimulatedRun], frames: list[list[NDArray[np.uint16]]]) -> None:
     plans: list[tuple[str, Callable[[], Segmenter], tuple[int, ...]]] = [
         ("catheter-chain", CatheterChain, LENGTHS),
+        ("learned-chain", LearnedChain, LENGTHS),
         ("four-step", FourStep, LENGTHS[:1]),
     ]
     print("runs with tracking and diastole, ms a frame" + "".join(f"{count:8} frames" for count in LENGTHS))

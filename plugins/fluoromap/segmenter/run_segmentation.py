@@ -63,6 +63,8 @@ def segment_run(
     context: Context,
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
+    least_detected: float | None = None,
+    confirms: Callable[[Chain], bool] | None = None,
 ) -> Segmentation:
     """Segment a run: tracked chains of all frames, and diastolic chains.
 
@@ -85,6 +87,8 @@ def segment_run(
         The field mask of the run -> the detector to use.
     search_again : bool
         Whether to search for missing catheters with :meth:`Detector.find_again`.
+    least_detected, confirms
+        See :func:`~fluoromap.segmenter.tracking.track_chains`.
     """
     context.check()
     field = find_field(run.frames, run.pixels)
@@ -122,7 +126,8 @@ def segment_run(
     mean = mean if mean.manual_needed is None else FrameChains(middle, ())
     catheters = len(catalogue.catheters)
     search = _chain_search(detector, log_image, context) if search_again else None
-    entries = track_chains(found, run.frame_times_ms, catheters, search, mean if len(averaged) > 1 else None)
+    seed = mean if len(averaged) > 1 else None
+    entries = track_chains(found, run.frame_times_ms, catheters, search, seed, least_detected, confirms)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains

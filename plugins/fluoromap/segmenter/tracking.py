@@ -88,6 +88,8 @@ def track_chains(
     catheters: int,
     search: ChainSearch | None = None,
     seed: FrameChains | None = None,
+    least_detected: float | None = None,
+    confirms: Callable[[Chain], bool] | None = None,
 ) -> tuple[FrameChains, ...]:
     """Give the chains of a run track numbers.
 
@@ -112,6 +114,11 @@ def track_chains(
     search : ChainSearch, optional
     seed : FrameChains, optional
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
+    least_detected : float, optional
+        Share of the frames of a long run in which a catheter must be found without ``search``. By default 0.2, or none where the
+        seed has it and half of the frames show it.
+    confirms : callable, optional
+        Whether a chain that ``search`` found counts as if it had been found without.
 
     Returns
     -------
@@ -138,14 +145,19 @@ def track_chains(
                 track.chain, track.time_ms = track.chains[first], float(frame_times_ms[first])
                 track.velocity = _first_velocity(track.chains, frame_times_ms)
         for frame in frames:
-            _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search)
-    least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
+            _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search, confirms)
+    share = _SEEN_AT_LEAST if least_detected is None else least_detected
+    least = max(2.0, share * len(found)) if len(found) >= _LONG_RUN else 1.0
     tracks_kept = [
         track
         for track in tracks
         if track.manual
         or track.detections >= least
-        or (track.from_seed and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found)))
+        or (
+            least_detected is None
+            and track.from_seed
+            and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found))
+        )
     ]
     tracks_kept.sort(key=lambda track: -track.detections)
     for track in tracks_kept:
@@ -225,8 +237,9 @@ def _overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
 
 
 def _advance(
-    tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None
-) -> None:
+    tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None,
+    confirms: Callable[[Chain], bool] | None,
+) -> None:  # fmt: skip
     numbers, turned = _assign(tracks, entry.chains, time_ms)
     by_hand = any(chain.manual for chain in entry.chains)
     present: list[Chain] = []
@@ -260,6 +273,7 @@ def _advance(
             shift, reach = _expected(track, time_ms)
             recovered = search(entry.frame, track.chain, shift, reach, present)
             if recovered is not None and not _overlaps(recovered, present):
+                track.detections += confirms is not None and confirms(recovered)
                 _extend(track, recovered, entry.frame, time_ms)
                 present.append(recovered)
     for chain in loose:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import PixelFacts
+from fluoromap.contracts import Chain, PixelFacts
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
@@ -26,17 +28,23 @@ _IN_A_RUN = Acceptance(
     least_score=0.4,
     seen_score=0.15,
     least_seen=0.85,
-    unseen_evidence=-1.5,
+    unseen_evidence=-0.9,
     strict=True,
     trust=_TRUST,
 )
 _ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
+_CONFIRMING_SCORE, _LEAST_CONFIRMING_SCORE = 0.5, 0.25
 _NEXT_FRAME_CELLS = 3
 """A catheter moves so far in a frame of a fast run, 2 mm."""
 _COARSE_BITS = 8
 _COARSE_NOISE = 0.004
+
+
+def confirms(chain: Chain) -> bool:
+    """Return whether a chain that was found again clearly shows its catheter."""
+    return bool(np.median(chain.scores) >= _CONFIRMING_SCORE and chain.scores.min() >= _LEAST_CONFIRMING_SCORE)
 
 
 def electrode_chains(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
@@ -19,11 +20,11 @@ from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probabi
 _EVEN_SHARE = 0.5
 _LEAST_PROBABILITY = 0.05
 _APART_MM = 0.6
-_FAINT, _CLEAR = 5.0, 12.0
-_FAINT_LOG_ODDS = 2.5
+_FAINT, _CLEAR = 5.0, 9.5
+_FAINT_LOG_ODDS = 4.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class JointEvidence:
     """Network and blobs of one log image, see :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
 
@@ -36,6 +37,7 @@ class JointEvidence:
     px_per_mm: float
     least_noise: float
     reach_cells: int = 1
+    _proposed: Proposals | None = None
 
     @property
     def smooth(self) -> Image:
@@ -54,10 +56,15 @@ class JointEvidence:
         return self.blobs.likeness
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
+        """Return the electrodes where ``allowed``, most probable first."""
+        self._proposed = self._compete(allowed, expected)
+        return self._proposed
+
+    def _compete(self, allowed: BoolArray, expected: int) -> Proposals:
         """Return possible blobs, and the network's proposals away from them.
 
-        Blobs that the network excludes are left out. A blob's place is more exact, and it resolves electrodes that are one
-        for the network. Places that the network proposed in another frame are not used.
+        Blobs that the network excludes are left out. A blob's place is more exact, and it resolves electrodes that are one for the
+        network. Places that the network proposed in another frame are not used.
         """
         blobs = self.blobs.proposals(allowed, expected)
         blobs = _taken(blobs, self.scores_at(blobs.points_uv) >= _LEAST_PROBABILITY)
@@ -89,7 +96,13 @@ class JointEvidence:
         probability: Array = 1.0 / (1.0 + np.exp(-_EVEN_SHARE * (of_network + of_contrast)))
         return probability
 
-    unseen_probability_at = probability_at
+    def unseen_probability_at(self, points_uv: Array) -> Array:
+        """Return the same, but 0 where a proposed electrode has the place."""
+        probability = self.probability_at(points_uv)
+        if self._proposed is not None and len(self._proposed) and len(points_uv):
+            away, _ = cKDTree(self._proposed.points_uv).query(points_uv)
+            probability[away < _APART_MM * self.px_per_mm] = 0.0
+        return probability
 
     def variance_at(self, points_uv: Array) -> Array:
         """Return the variance of blobs' places at points, (n,) pixels squared."""
