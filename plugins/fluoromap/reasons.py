@@ -64,7 +64,7 @@ _SENTENCES: dict[Reason, str] = {
     Reason.NO_A_PRIORI: "No biplane position is known here; a single view gives no depth.",
     Reason.PAIRING_FAILED: "The catheters of the two views do not belong together; check which runs are paired at this site.",
     Reason.SPACING_MISMATCH: "The electrode spacing found differs from the catalogue's; check the catheter's description.",
-    Reason.TABLE_MOVED: "The table moved between the two views; repeat one of them.",
+    Reason.TABLE_MOVED: "The table moved, or may have moved, between the two views; repeat one of them.",
     Reason.DEPTH_UNOBSERVABLE: "One view does not give the depth of this catheter to a useful accuracy.",
     Reason.DEPTH_ASSUMED: "The depth along the ray comes from the solver's start value, not from the image.",
     Reason.TRACK_INTERRUPTED: "The catheter was not seen in this frame.",

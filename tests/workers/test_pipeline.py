@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,26 @@ def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: st
     )  # fmt: skip
     moved = np.subtract([again["x_mm"], again["y_mm"], again["z_mm"]], [tip["x_mm"], tip["y_mm"], tip["z_mm"]])
     assert np.linalg.norm(moved) > 0.05
+
+
+def test_the_doubt_of_a_half_known_table_reaches_the_points(
+    service: TestClient, study_path: str, simulated_study: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "study"
+    shutil.copytree(simulated_study, copy)
+    path = min((copy / "dicom").iterdir())
+    run = pydicom.dcmread(path)
+    run.TableTopLateralPosition, run.TableTopLongitudinalPosition, run.TableTopVerticalPosition = 10, 20, 30
+    run.save_as(path)
+    _send(service, study_path, copy)
+    sites = service.get(f"{study_path}/sites").json()["items"]
+    doubtful = {site["site"] for site in sites if "table_moved" in site["warnings"]}
+    assert len(doubtful) == 1
+    points = service.get(f"/v1/jobs/{_job(service, study_path)['id']}/points").json()["points"]
+    located = [point for point in points if point["grade"] != "rejected"]
+    assert doubtful & {point["site"] for point in located}
+    for point in located:
+        assert ("table_moved" in point["reasons"]) == (point["site"] in doubtful)
 
 
 def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(

@@ -104,7 +104,7 @@ def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
 def _segment(job: StoredJob, uid: str) -> Work:
     run, catalogue = job.snapshot.runs[uid], job.catalogue
     facts = InstanceFacts.from_json(run.facts)
-    px_per_mm = run.gantry.camera().px_per_mm
+    px_per_mm = run.gantry.px_per_mm
     marks = {frame - 1: _chains(electrodes) for frame, electrodes in run.corrections.items()}
     plugin = job.snapshot.segmenter
 
@@ -171,11 +171,16 @@ def _match(job: StoredJob, study: str) -> Work:
 
 def _triangulate(job: StoredJob, study: str) -> Work:
     match, catalogue, plugin = job.stage("match"), job.catalogue, job.snapshot.triangulator
+    doubts = {site.site: site.doubts for site in job.snapshot.sites if site.doubts}
 
     def compute(context: Context) -> Triangulation:
         matching = load(Matching, match)
         located = build_triangulator(plugin.name, plugin.params).triangulate(matching.sites, catalogue, context)
-        return replace(located, rejected=(*matching.rejected, *located.rejected))
+        sites = tuple(
+            replace(site, reasons=tuple(dict.fromkeys((*site.reasons, *doubts.get(site.site, ())))))
+            for site in located.sites
+        )
+        return replace(located, sites=sites, rejected=(*matching.rejected, *located.rejected))
 
     def refused(refusal: Refusal) -> Triangulation:
         matching = load(Matching, match)
@@ -185,7 +190,8 @@ def _triangulate(job: StoredJob, study: str) -> Work:
     def rows(located: Triangulation) -> Iterable[Base]:
         return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
-    return Work(_key(job, "triangulate", asdict(catalogue), match.result), Triangulation, compute, refused, rows)
+    key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
+    return Work(key, Triangulation, compute, refused, rows)
 
 
 def _fuse(job: StoredJob, study: str) -> Work:

@@ -15,6 +15,7 @@ from fluoromap.geometry.gantry import ImageAxes
 
 Plane = Literal["single", "A", "B"]
 Pair = tuple[float, float]
+Point = tuple[float, float, float]
 
 _UID = re.compile(r"[0-9]+(\.[0-9]+)*")
 
@@ -62,7 +63,7 @@ _SENTENCES: dict[HeaderWarning, str] = {
         "PatientOrientation or FieldOfViewRotation does not fit the gantry angles; the service assumes an upright image."
     ),
     HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; the service uses its first position only.",
-    HeaderWarning.TABLE_MOVED: "The table moved during this run.",
+    HeaderWarning.TABLE_MOVED: "The table moved during this run; the service uses its first position only.",
     HeaderWarning.PIXEL_INTENSITY_UNKNOWN: (
         "PixelIntensityRelationship is missing; the service assumes pixels prepared for display."
     ),
@@ -71,6 +72,17 @@ _SENTENCES: dict[HeaderWarning, str] = {
     HeaderWarning.SHUTTER_IGNORED: "A shutter or collimator attribute makes no sense; the service ignores it.",
     HeaderWarning.R_WAVES_IGNORED: "RWavePointer names frames that do not exist; the service ignores them.",
 }
+
+
+class TableOrigin(StrEnum):
+    """The attributes that state a table's position; positions of different attributes have different origins."""
+
+    ISOCENTRE = "isocentre"
+    """TableXPositionToIsocenter (0018,9466) to TableZPositionToIsocenter (0018,9468)."""
+    TABLE_TOP = "table_top"
+    """TableTopVerticalPosition (300A,0128) to TableTopLateralPosition (300A,012A)."""
+    GE = "ge"
+    """The private block DLX_SERIE_01 of GE."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +111,8 @@ class InstanceFacts:
     patient_orientation : tuple of str or None
         PatientOrientation's row and column direction, for :func:`image_axes_from_orientation` once angles are known.
     table_mm : tuple of float or None
-        Table top (lateral, longitudinal, vertical) in the machine's own frame; only differences between runs have a meaning.
+        Table top along the patient's axes (LPS: x, y, z). Only differences between runs with the same ``table_origin`` have a
+        meaning.
     pixels : PixelFacts
     window : tuple of float or None
         The file's display window (centre, width) in stored values.
@@ -108,6 +121,8 @@ class InstanceFacts:
     missing : tuple of str
         DICOM keywords of gantry values that neither the header nor a substitute gives.
     warnings : tuple of HeaderWarning
+    table_origin : TableOrigin or None
+        The attributes that state ``table_mm``; None where the position is unknown.
 
     Raises
     ------
@@ -135,12 +150,13 @@ class InstanceFacts:
     pixel_spacing_mm: Pair | None
     image_axes: ImageAxes
     patient_orientation: tuple[str, str] | None
-    table_mm: tuple[float, float, float] | None
+    table_mm: Point | None
     pixels: PixelFacts
     window: Pair | None
     r_wave_frames: tuple[int, ...]
     missing: tuple[str, ...]
     warnings: tuple[HeaderWarning, ...]
+    table_origin: TableOrigin | None = None
 
     def __post_init__(self) -> None:
         uids = (self.sop_class_uid, self.sop_instance_uid, self.study_instance_uid, self.series_instance_uid)
@@ -161,6 +177,7 @@ class InstanceFacts:
         value = dataclasses.asdict(self)
         value["acquired"] = self.acquired.isoformat() if self.acquired else None
         value["warnings"] = [str(warning) for warning in self.warnings]
+        value["table_origin"] = str(self.table_origin) if self.table_origin else None
         listed: dict[str, Any] = _lists(value)
         return listed
 
@@ -171,13 +188,14 @@ class InstanceFacts:
         pixels = dict(fields["pixels"])
         shutter = pixels["shutter"]
         pixels["shutter"] = Shutter(**shutter) if shutter else None
-        acquired = fields["acquired"]
+        acquired, table_origin = fields["acquired"], fields.get("table_origin")
         return cls(
             **fields
             | {
                 "pixels": PixelFacts(**pixels),
                 "acquired": datetime.fromisoformat(acquired) if acquired else None,
                 "warnings": tuple(HeaderWarning(code) for code in fields["warnings"]),
+                "table_origin": TableOrigin(table_origin) if table_origin else None,
             }
         )
 

@@ -46,6 +46,7 @@ _MACROS: dict[str, tuple[str, ...]] = {
     ),
     "TablePositionSequence": (
         "TableTopVerticalPosition", "TableTopLongitudinalPosition", "TableTopLateralPosition",
+        "TableHorizontalRotationAngle", "TableHeadTiltAngle", "TableCradleTiltAngle",
     ),
     "IsocenterReferenceSystemSequence": (
         "TableXPositionToIsocenter", "TableYPositionToIsocenter", "TableZPositionToIsocenter",
@@ -70,19 +71,33 @@ _PLAIN = (
     "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "ShutterShape", "ShutterLeftVerticalEdge",
     "ShutterRightVerticalEdge", "ShutterUpperHorizontalEdge", "ShutterLowerHorizontalEdge", "CenterOfCircularShutter",
     "RadiusOfCircularShutter", "VerticesOfThePolygonalShutter", "SamplesPerPixel", "PhotometricInterpretation",
+    "PatientPosition", "TableAngle",
     "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
 )  # fmt: skip
 
 
-def _tag(keyword: str) -> BaseTag:
-    tag = tag_for_keyword(keyword)
+# GE's table position. The creator's element number 00bb gives its elements the numbers bb00 to bbFF, PS3.5 section 7.8.1.
+_PRIVATE_GROUP = 0x0019
+_PRIVATE_ELEMENTS = (0x21, 0x22, 0x23)
+_PRIVATE_BLOCKS = range(0x10, 0x100)
+
+
+def _tag(attribute: str | BaseTag) -> BaseTag:
+    """Return the tag of a keyword; a tag is returned unchanged."""
+    if isinstance(attribute, BaseTag):
+        return attribute
+    tag = tag_for_keyword(attribute)
     if tag is None:
-        raise KeyError(keyword)
+        raise KeyError(attribute)
     return Tag(tag)
 
 
 # The service reads only these: patient data stays in the file.
-_WANTED: list[BaseTag | int] = [_tag(keyword) for keyword in (*_PLAIN, *_MACRO_OF, *_FRAME_GROUPS)]
+_WANTED: list[BaseTag | int] = [
+    *(_tag(keyword) for keyword in (*_PLAIN, *_MACRO_OF, *_FRAME_GROUPS)),
+    *(Tag(_PRIVATE_GROUP, block) for block in _PRIVATE_BLOCKS),
+    *(Tag(_PRIVATE_GROUP, block << 8 | element) for block in _PRIVATE_BLOCKS for element in _PRIVATE_ELEMENTS),
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +177,22 @@ class Header:
         """Return texts as :meth:`numbers_per_frame` returns numbers."""
         return [self._texts(item, keyword) for item in self._macro_items(keyword)]
 
+    def private_number(self, creator: str, element: int) -> float | None:
+        """Return the first value of a private element of group 0019.
+
+        Parameters
+        ----------
+        creator : str
+            Value of the element that reserves the block, PS3.5 section 7.8.1.
+        element : int
+            Number within the block; the service reads 21, 22 and 23 (hexadecimal) only.
+        """
+        for block in _PRIVATE_BLOCKS:
+            if self._texts(self._dataset, Tag(_PRIVATE_GROUP, block)) == (creator,):
+                values = self._numbers(self._dataset, Tag(_PRIVATE_GROUP, block << 8 | element))
+                return values[0] if values else None
+        return None
+
     def tags(self, keyword: str) -> tuple[int, ...]:
         """Return the values of an attribute that refers to other attributes (VR AT)."""
         return tuple(int(value) for value in _values(self._value(self._dataset, keyword)) if isinstance(value, int))
@@ -193,20 +224,20 @@ class Header:
         items = self._value(dataset, keyword)
         return list(items) if items is not None and not isinstance(items, str | bytes) else []
 
-    def _numbers(self, dataset: Dataset, keyword: str) -> tuple[float, ...]:
+    def _numbers(self, dataset: Dataset, attribute: str | BaseTag) -> tuple[float, ...]:
         try:
-            values = tuple(float(value) for value in _values(self._value(dataset, keyword)))
+            values = tuple(float(value) for value in _values(self._value(dataset, attribute)))
         except (TypeError, ValueError):
             return ()
         return values if all(math.isfinite(value) for value in values) else ()
 
-    def _texts(self, dataset: Dataset, keyword: str) -> tuple[str, ...]:
-        values = tuple(str(value).strip(" \0") for value in _values(self._value(dataset, keyword)))
+    def _texts(self, dataset: Dataset, attribute: str | BaseTag) -> tuple[str, ...]:
+        values = tuple(str(value).strip(" \0") for value in _values(self._value(dataset, attribute)))
         return values if any(values) else ()
 
     @staticmethod
-    def _value(dataset: Dataset, keyword: str) -> Any:
-        tag = _tag(keyword)
+    def _value(dataset: Dataset, attribute: str | BaseTag) -> Any:
+        tag = _tag(attribute)
         if tag not in dataset:
             return None
         # The conversion of a damaged value raises nearly anything, from ValueError to struct.error. The value then counts

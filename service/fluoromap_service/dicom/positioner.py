@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fluoromap.geometry.gantry import LEAST_SOURCE_MM, UPRIGHT, ImageAxes
-from fluoromap_service.dicom.facts import HeaderWarning, Pair
+from fluoromap_service.dicom.facts import HeaderWarning, Pair, Point, TableOrigin
 from fluoromap_service.dicom.header import Header
 from fluoromap_service.dicom.orientation import image_axes_from_field_of_view, image_axes_from_orientation
 
 _STILL_DEG = 0.5
 _STILL_MM = 1.0
+
+_TABLE_ANGLES = ("TableAngle", "TableHorizontalRotationAngle", "TableHeadTiltAngle", "TableCradleTiltAngle")
+# Signs of the patient's axes (LPS) along the axes of a patient who lies on the back with the head first. PS3.3 C.7.3.1.1.2.
+_AXES_OF_POSITION = {"HFS": (1, 1, 1), "HFP": (-1, -1, 1), "FFS": (-1, 1, -1), "FFP": (1, -1, -1)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,19 +139,30 @@ def orientation_letters(header: Header) -> tuple[str, str] | None:
     return (letters[0], letters[1]) if len(letters) == 2 and all(letters) else None
 
 
-def table_mm(header: Header) -> tuple[float, float, float] | None:
-    """Return the table top (lateral, longitudinal, vertical) in the machine's frame; None unless all three exist.
+def table_position(header: Header) -> tuple[Point | None, TableOrigin | None]:
+    """Return the table top's position and the origin it counts from.
 
-    (300A,0128) to (300A,012A), otherwise the Enhanced objects' table position to the isocentre (0018,9466) to (0018,9468).
+    The position is in millimetres along the patient's axes (LPS). Both are None unless all three values exist.
+
+    The standard's words "lateral" and "longitudinal" are those of an operator at the table's side, who faces the patient:
+    lateral is towards the head, longitudinal towards the patient's left (PS3.3 C.8.7.4.1.3, C.8.19.6.11). In GE's private
+    block lateral is towards the left, longitudinal towards the head, as recordings of a phantom have shown. Vertical is
+    downwards everywhere. The position of a tilted or turned table counts as unknown, because its axes are not the patient's.
     """
-    for keywords in (
-        ("TableTopLateralPosition", "TableTopLongitudinalPosition", "TableTopVerticalPosition"),
-        ("TableXPositionToIsocenter", "TableZPositionToIsocenter", "TableYPositionToIsocenter"),
-    ):
-        lateral, longitudinal, vertical = (header.number(keyword) for keyword in keywords)
-        if lateral is not None and longitudinal is not None and vertical is not None:
-            return lateral, longitudinal, vertical
-    return None
+    signs = _AXES_OF_POSITION.get(header.text("PatientPosition") or "HFS")
+    if signs is None or any(abs(header.number(angle) or 0.0) > _STILL_DEG for angle in _TABLE_ANGLES):
+        return None, None
+    stated = {
+        TableOrigin.ISOCENTRE: [header.number(f"Table{axis}PositionToIsocenter") for axis in "XYZ"],
+        TableOrigin.TABLE_TOP: [
+            header.number(f"TableTop{name}Position") for name in ("Longitudinal", "Vertical", "Lateral")
+        ],
+        TableOrigin.GE: [header.private_number("DLX_SERIE_01", element) for element in (0x23, 0x21, 0x22)],
+    }
+    for origin, (x, y, z) in stated.items():
+        if x is not None and y is not None and z is not None:
+            return (signs[0] * x, signs[1] * y, signs[2] * z), origin
+    return None, None
 
 
 def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:

@@ -21,7 +21,13 @@ from fluoromap_service.dicom.frames import read_frame
 from fluoromap_service.dicom.header import Header, read_header
 from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
 from fluoromap_service.dicom.pixel_layout import PixelLayout, pixel_layout
-from fluoromap_service.dicom.positioner import gantry_facts, image_axes, orientation_letters, table_mm, warn_of_motion
+from fluoromap_service.dicom.positioner import (
+    gantry_facts,
+    image_axes,
+    orientation_letters,
+    table_position,
+    warn_of_motion,
+)
 from fluoromap_service.dicom.timing import acquisition_time, frame_times_ms
 from fluoromap_service.problem import Problem
 
@@ -94,6 +100,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
     gantry = gantry_facts(header, rows, columns, warnings)
     axes = image_axes(header, gantry, warnings)
     warn_of_motion(header, warnings)
+    table_mm, table_origin = table_position(header)
     pixels = pixel_facts(header, rows, columns, bits_stored, warnings)
     waves = r_wave_frames(header, frames, warnings)
     return InstanceFacts(
@@ -117,12 +124,13 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
         pixel_spacing_mm=gantry.pixel_spacing_mm,
         image_axes=axes,
         patient_orientation=orientation_letters(header),
-        table_mm=table_mm(header),
+        table_mm=table_mm,
         pixels=pixels,
         window=window(header),
         r_wave_frames=waves,
         missing=gantry.missing,
         warnings=tuple(dict.fromkeys(warnings)),
+        table_origin=table_origin,
     )
 
 

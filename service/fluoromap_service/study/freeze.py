@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from fluoromap.registry import DEFAULTS, Kind, UnknownPlugin, plugin
+from fluoromap_service.dicom.facts import Point
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Study
 from fluoromap_service.study import corrections, sites
@@ -24,6 +25,7 @@ from fluoromap_service.study.snapshot import (
     Snapshot,
 )
 from fluoromap_service.study.studies import lock
+from fluoromap_service.study.table_offsets import table_offsets_mm
 
 LAT_SD_MS = 2.0
 """Standard deviation of an activation time whose source gives none: about the difference of two readers."""
@@ -76,6 +78,7 @@ def freeze(
     runs = {run.uid: run for run in runs_of(session, study.id)}
     by_hand = corrections.of_study(session, study.id)
     used = sorted({uid for site in ready for uid in (site.view_a, site.view_b) if uid is not None})
+    offsets = table_offsets_mm(runs[uid].facts for uid in used)
     return Snapshot(
         study=study.id,
         catheters=catheters_of(study),
@@ -83,7 +86,7 @@ def freeze(
         mapping=study.mapping,
         **plugins,
         view=view,
-        runs={uid: _run_snapshot(runs[uid], by_hand.get(uid, {})) for uid in used},
+        runs={uid: _run_snapshot(runs[uid], by_hand.get(uid, {}), offsets.get(uid)) for uid in used},
         sites=tuple(_site_snapshot(site) for site in ready),
         rejected=tuple(
             RejectedSiteSnapshot(
@@ -171,9 +174,13 @@ def _place(site: BoundSite) -> str:
     return f"pairs.{site.pair}" if site.site is None else f"sites.{site.site}"
 
 
-def _run_snapshot(run: StudyRun, by_hand: dict[int, tuple[CorrectedElectrode, ...]]) -> RunSnapshot:
+def _run_snapshot(
+    run: StudyRun, by_hand: dict[int, tuple[CorrectedElectrode, ...]], table_offset_mm: Point | None
+) -> RunSnapshot:
     gantry = effective_gantry(run.facts, run.link.gantry)
     assert gantry is not None, "a ready site's runs have their geometry"
+    if table_offset_mm is not None:
+        gantry = gantry.model_copy(update={"table_offset_mm": table_offset_mm})
     return RunSnapshot(sha256=run.instance.sha256, facts=run.facts.to_json(), gantry=gantry, corrections=by_hand)
 
 
@@ -185,5 +192,11 @@ def _site_snapshot(site: BoundSite) -> SiteSnapshot:
     assert site.view_b is not None
     sd = LAT_SD_MS if site.lat_sd_ms is None else site.lat_sd_ms
     return SiteSnapshot(
-        site=site.site, lat_ms=site.lat_ms, lat_sd_ms=sd, view_a=site.view_a, view_b=site.view_b, bound_by=site.bound_by
+        site=site.site,
+        lat_ms=site.lat_ms,
+        lat_sd_ms=sd,
+        view_a=site.view_a,
+        view_b=site.view_b,
+        bound_by=site.bound_by,
+        doubts=site.doubts,
     )

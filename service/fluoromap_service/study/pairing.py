@@ -19,13 +19,12 @@ from datetime import datetime
 from typing import Literal
 
 from fluoromap.geometry import direction_angle_deg, view_axes
+from fluoromap_service.dicom.facts import TableOrigin
 
 PAIRING_ANGLE_DEG = 30.0
 """Smallest angle between the views of two runs that acquisition time pairs."""
 ROUNDING_DEG = 1e-6
 """Tolerance of the comparison of angles, so that 30 degrees count as 30 degrees."""
-TABLE_STILL_MM = 1.0
-"""Largest distance between two positions of a table that did not move."""
 
 Direction = tuple[float, float, float]
 """Unit vector from the isocentre to the detector in patient axes (LPS)."""
@@ -46,8 +45,8 @@ class Run:
     direction : Direction or None
         None while gantry angles are missing.
     acquired : datetime or None
-    table_mm : tuple of float or None
-        Table top in the machine's own frame.
+    table_origin : TableOrigin or None
+        The attributes that state the table's position; None where it is unknown.
     series_number : int or None
     file_name : str or None
         Name of the uploaded file.
@@ -59,7 +58,7 @@ class Run:
     arrival: int
     direction: Direction | None
     acquired: datetime | None
-    table_mm: tuple[float, float, float] | None = None
+    table_origin: TableOrigin | None = None
     series_number: int | None = None
     file_name: str | None = None
     site: str | None = None
@@ -259,8 +258,8 @@ def _base_name(path: str) -> str:
 def pairs_by_time(runs: Sequence[Run]) -> list[Pair]:
     """Pair runs that follow each other in acquisition time.
 
-    Their views are 30 degrees or more apart, and the table is at rest. A run that repeats a direction stays alone. Of
-    all ways to pair neighbours, the one with most pairs wins; then the one with the least time between the runs of a
+    Their views are 30 degrees or more apart. The table may move between them. A run that repeats a direction stays alone.
+    Of all ways to pair neighbours, the one with most pairs wins; then the one with the least time between the runs of a
     pair; then the earliest.
     """
     timed = sorted((run for run in runs if run.acquired is not None), key=_moment)
@@ -270,7 +269,7 @@ def pairs_by_time(runs: Sequence[Run]) -> list[Pair]:
         skipped = best[index + 1]
         first, second = timed[index], timed[index + 1]
         best[index] = skipped
-        if _apart(first, second) and not table_moved(first, second):
+        if _apart(first, second):
             gap = (_acquired(second) - _acquired(first)).total_seconds()
             count, total, pairs = best[index + 2]
             joined: Best = (count + 1, total + gap, [(first, second), *pairs])
@@ -309,11 +308,13 @@ def _apart(first: Run, second: Run) -> bool:
     return angle is not None and angle >= PAIRING_ANGLE_DEG - ROUNDING_DEG
 
 
-def table_moved(first: Run, second: Run) -> bool:
-    """Return whether both headers give the table's position and it differs between the runs."""
-    if first.table_mm is None or second.table_mm is None:
-        return False
-    return math.dist(first.table_mm, second.table_mm) > TABLE_STILL_MM
+def tables_comparable(first: Run, second: Run) -> bool:
+    """Return whether the table's displacement can be computed, or no run states it.
+
+    Two positions can be compared when they count from the same origin. Otherwise the displacement between the runs is unknown
+    although a header states a position.
+    """
+    return first.table_origin == second.table_origin
 
 
 def lateral_first(first: Run, second: Run) -> Pair:

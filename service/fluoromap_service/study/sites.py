@@ -37,6 +37,8 @@ class BoundSite:
     missing : tuple of str
         Of "site", "lat_ms", "view_a", "view_b", "gantry:view_a", "gantry:view_b".
     warnings : tuple of str
+    doubts : tuple of Reason
+        Why the positions of a pair that a job can use deserve less trust.
     unusable : Reason or None
         Why a job cannot use the pair although nothing is missing.
     angle_deg : float or None
@@ -54,6 +56,7 @@ class BoundSite:
     unusable: Reason | None = None
     angle_deg: float | None = None
     pair: int | None = None
+    doubts: tuple[Reason, ...] = ()
 
     @property
     def ready(self) -> bool:
@@ -144,7 +147,7 @@ def _run_value(run: StudyRun) -> pairing.Run:
         arrival=run.link.id,
         direction=None if primary is None or secondary is None else pairing.central_ray(primary, secondary),
         acquired=run.facts.acquired,
-        table_mm=run.facts.table_mm,
+        table_origin=run.facts.table_origin,
         series_number=run.facts.series_number,
         file_name=run.link.file_name,
         site=run.link.site,
@@ -159,8 +162,9 @@ def _with_geometry(runs: Sequence[StudyRun]) -> set[str]:
 def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
     missing = () if row.lat_ms is not None else ("lat_ms",)
     unusable, angle_deg = _pair_check(runs)
+    doubts = _doubts(runs)
     warnings = [str(Reason.PAIRED_BY_ORDER)] if runs.bound_by == "order" else []
-    warnings += [] if unusable is None else [str(unusable)]
+    warnings += [str(reason) for reason in (*doubts, *([] if unusable is None else [unusable]))]
     return BoundSite(
         site=row.name,
         lat_ms=row.lat_ms,
@@ -172,12 +176,14 @@ def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
         warnings=tuple(warnings),
         unusable=unusable,
         angle_deg=angle_deg,
+        doubts=doubts,
     )
 
 
 def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundSite:
     runs = SiteRuns(*pair)
     unusable, angle_deg = _pair_check(runs)
+    doubts = _doubts(runs)
     return BoundSite(
         site=None,
         lat_ms=None,
@@ -186,10 +192,11 @@ def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundS
         view_b=pair[1].uid,
         bound_by="time",
         missing=("site", "lat_ms", *_missing_runs(runs, with_geometry)),
-        warnings=() if unusable is None else (str(unusable),),
+        warnings=tuple(str(reason) for reason in (*doubts, *([] if unusable is None else [unusable]))),
         unusable=unusable,
         angle_deg=angle_deg,
         pair=number,
+        doubts=doubts,
     )
 
 
@@ -212,11 +219,16 @@ def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
     if runs.a is None or runs.b is None:
         return None, None
     angle_deg = pairing.view_angle_deg(runs.a, runs.b)
-    if pairing.table_moved(runs.a, runs.b):
-        return Reason.TABLE_MOVED, angle_deg
     if angle_deg is not None and angle_deg < PARALLEL_BELOW_DEG:
         return Reason.VIEWS_PARALLEL, angle_deg
     return None, angle_deg
+
+
+def _doubts(runs: SiteRuns) -> tuple[Reason, ...]:
+    """Return why the positions of a usable pair deserve less trust."""
+    if runs.a is None or runs.b is None or pairing.tables_comparable(runs.a, runs.b):
+        return ()
+    return (Reason.TABLE_MOVED,)
 
 
 def site_of(session: Session, study: Study, name: str, *, also_empty: bool = False) -> BoundSite:

@@ -26,7 +26,11 @@ class PluginSnapshot(_Frozen):
 
 
 class GantrySnapshot(_Frozen):
-    """Effective gantry of a run: the header's values, completed and overridden by the study's."""
+    """Effective gantry of a run: the header's values, completed and overridden by the study's.
+
+    ``table_offset_mm`` is the displacement of the table, and of the patient on it, since the study's first run with a known
+    table position: along the patient's axes (LPS), zero where the position is unknown.
+    """
 
     primary_deg: float
     secondary_deg: float
@@ -36,10 +40,24 @@ class GantrySnapshot(_Frozen):
     rows: int
     columns: int
     image_axes: tuple[tuple[int, int], tuple[int, int]]
+    table_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def position(self) -> Gantry:
+        """Return the position of source and detector about the isocentre."""
+        return Gantry(**self.model_dump(exclude={"table_offset_mm"}))
 
     def camera(self) -> Camera:
-        """Return the camera of this gantry position."""
-        return camera_from_gantry(Gantry(**self.model_dump()))
+        """Return the camera in the study's frame, which moves with the patient.
+
+        The origin is the place in the patient where the isocentre was during the first run.
+        """
+        camera = camera_from_gantry(self.position())
+        return camera.translated(self.table_offset_mm) if any(self.table_offset_mm) else camera
+
+    @property
+    def px_per_mm(self) -> float:
+        """Pixels per millimetre at the isocentre, wherever the table is."""
+        return camera_from_gantry(self.position()).px_per_mm
 
 
 class CorrectedElectrode(_Frozen):
@@ -62,7 +80,7 @@ class RunSnapshot(_Frozen):
 
 
 class SiteSnapshot(_Frozen):
-    """A ready site: two runs and an activation time."""
+    """A ready site: two runs and an activation time; ``doubts``: why its positions deserve less trust."""
 
     site: str
     lat_ms: float
@@ -70,6 +88,7 @@ class SiteSnapshot(_Frozen):
     view_a: str
     view_b: str
     bound_by: str = "explicit"
+    doubts: tuple[Reason, ...] = ()
 
     def run(self, view: View) -> str:
         """Return the SOP Instance UID of a view."""

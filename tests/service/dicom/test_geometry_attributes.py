@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pydicom
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydicom.dataset import Dataset
-from pydicom.uid import EnhancedXAImageStorage
+from pydicom.uid import EnhancedXAImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from fluoromap.geometry import Gantry, camera_from_gantry, view_axes
 from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom import HeaderWarning, InstanceFacts, image_axes_from_orientation, read_instance
+from fluoromap_service.dicom.facts import TableOrigin
 from fluoromap_service.dicom.orientation import (
     field_of_view_of,
     image_axes_from_field_of_view,
@@ -228,7 +230,8 @@ def test_enhanced_xa(make_xa: MakeXa) -> None:
     assert (found.source_detector_mm, found.source_isocentre_mm) == (1050, 770)
     assert found.pixel_spacing_mm == (0.3, 0.3)
     assert found.image_axes == ((-1, 0), (0, 1))
-    assert found.table_mm == (3, 100, 900)
+    # Lateral is head to foot and longitudinal left to right, PS3.3 C.8.19.6.11 and C.8.7.4.1.3.
+    assert (found.table_mm, found.table_origin) == ((100, 900, 3), TableOrigin.TABLE_TOP)
     assert found.plane == "B"
     assert found.pixels.logarithmic
     assert found.pixels.shutter is not None
@@ -241,3 +244,85 @@ def test_enhanced_xa_that_moved(make_xa: MakeXa) -> None:
     found = enhanced(make_xa, [30, 35, 40], [100, 102, 110])
     assert set(found.warnings) == {HeaderWarning.POSITIONER_MOVED, HeaderWarning.TABLE_MOVED}
     assert found.primary_deg == 30
+
+
+def ge_block(dataset: Dataset, lateral: str, longitudinal: str, vertical: str, block: int = 0x10) -> None:
+    """Add GE's private table position; ``block``: the creator's element number."""
+    dataset.add_new((0x0019, block), "LO", "DLX_SERIE_01")
+    for element, value in ((0x21, vertical), (0x22, longitudinal), (0x23, lateral)):
+        dataset.add_new((0x0019, block << 8 | element), "DS", value)
+
+
+def with_private_block(make_xa: MakeXa, change: Callable[[Dataset], None], **attributes: Any) -> InstanceFacts:
+    path = make_xa(FRAMES, **attributes)
+    dataset = pydicom.dcmread(path)
+    change(dataset)
+    dataset.save_as(path)
+    return read_instance(path)
+
+
+@pytest.mark.parametrize("block", [0x10, 0x11, 0xFF])
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian])
+def test_table_position_in_the_private_block_of_ge(make_xa: MakeXa, block: int, syntax: str) -> None:
+    def change(dataset: Dataset) -> None:
+        ge_block(dataset, "9.20", "503.90", "84", block)
+
+    found = with_private_block(make_xa, change, syntax=syntax)
+    assert (found.table_mm, found.table_origin) == ((9.2, 84.0, 503.9), TableOrigin.GE)
+
+
+def test_the_same_elements_of_another_creator_are_no_table_position(make_xa: MakeXa) -> None:
+    def change(dataset: Dataset) -> None:
+        ge_block(dataset, "1", "2", "3")
+        dataset[0x0019, 0x0010].value = "OTHER_SERIE_01"
+
+    found = with_private_block(make_xa, change)
+    assert (found.table_mm, found.table_origin) == (None, None)
+
+
+def test_an_incomplete_private_table_position_is_none(make_xa: MakeXa) -> None:
+    found = with_private_block(make_xa, lambda dataset: ge_block(dataset, "1", "", "3"))
+    assert (found.table_mm, found.table_origin) == (None, None)
+
+
+STANDARD_TABLE = {
+    "TableTopLateralPosition": 3.0,
+    "TableTopLongitudinalPosition": 1.0,
+    "TableTopVerticalPosition": 2.0,
+}
+ISOCENTRE_TABLE = {
+    "TableXPositionToIsocenter": 4.0,
+    "TableYPositionToIsocenter": 5.0,
+    "TableZPositionToIsocenter": 6.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        (STANDARD_TABLE, ((1, 2, 3), TableOrigin.TABLE_TOP)),
+        (ISOCENTRE_TABLE, ((4, 5, 6), TableOrigin.ISOCENTRE)),
+        (STANDARD_TABLE | ISOCENTRE_TABLE, ((4, 5, 6), TableOrigin.ISOCENTRE)),
+    ],
+)
+def test_standard_attributes_of_the_table_win_over_private_ones(
+    make_xa: MakeXa, attributes: dict[str, float], expected: tuple[tuple[float, float, float], TableOrigin]
+) -> None:
+    found = with_private_block(make_xa, lambda dataset: ge_block(dataset, "9", "8", "7"), **attributes)
+    assert (found.table_mm, found.table_origin) == expected
+
+
+@pytest.mark.parametrize(
+    ("position", "table_mm"),
+    [("HFS", (1, 2, 3)), ("HFP", (-1, -2, 3)), ("FFS", (-1, 2, -3)), ("FFP", (1, -2, -3)), ("HFDL", None)],
+)
+def test_the_table_moves_along_the_axes_of_the_patient_as_he_lies(
+    make_xa: MakeXa, position: str, table_mm: tuple[float, float, float] | None
+) -> None:
+    assert facts(make_xa, PatientPosition=position, **STANDARD_TABLE).table_mm == table_mm
+
+
+@pytest.mark.parametrize("angle", ["TableAngle", "TableHorizontalRotationAngle", "TableHeadTiltAngle"])
+def test_the_position_of_a_tilted_table_is_unknown(make_xa: MakeXa, angle: str) -> None:
+    assert facts(make_xa, **{angle: 0.1}, **STANDARD_TABLE).table_mm is not None
+    assert facts(make_xa, **{angle: 5.0}, **STANDARD_TABLE).table_mm is None

@@ -10,6 +10,7 @@ import pytest
 from pydicom.pixels.utils import pixel_array
 
 from fluoromap_service.dicom import DicomCode, open_frames, read_instance
+from fluoromap_service.dicom.facts import TableOrigin
 from fluoromap_service.problem import Problem
 
 Sample = Callable[[str], Path]
@@ -63,3 +64,11 @@ def test_radiofluoroscopy_shutter(sample: Sample) -> None:
     assert facts.pixels.shutter.rectangle == (9, 949, 9, 949)
     assert facts.pixels.shutter.polygon is None
     assert facts.window == (127, 255)
+
+
+def test_table_positions_of_a_real_c_arm_in_its_private_block(sample: Sample) -> None:
+    runs = [read_instance(sample(f"real_c_arm/ge_phantom_im{number}.dcm")) for number in range(1, 9)]
+    assert {run.table_origin for run in runs} == {TableOrigin.GE}
+    assert [run.table_mm for run in runs] == [
+        *[(9.2, 84.0, 503.9)] * 4, (9.2, 66.3, 503.9), (7.7, 55.1, 470.2), (-7.5, 55.1, 510.0), (29.6, 55.1, 522.3),
+    ]  # fmt: skip

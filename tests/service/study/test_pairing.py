@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fluoromap_service.dicom.facts import TableOrigin
 from fluoromap_service.study.pairing import (
     Pairing,
     Run,
@@ -18,7 +19,7 @@ from fluoromap_service.study.pairing import (
     named_run,
     pair_runs,
     pairs_by_time,
-    table_moved,
+    tables_comparable,
     view_angle_deg,
 )
 
@@ -70,11 +71,22 @@ def test_runs_without_time_or_angles_stay_alone() -> None:
     assert view_angle_deg(run(1, None), run(2, PA)) is None
 
 
-def test_a_table_that_moved_prevents_pairing_by_time() -> None:
-    still, moved = (0.0, 0.0, 0.0), (0.0, 1.1, 0.0)
-    assert not table_moved(run(1, LAT, table_mm=still), run(2, PA, table_mm=(0.0, 0.9, 0.0)))
-    assert not table_moved(run(1, LAT, table_mm=still), run(2, PA))
-    assert pairs_by_time([run(1, LAT, table_mm=still), run(2, PA, table_mm=moved)]) == []
+@pytest.mark.parametrize(
+    ("first", "second", "comparable"),
+    [
+        (TableOrigin.GE, TableOrigin.GE, True),
+        (None, None, True),
+        (TableOrigin.GE, None, False),
+        (None, TableOrigin.TABLE_TOP, False),
+        (TableOrigin.GE, TableOrigin.TABLE_TOP, False),
+    ],
+)
+def test_only_positions_of_the_table_with_the_same_origin_can_be_compared(
+    first: TableOrigin | None, second: TableOrigin | None, comparable: bool
+) -> None:
+    pair = run(1, LAT, table_origin=first), run(2, PA, table_origin=second)
+    assert tables_comparable(*pair) is comparable
+    assert len(pairs_by_time(pair)) == 1
 
 
 def test_view_a_is_nearer_to_lateral_unless_somebody_named_the_views() -> None:

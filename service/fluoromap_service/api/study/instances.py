@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap.geometry import LEAST_SOURCE_MM, Gantry
+from fluoromap.geometry import LEAST_SOURCE_MM
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
@@ -283,7 +283,7 @@ def _check_gantry(run: StudyRun) -> None:
     if gantry is None:
         return
     try:
-        Gantry(**gantry.model_dump())
+        gantry.position()
     except ValueError as error:
         raise Problem(
             422,

@@ -6,15 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from small_runs import edited, run_uid, small_run
 
+from fluoromap.geometry import camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies
 from fluoromap_service.study.freeze import PipelineRequest, freeze
+from fluoromap_service.study.snapshot import Snapshot
 
 Upload = Callable[..., Any]
 LAT, PA = -90.0, 0.0
@@ -254,31 +257,56 @@ def test_a_pair_between_20_and_30_degrees_is_computed(service: TestClient, study
     assert _reasons(study_path, "X") == ()
 
 
-def test_a_table_that_moved_is_not_paired_and_refused_when_named(
-    service: TestClient, study_path: str, upload: Upload, tmp_path: Path, site_list: Any
-) -> None:
-    upload((1, LAT))
-    moved = edited(
-        small_run(tmp_path, 2, PA),
-        TableTopLateralPosition=30,
-        TableTopLongitudinalPosition=0,
-        TableTopVerticalPosition=0,
-    )
-    still = edited(
-        small_run(tmp_path, 1, LAT),
-        SOPInstanceUID="2.25.77",
-        TableTopLateralPosition=0,
-        TableTopLongitudinalPosition=0,
-        TableTopVerticalPosition=0,
-    )
-    service.delete(f"{study_path}/instances/{run_uid(1)}")
-    for content in (moved, still):
+def _table(lateral: float, longitudinal: float, vertical: float) -> dict[str, float]:
+    return {
+        "TableTopLateralPosition": lateral,
+        "TableTopLongitudinalPosition": longitudinal,
+        "TableTopVerticalPosition": vertical,
+    }
+
+
+def _frozen(study_path: str) -> Snapshot:
+    with writing() as session:
+        return freeze(session, studies.get(session, study_path.rsplit("/", 1)[1]), PipelineRequest())
+
+
+def _send(service: TestClient, study_path: str, *contents: bytes) -> None:
+    for content in contents:
         answer = service.post(f"{study_path}/instances", content=content, headers={"Content-Type": "application/dicom"})
         assert answer.status_code == 201, answer.text
-    assert site_list() == {}
-    put = service.put(f"{study_path}/sites/X", json={"lat_ms": 1, "view_a": "2.25.77", "view_b": run_uid(2)}).json()
-    assert "table_moved" in put["warnings"]
-    assert _reasons(study_path, "X") == (Reason.TABLE_MOVED,)
+
+
+def test_runs_with_a_moved_table_are_paired_in_the_frame_of_the_first_run(
+    service: TestClient, study_path: str, tmp_path: Path, site_list: Any
+) -> None:
+    still = edited(small_run(tmp_path, 1, LAT), **_table(1, 2, 3))
+    moved = edited(small_run(tmp_path, 2, PA), **_table(31, 12, -2))
+    _send(service, study_path, moved, still)
+    assert _views(site_list()["pair 1"]) == (run_uid(1), run_uid(2), "time")
+    put = service.put(f"{study_path}/sites/X", json={"lat_ms": 1, "view_a": run_uid(1), "view_b": run_uid(2)}).json()
+    assert put["warnings"] == []
+    runs = _frozen(study_path).runs
+    first, second = (runs[run_uid(number)].gantry for number in (1, 2))
+    assert (first.table_offset_mm, second.table_offset_mm) == ((0, 0, 0), (10, -5, 30))
+    # A point of the patient that the table carried along.
+    point = np.array([4.0, -7.0, 11.0])
+    np.testing.assert_allclose(first.camera().project(point), camera_from_gantry(first.position()).project(point))
+    np.testing.assert_allclose(
+        second.camera().project(point), camera_from_gantry(second.position()).project(point + np.array([10, -5, 30]))
+    )
+    assert second.px_per_mm == camera_from_gantry(second.position()).px_per_mm
+
+
+def test_a_table_position_that_only_one_run_states_is_a_doubt(
+    service: TestClient, study_path: str, tmp_path: Path
+) -> None:
+    _send(service, study_path, edited(small_run(tmp_path, 1, LAT), **_table(1, 2, 3)), small_run(tmp_path, 2, PA))
+    put = service.put(f"{study_path}/sites/X", json={"lat_ms": 1, "view_a": run_uid(1), "view_b": run_uid(2)}).json()
+    assert (put["missing"], put["warnings"]) == ([], ["table_moved"])
+    assert _reasons(study_path, "X") == ()
+    snapshot = _frozen(study_path)
+    assert snapshot.site("X").doubts == (Reason.TABLE_MOVED,)
+    assert {run.gantry.table_offset_mm for run in snapshot.runs.values()} == {(0, 0, 0)}
 
 
 def test_no_ready_site_lists_what_each_misses(service: TestClient, study_path: str, upload: Upload) -> None:
