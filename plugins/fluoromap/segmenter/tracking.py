@@ -38,7 +38,7 @@ TrackJudge = Callable[[Mapping[int, Chain]], bool]
 """frame -> chain of one track -> whether the run shows a catheter there."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Track:
     """A catheter along the run.
 
@@ -131,18 +131,17 @@ def track_chains(
     if not found:
         return ()
     tracks = _follow(found, frame_times_ms, catheters, search, seed)
-    if accepts is not None:
-        for _ in range(_MOST_RETRIES):
-            wrong = [track for track in tracks if not track.manual and not accepts(track.chains)]
-            if not wrong:
-                break
-            # A false track may have taken a catheter's place.
-            tracks = [track for track in tracks if track not in wrong]
-            found = [_without(entry, wrong) for entry in found]
-            seed = None if seed is None else _without(seed, wrong)
-            if any(entry.chains for entry in found):
-                tracks = _follow(found, frame_times_ms, catheters, search, seed)
-        tracks = [track for track in tracks if track.manual or accepts(track.chains)]
+    for attempt in range(_MOST_RETRIES + 1):
+        wrong = [track for track in tracks if not (accepts is None or track.manual or accepts(track.chains))]
+        tracks = [track for track in tracks if track not in wrong]
+        if not wrong or attempt == _MOST_RETRIES:
+            break
+        # A false track may have taken a catheter's place.
+        found = [_without(entry, wrong) for entry in found]
+        seed = None if seed is None else _without(seed, wrong)
+        if not any(entry.chains for entry in found):
+            break
+        tracks = _follow(found, frame_times_ms, catheters, search, seed)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
     tracks_kept = [
         track

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ SHARED_MS = 21.0
 _OWN_CELLS, _MEAN_CELLS, _NEXT_FRAME_CELLS = 1, 2, 3
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
 _REACH_PX = 6.0
+_LOOSE_PX = 3.0
 
 
 @dataclass(slots=True, eq=False)
@@ -87,7 +88,9 @@ class FrameSearch:
             self.network.reach_cells = max(reach_cells, _MEAN_CELLS)
             chains: list[Chain] = []
             for chain in entry.chains:
-                again = self.detector.find_again(x, chain, np.zeros(2), _REACH_PX, chains)
+                # The frame is part of the mean: its place there is no independent measurement.
+                loose = replace(chain, covariance_px2=chain.covariance_px2 + _LOOSE_PX**2 * np.eye(2))
+                again = self.detector.find_again(x, loose, np.zeros(2), _REACH_PX, chains)
                 chains += [] if again is None else [again]
             entry = FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
         self.network.reach_cells = _OWN_CELLS

@@ -6,8 +6,9 @@ noise: a catheter becomes clear in it, while beads of contrast medium stay as im
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import affine_transform
@@ -21,19 +22,24 @@ from fluoromap.segmenter.proposals import log_odds
 
 _AVERAGED = 8
 _PICTURES = 3
-_MARGIN_PX = 48.0
+_MARGIN_PX = 40.0
+_KEPT_FRAMES = _PICTURES * _AVERAGED
 _LEAST_SHARE = 0.6
 _LEAST_MEDIAN, _LEAST_LOW = 0.1, -1.5
 _LOW_QUANTILE = 0.1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class TrackEvidence:
-    """Judge of the tracks of one run. log_image : frame -> log image. frames : number of the run's frames."""
+    """Judge of the tracks of one run.
+
+    frames : number of the run's frames.
+    """
 
     trained: Trained
     px_per_mm: float
     frames: int
+    _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
     def __call__(self, chains: Mapping[int, Chain], log_image: Callable[[int], Image]) -> bool:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
@@ -41,8 +47,8 @@ class TrackEvidence:
             return False
         numbers = sorted(chains)
         odds = np.array([self._log_odds(chains, group, log_image) for group in _groups(numbers)])
-        low = np.quantile(odds, _LOW_QUANTILE, axis=1, method="lower")
-        return bool((np.median(odds, axis=1) >= _LEAST_MEDIAN).all() and (low >= _LEAST_LOW).all())
+        low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
+        return bool((np.median(odds, axis=1) >= _LEAST_MEDIAN).all() and low >= _LEAST_LOW)
 
     def _log_odds(
         self, chains: Mapping[int, Chain], group: Sequence[int], log_image: Callable[[int], Image]
@@ -55,11 +61,21 @@ class TrackEvidence:
         for frame in group:
             turn, shift = _similarity(middle, chains[frame].pixels_uv)
             offset = (turn @ first + shift + 0.5) * scale - 0.5
-            small = resampled(log_image(frame), scale)
+            small = self._small(frame, log_image, scale)
             total += affine_transform(small, turn[::-1, ::-1], offset[::-1], total.shape, order=1, mode="nearest")
         total /= len(group)
         seen = NetworkResponse.of_reduced(total, self.trained, scale)
         return log_odds(seen.probability_at(middle - first))
+
+
+    def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
+        """Return a frame at the network's scale; the latest are kept for the other tracks."""
+        small = self._reduced.get(frame)
+        if small is None:
+            small = self._reduced[frame] = resampled(log_image(frame), scale)
+            if len(self._reduced) > _KEPT_FRAMES:
+                self._reduced.popitem(last=False)
+        return small
 
 
 def _groups(frames: Sequence[int]) -> list[Sequence[int]]:
