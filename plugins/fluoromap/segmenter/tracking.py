@@ -28,7 +28,8 @@ _SEEN_AT_LEAST = 0.2
 _RECOVERED_AT_LEAST = 0.5
 _LONG_RUN = 5
 _REVERSED_PX = 4.0
-_MOST_RETRIES = 2
+_MOST_RETRIES, _JUDGED_FRAMES = 2, 4
+_ACCEPTED_AT_LEAST = 0.6
 
 ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
@@ -119,8 +120,8 @@ def track_chains(
     seed : FrameChains, optional
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
     accepts : TrackJudge, optional
-        Decides about each track. Where it rejects one, the run is tracked again without the track's chains, twice at most. All are
-        accepted by default.
+        Decides about each track of four or more frames. Where it rejects one, the run is tracked again without the track's chains,
+        twice at most. An accepted track has chains in 0.6 of the frames. All tracks are accepted by default.
 
     Returns
     -------
@@ -131,24 +132,17 @@ def track_chains(
     if not found:
         return ()
     tracks = _follow(found, frame_times_ms, catheters, search, seed)
-    for attempt in range(_MOST_RETRIES + 1):
-        wrong = [track for track in tracks if not (accepts is None or track.manual or accepts(track.chains))]
-        tracks = [track for track in tracks if track not in wrong]
-        if not wrong or attempt == _MOST_RETRIES:
-            break
-        # A false track may have taken a catheter's place.
-        found = [_without(entry, wrong) for entry in found]
-        seed = None if seed is None else _without(seed, wrong)
-        if not any(entry.chains for entry in found):
-            break
-        tracks = _follow(found, frame_times_ms, catheters, search, seed)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
+    if accepts is not None:
+        least = max(least, _ACCEPTED_AT_LEAST * len(found))
+        tracks = _accepted(tracks, found, frame_times_ms, catheters, search, accepts)
     tracks_kept = [
         track
         for track in tracks
         if track.manual
         or track.detections >= least
         or (track.from_seed and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found)))
+        or (accepts is not None and len(track.chains) >= least)
     ]
     tracks_kept.sort(key=lambda track: -track.detections)
     for track in tracks_kept:
@@ -195,6 +189,34 @@ def _follow(
                 track.velocity = _first_velocity(track.chains, frame_times_ms)
         for frame in frames:
             _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search)
+    return tracks
+
+
+def _accepted(
+    tracks: list[_Track],
+    found: Sequence[FrameChains],
+    frame_times_ms: Array,
+    catheters: int,
+    search: ChainSearch | None,
+    accepts: TrackJudge,
+) -> list[_Track]:
+    """Return the tracks without wrong ones.
+
+    A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
+    """
+    judged = min(_JUDGED_FRAMES, len(found))
+    for attempt in range(_MOST_RETRIES + 1):
+        wrong = [
+            track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
+        ]
+        tracks = [track for track in tracks if track not in wrong]
+        found = [_without(entry, wrong) for entry in found]
+        if not wrong or attempt == _MOST_RETRIES or not any(entry.chains for entry in found):
+            break
+        sure = [track for track in tracks if len(track.chains) >= judged]
+        start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in sure))
+        seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
+        tracks = _follow(found, frame_times_ms, catheters, search, seed)
     return tracks
 
 

@@ -23,50 +23,48 @@ from fluoromap.segmenter.proposals import log_odds
 _AVERAGED = 8
 _PICTURES = 3
 _MARGIN_PX = 40.0
+_SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
-_LEAST_SHARE = 0.6
-_LEAST_MEDIAN, _LEAST_LOW = 0.1, -1.5
+_LEAST_MEDIAN, _LEAST_LOW = 0.2, -1.5
 _LOW_QUANTILE = 0.1
 
 
 @dataclass(slots=True, eq=False)
 class TrackEvidence:
-    """Judge of the tracks of one run.
-
-    frames : number of the run's frames.
-    """
+    """Judge of the tracks of one run."""
 
     trained: Trained
     px_per_mm: float
-    frames: int
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
     def __call__(self, chains: Mapping[int, Chain], log_image: Callable[[int], Image]) -> bool:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
-        if len(chains) < _LEAST_SHARE * self.frames:
-            return False
-        numbers = sorted(chains)
-        odds = np.array([self._log_odds(chains, group, log_image) for group in _groups(numbers)])
+        frames = sorted(chains)
+        paths = np.array([chains[frame].pixels_uv for frame in frames])
+        odds = np.array(
+            [
+                np.concatenate([self._log_odds(frames[group], part, log_image) for part in _sections(paths[group])])
+                for group in _groups(len(frames))
+            ]
+        )
         low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
         return bool((np.median(odds, axis=1) >= _LEAST_MEDIAN).all() and low >= _LEAST_LOW)
 
-    def _log_odds(
-        self, chains: Mapping[int, Chain], group: Sequence[int], log_image: Callable[[int], Image]
-    ) -> Array:
+    def _log_odds(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
+        """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
         scale = network_scale(self.px_per_mm)
-        middle = chains[group[len(group) // 2]].pixels_uv
+        middle = path_uv[len(frames) // 2]
         first = np.floor(middle.min(axis=0) - _MARGIN_PX / scale)
         columns, rows = np.ceil((middle.max(axis=0) - first) * scale + _MARGIN_PX).astype(np.int64)
         total = np.zeros((rows, columns), np.float32)
-        for frame in group:
-            turn, shift = _similarity(middle, chains[frame].pixels_uv)
+        for frame, points in zip(frames, path_uv, strict=True):
+            turn, shift = _similarity(middle, points)
             offset = (turn @ first + shift + 0.5) * scale - 0.5
             small = self._small(frame, log_image, scale)
             total += affine_transform(small, turn[::-1, ::-1], offset[::-1], total.shape, order=1, mode="nearest")
-        total /= len(group)
+        total /= len(frames)
         seen = NetworkResponse.of_reduced(total, self.trained, scale)
         return log_odds(seen.probability_at(middle - first))
-
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
@@ -78,12 +76,16 @@ class TrackEvidence:
         return small
 
 
-def _groups(frames: Sequence[int]) -> list[Sequence[int]]:
-    """Return up to three groups of up to eight frames, evenly spread over a track."""
-    size = min(_AVERAGED, len(frames))
-    count = min(_PICTURES, -(-len(frames) // size))
-    starts = np.linspace(0, len(frames) - size, count).astype(np.int64)
-    return [frames[start : start + size] for start in starts]
+def _groups(frames: int) -> list[slice]:
+    """Return up to three groups of up to eight of a track's frames, evenly spread."""
+    size = min(_AVERAGED, frames)
+    count = min(_PICTURES, -(-frames // size))
+    return [slice(start, start + size) for start in np.linspace(0, frames - size, count).astype(np.int64).tolist()]
+
+
+def _sections(path_uv: Array) -> list[Array]:
+    """Split a path (frames, electrodes, 2) into sections of about five electrodes: long catheters bend as they move."""
+    return np.array_split(path_uv, -(-path_uv.shape[1] // _SECTION), axis=1)
 
 
 def _similarity(points: Array, moved: Array) -> tuple[Array, Array]:
