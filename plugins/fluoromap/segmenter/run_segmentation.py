@@ -149,6 +149,9 @@ def segment_run(
         chains = _add_missing_catheters(mean_image, chains, detector, averaged, entries, catheters)
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
+    if shows_catheter is not None and count > 1:
+        tracks = {chain.track for entry in entries for chain in entry.chains}
+        chains = tuple(chain for chain in chains if chain.manual or chain.track in tracks)
     reason = None if chains else Reason.MANUAL_NEEDED
     if chains and detector.shows_extra_catheter(mean_image, chains):
         reason = Reason.EXTRA_CATHETER

@@ -43,14 +43,14 @@ class TrackEvidence:
         paths = np.array([chains[frame].pixels_uv for frame in frames])
         odds = np.array(
             [
-                np.concatenate([self._log_odds(frames[group], part, log_image) for part in _sections(paths[group])])
+                np.concatenate([self.log_odds_along(frames[group], part, log_image) for part in _sections(paths[group])])
                 for group in _groups(len(frames))
             ]
         )
         low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
         return bool((np.median(odds, axis=1) >= _LEAST_MEDIAN).all() and low >= _LEAST_LOW)
 
-    def _log_odds(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
+    def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
         scale = network_scale(self.px_per_mm)
         middle = path_uv[len(frames) // 2]
