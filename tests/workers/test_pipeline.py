@@ -19,7 +19,7 @@ from fluoromap.contracts import Context, Marks, Refusal, Run, Segmentation
 from fluoromap.fuser.smooth_surface import SmoothSurface
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.store.engine import reading
@@ -177,16 +177,16 @@ def test_the_doubt_of_a_half_known_table_reaches_the_points(
 def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    segment = CatheterChain.segment
+    segment = LearnedChain.segment
     calls: list[int] = []
 
-    def fails_once(self: CatheterChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
+    def fails_once(self: LearnedChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
         calls.append(1)
         if len(calls) == 1:
             raise ArithmeticError("the plugin's own words")
         return segment(self, run, catalogue, corrections, context)
 
-    monkeypatch.setattr(CatheterChain, "segment", fails_once)
+    monkeypatch.setattr(LearnedChain, "segment", fails_once)
     job = _job(service, sent)
     assert job["state"] == "succeeded"
     failed = [row for row in job["stages"] if row["state"] == "failed"]
@@ -200,7 +200,7 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
 
 
 REFUSALS = {
-    "segmenter": (CatheterChain, "segment", Reason.MANUAL_NEEDED),
+    "segmenter": (LearnedChain, "segment", Reason.MANUAL_NEEDED),
     "triangulator": (MaximumLikelihood, "triangulate", Reason.TABLE_MOVED),
     "monoplane": (MotionPrior, "track", Reason.DEPTH_UNOBSERVABLE),
     "fuser": (SmoothSurface, "fuse", Reason.TOO_FEW_SITES),

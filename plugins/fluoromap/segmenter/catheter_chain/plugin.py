@@ -1,4 +1,4 @@
-"""Segmenter ``catheter-chain``, the default: blobs linked to chains that fit the catalogue."""
+"""Segmenter ``catheter-chain``: blobs linked to chains that fit the catalogue."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CatheterChain:
     """
 
     name: ClassVar[str] = "catheter-chain"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
     Params: ClassVar[type[BaseModel]] = NoParams
 
     def __init__(self, params: BaseModel | None = None) -> None:

@@ -45,7 +45,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "3"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -76,6 +76,6 @@ class LearnedChain:
         def detector_of(field: FieldMask) -> Detector:
             return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
 
-        judge = None if alone else TrackEvidence(trained, run.px_per_mm)
+        judge = None if alone else TrackEvidence(trained, run.px_per_mm, len(run.frames))
         found = segment_run(run, catalogue, marks, context, detector_of, True, judge)
         return visible_part(found, _DIM_BELOW)

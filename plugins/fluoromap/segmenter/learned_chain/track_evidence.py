@@ -25,16 +25,22 @@ _PICTURES = 3
 _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
-_LEAST_MEDIAN, _LEAST_LOW = 0.2, -1.5
+_LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.2, -2.0
+"""Log-odds of the middle electrode in each mean; less where half of the single frames show the catheter; of the worst electrode."""
 _LOW_QUANTILE = 0.1
+_CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
 @dataclass(slots=True, eq=False)
 class TrackEvidence:
-    """Judge of the tracks of one run."""
+    """Judge of the tracks of one run.
+
+    frames : number of the run's frames.
+    """
 
     trained: Trained
     px_per_mm: float
+    frames: int
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
     def __call__(self, chains: Mapping[int, Chain], log_image: Callable[[int], Image]) -> bool:
@@ -47,8 +53,10 @@ class TrackEvidence:
                 for group in _groups(len(frames))
             ]
         )
+        clear = sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames
         low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
-        return bool((np.median(odds, axis=1) >= _LEAST_MEDIAN).all() and low >= _LEAST_LOW)
+        least = _LEAST_WHERE_CLEAR if clear else _LEAST_MEDIAN
+        return bool((np.median(odds, axis=1) >= least).all() and low >= _LEAST_LOW)
 
     def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
@@ -74,6 +82,11 @@ class TrackEvidence:
             if len(self._reduced) > _KEPT_FRAMES:
                 self._reduced.popitem(last=False)
         return small
+
+
+def _is_clear(chain: Chain) -> bool:
+    """Return whether network and contrast show a chain in its frame."""
+    return bool(np.median(chain.scores) >= _CLEAR_SCORE and chain.scores.min() >= _LEAST_CLEAR_SCORE)
 
 
 def _groups(frames: int) -> list[slice]:

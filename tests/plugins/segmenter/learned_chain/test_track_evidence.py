@@ -44,7 +44,7 @@ def chains(path_uv):
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
     trained = read_weights(Path(SHIPPED))
-    judge = TrackEvidence(trained, PX_PER_MM)
+    judge = TrackEvidence(trained, PX_PER_MM, FRAMES)
     alone = [NetworkResponse.of_image(image, trained, PX_PER_MM) for image in images]
     for path_uv in noisy.truth.pixels_uv.values():
         assert judge(chains(path_uv), lambda frame: images[frame])
@@ -56,7 +56,7 @@ def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images)
 
 
 def test_a_track_beside_the_catheters_is_rejected(noisy, images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     path_uv = noisy.truth.pixels_uv["reference"]
     for shift in ([0.0, 60.0], [70.0, 0.0], [-55.0, -40.0]):
         beside = path_uv + np.array(shift)
@@ -64,7 +64,7 @@ def test_a_track_beside_the_catheters_is_rejected(noisy, images):
 
 
 def test_a_long_catheter_is_judged_in_sections(images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     row = np.stack([np.linspace(100.0, 400.0, 20), np.full(20, 200.0)], axis=1)
     path_uv = np.repeat(row[None], FRAMES, axis=0)
     assert not judge(chains(path_uv), lambda frame: images[frame])
