@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -16,12 +15,15 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
-from fluoromap.segmenter.tracking import ChainSearch, chain_distance, track_chains
+from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
 
 _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
+
+RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image]], bool]
+"""(frame -> chain of one track, frame -> log image) -> whether the run shows a catheter there."""
 
 
 class Detector(Protocol):
@@ -74,7 +76,7 @@ def segment_run(
     context: Context,
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
-    shows_catheter: Callable[[Mapping[int, Chain], Callable[[int], Image]], bool] | None = None,
+    shows_catheter: RunJudge | None = None,
 ) -> Segmentation:
     """Segment a run: tracked chains of all frames, and diastolic chains.
 
@@ -97,9 +99,8 @@ def segment_run(
         The field mask of the run -> the detector to use.
     search_again : bool
         Whether to search for missing catheters with :meth:`Detector.find_again`.
-    shows_catheter : callable, optional
-        Chains of one track (frame -> chain), log images (frame -> image) -> whether the run shows a catheter there. All tracks
-        and all diastolic chains are accepted by default; else a diastolic chain needs an accepted track.
+    shows_catheter : RunJudge, optional
+        Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     """
     context.check()
     field = find_field(run.frames, run.pixels)
@@ -117,7 +118,9 @@ def segment_run(
     images: deque[tuple[int, Image]] = deque(maxlen=3)
     for index in range(count):
         context.check()
-        images += [(after, log_image(after)) for after in range(images[-1][0] + 1 if images else 0, min(index + 2, count))]
+        images += [
+            (after, log_image(after)) for after in range(images[-1][0] + 1 if images else 0, min(index + 2, count))
+        ]
         (x,) = (image for number, image in images if number == index)
         motion[index] = meter(x)
         entry = detector.find_chains(x, index, _beside(index, images, run.frame_times_ms))
@@ -140,7 +143,7 @@ def segment_run(
     catheters = len(catalogue.catheters)
     search = _chain_search(detector, log_image, context) if search_again else None
     seed = mean if len(averaged) > 1 else None
-    accepts = None if shows_catheter is None else partial(shows_catheter, log_image=log_image)
+    accepts = None if shows_catheter is None else _judge(shows_catheter, log_image)
     entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
@@ -174,6 +177,10 @@ def _beside(frame: int, images: Iterable[tuple[int, Image]], frame_times_ms: Arr
         for number, image in images
         if number != frame and abs(frame_times_ms[number] - frame_times_ms[frame]) <= _SAME_MOMENT_MS
     ]
+
+
+def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image]) -> TrackJudge:
+    return lambda chains: shows_catheter(chains, log_image)
 
 
 def _chain_search(detector: Detector, log_image: Callable[[int], Image], context: Context) -> ChainSearch:

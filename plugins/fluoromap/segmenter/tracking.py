@@ -29,7 +29,7 @@ _RECOVERED_AT_LEAST = 0.5
 _LONG_RUN = 5
 _REVERSED_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
-_ACCEPTED_AT_LEAST = 0.6
+_ACCEPTED_AT_LEAST = 0.5
 
 ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
@@ -121,7 +121,7 @@ def track_chains(
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
     accepts : TrackJudge, optional
         Decides about each track of four or more frames. Where it rejects one, the run is tracked again without the track's chains,
-        twice at most. An accepted track has chains in 0.6 of the frames. All tracks are accepted by default.
+        twice at most. An accepted track has chains in half of the frames. All tracks are accepted by default.
 
     Returns
     -------

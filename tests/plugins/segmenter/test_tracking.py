@@ -101,7 +101,9 @@ def test_a_rejected_track_leaves_its_place_to_the_catheter_that_it_kept_out():
 
     found = run([[false] if frame < 8 else [right] for frame in range(20)])
     assert len({one.track for entry in track_chains(found, times(20), 1, search) for one in entry.chains}) <= 2
-    entries = track_chains(found, times(20), 1, search, accepts=lambda chains: chains[max(chains)].pixels_uv[0, 0] < 200)
+    entries = track_chains(
+        found, times(20), 1, search, accepts=lambda chains: chains[max(chains)].pixels_uv[0, 0] < 200
+    )
     assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
 
 

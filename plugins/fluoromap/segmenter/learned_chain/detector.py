@@ -58,7 +58,9 @@ def electrode_chains(
 
     def ask(x: Image) -> JointEvidence:
         blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
-        return JointEvidence(network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, network.reach_cells)
+        return JointEvidence(
+            network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, network.reach_cells
+        )
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else _IN_A_RUN)
     return FrameSearch(detector, network, len(catalogue.catheters), frame_ms <= SHARED_MS)

@@ -60,7 +60,7 @@ class FrameSearch:
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image; see :class:`~fluoromap.segmenter.run_segmentation.Detector`."""
-        mean = np.mean([x, *beside], axis=0, dtype=np.float32) if beside and self._noisy else None
+        mean = _mean([x, *beside]) if beside and self._noisy else None
         if self.shares and frame == self._complete + 1:
             entry = self._search(x, mean, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= self._chains:
@@ -68,7 +68,7 @@ class FrameSearch:
         entry = self._search(x, mean, frame, _OWN_CELLS)
         if beside and (len(entry.chains) < self.catheters or entry.manual_needed is not None):
             if mean is None:
-                mean = np.mean([x, *beside], axis=0, dtype=np.float32)
+                mean = _mean([x, *beside])
                 other = self._search(x, mean, frame, _OWN_CELLS)
                 self._noisy = len(other.chains) > len(entry.chains)
             else:
@@ -103,3 +103,8 @@ class FrameSearch:
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""
         return self.detector.shows_extra_catheter(x, chains)
+
+
+def _mean(images: Sequence[Image]) -> Image:
+    mean: Image = np.mean(images, axis=0, dtype=np.float32)
+    return mean

@@ -21,7 +21,7 @@ from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
 
 _AVERAGED = 8
-_PICTURES = 3
+_PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
@@ -49,7 +49,9 @@ class TrackEvidence:
         paths = np.array([chains[frame].pixels_uv for frame in frames])
         odds = np.array(
             [
-                np.concatenate([self.log_odds_along(frames[group], part, log_image) for part in _sections(paths[group])])
+                np.concatenate(
+                    [self.log_odds_along(frames[group], part, log_image) for part in _sections(paths[group])]
+                )
                 for group in _groups(len(frames))
             ]
         )
@@ -90,7 +92,7 @@ def _is_clear(chain: Chain) -> bool:
 
 
 def _groups(frames: int) -> list[slice]:
-    """Return up to three groups of up to eight of a track's frames, evenly spread."""
+    """Return the first and the last eight of a track's frames."""
     size = min(_AVERAGED, frames)
     count = min(_PICTURES, -(-frames // size))
     return [slice(start, start + size) for start in np.linspace(0, frames - size, count).astype(np.int64).tolist()]

@@ -46,7 +46,7 @@ def test_a_frame_without_its_catheter_is_searched_in_the_mean_and_the_chain_foun
     frames, detector, _ = search(2.0, shares=False)
     entry = frames.find_chains(X + 1, 0, [X + 2, X + 3])
     assert detector.searched == [1.0, 2.0]
-    (at, known), = detector.found_again
+    ((at, known),) = detector.found_again
     assert at == 1.0
     assert np.allclose(entry.chains[0].pixels_uv, POINTS + 1)
     # The frame is part of the mean, so the mean's place must hardly count.

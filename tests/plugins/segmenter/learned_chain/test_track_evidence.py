@@ -49,9 +49,7 @@ def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images)
     for path_uv in noisy.truth.pixels_uv.values():
         assert judge(chains(path_uv), lambda frame: images[frame])
         odds = judge.log_odds_along(list(range(FRAMES)), path_uv, lambda frame: images[frame])
-        single = [
-            np.median(seen.probability_at(points)) for seen, points in zip(alone, path_uv, strict=True)
-        ]
+        single = [np.median(seen.probability_at(points)) for seen, points in zip(alone, path_uv, strict=True)]
         assert 1.0 / (1.0 + np.exp(-np.median(odds))) > np.median(single)
 
 
