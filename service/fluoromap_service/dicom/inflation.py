@@ -51,7 +51,7 @@ def open_dicom(path: Path) -> Iterator[BufferedReader]:
 
 
 def _inflate(source: IO[bytes], target: IO[bytes], most_bytes: int) -> None:
-    """Inflate the rest of a file without a header of its own (RFC 1951) into another file."""
+    """Write the inflated rest of a file (RFC 1951) into another file."""
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     written = 0
     data = source.read(_CHUNK_BYTES)

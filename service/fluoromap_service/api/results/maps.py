@@ -205,7 +205,10 @@ def _map_picture(chamber: ChamberMap) -> bytes:
     },
 )
 def get_map_picture(job_id: JobId, request: Request, caller: Reader) -> Response:
-    """Return a picture of the map from six sides, with sites, isochrones and the colour bar in ms."""
+    """Return a picture of the map from six sides.
+
+    It has sites, isochrones and the colour bar in ms.
+    """
     with reading() as session:
         finished = map_of(session, job_of(session, job_id))
     picture = kept_rendering(
@@ -216,7 +219,10 @@ def get_map_picture(job_id: JobId, request: Request, caller: Reader) -> Response
     return file_response(request, picture.path, picture.sha256, "image/png", f"map-{job_id}.png", inline=True)
 
 
-_MESHES = {media: {"schema": {"type": "string", "format": "binary"}} for media in MESH_MEDIA_TYPES.values()}
+_MESHES = {
+    media: {"schema": {"type": "string"} if media.startswith("text/") else {"type": "string", "format": "binary"}}
+    for media in MESH_MEDIA_TYPES.values()
+}
 
 
 @router.get(

@@ -63,9 +63,12 @@ def test_every_body_has_its_media_type_and_schema(name: str, operation: Operatio
         assert set(body["content"]) == {"application/json"}
 
 
-def test_binary_answers_are_declared_as_such() -> None:
+def test_binary_answers_and_texts_are_declared_as_such() -> None:
     for name, operation in OPERATIONS:
         for answer in operation["responses"].values():
             for media, form in answer.get("content", {}).items():
+                if media in ("text/csv", "text/html"):
+                    assert form["schema"]["type"] == "string", (name, media)
+                    assert "format" not in form["schema"], (name, media)
                 if media.startswith(("image/", "model/")) or media in ("application/zip", "application/x-matlab-data"):
                     assert form["schema"] == {"type": "string", "format": "binary"}, (name, media)
