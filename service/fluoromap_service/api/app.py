@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 import structlog
 from fastapi import Depends, FastAPI
-from fastapi.responses import JSONResponse
+from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
@@ -21,6 +21,7 @@ from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, plugins
+from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
     activation_times,
     catheter_types,
@@ -82,6 +83,10 @@ def create_app() -> FastAPI:
     @app.get("/v1/openapi.json", include_in_schema=False)
     def openapi(caller: Reader) -> JSONResponse:
         return JSONResponse(document(app))
+
+    @app.get("/docs", include_in_schema=False)
+    def docs(caller: Reader) -> HTMLResponse:
+        return HTMLResponse(api_page(document(app)))
 
     app.add_middleware(BodyLimit)
     app.add_middleware(Doorkeeper)
