@@ -29,7 +29,7 @@ def test_curl_lines_work_without_and_with_a_token(simulated_study: Path, tmp_pat
     block = re.search(r"^```bash\n(HOST=.*?)^```", README.read_text(), re.M | re.S)
     assert block is not None
     lines = block[1]
-    assert (lines.count("ask "), lines.count("curl")) == (10, 1)
+    assert (lines.count("ask "), lines.count("curl")) == (11, 1)
     environment = environment_of(tmp_path / "data", simulated_study.parent / "numba")
     port = free_port()
     with embedded(environment, port):

@@ -44,7 +44,10 @@ def _prose(text: str) -> Markup:
 
 
 def _kind(schema: Json) -> Markup:
-    """Return a schema in a word or two; a schema with a name is a link to it."""
+    """Return a schema in a few words.
+
+    A schema with a name is a link to it.
+    """
     if "$ref" in schema:
         name = escape(schema["$ref"].rsplit("/", 1)[-1])
         return Markup('<a href="#{0}">{0}</a>').format(name)

@@ -47,7 +47,10 @@ class GantryPatch(BaseModel):
         for keyword, field in names.items():
             if keyword in given and field in given:
                 raise ValueError(f"{field} and {keyword} are the same value; give one of them")
-        return {names.get(name, name): value for name, value in given.items()}
+        # A strict reader takes a tuple here, and JSON has lists only.
+        return {
+            names.get(name, name): tuple(value) if isinstance(value, list) else value for name, value in given.items()
+        }
 
 
 def changed_gantry(before: dict[str, Any], change: GantryPatch | None) -> dict[str, Any]:
