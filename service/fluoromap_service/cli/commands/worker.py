@@ -8,7 +8,6 @@ from fluoromap_service import logs
 from fluoromap_service.cli.environment import apply_options, keep_compiled_kernels
 from fluoromap_service.cli.options import DataDir
 from fluoromap_service.jobs.queue import celery_app
-from fluoromap_service.settings import settings
 
 app = typer.Typer(add_completion=False)
 
@@ -21,7 +20,6 @@ def worker(data_dir: DataDir = None) -> None:
     logs.configure()
     celery_app().worker_main(
         [
-            "--quiet", "worker", "--pool", "prefork", "-c", str(settings().workers), "-n", "fluoromap@%h",
-            "--without-gossip", "--without-mingle", "--loglevel", "WARNING",
+            "--quiet", "worker", "-n", "fluoromap@%h", "--without-gossip", "--without-mingle", "--loglevel", "WARNING",
         ]
     )  # fmt: skip

@@ -1,0 +1,40 @@
+"""The recognition of a queue that nobody serves: stages are ready, and no stage of any job begins, lives or ends."""
+
+from __future__ import annotations
+
+import time
+
+from sqlalchemy import exists, select
+from sqlalchemy.orm import Session
+
+from fluoromap_service.settings import settings
+from fluoromap_service.store.models import Event, StageRow, StageState
+
+
+def stall_seconds() -> float:
+    """Return the silence after which ready stages count as stalled.
+
+    A running stage writes an event with every heartbeat. Two of them must be missing.
+    """
+    return 2 * settings().heartbeat_seconds
+
+
+class StallWatch:
+    """Watches the events of stages from look to look, by this process's own clock."""
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+        self._since = time.monotonic()
+
+    def reset(self) -> None:
+        """Begin anew, after a time in which the database could not be read."""
+        self._since = time.monotonic()
+
+    def look(self, session: Session) -> bool:
+        """Return whether stages have been ready for ``stall_seconds`` while no stage changed."""
+        now = time.monotonic()
+        waiting = session.scalar(select(exists().where(StageRow.state == StageState.READY)))
+        newest = session.scalar(select(Event.id).where(Event.kind == "stage").order_by(Event.id.desc()).limit(1))
+        if not waiting or newest != self._newest:
+            self._newest, self._since = newest, now
+        return now - self._since > stall_seconds()
