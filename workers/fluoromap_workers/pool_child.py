@@ -70,16 +70,8 @@ class WorkerLink:
             os._exit(0)
 
 
-def serve(connection: Connection, worker: int) -> None:
-    """Run stages until the worker ends.
-
-    Parameters
-    ----------
-    connection : Connection
-        Pipe to the thread of the worker that uses this process.
-    worker : int
-        Process id of the worker, for the log.
-    """
+def serve(connection: Connection) -> None:
+    """Run stages until the worker ends; ``connection`` is the pipe to the worker's thread."""
     # The parent is the server of forks, which ends with the worker.
     end_with_parent(os.getppid())
     # Ctrl-C reaches every process of a terminal; the worker ends its stages in order.
@@ -90,7 +82,6 @@ def serve(connection: Connection, worker: int) -> None:
     # The loaded code stays. Else the collector would walk through it again while a stage makes its small objects.
     gc.freeze()
     link = WorkerLink(connection)
-    log.debug("process_ready", worker=worker)
     link.send("ready")
     while True:
         order, subject = link.orders.get()

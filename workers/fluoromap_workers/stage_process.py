@@ -7,7 +7,6 @@ plugin that never releases the interpreter lock keeps its claim. The thread kill
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -44,22 +43,25 @@ class StageProcess:
         self._connection: Connection | None = None
         self._ready = False
 
-    @property
-    def pid(self) -> int | None:
-        """The id of the process; None before its start and after its end."""
-        return None if self._process is None else int(self._process.pid)
-
     def start(self) -> None:
         """Start the process unless it lives."""
         if self._process is not None and self._process.is_alive():
             return
         self.kill()
         own, other = _context.Pipe()
-        process = _context.Process(target=pool_child.serve, args=(other, os.getpid()), daemon=True)
+        process = _context.Process(target=pool_child.serve, args=(other,), daemon=True)
         process.start()
         # With this end open the pipe would not close when the process dies.
         other.close()
         self._process, self._connection, self._ready = process, own, False
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether the process still prepares its first stage."""
+        process, connection = self._process, self._connection
+        if self._ready or process is None or connection is None or connection.closed:
+            return False
+        return bool(process.is_alive()) and not connection.poll()
 
     def is_ready(self) -> bool:
         """Start the process where needed and wait until it can run a stage; return False when it cannot."""

@@ -30,7 +30,8 @@ STALLED_EXIT_CODE = 75
 log = structlog.get_logger(__name__)
 
 _drain = Drain()
-_processes: waiting_line.LifoQueue[StageProcess] = waiting_line.LifoQueue()
+_all_processes: list[StageProcess] = []
+_free_processes: waiting_line.LifoQueue[StageProcess] = waiting_line.LifoQueue()
 
 
 @shared_task(name=queue.RUN_STAGE)  # type: ignore[untyped-decorator,unused-ignore]
@@ -56,11 +57,11 @@ def _place() -> Iterator[Place]:
     if settings().eager:
         yield THIS_PROCESS
         return
-    process = _processes.get()
+    process = _free_processes.get()
     try:
         yield process
     finally:
-        _processes.put(process)
+        _free_processes.put(process)
 
 
 def _run_stages(stage_id: int, place: Place) -> None:
@@ -86,16 +87,15 @@ class Processes(bootsteps.StartStopStep):  # type: ignore[misc]
 
     requires = frozenset({"celery.worker.components:Pool"})
 
-    def __init__(self, parent: Any, **options: Any) -> None:
-        self._all = [StageProcess(_drain) for _ in range(settings().workers)]
-
     def start(self, parent: Any) -> None:
-        for process in self._all:
+        for _ in range(settings().workers):
+            process = StageProcess(_drain)
             process.start()
-            _processes.put(process)
+            _all_processes.append(process)
+            _free_processes.put(process)
 
     def terminate(self, parent: Any) -> None:
-        for process in self._all:
+        for process in _all_processes:
             process.kill()
 
 
@@ -128,6 +128,10 @@ class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
             with reading() as session:
                 stalled = self._stall.look(session)
         except SQLAlchemyError:
+            self._stall.reset()
+            return
+        # At the very first start a process compiles its kernels before it takes a stage.
+        if any(process.is_starting for process in _all_processes):
             self._stall.reset()
             return
         if stalled and not _drain.begun:

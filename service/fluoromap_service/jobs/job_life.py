@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, or_, select, update
+from sqlalchemy import Row, func, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
@@ -31,6 +31,8 @@ from fluoromap_service.store.models import (
 from fluoromap_service.study.snapshot import Snapshot
 
 LONGEST_REPUBLISH_SECONDS = 60.0
+WORKER_SECONDS = 30.0
+"""A worker that is silent for longer counts as dead."""
 CLOCK_TOLERANCE_SECONDS = 1.0
 """A stored time that lies further in the future comes from before the clock was set back."""
 _REPORTED = (
@@ -294,6 +296,14 @@ def worker_seen(session: Session, name: str) -> None:
         session.add(WorkerSeen(name=name, seen=now))
     else:
         row.seen = now
+
+
+def living_workers(session: Session, name: str | None = None) -> int:
+    """Return how many workers gave a sign of life in the last ``WORKER_SECONDS``, of all names or of one."""
+    # A time in the future comes from before the clock was set back.
+    alive = WorkerSeen.seen.between(db_now() - WORKER_SECONDS, db_now() + WORKER_SECONDS)
+    query = select(func.count()).select_from(WorkerSeen).where(alive)
+    return session.scalar(query if name is None else query.where(WorkerSeen.name == name)) or 0
 
 
 def _held(held: Claim) -> tuple[Any, ...]:

@@ -27,7 +27,7 @@ class StallWatch:
         self._since = time.monotonic()
 
     def reset(self) -> None:
-        """Begin anew, after a time in which the database could not be read."""
+        """Begin anew: the silence until now has another cause."""
         self._since = time.monotonic()
 
     def look(self, session: Session) -> bool:
