@@ -10,13 +10,15 @@ from sqlalchemy.orm import Session
 from fluoromap_service.settings import settings
 from fluoromap_service.store.models import Event, StageRow, StageState
 
+SHORTEST_STALL_SECONDS = 20.0
+
 
 def stall_seconds() -> float:
     """Return the silence after which ready stages count as stalled.
 
     A running stage writes an event with every heartbeat. Two of them must be missing.
     """
-    return 2 * settings().heartbeat_seconds
+    return max(2 * settings().heartbeat_seconds, SHORTEST_STALL_SECONDS)
 
 
 class StallWatch:
