@@ -225,7 +225,7 @@ class Faults:
         while True:
             program = self._chance.choice((*self._stack.programs.values(), *self._stack.servers.values()))
             members = program.members()
-            if members and (self._chance.random() < ROOT_SHARE or program in self._stack.servers.values()):
+            if members and self._chance.random() < ROOT_SHARE:
                 return members[0]
             if members[1:]:
                 return self._chance.choice(members[1:])
