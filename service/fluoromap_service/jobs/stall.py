@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
@@ -22,19 +23,21 @@ def stall_seconds() -> float:
 
 
 class StallWatch:
-    """Watches the events of stages from look to look, by this process's own clock."""
+    """Watches the events of stages from look to look, by a clock that nobody can set."""
 
-    def __init__(self) -> None:
-        self._newest: int | None = None
-        self._since = time.monotonic()
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        # No event has this id, so the first look begins the silence.
+        self._newest: int | None = -1
+        self._since = clock()
 
     def reset(self) -> None:
         """Begin anew: the silence until now has another cause."""
-        self._since = time.monotonic()
+        self._since = self._clock()
 
     def look(self, session: Session) -> bool:
         """Return whether stages have been ready for ``stall_seconds`` while no stage changed."""
-        now = time.monotonic()
+        now = self._clock()
         waiting = session.scalar(select(exists().where(StageRow.state == StageState.READY)))
         newest = session.scalar(select(Event.id).where(Event.kind == "stage").order_by(Event.id.desc()).limit(1))
         if not waiting or newest != self._newest:
