@@ -52,8 +52,8 @@ SPEC = StudySpec(seed=7, sites=5, frames=12, frame_rate_hz=15.0)
 JOBS_AT_ONCE = 2
 RESULTS = ("points", "tracks", "map", "mesh.ply")
 CLOCK_JUMP_SECONDS = 3600.0
-ROOT_SHARE = 0.1
-"""Share of the faults that hit a program itself. It takes its processes with it, and needs seconds to start."""
+UP_WEIGHT = 0.3
+"""How often ``fluoromap up`` is hit, against other kinds. All its processes end with it, and it needs seconds to start."""
 
 
 class Hung(Exception):
@@ -176,7 +176,10 @@ class Stack:
             shutil.rmtree(self.server_folder, ignore_errors=True)
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request until the service answers it. Only 429 and 503 may ask for patience."""
+        """Send a request until the service answers it.
+
+        Only 429 and 503 may ask for patience.
+        """
         end = time.monotonic() + PATIENCE_SECONDS
         last = "no answer"
         while time.monotonic() < end:
@@ -220,28 +223,31 @@ class Faults:
         others = (self._stop, self._database_away, self._broker_away, self._clock_jump, self._garbage)
         (self._kill if self._chance.random() < 0.9 else self._chance.choice(others))()
 
-    def _member(self) -> psutil.Process:
-        """Choose a program, and mostly one of the processes that it has started."""
+    def _member(self) -> tuple[str, psutil.Process]:
+        """Choose a kind of process, then a process of this kind."""
         while True:
-            program = self._chance.choice((*self._stack.programs.values(), *self._stack.servers.values()))
-            members = program.members()
-            if members and self._chance.random() < ROOT_SHARE:
-                return members[0]
-            if members[1:]:
-                return self._chance.choice(members[1:])
+            kinds: dict[str, list[psutil.Process]] = {}
+            for program in (*self._stack.programs.values(), *self._stack.servers.values()):
+                for member in program.members():
+                    with suppress(psutil.NoSuchProcess):
+                        kinds.setdefault(_kind(member), []).append(member)
+            # Kills of the root alone would keep the service starting for ever.
+            if len(kinds) > 1:
+                names = sorted(kinds)
+                weights = [UP_WEIGHT if name == "fluoromap up" else 1.0 for name in names]
+                (kind,) = self._chance.choices(names, weights)
+                return kind, self._chance.choice(kinds[kind])
             time.sleep(0.05)
 
     def _kill(self) -> None:
         with suppress(psutil.NoSuchProcess):
-            member = self._member()
-            kind = _kind(member)
+            kind, member = self._member()
             member.kill()
             self.counts[f"kill -9 {kind}"] += 1
 
     def _stop(self) -> None:
         with suppress(psutil.NoSuchProcess):
-            member = self._member()
-            kind = _kind(member)
+            kind, member = self._member()
             member.suspend()
             self.counts[f"SIGSTOP {kind}"] += 1
             time.sleep(LEASE_SECONDS + 2)
@@ -270,7 +276,10 @@ class Faults:
         self.counts["broker away, messages lost"] += 1
 
     def _clock_jump(self) -> None:
-        """Move every stored time of the queue: the database's clock then is an hour behind, or ahead, of them."""
+        """Move every stored time of the queue.
+
+        The database's clock then is an hour behind or ahead of them.
+        """
         seconds = self._chance.choice((-1, 1)) * CLOCK_JUMP_SECONDS
         move = "lease_until = lease_until + :s, published = published + :s"
         self._stack.execute(f"UPDATE stage SET {move} WHERE state IN ('ready', 'running')", s=seconds)
@@ -391,7 +400,10 @@ class Campaign:
         self.slowest_end = max(self.slowest_end, time.monotonic() - last_fault)
 
     def check_store(self) -> int:
-        """Count doubled jobs and results without files; return how many files have no row."""
+        """Count doubled jobs and results without files.
+
+        Return how many files have no row.
+        """
         found = {row[0] for row in self._stack.rows("SELECT id FROM job")}
         self.wrong["doubled"] += len(found - set(self.jobs))
         self.wrong["lost"] += len(set(self.jobs) - found)

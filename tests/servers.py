@@ -57,7 +57,9 @@ def redis(folder: Path) -> str:
 
 
 def handed_over(folder: Path, kind: str) -> tuple[list[str], dict[str, Any]]:
-    """End a session's server, "postgresql" or "redis", for a caller who starts and ends it alone from now on.
+    """End a session's server, so that the caller can start it alone.
+
+    ``kind`` is "postgresql" or "redis".
 
     Returns
     -------

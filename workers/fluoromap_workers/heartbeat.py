@@ -38,7 +38,10 @@ class Beats:
         self._last_beat = self._last_look = time.monotonic()
 
     def send_if_due(self) -> Answer:
-        """Send a sign of life when it is time, and return whether the work is still wanted."""
+        """Send a sign of life when it is time.
+
+        Return whether the work is still wanted.
+        """
         now = time.monotonic()
         try:
             if now - self._last_beat >= settings().heartbeat_seconds or self.fraction != self._stored:

@@ -27,14 +27,14 @@ LONGEST_MESSAGE = 500
 
 
 class PluginFailed(Exception):
-    """The plugin raised, or another version of it is installed. The message reaches the reader of the job.
+    """The plugin raised, or another version of it is installed.
 
-    ``code`` is the code of the stage's error.
+    ``error`` is the error of the stage, with its code. It reaches the reader of the job.
     """
 
-    def __init__(self, code: str, detail: str) -> None:
-        super().__init__(detail)
-        self.code = code
+    def __init__(self, error: dict[str, str]) -> None:
+        super().__init__(error["detail"])
+        self.error = error
 
 
 log = structlog.get_logger(__name__)
@@ -90,7 +90,10 @@ def run(stage_id: int, worker: str, place: Place = THIS_PROCESS) -> str | None:
 
 
 def work(held: Claim, context: Context) -> None:
-    """Run a claimed stage and store its end. A stage that stops because it is unwanted stays claimed."""
+    """Run a claimed stage and store its end.
+
+    A stage that stops because nobody wants it stays claimed.
+    """
     bound = log.bind(job=held.job_id, stage=held.name, attempt=held.attempt)
     bound.info("stage_started")
     try:
@@ -102,20 +105,20 @@ def work(held: Claim, context: Context) -> None:
         bound.warning("stage_interrupted", error=type(error).__name__)
     except PluginFailed as failure:
         bound.warning("stage_failed", exc_info=failure.__cause__)
-        _fail(held, failure.code, str(failure), bound)
+        _fail(held, failure.error, bound)
     except Exception as error:
         bound.error("stage_broken", error=type(error).__name__, exc_info=error)
         detail = "The service could not prepare or store the work of this stage. Look at the worker's log."
-        _fail(held, "internal", detail, bound)
+        _fail(held, {"code": "internal", "detail": detail}, bound)
 
 
-def _fail(held: Claim, code: str, detail: str, bound: BoundLogger) -> None:
+def _fail(held: Claim, error: dict[str, str], bound: BoundLogger) -> None:
     try:
         with writing() as session:
-            job_life.fail(session, held, {"code": code, "detail": detail})
-    except SQLAlchemyError as error:
+            job_life.fail(session, held, error)
+    except SQLAlchemyError as away:
         # The lease runs out, and another attempt fails in the same way.
-        bound.warning("failure_not_stored", error=type(error).__name__)
+        bound.warning("failure_not_stored", error=type(away).__name__)
 
 
 def finish_known(job_id: str) -> None:
@@ -168,11 +171,11 @@ def _computed(held: Claim, work: Work, context: Context) -> tuple[Any, bytes]:
     except StageStopped:
         raise
     except PluginChanged as error:
-        raise PluginFailed("plugin_changed", str(error)) from error
+        raise PluginFailed({"code": "plugin_changed", "detail": str(error)}) from error
     except Exception as error:
         message = " ".join(str(error).split()) or "no message"
         sentence = f"The stage {held.name!r} failed: {type(error).__name__}: {message}"
-        raise PluginFailed("plugin_failed", sentence[:LONGEST_MESSAGE]) from error
+        raise PluginFailed({"code": "plugin_failed", "detail": sentence[:LONGEST_MESSAGE]}) from error
 
 
 def _prepare(claim: Claim) -> Work:

@@ -64,7 +64,10 @@ class StageProcess:
         return bool(process.is_alive()) and not connection.poll()
 
     def is_ready(self) -> bool:
-        """Start the process where needed and wait until it can run a stage; return False when it cannot."""
+        """Start the process where needed and wait until it can run a stage.
+
+        Return False when it cannot.
+        """
         for _ in range(2):
             self.start()
             end = time.monotonic() + START_SECONDS
@@ -167,7 +170,10 @@ class StageProcess:
             self.kill()
 
     def _end(self, held: Claim, answer: Answer) -> None:
-        """Store that a cancelled stage has stopped. Another worker stores the end of a stage whose claim was lost."""
+        """Store that a cancelled stage has stopped.
+
+        Another worker stores the end of a stage whose claim was lost.
+        """
         if answer == "cancelled":
             _store(lambda session: job_life.stopped(session, held))
 

@@ -53,7 +53,10 @@ def run_stage(stage_id: int) -> None:
 
 @contextmanager
 def _place() -> Iterator[Place]:
-    """Give a place to run stages: this process when jobs run at once, else one of the worker's processes."""
+    """Give a place to run stages.
+
+    It is this process when jobs run at once, else one of the worker's processes.
+    """
     if settings().eager:
         yield THIS_PROCESS
         return
@@ -102,8 +105,8 @@ class Processes(bootsteps.StartStopStep):  # type: ignore[misc]
 class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
     """Sweeps every second from the worker's own timer, and stores that the worker lives.
 
-    It ends the worker when stages wait and nobody runs one: then the worker no longer takes messages. Whoever started the
-    worker starts it again.
+    It ends the worker when stages wait and nobody runs one: then the worker no longer takes messages. The supervisor or the
+    container restarts it.
     """
 
     requires = frozenset({"celery.worker.components:Timer"})

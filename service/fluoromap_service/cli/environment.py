@@ -16,7 +16,10 @@ SUPERVISOR = "FLUOROMAP_SUPERVISOR"
 
 
 def end_with_supervisor() -> None:
-    """Let this process end when the supervisor that started it has ended; without a supervisor do nothing."""
+    """Let this process end when its supervisor has ended.
+
+    Without a supervisor do nothing.
+    """
     supervisor = os.environ.pop(SUPERVISOR, None)
     if supervisor is not None:
         end_with_parent(int(supervisor))

@@ -15,7 +15,9 @@ NAME = "service.lock"
 
 @contextmanager
 def only_one(data_dir: Path) -> Iterator[None]:
-    """Hold the lock of a data folder. The kernel releases it when this process ends, however it ends.
+    """Hold the lock of a data folder.
+
+    The kernel releases it when this process ends, also when it is killed.
 
     Raises
     ------

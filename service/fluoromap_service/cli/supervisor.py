@@ -115,7 +115,10 @@ class _Child:
         return time.monotonic() - self.start_time > STEADY_SECONDS
 
     def restart_when_dead(self) -> None:
-        """Start a dead child again: at once when it had lived long, else after a longer and longer time."""
+        """Start a dead child again.
+
+        It starts at once when it had lived long, else after a longer and longer time.
+        """
         if self.alive:
             return
         now = time.monotonic()

@@ -229,7 +229,10 @@ def cancel(session: Session, job_id: str) -> bool:
 
 
 def give_back(session: Session, held: Claim) -> None:
-    """Free a stage whose process has died or must end, as :func:`reap` does after the lease."""
+    """Free a stage whose process has died or must end.
+
+    :func:`reap` does the same after the end of a lease.
+    """
     job = _lock(session, held.job_id)
     stage = session.scalar(select(StageRow).where(*_held(held)))
     if stage is not None:
@@ -271,7 +274,10 @@ def reap(session: Session) -> int:
 
 
 def _free(session: Session, job: Job, stage: StageRow) -> None:
-    """End an attempt that gave no result: the stage is ready for another one, cancelled, or failed after the last."""
+    """End an attempt that gave no result.
+
+    The stage is ready for another attempt, cancelled, or failed after the last one.
+    """
     if job.cancel_requested:
         stage.state = StageState.CANCELLED
     elif stage.attempt >= settings().max_attempts:
@@ -299,7 +305,10 @@ def worker_seen(session: Session, name: str) -> None:
 
 
 def living_workers(session: Session, name: str | None = None) -> int:
-    """Return how many workers gave a sign of life in the last ``WORKER_SECONDS``, of all names or of one."""
+    """Return how many workers gave a recent sign of life.
+
+    Recent means within ``WORKER_SECONDS``. With ``name`` only the worker of that name counts.
+    """
     # A time in the future comes from before the clock was set back.
     alive = WorkerSeen.seen.between(db_now() - WORKER_SECONDS, db_now() + WORKER_SECONDS)
     query = select(func.count()).select_from(WorkerSeen).where(alive)

@@ -56,7 +56,7 @@ class ReturnsNone(Hangs):
 
 
 def install(folder: Path) -> None:
-    """Write the metadata that makes Python find these plugins, into a folder of its path."""
+    """Write the metadata by which Python finds these plugins."""
     metadata = folder / "faulty_plugins-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty-plugins\nVersion: 1.0\n")

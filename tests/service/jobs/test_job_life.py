@@ -286,7 +286,10 @@ def test_every_change_is_an_event_in_order(job: str) -> None:
 
 
 def _move_clock_back(seconds: float) -> None:
-    """Move all stored times of the queue into the future, as if somebody had set the database's clock back."""
+    """Move all stored times of the queue into the future.
+
+    The effect is the same as when somebody sets the database's clock back.
+    """
     with writing() as session:
         session.execute(
             update(StageRow).values(lease_until=StageRow.lease_until + seconds, published=StageRow.published + seconds)

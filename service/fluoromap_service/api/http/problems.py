@@ -84,7 +84,10 @@ DATABASE_RETRY_SECONDS = 5
 
 
 def database_away(error: Exception) -> Problem:
-    """Return the 503 for a database that gave no answer, and log one line without its address."""
+    """Return the 503 for a database that gave no answer.
+
+    Log one line, without the address of the database.
+    """
     log.warning("database_unavailable", error=type(error).__name__)
     return Problem(
         503, "database_unavailable", "The database does not answer or is locked; nothing was changed. Send the request again.",

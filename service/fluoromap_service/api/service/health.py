@@ -122,7 +122,10 @@ async def health() -> Health:
     responses={503: {"model": Readiness, "description": "A part is missing; the checks name it."}},
 )
 def ready(response: Response) -> Readiness:
-    """Report whether database, broker, files and a worker are ready, and the queue is served; open to all."""
+    """Report whether database, broker, files, a worker and the queue are ready.
+
+    It is open to all.
+    """
     checks = []
     for name, (check, failure) in _CHECKS.items():
         try:
