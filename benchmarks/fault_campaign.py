@@ -227,8 +227,8 @@ class Faults:
         """Choose a kind of process, then a process of this kind."""
         while True:
             kinds: dict[str, list[psutil.Process]] = {}
-            for program in (*self._stack.programs.values(), *self._stack.servers.values()):
-                for member in program.members():
+            for each in (*self._stack.programs.values(), *self._stack.servers.values()):
+                for member in each.members():
                     with suppress(psutil.NoSuchProcess):
                         kinds.setdefault(_kind(member), []).append(member)
             # Kills of the root alone would keep the service starting for ever.
