@@ -187,9 +187,9 @@ def test_a_worker_that_must_end_gives_its_stages_back(service: Service) -> None:
     members = [worker, *worker.children(recursive=True)]
     worker.terminate()
     until(lambda: all(gone(member) for member in members))
-    given_back = [stage for stage in service.job(job)["stages"] if stage["attempt"] == 1]
-    assert given_back
-    assert "ready" in {stage["state"] for stage in given_back}
+    stages = service.job(job)["stages"]
+    # The next worker may have taken the stage already.
+    assert any((stage["state"], stage["attempt"]) == ("ready", 1) or stage["attempt"] == 2 for stage in stages)
     httpx.post(f"{service.url}/v1/jobs/{job}:cancel")
     assert service.ended(job)["state"] == "cancelled"
 
