@@ -50,18 +50,29 @@ class StageProcess:
         self.kill()
         own, other = _context.Pipe()
         process = _context.Process(target=pool_child.serve, args=(other,), daemon=True)
-        process.start()
-        # With this end open the pipe would not close when the process dies.
-        other.close()
+        try:
+            process.start()
+        except (EOFError, OSError) as error:
+            # Somebody killed the server of forks; the next start makes another one.
+            log.warning("process_not_started", error=type(error).__name__)
+            own.close()
+            return
+        finally:
+            # With this end open the pipe would not close when the process dies.
+            other.close()
         self._process, self._connection, self._ready = process, own, False
 
     @property
     def is_starting(self) -> bool:
         """Whether the process still prepares its first stage."""
         process, connection = self._process, self._connection
-        if self._ready or process is None or connection is None or connection.closed:
+        if self._ready or process is None or connection is None:
             return False
-        return bool(process.is_alive()) and not connection.poll()
+        try:
+            return bool(process.is_alive()) and not connection.poll()
+        except (OSError, ValueError):
+            # The thread of the process has just ended it.
+            return False
 
     def is_ready(self) -> bool:
         """Start the process where needed and wait until it can run a stage.
@@ -79,7 +90,7 @@ class StageProcess:
                 self._ready = message is not None and message[0] == "ready"
             if self._drain.begun:
                 return False
-            if self._ready and self._process.is_alive():
+            if self._ready:
                 return True
             self.kill()
         log.warning("process_not_ready")
