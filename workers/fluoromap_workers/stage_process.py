@@ -141,6 +141,9 @@ class StageProcess:
 
     def finish_known(self, job_id: str) -> None:
         """End all ready stages of a job whose results are stored."""
+        if self._connection is None:
+            # The process was killed after the stage. The next stage starts another one.
+            return
         end = time.monotonic() + settings().stage_seconds
         try:
             self._send("known", job_id)
