@@ -136,6 +136,7 @@ async def _sweep() -> None:
     while True:
         try:
             await run_in_threadpool(queue.sweep)
+            await run_in_threadpool(health.watch_queue)
             failing = False
         except Exception as error:
             # The database may come back: log the first failure only.

@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from fluoromap_service import auth
-from fluoromap_service.api.http.problems import answer
+from fluoromap_service.api.http.problems import DATABASE_AWAY, answer, database_away
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
@@ -43,6 +43,9 @@ class Doorkeeper:
             _demand(caller, Scope.READ if scope.get("method") in _READING else Scope.WRITE)
         except Problem as problem:
             await answer(problem)(scope, receive, send)
+            return
+        except DATABASE_AWAY as error:
+            await answer(database_away(error))(scope, receive, send)
             return
         scope.setdefault("state", {})["caller"] = caller
         await self._app(scope, receive, send)
