@@ -241,7 +241,7 @@ def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
 
 
 RETURNED = {
-    "segmenter": (LearnedChain, "segment", "catheter-chain returned NoneType, expected Segmentation"),
+    "segmenter": (LearnedChain, "segment", "learned-chain returned NoneType, expected Segmentation"),
     "triangulator": (MaximumLikelihood, "triangulate", "maximum-likelihood returned NoneType, expected Triangulation"),
     "monoplane": (MotionPrior, "track", "motion-prior returned NoneType, expected Track"),
     "fuser": (SmoothSurface, "fuse", "smooth-surface returned NoneType, expected ChamberMap"),

@@ -171,7 +171,10 @@ def segment_run(
 
 
 def _beside(frame: int, images: Iterable[tuple[int, Image]], frame_times_ms: Array) -> list[Image]:
-    """Return the images of other frames that are so near in time that catheters have hardly moved."""
+    """Return the images of other frames that are near in time.
+
+    Catheters have hardly moved between them.
+    """
     return [
         image
         for number, image in images

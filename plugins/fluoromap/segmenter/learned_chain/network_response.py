@@ -53,7 +53,10 @@ class NetworkResponse:
 
     @classmethod
     def of_reduced(cls, small: Image, trained: Trained, scale: float) -> NetworkResponse:
-        """Ask the network about a log image that is already reduced to ``scale`` times its size."""
+        """Ask the network about a reduced log image.
+
+        It has ``scale`` times the size of the frame.
+        """
         answers = answer(trained, normalise(small))
         odds = trained.odds_gain * answers[..., _HEAT] + trained.odds_offset
         probability = 1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))

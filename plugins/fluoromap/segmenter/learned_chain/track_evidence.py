@@ -99,12 +99,18 @@ def _groups(frames: int) -> list[slice]:
 
 
 def _sections(path_uv: Array) -> list[Array]:
-    """Split a path (frames, electrodes, 2) into sections of about five electrodes: long catheters bend as they move."""
+    """Split a path into sections of about five electrodes.
+
+    A path has the shape (frames, electrodes, 2). Long catheters bend as they move.
+    """
     return np.array_split(path_uv, -(-path_uv.shape[1] // _SECTION), axis=1)
 
 
 def _similarity(points: Array, moved: Array) -> tuple[Array, Array]:
-    """Return matrix (2, 2) and shift (2,) of the turn and scale that move the points best, (n, 2) each."""
+    """Return the matrix and the shift that move points best.
+
+    The matrix (2, 2) turns and scales. Both sets of points have the shape (n, 2).
+    """
     middle, to = points.mean(axis=0), moved.mean(axis=0)
     flat, other = ((side @ np.array([1.0, 1.0j])) for side in (points - middle, moved - to))
     factor = np.vdot(flat, other) / max(float(np.vdot(flat, flat).real), 1e-9)
