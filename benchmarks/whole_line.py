@@ -4,7 +4,7 @@ A phantom's study with a decapolar catheter in the coronary sinus as reference, 
 the isocentre, shown and stored as 8 bit JPEG, with gantry errors (0.3 degrees, 0.6 mm an axis of a view) and breathing. The runs go
 through the stages of a job: ``learned-chain``, matching, triangulation. ``--case`` chooses other catalogues of 2 to 6 catheters.
 
-Prints for each seed and for all: sites that were located, catheters with the right name (all electrodes within 6 px of their own
+Prints for each seed and for all: sites that were located, catheters with the right name (all electrodes within 5 px of their own
 place in both views at diastole), the mapping tip's error relative to the reference catheter and the same for all electrodes (RMS,
 mm), and the share of 95 % ellipsoids that hold the true relative position. The last line gives the bootstrap interval over seeds.
 """
@@ -30,11 +30,11 @@ from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy, Study
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
+from fluoromap.triangulator.reference_origin import usual_electrodes
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 Array = NDArray[np.float64]
 
-NAMED_PX = 6.0
 FIELD_MM = 292.0
 CASES: dict[str, tuple[str, ...]] = {
     "lab": ("decapolar-2-5-2", "hexapolar-2-5-2", "ablation-4"),
@@ -86,7 +86,9 @@ def main() -> None:
     parser.add_argument("--draw", type=Path, metavar="FOLDER", help="draw a frame of each run")
     given = parser.parse_args()
     catalogue = catalogue_of(CASES[given.case])
-    print(f"{given.case}: {', '.join(CASES[given.case])}; {given.segmenter}, {given.contrast}, {given.frames} frames a run")
+    print(
+        f"{given.case}: {', '.join(CASES[given.case])}; {given.segmenter}, {given.contrast}, {given.frames} frames a run"
+    )
     print(f"{'seed':8}{'located':>10}{'named':>13}{'wrong':>6}{'tip mm':>9}{'all mm':>9}{'inside':>10}{'points':>9}")
     tallies = []
     for seed in range(given.seed, given.seed + given.seeds):
@@ -133,8 +135,9 @@ def measure(spec: StudySpec, segmenter: Segmenter, pictures: Path | None = None)
             seen = all(_is_seen(matched, catheter.name, view) for view in (0, 1))
             tally.named += seen and not any(wrong)
             tally.wrong += any(wrong)
+    origin = usual_electrodes(located.sites, study.catalogue.reference)
     for at_site in located.sites:
-        _count(tally, at_site, study)
+        _count(tally, at_site, study, origin)
     return tally
 
 
@@ -149,13 +152,18 @@ def _is_seen(matched: MatchedSite, name: str, view: int) -> bool:
     return any(chain.catheter == name for chain in observation.chains)
 
 
-def _count(tally: Tally, at_site: LocatedSite, study: SimulatedStudy) -> None:
+def _count(tally: Tally, at_site: LocatedSite, study: SimulatedStudy, origin: tuple[int, ...]) -> None:
+    """Compare a site with its truth.
+
+    The origin is the mean of these electrodes of the reference catheter.
+    """
     truth = next(site for site in study.sites if site.name == at_site.site).truth
+    origin_mm = truth.relative_mm[study.catalogue.reference][[number - 1 for number in origin]].mean(axis=0)
     tally.located += 1
     for point in at_site.points:
         if point.relative_mm is None or point.relative_covariance_mm2 is None:
             continue
-        error = point.relative_mm - truth.relative_mm[point.catheter][point.electrode - 1]
+        error = point.relative_mm - truth.relative_mm[point.catheter][point.electrode - 1] + origin_mm
         square = float(error @ error)
         tally.all_mm2.append(square)
         if (point.catheter, point.electrode) == (study.catalogue.mapping, 1):
@@ -185,9 +193,12 @@ def _draw(site: SimulatedSite, found: Sequence[Segmentation], folder: Path, seed
     for run, segmentation in zip(site.runs, found, strict=True):
         entry = segmentation.frames[len(segmentation.frames) // 2]
         labels = {
-            name: {k + 1: uv for k, uv in enumerate(pixels[entry.frame])} for name, pixels in run.truth.pixels_uv.items()
+            name: {k + 1: uv for k, uv in enumerate(pixels[entry.frame])}
+            for name, pixels in run.truth.pixels_uv.items()
         }
-        drawn(as_jpeg(run.frames[entry.frame]), entry.chains, labels).save(folder / f"{seed}-{site.name}-{run.view}.png")
+        drawn(as_jpeg(run.frames[entry.frame]), entry.chains, labels).save(
+            folder / f"{seed}-{site.name}-{run.view}.png"
+        )
 
 
 def _rms(squares: Sequence[float]) -> float:
