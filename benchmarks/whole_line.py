@@ -40,6 +40,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "lab": ("decapolar-2-5-2", "hexapolar-2-5-2", "ablation-4"),
     "two": ("quadripolar-2-5-2", "ablation-4"),
     "leads": ("quadripolar-2-5-2", "pacing-lead", "ablation-4"),
+    "circular": ("quadripolar-2-5-2", "circular-10", "ablation-4"),
     "duodecapolar": ("duodecapolar-2-2-2", "quadripolar-2-5-2", "ablation-8"),
     "six": (
         "decapolar-2-5-2", "hexapolar-2-5-2", "quadripolar-2-5-2", "quadripolar-5-5-5", "octapolar-2-5-2", "ablation-3.5",
@@ -158,6 +159,9 @@ def _count(tally: Tally, at_site: LocatedSite, study: SimulatedStudy, origin: tu
     The origin is the mean of these electrodes of the reference catheter.
     """
     truth = next(site for site in study.sites if site.name == at_site.site).truth
+    if not origin:
+        tally.located += 1
+        return
     origin_mm = truth.relative_mm[study.catalogue.reference][[number - 1 for number in origin]].mean(axis=0)
     tally.located += 1
     for point in at_site.points:

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 SEMI_AXES_MM = (22.0, 22.0, 40.0)
 RADIUS_6F_MM, RADIUS_7F_MM = 1.0, 1.17
+RADIUS_CIRCULAR_MM = 0.75
 PACING_SLIP_MM = 1.5
 """Standard deviation an axis of a resting catheter's tip from site to site; the reference does not slip."""
 _SEPTUM_MM_PER_MS = 0.6
@@ -73,7 +74,7 @@ def draw_anatomy(
     """Draw a random heart: pose, rate, focus, conduction and motion.
 
     The first two short catheters beside the mapping catheter lie in the right ventricle, the first long one in the coronary
-    sinus, all others in the right atrium.
+    sinus, circular ones and all others in the right atrium.
     """
     rate = float(rng.uniform(*HEART_RATE_HZ[heart]))
     chamber, reference, resting = _right_heart(rng, catalogue)
@@ -181,12 +182,16 @@ def _places(catheters: Sequence[Catheter]) -> list[tuple[Catheter, _Place]]:
     places = []
     for catheter in catheters:
         is_long = float(catheter.arc_lengths_mm[-1]) >= _LONG_MM
-        chosen = next(spots for spots in ((sinus if is_long else ventricle), atrium, ventricle, sinus) if spots)
+        usual = atrium if catheter.is_circular else sinus if is_long else ventricle
+        chosen = next(spots for spots in (usual, atrium, ventricle, sinus) if spots)
         places.append((catheter, chosen.pop(0)))
     return places
 
 
 def _diagnostic(catheter: Catheter, tip: Array, behind: Array, bow: Array, entry: Array) -> Shaft:
+    """Make a diagnostic catheter; one with equal rings is a loop about ``tip`` across its heading."""
+    if catheter.is_circular:
+        return Shaft.around(catheter, RADIUS_CIRCULAR_MM, tip, behind - tip, entry)
     return Shaft.through(catheter, RADIUS_6F_MM, False, tip, behind, bow, entry)
 
 

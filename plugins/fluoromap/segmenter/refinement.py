@@ -94,7 +94,8 @@ def refine(
     px_per_mm : float
         At the isocentre.
     noise : float
-        Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+        Standard deviation of a pixel of the log image at half its size, log units, see
+        :func:`~fluoromap.segmenter.log_image.pixel_noise`.
     hidden : (n, electrodes)
         Electrodes behind another catheter. They are put on the curve through the others and get the mean misfit of the
         others.
@@ -104,7 +105,7 @@ def refine(
     points = np.array(points_uv, dtype=np.float64, order="C")
     arc_mm = catheter.arc_lengths_mm
     misfits, bands, arc = np.empty((3, *points.shape[:2]))
-    axes, unit_sd, residual_sd = np.empty((3, *points.shape))
+    axes, unit_sd = np.empty((2, *points.shape))
     sides = np.empty(misfits.shape, np.int64)
     radius = 0.5 * _diameter_mm(catheter) * px_per_mm
     half = np.full(len(arc_mm), 0.5 * catheter.ring_mm * px_per_mm)
@@ -116,7 +117,7 @@ def refine(
         _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
         longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
         scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
-        _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, residual_sd, misfits)
+        _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, misfits)
         shifts[:] = int(_LAST_REACH_PX / _STEP_PX)
     _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
     sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
@@ -189,11 +190,11 @@ def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, residual_sd, misfits):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, misfits):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move the points to the best nearby positions of bands along these axes.
 
-    Writes the standard deviations along and across for a pixel noise of 1 and for the noise that the residuals of the fit show, and
-    the share of the variance along the axis that stays unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a
+    Writes the standard deviations along and across for a pixel noise of 1, and the share of the variance along the axis
+    that stays unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a
     dome of its radius.
 
     shifts, sides : largest shift and half length of the template, in steps.
@@ -258,12 +259,8 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, r
                     squares += value * value
                 best = scores[chosen]
                 depth = max(best, 0.0) / max(strength, 1e-9)
-                misfit = max(1.0 - depth * best / max(squares - total * total / m, 1e-12), 0.0)
                 if way == 0:
-                    misfits[row, k] = misfit
-                residual_sd[row, k, way] = math.sqrt(
-                    _STEP_PX * strength / (m * max(edges, 1e-9)) * misfit / max(1.0 - misfit, 1e-3)
-                )
+                    misfits[row, k] = max(1.0 - depth * best / max(squares - total * total / m, 1e-12), 0.0)
                 # Cramer-Rao bound of a shift in white noise of 1 a pixel, averaged over the band's width.
                 unit_sd[row, k, way] = math.sqrt(_STEP_PX / (wide * max(edges, 1e-9))) / max(depth, 1e-6)
                 moved = float(chosen - shift)
