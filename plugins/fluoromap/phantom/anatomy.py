@@ -189,7 +189,10 @@ def _places(catheters: Sequence[Catheter]) -> list[tuple[Catheter, _Place]]:
 
 
 def _diagnostic(catheter: Catheter, tip: Array, behind: Array, bow: Array, entry: Array) -> Shaft:
-    """Make a diagnostic catheter; one with equal rings is a loop about ``tip`` across its heading."""
+    """Make a diagnostic catheter.
+
+    A circular one is a loop about ``tip`` across its heading.
+    """
     if catheter.is_circular:
         return Shaft.around(catheter, RADIUS_CIRCULAR_MM, tip, behind - tip, entry)
     return Shaft.through(catheter, RADIUS_6F_MM, False, tip, behind, bow, entry)

@@ -21,7 +21,10 @@ ENTRY = np.array([-18.0, 8.0, 95.0])
 
 
 def run_of(loop_type, normal):
-    """Return a lateral run of a circular and an ablation catheter, and the electrodes of each, (frames, n, 2) pixels."""
+    """Return a lateral run of a circular and an ablation catheter.
+
+    The electrodes of each come with it, (frames, n, 2) pixels.
+    """
     appearance = APPEARANCES["LAT"]
     ablation = Shaft.through(
         catheter_type("ablation-4", "ablation"), 1.17, True, np.array([4.0, -18.0, -24.0]), np.array([0.0, -8.0, -4.0]),
@@ -53,7 +56,10 @@ def segmented(run, types):
 
 
 def chains_on(entry, truth):
-    """Return the catheter on which each chain lies: nine tenths of its electrodes are within 5 px of that catheter's."""
+    """Return the catheter on which each chain lies, else None.
+
+    Nine tenths of its electrodes are within 5 px of that catheter's.
+    """
     found = []
     for chain in entry.chains:
         share = {
