@@ -52,7 +52,13 @@ class PreviewOut(BaseModel):
 @router.get(
     "/{uid}/frames/{n}.png",
     response_class=Response,
-    responses={200: {"content": {"image/png": {}}, "description": "The frame."}, **responses(401, 403, 404, 422, 429)},
+    responses={
+        200: {
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "The frame.",
+        },
+        **responses(401, 403, 404, 422, 429),
+    },
 )
 def get_frame(
     study_id: StudyId,
