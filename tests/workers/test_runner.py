@@ -228,3 +228,20 @@ def test_a_result_that_comes_late_is_thrown_away(stage: int, monkeypatch: pytest
     row = _run(stage, monkeypatch, overtaken)
     assert row.state == StageState.RUNNING
     assert row.result is None
+
+
+def test_a_damaged_stored_result_is_computed_again(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = _run(stage, monkeypatch, lambda context: ("answer", 42))
+    assert row.result is not None
+    files.path_of(row.result).write_bytes(b"damaged")
+    with writing() as session:
+        session.get_one(StageRow, stage).state = StageState.READY
+    row = _run(stage, monkeypatch, lambda context: ("answer", 42))
+    assert (row.state, row.reused) == (StageState.DONE, False)
+    assert row.result is not None
+    assert files.is_whole(row.result)
+
+
+def test_a_damaged_input_fails_the_stage_by_name(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = _run(stage, monkeypatch, _raises(files.BrokenFile("0" * 64)))
+    assert (row.state, (row.error or {})["code"]) == (StageState.FAILED, "input_broken")

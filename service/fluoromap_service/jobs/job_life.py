@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, or_, select, update
+from sqlalchemy import Row, delete, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
@@ -24,6 +24,7 @@ from fluoromap_service.store.models import (
     Event,
     Job,
     JobState,
+    Point,
     StageRow,
     StageState,
     WorkerSeen,
@@ -35,6 +36,12 @@ _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
 """Columns of a stage that its events report."""
+
+_INPUT_BROKEN = {
+    "code": "input_broken",
+    "detail": "A stored file that this stage reads is damaged. Upload the runs of this study again, then start a new job; "
+    "'fluoromap check' names the damaged files.",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +202,45 @@ def fail(session: Session, held: Claim, error: dict[str, Any]) -> bool:
         return False
     _settle(session, job)
     return True
+
+
+def mend_input(session: Session, held: Claim, sha256: str) -> None:
+    """Compute a damaged input of a running stage again, or fail the stage.
+
+    A result of this job becomes ready again, and the stages after it wait for it. A run cannot be computed: the stage
+    fails and its error names the remedy.
+
+    Parameters
+    ----------
+    session : Session
+    held : Claim
+        The stage that met the damaged file.
+    sha256 : str
+        Address of the damaged file.
+    """
+    job = _lock(session, held.job_id)
+    rows = _stages(session, job.id)
+    own = next(row for row in rows if row.id == held.stage_id)
+    broken = [row for row in rows if row.state == StageState.DONE and row.result == sha256]
+    # Another stage may have met the same file first: then the input is being computed already.
+    inputs = {name for name in STAGES if own.name in after(STAGES[name].name)}
+    mending = any(row.name in inputs and row.state not in ENDED_STAGE for row in rows)
+    if not (broken or mending) or any(row.attempt >= settings().max_attempts for row in broken):
+        _end(session, held, StageState.FAILED, error=_INPUT_BROKEN)
+        _settle(session, job)
+        return
+    if not _end(session, held, StageState.PENDING, progress=0.0):
+        return
+    following = {name for row in broken for name in after(STAGES[row.name].name)}
+    for row in rows:
+        if row in broken or (row.name in following and row.state in (StageState.DONE, StageState.READY)):
+            row.state = StageState.READY if row in broken else StageState.PENDING
+            row.result, row.reused, row.progress, row.published, row.publications = None, False, 0.0, None, 0
+            _report_stage(session, job.id, row)
+    if any(row.name == "triangulate" and row.state in (StageState.READY, StageState.PENDING) for row in rows):
+        session.execute(delete(Point).where(Point.job_id == job.id))
+    session.flush()
+    _settle(session, job)
 
 
 def stopped(session: Session, held: Claim) -> None:

@@ -124,7 +124,7 @@ def add(
 ) -> bool:
     """Store an incoming file and refer to it from the study.
 
-    Return False when both exist already.
+    Return False when both exist already. The file is stored again in that case too, because the stored one may be damaged.
 
     Raises
     ------
@@ -140,8 +140,8 @@ def add(
             "The store has another file with the same SOP Instance UID; the sender must make a new UID for a changed file.",
             [("SOPInstanceUID", "already stored with other content")],
         )
+    files.keep(session, path, sha256=sha256)
     if known is None:
-        files.keep(session, path, sha256=sha256)
         session.add(
             Instance(
                 sop_instance_uid=facts.sop_instance_uid,

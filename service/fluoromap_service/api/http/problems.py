@@ -10,10 +10,14 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
+from sqlalchemy import select
 from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
 from fluoromap_service.problem import Problem
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.files import BrokenFile
+from fluoromap_service.store.models import Instance
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -108,6 +112,17 @@ def install(app: FastAPI) -> None:
         return answer(
             Problem(422, "invalid", "Some fields of the request are wrong; see 'errors' for each of them.", places)
         )
+
+    @app.exception_handler(BrokenFile)
+    def broken_file(request: Request, error: BrokenFile) -> JSONResponse:
+        log.error("broken_file", sha256=error.sha256)
+        with reading() as session:
+            uid = session.scalar(select(Instance.sop_instance_uid).where(Instance.sha256 == error.sha256).limit(1))
+        if uid is None:
+            detail = "The stored file of this result is damaged. Start a new job; it computes the result again."
+            return answer(Problem(409, "result_broken", detail))
+        detail = "The stored file of this run is damaged. Upload the same file again; it replaces the damaged one."
+        return answer(Problem(409, "run_broken", detail, [("sop_instance_uid", uid)]))
 
     @app.exception_handler(DataError)
     async def value_out_of_range(request: Request, error: DataError) -> JSONResponse:

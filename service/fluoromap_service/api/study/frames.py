@@ -24,7 +24,10 @@ router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"]
 @router.get(
     "/{uid}/frames/{n}.png",
     response_class=Response,
-    responses={200: {"content": {"image/png": {}}, "description": "The frame."}, **responses(401, 403, 404, 422, 429)},
+    responses={
+        200: {"content": {"image/png": {}}, "description": "The frame."},
+        **responses(401, 403, 404, 409, 422, 429),
+    },
 )
 def get_frame(
     study_id: StudyId,
@@ -49,7 +52,8 @@ def get_frame(
     etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
     if is_known(request, etag):
         return not_modified(etag)
-    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, files.path_of(run.instance.sha256), run.facts, n - 1, chosen)
+    path = files.checked_path(run.instance.sha256)
+    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
     # A stored file never changes, so a browser may keep the picture.
     return Response(
         picture, media_type="image/png", headers={"ETag": etag, "Cache-Control": "private, max-age=3600, immutable"}
