@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
 from fluoromap_service.settings import settings
+from fluoromap_service.store import tally
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.models import (
     ENDED_JOB,
@@ -36,6 +37,9 @@ _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
 """Columns of a stage that its events report."""
+
+SECONDS_BUCKETS = (0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 1800.0)
+"""Upper limits of the histogram of stage durations, in seconds."""
 
 _INPUT_BROKEN = {
     "code": "input_broken",
@@ -73,6 +77,7 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
     )
     session.add(job)
     session.flush()
+    now = session.scalar(select(db_now()))
     ids: dict[StageName, list[int]] = {}
     for stage in PIPELINE:
         depends_on = [number for name in stage.depends_on for number in ids[name]]
@@ -81,6 +86,7 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
             StageRow(
                 job_id=job.id, name=stage.name, subject=subject, plugin=plugin.name, plugin_version=plugin.version,
                 depends_on=depends_on, state=StageState.PENDING if depends_on else StageState.READY,
+                ready_since=None if depends_on else now,
             )
             for subject in subjects_of(stage, snapshot)
         ]  # fmt: skip
@@ -152,6 +158,7 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
             state=StageState.RUNNING,
             attempt=StageRow.attempt + 1,
             lease_until=db_now() + settings().lease_seconds,
+            started=db_now(),
             worker=worker,
             progress=0.0,
         )
@@ -231,11 +238,13 @@ def mend_input(session: Session, held: Claim, sha256: str) -> None:
         return
     if not _end(session, held, StageState.PENDING, progress=0.0):
         return
+    now = session.scalar(select(db_now()))
     following = {name for row in broken for name in after(STAGES[row.name].name)}
     for row in rows:
         if row in broken or (row.name in following and row.state in (StageState.DONE, StageState.READY)):
             row.state = StageState.READY if row in broken else StageState.PENDING
             row.result, row.reused, row.progress, row.published, row.publications = None, False, 0.0, None, 0
+            row.ready_since = now if row in broken else None
             _report_stage(session, job.id, row)
     if any(row.name == "triangulate" and row.state in (StageState.READY, StageState.PENDING) for row in rows):
         session.execute(delete(Point).where(Point.job_id == job.id))
@@ -300,6 +309,8 @@ def reap(session: Session) -> int:
             }
         else:
             stage.state = StageState.READY
+            stage.ready_since = session.scalar(select(db_now()))
+        tally.add(session, {"leases_reaped": 1.0})
         stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
         _report_stage(session, job_id, stage)
         _settle(session, job)
@@ -338,7 +349,20 @@ def _end(session: Session, held: Claim, state: StageState, **values: Any) -> boo
     if ended is None:
         return False
     _report_stage(session, held.job_id, ended)
+    if state in ENDED_STAGE:
+        _count(session, held, state)
     return True
+
+
+def _count(session: Session, held: Claim, state: StageState) -> None:
+    """Add the end of a stage to the sums that the metrics report."""
+    started = StageRow.started
+    seconds = session.scalar(select(db_now() - started).where(StageRow.id == held.stage_id)) or 0.0
+    bucket = next((limit for limit in SECONDS_BUCKETS if seconds <= limit), float("inf"))
+    counts = {f"stages|{held.name}|{state}": 1.0}
+    if state == StageState.DONE:
+        counts |= {f"stage_seconds|{held.name}": max(seconds, 0.0), f"stage_seconds_bucket|{held.name}|{bucket:g}": 1.0}
+    tally.add(session, counts)
 
 
 def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState], names: Iterable[str]) -> None:
@@ -365,16 +389,19 @@ def _settle(session: Session, job: Job) -> None:
         _cancel_waiting(session, job.id, (StageState.PENDING,), lost)
         rows = _stages(session, job.id)
     ended = {row.id for row in rows if row.state in ENDED_STAGE}
+    now = session.scalar(select(db_now()))
     for row in rows:
         if row.state == StageState.PENDING and set(row.depends_on) <= ended:
             row.state = StageState.READY
+            row.ready_since = now
             _report_stage(session, job.id, row)
     if len(ended) == len(rows):
         if job.cancel_requested:
             job.state = JobState.CANCELLED
         else:
             job.state = JobState.FAILED if broken else JobState.SUCCEEDED
-        job.finished = session.scalar(select(db_now()))
+        job.finished = now
+        tally.add(session, {f"jobs|{job.state}": 1.0})
         _report_job(session, job)
 
 

@@ -23,6 +23,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap_service.settings import settings
 from fluoromap_service.store.models import File, Instance, Rendering, StageResult, StageRow
+from fluoromap_service.store.private_folder import make_private_folder
 
 CHUNK_BYTES = 1 << 20
 ABANDONED_SECONDS = 5.0
@@ -56,7 +57,8 @@ def incoming() -> Iterator[Path]:
     The file is removed at the end unless it was kept.
     """
     folder = incoming_folder()
-    folder.mkdir(parents=True, exist_ok=True)
+    make_private_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
     handle, name = tempfile.mkstemp(dir=folder)
     path = Path(name)
     try:

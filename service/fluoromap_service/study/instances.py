@@ -15,7 +15,7 @@ from fluoromap_service.dicom.facts import InstanceFacts
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
-from fluoromap_service.store.engine import writing
+from fluoromap_service.store.engine import empty_write_ahead_log, writing
 from fluoromap_service.store.models import ENDED_JOB, Correction, File, Instance, Job, Rendering, Site, StudyInstance
 from fluoromap_service.study.snapshot import GantrySnapshot
 
@@ -244,3 +244,4 @@ def unlink_unreferenced(hashes: Iterable[str]) -> None:
             files.lock(session)
             if session.get(File, sha256) is None:
                 files.path_of(sha256).unlink(missing_ok=True)
+    empty_write_ahead_log()

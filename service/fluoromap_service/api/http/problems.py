@@ -15,6 +15,7 @@ from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
 from fluoromap_service.problem import Problem
+from fluoromap_service.store.disk import FULL
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.files import BrokenFile
 from fluoromap_service.store.models import Instance
@@ -70,10 +71,17 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+def no_space() -> Problem:
+    """Return the 507 for a disk that has no room left."""
+    detail = "The disk of the service is nearly full; delete studies that nobody needs, or give it more space."
+    return Problem(507, "no_space", detail)
+
+
 _CODES = {
     400: "malformed",
     404: "not_found",
     405: "method_not_allowed",
+    408: "request_timeout",
     413: "too_large",
     415: "unsupported_media_type",
 }
@@ -129,9 +137,9 @@ def install(app: FastAPI) -> None:
         detail = "The request contains a NUL character or a number out of range; remove it."
         return answer(Problem(422, "invalid", detail))
 
-    @app.exception_handler(Exception)
-    async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        log.error(
-            "unexpected_error", error=type(error).__name__, path=request.scope.get("route_path", ""), exc_info=error
-        )
-        return answer(Problem(500, "internal", "The service failed and changed nothing; see its log."))
+    @app.exception_handler(OSError)
+    async def disk_is_full(request: Request, error: OSError) -> JSONResponse:
+        if error.errno not in FULL:
+            raise error
+        log.error("disk_full", path=getattr(request.scope.get("route"), "path", ""))
+        return answer(no_space())

@@ -9,7 +9,6 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
-from starlette.concurrency import run_in_threadpool
 
 from fluoromap.geometry import LEAST_SOURCE_MM
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
@@ -19,7 +18,7 @@ from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
-from fluoromap_service.api.study.uploads import Part, receive
+from fluoromap_service.api.study.uploads import Part, in_upload_thread, receive
 from fluoromap_service.dicom import InstanceFacts, read_instance
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
@@ -161,7 +160,7 @@ async def upload_instances(
 
     A problem of one file does not affect the others.
     """
-    await run_in_threadpool(_check_study, study_id)
+    await in_upload_thread(_check_study, study_id)
     with ExitStack() as stack:
         parts, site_field = await receive(request, stack)
         site = site if site_field is None else site_field
@@ -175,7 +174,7 @@ async def upload_instances(
                 "The request has no part named 'file'; send each run as such a part.",
                 [("file", "missing")],
             )
-        return await run_in_threadpool(_store, study_id, parts, site, once)
+        return await in_upload_thread(_store, study_id, parts, site, once)
 
 
 def _check_study(study_id: str) -> None:

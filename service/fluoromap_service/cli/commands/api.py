@@ -7,6 +7,7 @@ import uvicorn
 
 from fluoromap_service import auth, logs
 from fluoromap_service.api.app import create_app
+from fluoromap_service.api.http.connections import TimedConnection
 from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options, keep_compiled_kernels
 from fluoromap_service.cli.options import DataDir, Host, Port
@@ -28,6 +29,8 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
         auth.check_may_start(settings().host)
     uvicorn.run(
         create_app(),
+        http=TimedConnection,
+        log_config=None,
         host=settings().host,
         port=settings().port,
         log_level="warning",
