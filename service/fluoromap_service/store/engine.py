@@ -64,6 +64,12 @@ def engine() -> Engine:
     return _engine(settings().effective_database_url)
 
 
+def forget_engine() -> None:
+    """Close all connections, so that the next one opens a database that was replaced."""
+    engine().dispose()
+    _engine.cache_clear()
+
+
 def forget_connections() -> None:
     """Drop the connections that a fork inherited; the parent's side stays open."""
     engine().dispose(close=False)

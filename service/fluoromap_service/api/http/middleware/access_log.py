@@ -5,6 +5,7 @@ A path can contain a SOP Instance UID or a site's name, so the line has the rout
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter
 from typing import Any
@@ -39,6 +40,18 @@ def route_of(scope: Scope) -> str:
     return str(getattr(scope.get("route"), "path", NO_ROUTE))
 
 
+def ids_of(scope: Scope) -> dict[str, str]:
+    """Return the ids of study and job in the path; other text there is none of ours and may be a name."""
+    ids = {name: str(scope.get("path_params", {}).get(name)) for name in ("study_id", "job_id")}
+    return {name: value for name, value in ids.items() if re.fullmatch("[0-9a-f]{32}", value)}
+
+
+def method_of(scope: Scope) -> str:
+    """Return the method of the request."""
+    method = str(scope["method"])
+    return method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS") else "other"
+
+
 class AccessLog:
     """ASGI middleware that logs and counts requests, and answers unexpected errors with 500.
 
@@ -71,7 +84,7 @@ class AccessLog:
                 await answer(problem)(scope, receive, send_counted)
         finally:
             seconds = time.perf_counter() - start
-            self._counts.add(_method(scope), route_of(scope), status, seconds)
+            self._counts.add(method_of(scope), route_of(scope), status, seconds)
             caller = scope.get("state", {}).get("caller")
             log.info(
                 "request",
@@ -84,10 +97,4 @@ class AccessLog:
 
 
 def _request(scope: Scope) -> dict[str, Any]:
-    ids = {name: value for name, value in scope.get("path_params", {}).items() if name in ("study_id", "job_id")}
-    return {"method": _method(scope), "path": route_of(scope), **ids}
-
-
-def _method(scope: Scope) -> str:
-    method = str(scope["method"])
-    return method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS") else "other"
+    return {"method": method_of(scope), "path": route_of(scope), **ids_of(scope)}

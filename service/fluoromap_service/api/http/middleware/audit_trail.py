@@ -11,7 +11,7 @@ import threading
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fluoromap_service.api.http.middleware.access_log import NO_ROUTE, route_of
+from fluoromap_service.api.http.middleware.access_log import NO_ROUTE, ids_of, method_of, route_of
 from fluoromap_service.store import audit
 from fluoromap_service.store.audit import Act
 from fluoromap_service.store.engine import writing
@@ -75,6 +75,6 @@ class AuditTrail:
         finally:
             route, caller = route_of(scope), scope.get("state", {}).get("caller")
             if caller is not None and route not in NOT_RECORDED:
-                ids = scope.get("path_params", {})
+                ids = ids_of(scope)
                 subject = {"study": ids.get("study_id"), "job": ids.get("job_id"), **dict([created] if created else [])}
-                self._acts.add(Act(caller.name, f"{scope['method']} {route}", status=status, **subject))
+                self._acts.add(Act(caller.name, f"{method_of(scope)} {route}"[:200], status=status, **subject))
