@@ -57,7 +57,7 @@ def examine(settled_seconds: float = SETTLED_SECONDS) -> Findings:
     broken = sorted(sha256 for sha256 in rows if not _has_its_hash(sha256))
     with reading() as session:
         pairs = session.execute(select(Instance.sha256, Instance.sop_instance_uid)).all()
-        runs = {sha256: uid for sha256, uid in pairs}
+        runs = {row.sha256: row.sop_instance_uid for row in pairs}
         jobs = {
             job
             for sha256 in broken
