@@ -127,12 +127,14 @@ def read_job(session: Session, job: Job) -> JobAnswer:
 def job_summaries(session: Session, jobs: Sequence[Job]) -> dict[str, JobSummary]:
     """Return the entries of several jobs in a list, by their ids.
 
-    The database computes the progress of the jobs that have not ended. No stage and no snapshot is read.
+    The database computes the progress of the running jobs; no stage of a queued job has begun. No stage and no snapshot is read.
     """
-    active = [job.id for job in jobs if job.state not in ENDED_JOB]
+    progress = {job.id: 0.0 for job in jobs if job.state == JobState.QUEUED}
+    active = [job.id for job in jobs if job.state == JobState.RUNNING]
     part = case((StageRow.state.in_(list(ENDED_STAGE)), 1.0), else_=StageRow.progress)
     means = select(StageRow.job_id, func.avg(part)).where(StageRow.job_id.in_(active)).group_by(StageRow.job_id)
-    progress = {job_id: round(mean, 4) for job_id, mean in session.execute(means)}
+    if active:
+        progress |= {job_id: round(mean, 4) for job_id, mean in session.execute(means)}
     return {
         job.id: JobSummary(
             id=job.id,
