@@ -66,7 +66,7 @@ class Timings:
 
 
 async def _request(address: tuple[str, int], head: str, body: bytes = b"") -> tuple[int, bytes]:
-    """Send one request on a connection of its own and return status and body."""
+    """Send one request on a new connection; return status and body."""
     reader, writer = await asyncio.open_connection(*address)
     try:
         writer.write(f"{head}\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n".encode())
@@ -160,7 +160,7 @@ def _runs(folder: Path) -> tuple[list[bytes], bytes]:
 
 
 def _fill(queued: int, ended: int, sites: int) -> str:
-    """Add a study with queued jobs of many sites and with ended jobs; return its id."""
+    """Add a study with queued and ended jobs; return its id."""
     from sqlalchemy import insert
 
     from fluoromap_service.store import schema

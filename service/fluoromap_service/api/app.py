@@ -121,7 +121,10 @@ async def _warm_up() -> None:
 
 
 async def _repeat(failure: str, act: Callable[[], None], seconds: float) -> None:
-    """Act again and again as long as the service runs; ``failure`` is the log event of an act that failed."""
+    """Repeat an act as long as the service runs.
+
+    ``failure`` is the log event of an act that failed.
+    """
     failing = False
     # Threads of its own: work on the service itself must go on when all requests wait.
     limiter = CapacityLimiter(1)

@@ -148,7 +148,10 @@ def _staging() -> Iterator[Path]:
 
 
 def _take_snapshot(database: Path, folder: Path) -> list[str]:
-    """Link all files and copy the database at one moment; return the hashes of missing files."""
+    """Link all files and copy the database at one moment.
+
+    Return the hashes of missing files.
+    """
     missing = []
     # Nobody can delete a file or commit a row until this transaction ends.
     with writing() as session:

@@ -20,7 +20,7 @@ class NoSpace(OSError):
 
 
 def free_bytes() -> int:
-    """Return the space that this user may still fill on the disk of the data folder."""
+    """Return the space that this user may still fill."""
     facts = os.statvfs(_existing(settings().data_dir))
     return facts.f_bavail * facts.f_frsize
 

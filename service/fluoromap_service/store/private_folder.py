@@ -20,7 +20,10 @@ def make_private_folder(folder: Path) -> None:
 
 
 def make_private_file(path: Path) -> None:
-    """Make an empty file that other users cannot read, or close an existing one to them."""
+    """Make an empty file that other users cannot read.
+
+    An existing file is closed to them.
+    """
     os.close(os.open(path, os.O_CREAT | os.O_RDWR, FILE_MODE))
     _take_away(path, FILE_MODE)
 

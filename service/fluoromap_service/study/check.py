@@ -74,7 +74,10 @@ def examine(settled_seconds: float = SETTLED_SECONDS) -> Findings:
 
 
 def mend(findings: Findings) -> None:
-    """Remove orphans and unused files, and forget damaged results so that they are computed again."""
+    """Remove orphans and unused files, and forget damaged results.
+
+    A new job computes a forgotten result again.
+    """
     unlink_unreferenced(findings.orphans)
     with writing() as session:
         files.lock(session)

@@ -27,7 +27,10 @@ log = structlog.get_logger(__name__)
 
 
 def clean_up() -> None:
-    """Remove everything that is out of date; any process may call it at any time."""
+    """Remove everything that is out of date.
+
+    Any process may call it at any time.
+    """
     removed = files.remove_abandoned()
     if removed:
         log.info("incoming_files_removed", files=removed)
@@ -41,7 +44,10 @@ def clean_up() -> None:
 
 
 def delete_old_studies(days: float) -> int:
-    """Delete the studies without a change or a job for so many days, and return how many."""
+    """Delete the studies without a change or job for so many days.
+
+    Return how many.
+    """
     last_job = select(func.max(Job.created)).where(Job.study_id == Study.id).scalar_subquery()
     limit = db_now() - days * 86400.0
     old = select(Study.id).where(Study.updated < limit, func.coalesce(last_job, 0.0) < limit)
@@ -63,7 +69,10 @@ def delete_old_studies(days: float) -> int:
 
 
 def delete_renderings() -> int:
-    """Delete kept pictures, meshes and pages, and return how many; the service makes them again on request."""
+    """Delete kept pictures, meshes and pages, and return how many.
+
+    The service makes them again on request.
+    """
     deleted = 0
     while True:
         with writing() as session:

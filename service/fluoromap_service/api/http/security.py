@@ -102,7 +102,10 @@ def _check_local(connection: HTTPConnection) -> None:
 
 
 def _is_navigation(connection: HTTPConnection) -> bool:
-    """Return whether a person follows a link to this service; the page with the link cannot read the answer."""
+    """Return whether a person follows a link to this service.
+
+    The page with the link cannot read the answer.
+    """
     headers = connection.headers
     return (
         connection.scope.get("method") == "GET"

@@ -215,7 +215,10 @@ def _write_part(write: Callable[[bytes], None], part: bytes) -> None:
 
 
 async def in_upload_thread(function: Callable[..., Answer], *arguments: Any) -> Answer:
-    """Call a function in a thread of the uploads; they need not wait for the threads of readers."""
+    """Call a function in a thread of the uploads.
+
+    They need not wait for the threads of readers.
+    """
     return await to_thread.run_sync(function, *arguments, limiter=_threads())
 
 

@@ -1,4 +1,4 @@
-"""Security headers on every answer, whoever makes it."""
+"""Security headers on every answer, also of the layers around the routes."""
 
 from __future__ import annotations
 

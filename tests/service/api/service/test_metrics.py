@@ -1,4 +1,4 @@
-"""The metrics: well formed, true, without patient data, and the ones that dashboard and alerts use."""
+"""The metrics: well formed, true, without patient data, and equal to those of dashboard and alerts."""
 
 from __future__ import annotations
 

@@ -41,7 +41,10 @@ def route_of(scope: Scope) -> str:
 
 
 def ids_of(scope: Scope) -> dict[str, str]:
-    """Return the ids of study and job in the path; other text there is none of ours and may be a name."""
+    """Return the ids of study and job in the path.
+
+    Other text in their place is left out, because it may be a name.
+    """
     ids = {name: str(scope.get("path_params", {}).get(name)) for name in ("study_id", "job_id")}
     return {name: value for name, value in ids.items() if re.fullmatch("[0-9a-f]{32}", value)}
 

@@ -37,7 +37,10 @@ class Acts:
                 self._waiting.append(act)
 
     def flush(self) -> None:
-        """Write all waiting acts to the trail. After a failure of the database they wait for the next call."""
+        """Write all waiting acts to the trail.
+
+        After a failure of the database they wait for the next call.
+        """
         with self._flushing:
             with self._lock:
                 batch = list(self._waiting)
