@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -34,7 +35,7 @@ def export(
     apply_options(data_dir=data_dir)
     with explain_database_failures():
         schema.upgrade()
-        with reading() as session, sys.stdout if file is None else file.open("x") as stream:
+        with reading() as session, nullcontext(sys.stdout) if file is None else file.open("x") as stream:
             for entry in trail.entries(session):
                 stream.write(json.dumps(trail.as_json(entry)) + "\n")
 
