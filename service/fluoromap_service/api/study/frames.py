@@ -57,7 +57,7 @@ class PreviewOut(BaseModel):
             "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
             "description": "The frame.",
         },
-        **responses(401, 403, 404, 422, 429),
+        **responses(401, 403, 404, 409, 422, 429),
     },
 )
 def get_frame(
@@ -78,8 +78,8 @@ def get_frame(
     """
     chosen = None if window is None else _window(window)
     run, catalogue = _run_with_frame(study_id, uid, n)
-    path, px_per_mm = files.path_of(run.instance.sha256), _px_per_mm(run)
     if electrodes:
+        path, px_per_mm = files.checked_path(run.instance.sha256), _px_per_mm(run)
         marked = run_in_pool(
             Task.FIND_ELECTRODES, preview.preview_png, path, run.facts, catalogue, n - 1, px_per_mm, chosen
         )
@@ -88,6 +88,7 @@ def get_frame(
     etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
     if is_known(request, etag):
         return not_modified(etag)
+    path = files.checked_path(run.instance.sha256)
     picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
     # A stored file never changes, so a browser may keep the picture.
     return Response(
@@ -95,14 +96,14 @@ def get_frame(
     )
 
 
-@router.get("/{uid}/frames/{n}/preview", responses=responses(401, 403, 404, 422, 429))
+@router.get("/{uid}/frames/{n}/preview", responses=responses(401, 403, 404, 409, 422, 429))
 def get_preview(study_id: StudyId, uid: InstanceUid, n: FrameNumber, caller: Reader) -> PreviewOut:
     """Find the electrodes of one frame without a job, for showing only.
 
     The run's geometry may be incomplete: then the scale is found from the study's catheters, and `scale` says so.
     """
     run, catalogue = _run_with_frame(study_id, uid, n)
-    path = files.path_of(run.instance.sha256)
+    path = files.checked_path(run.instance.sha256)
     found = run_in_pool(
         Task.FIND_ELECTRODES, preview.preview_electrodes, path, run.facts, catalogue, n - 1, _px_per_mm(run)
     )
