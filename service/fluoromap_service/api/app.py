@@ -105,11 +105,8 @@ def create_app() -> FastAPI:
     app.add_middleware(DiskSpace)
     app.add_middleware(AuditTrail, acts=acts)
     app.add_middleware(Doorkeeper, sign_ins=sign_ins)
-    app.add_middleware(RequestBody)
-    app.add_middleware(AccessLog, counts=counts)
-    app.add_middleware(SecurityHeaders)
     if settings().cors_origins:
-        # The outermost layer: a browser asks for permission without a token, and reads refusals too.
+        # Before the doorkeeper: a browser asks for permission without a token, and reads refusals too.
         app.add_middleware(
             CORSMiddleware,
             allow_origins=settings().allowed_origins,
@@ -117,6 +114,9 @@ def create_app() -> FastAPI:
             allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "If-None-Match", "Last-Event-ID"],
             expose_headers=["Location", "Link", "ETag", "Retry-After", "Idempotency-Replayed", "Content-Disposition"],
         )
+    app.add_middleware(RequestBody)
+    app.add_middleware(AccessLog, counts=counts)
+    app.add_middleware(SecurityHeaders)
     return app
 
 

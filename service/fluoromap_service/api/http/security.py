@@ -97,12 +97,13 @@ def _check_local(connection: HTTPConnection) -> None:
     name = _host_name(host)
     if name is None or not auth.is_loopback(name):
         raise Problem(403, "foreign_host", "Without tokens this service answers only under localhost or 127.0.0.1.")
-    site = connection.headers.get("sec-fetch-site", "none")
-    if site not in ("same-origin", "none") and not _is_navigation(connection):
-        raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
     origin = connection.headers.get("origin")
+    allowed = origin is not None and origin.lower() in settings().allowed_origins
+    site = connection.headers.get("sec-fetch-site", "none")
+    if site not in ("same-origin", "none") and not allowed and not _is_navigation(connection):
+        raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
     own = f"{connection.scope['scheme']}://{host}".lower()
-    if origin is not None and origin.lower() not in (own, *settings().allowed_origins):
+    if origin is not None and not allowed and origin.lower() != own:
         raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
 
 
