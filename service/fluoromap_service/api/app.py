@@ -8,9 +8,11 @@ from contextlib import asynccontextmanager, suppress
 
 import structlog
 from anyio import CapacityLimiter, to_thread
-from fastapi import FastAPI
-from fastapi.responses import JSONResponse
+from fastapi import Depends, FastAPI
+from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware.cors import CORSMiddleware
 
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.body_limit import BodyLimit
@@ -19,13 +21,24 @@ from fluoromap_service.api.http.middleware.audit_trail import FLUSH_SECONDS, Act
 from fluoromap_service.api.http.middleware.disk_space import DiskSpace
 from fluoromap_service.api.http.middleware.request_body import RequestBody
 from fluoromap_service.api.http.middleware.security_headers import SecurityHeaders
+from fluoromap_service.api.http.query_names import check_query_names
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, metrics, plugins
-from fluoromap_service.api.study import activation_times, electrodes, electrograms, frames, instances, sites, studies
+from fluoromap_service.api.service.api_page import api_page
+from fluoromap_service.api.study import (
+    activation_times,
+    catheter_types,
+    electrodes,
+    electrograms,
+    frames,
+    instances,
+    sites,
+    studies,
+)
 from fluoromap_service.jobs import queue
 from fluoromap_service.settings import settings
 from fluoromap_service.study.upkeep import clean_up
@@ -35,6 +48,7 @@ CLEAN_UP_SECONDS = 60.0
 
 ROUTERS = (
     studies.router,
+    catheter_types.router,
     instances.router,
     frames.router,
     electrodes.router,
@@ -68,6 +82,8 @@ def create_app() -> FastAPI:
         redoc_url=None,
         openapi_url=None,
         redirect_slashes=False,
+        dependencies=[Depends(check_query_names)],
+        generate_unique_id_function=_operation_id,
         lifespan=_lifespan,
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
@@ -80,15 +96,36 @@ def create_app() -> FastAPI:
     def openapi(caller: Reader) -> JSONResponse:
         return JSONResponse(document(app))
 
+    @app.get("/docs", include_in_schema=False)
+    def docs(caller: Reader) -> HTMLResponse:
+        return HTMLResponse(api_page(document(app)))
+
     # The last one added is the outermost.
     app.add_middleware(BodyLimit)
     app.add_middleware(DiskSpace)
     app.add_middleware(AuditTrail, acts=acts)
     app.add_middleware(Doorkeeper, sign_ins=sign_ins)
+    if settings().cors_origins:
+        # Before the doorkeeper: a browser asks for permission without a token, and reads refusals too.
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings().allowed_origins,
+            allow_methods=["GET", "POST", "PUT", "PATCH", "DELETE"],
+            allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "If-None-Match", "Last-Event-ID"],
+            expose_headers=["Location", "Link", "ETag", "Retry-After", "Idempotency-Replayed", "Content-Disposition"],
+        )
     app.add_middleware(RequestBody)
     app.add_middleware(AccessLog, counts=counts)
     app.add_middleware(SecurityHeaders)
     return app
+
+
+def _operation_id(route: APIRoute) -> str:
+    """Return the name of a route's function.
+
+    Generators of clients name their calls after it.
+    """
+    return route.name
 
 
 @asynccontextmanager
@@ -100,7 +137,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     ]
     if not settings().eager:
         tasks += [
-            asyncio.create_task(_repeat("sweep_failed", queue.sweep, SWEEP_SECONDS)),
+            asyncio.create_task(_repeat("sweep_failed", _sweep, SWEEP_SECONDS)),
             asyncio.create_task(_warm_up()),
         ]
     try:
@@ -118,6 +155,12 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 async def _warm_up() -> None:
     await run_in_threadpool(file_pool.start)
+
+
+def _sweep() -> None:
+    """Free the stages of dead workers, announce ready stages, and watch the queue."""
+    queue.sweep()
+    health.watch_queue()
 
 
 async def _repeat(failure: str, act: Callable[[], None], seconds: float) -> None:

@@ -70,11 +70,6 @@ def forget_engine() -> None:
     _engine.cache_clear()
 
 
-def forget_connections() -> None:
-    """Drop the connections that a fork inherited; the parent's side stays open."""
-    engine().dispose(close=False)
-
-
 @contextmanager
 def reading() -> Iterator[Session]:
     """Open a transaction that only reads.

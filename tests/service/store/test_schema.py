@@ -17,6 +17,7 @@ from sqlalchemy import inspect, select, text
 
 from fluoromap_service import auth
 from fluoromap_service.jobs import job_life
+from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import engine as store_engine
 from fluoromap_service.store import schema
@@ -156,3 +157,16 @@ def _make_first_schema() -> None:
         command.upgrade(config, "0001")
         for statement in FIRST_ROWS:
             connection.exec_driver_sql(statement)
+
+
+@pytest.mark.usefixtures("database")
+def test_missing_and_newer_tables_are_refused_in_a_sentence() -> None:
+    with pytest.raises(Problem, match="db upgrade"):
+        schema.check()
+    schema.upgrade()
+    schema.check()
+    with engine().begin() as connection:
+        connection.execution_options(writes=True).execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    for refuse in (schema.check, schema.upgrade):
+        with pytest.raises(Problem, match="newer version"):
+            refuse()

@@ -11,7 +11,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from sqlalchemy import select
-from sqlalchemy.exc import DataError
+from sqlalchemy.exc import DataError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from fluoromap_service.problem import Problem
@@ -88,6 +89,24 @@ _CODES = {
 """Codes of errors that the framework raises."""
 
 
+DATABASE_AWAY = (OperationalError, InterfaceError, PoolTimeout)
+"""The errors of a database that cannot be reached, is locked, or has no free connection."""
+
+DATABASE_RETRY_SECONDS = 5
+
+
+def database_away(error: Exception) -> Problem:
+    """Return the 503 for a database that gave no answer.
+
+    Log one line, without the address of the database.
+    """
+    log.warning("database_unavailable", error=type(error).__name__)
+    return Problem(
+        503, "database_unavailable", "The database does not answer or is locked; nothing was changed. Send the request again.",
+        headers={"Retry-After": str(DATABASE_RETRY_SECONDS)},
+    )  # fmt: skip
+
+
 def install(app: FastAPI) -> None:
     """Make every error of the application a problem document."""
 
@@ -143,3 +162,9 @@ def install(app: FastAPI) -> None:
             raise error
         log.error("disk_full", path=getattr(request.scope.get("route"), "path", ""))
         return answer(no_space())
+
+    async def unavailable(request: Request, error: Exception) -> JSONResponse:
+        return answer(database_away(error))
+
+    for kind in DATABASE_AWAY:
+        app.add_exception_handler(kind, unavailable)

@@ -25,7 +25,10 @@ router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"]
     "/{uid}/frames/{n}.png",
     response_class=Response,
     responses={
-        200: {"content": {"image/png": {}}, "description": "The frame."},
+        200: {
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "The frame.",
+        },
         **responses(401, 403, 404, 409, 422, 429),
     },
 )
