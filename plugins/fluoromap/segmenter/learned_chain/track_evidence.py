@@ -6,7 +6,7 @@ noise: a catheter becomes clear in it, while beads of contrast medium stay as im
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -45,7 +45,8 @@ class TrackEvidence:
 
     def __call__(self, chains: Mapping[int, Chain], log_image: Callable[[int], Image]) -> bool:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
-        frames = sorted(chains)
+        usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
+        frames = sorted(frame for frame, chain in chains.items() if chain.electrodes == usual)
         paths = np.array([chains[frame].pixels_uv for frame in frames])
         odds = np.array(
             [

@@ -66,3 +66,10 @@ def test_a_long_catheter_is_judged_in_sections(images):
     row = np.stack([np.linspace(100.0, 400.0, 20), np.full(20, 200.0)], axis=1)
     path_uv = np.repeat(row[None], FRAMES, axis=0)
     assert not judge(chains(path_uv), lambda frame: images[frame])
+
+
+def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    track = chains(noisy.truth.pixels_uv["reference"])
+    track[2] = next(iter(chains(noisy.truth.pixels_uv["reference"][2:3, :3]).values()))
+    assert judge(track, lambda frame: images[frame])
