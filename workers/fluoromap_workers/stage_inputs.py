@@ -254,6 +254,7 @@ def _monoplane_view(
         a_priori_frame=located.frame_a if first else located.frame_b,
         cycle=located.cycle,
         others=others,
+        variation=located.variation,
     )
 
 

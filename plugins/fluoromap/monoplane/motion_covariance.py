@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Self
 
 import numpy as np
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue, follows_tip
-from fluoromap.contracts import Array, MonoplaneView
+from fluoromap.contracts import Array, MonoplaneView, StudyVariation
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
 from fluoromap.monoplane.view_electrodes import isocentre_covariance_mm2
@@ -17,6 +18,8 @@ FIXED, OFFSET, TILT, BEND = range(4)
 _READING_SD_FRAMES = 0.29
 """An R wave is timed to the nearest frame: standard deviation of a uniform distribution one frame wide."""
 _SYSTOLE_PHASE = 0.3
+_FOLLOWS_INTERVAL = 0.5
+"""Change of a beat's amplitude with the interval before it, both as shares."""
 _ALIGNED_SD_CYCLE = 0.01
 _OFFSET_HARMONICS, _SHAPE_HARMONICS = 4, 3
 _LASTING_SHARE = 0.7
@@ -53,9 +56,23 @@ class MotionParams(BaseModel, extra="forbid"):
     )
     gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of each gantry angle, degrees.")
     magnification_sd: float = Field(
-        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+        0.003, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
     )
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
+
+    def of_study(self, variation: StudyVariation) -> Self:
+        """Return the parameters with the breathing, beats and gantry errors that the study shows."""
+        return self.model_copy(
+            update={
+                "respiration_head_feet_sd_mm": variation.breathing * self.respiration_head_feet_sd_mm,
+                "respiration_other_sd_mm": variation.breathing * self.respiration_other_sd_mm,
+                "respiration_drift_sd_mm": variation.breathing * self.respiration_drift_sd_mm,
+                "beat_sd_mm": variation.beats * self.beat_sd_mm,
+                "gantry_angle_sd_deg": variation.gantry_angle * self.gantry_angle_sd_deg,
+                "isocentre_sd_mm": variation.gantry_offset * self.isocentre_sd_mm,
+                "magnification_sd": variation.gantry_angle * self.magnification_sd,
+            }
+        )
 
     def respiration_sd_mm(self) -> Array:
         """Return the breathing standard deviations (3,) along the patient's axes, mm."""
@@ -85,41 +102,57 @@ class MotionCovariance:
 
     def window(self, frames: slice) -> PathPrior:
         """Return the prior of consecutive frames, about one beat."""
-        columns, parts = [], []
-        for part, block in self._parts(frames):
-            columns.append(block)
+        columns, unseen, parts = [], [], []
+        rays = self.rays[frames]
+        for part, seen_along, block in self._parts(frames):
+            along = _along(rays, block)
+            columns.append(block if seen_along else block - along)
+            unseen.append(np.zeros_like(along) if seen_along else along)
             parts += [part] * block.shape[-1]
         mean = self._expected.mean_mm[frames]
-        return PathPrior(mean, np.concatenate(columns, axis=-1), np.array(parts), self._white(frames))
+        return PathPrior(
+            mean,
+            np.concatenate(columns, axis=-1),
+            np.concatenate(unseen, axis=-1),
+            np.array(parts),
+            self._white(frames),
+        )
 
-    def _parts(self, frames: slice) -> Iterator[tuple[int, Array]]:
-        """Yield columns (n, m, 3, k) with their part."""
+    def _parts(self, frames: slice) -> Iterator[tuple[int, bool, Array]]:
+        """Yield each part, whether the view shows its depth, and its columns (n, m, 3, k).
+
+        A view shows the depth of a beat by its motion across the rays, and the depth of a tilt by the catheter's lengths. It
+        does not show the depth of a catheter as a whole, nor that of breathing: 1 mm changes the size of the image by 0.2 %.
+        """
         p, expected = self._params, self._expected
         mean = expected.mean_mm[frames]
         n, m = mean.shape[:2]
         breath = p.respiration_sd_mm()
         everywhere = np.ones((n, m, 1, 1))
         isocentre = isocentre_covariance_mm2(self._camera, p.isocentre_sd_mm)
-        yield FIXED, everywhere * _root(expected.common_mm2 + np.diag(breath**2) + isocentre)
+        yield FIXED, False, everywhere * _root(expected.common_mm2 + np.diag(breath**2) + isocentre)
         # Biplane positions are those at the middle of the two runs' breathing positions. This run's breathing position is
         # as far from the middle as the other run's. The other run alone measured the depth, so that the error along the
         # ray is twice the distance to the middle.
         depth = min(self._axis @ expected.common_mm2 @ self._axis, self._axis @ np.diag(breath**2) @ self._axis / 2)
-        yield FIXED, everywhere * np.sqrt(depth) * self._axis[:, None]
+        yield FIXED, False, everywhere * np.sqrt(depth) * self._axis[:, None]
         if breath.max() > 0:
             drift = p.respiration_drift_sd_mm * breath / breath.max()
-            yield FIXED, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
+            yield FIXED, False, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
         # The other view measured the depth; its wrong gantry angle rotates that depth about the isocentre.
-        turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
-        yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
+        from_isocentre = mean - self._camera.isocentre_world_mm
+        turned = np.cross(np.eye(3), from_isocentre[:, :, None]).swapaxes(-1, -2)
+        yield FIXED, False, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
         # This view's wrong angle is a source of its own, else its effect would be taken for another size, that is depth.
-        yield FIXED, turned * np.radians(p.gantry_angle_sd_deg)
-        yield FIXED, (mean * p.magnification_sd)[..., None]
+        # It displaces the image, not the electrode: only its part across the rays counts.
+        rays = self.rays[frames]
+        yield FIXED, False, _across(rays, turned) * np.radians(p.gantry_angle_sd_deg)
+        yield FIXED, False, _across(rays, from_isocentre[..., None]) * p.magnification_sd
         yield from self._beats(frames, self.rays[frames])
         if expected.beats:
             yield from self._free(frames)
 
-    def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, Array]]:
+    def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, bool, Array]]:
         """Yield the deviations of this beat from the mean beat.
 
         The mean beats of the two views differ too.
@@ -131,20 +164,23 @@ class MotionCovariance:
         reading = _READING_SD_FRAMES / expected.frames_per_cycle
         timing = np.hypot(p.beat_timing_sd, reading)
         uneven = _SYSTOLE_PHASE * expected.cycle_spread
-        yield FIXED, moved * p.beat_amplitude_sd
-        yield FIXED, velocity * np.hypot(timing, uneven)
+        # A long interval fills the heart: the beat after it is stronger.
+        amplitude = np.hypot(p.beat_amplitude_sd, _FOLLOWS_INTERVAL * expected.cycle_spread)
+        yield FIXED, True, moved * amplitude
+        yield FIXED, True, velocity * np.hypot(timing, uneven)
         averaged = 1 / np.sqrt(expected.beats)
         for name in self._catheters:
-            yield FIXED, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
+            yield FIXED, False, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
         if expected.own_cycle:
             # Depth comes from the other view's run, and this view cannot show how that run's beats differ.
-            yield FIXED, _along(rays, moved * p.beat_amplitude_sd * averaged)
+            yield FIXED, False, _along(rays, moved * amplitude * averaged)
             yield (
                 FIXED,
+                False,
                 _along(rays, velocity * np.hypot(p.beat_timing_sd * averaged, np.hypot(uneven, _ALIGNED_SD_CYCLE))),
             )
 
-    def _free(self, frames: slice) -> Iterator[tuple[int, Array]]:
+    def _free(self, frames: slice) -> Iterator[tuple[int, bool, Array]]:
         """Yield each catheter's offset, tilt and bend over the beat.
 
         The view itself determines their sizes.
@@ -154,9 +190,9 @@ class MotionCovariance:
         for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
             own = self._names == name
             tilt_sd, bend_sd = self._looseness(name)
-            yield OFFSET, _in_time(fast, np.where(own, offset_sd, 0.0)[..., None, None] * self._follows[frames])
-            yield TILT, _in_time(slow, (tilt_sd * tilt)[:, None, None] * np.eye(3))
-            yield BEND, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
+            yield OFFSET, False, _in_time(fast, np.where(own, offset_sd, 0.0)[..., None, None] * self._follows[frames])
+            yield TILT, True, _in_time(slow, (tilt_sd * tilt)[:, None, None] * np.eye(3))
+            yield BEND, True, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
 
     def _looseness(self, name: str) -> tuple[float, float]:
         """Return a catheter's deviation from its expected shape.
@@ -228,6 +264,12 @@ def _along(rays: Array, columns: Array) -> Array:
     """Return the part of columns (n, m, 3, k) along the rays (n, m, 3)."""
     share: Array = rays[..., None] * np.einsum("nmi,nmik->nmk", rays, columns)[..., None, :]
     return share
+
+
+def _across(rays: Array, columns: Array) -> Array:
+    """Return the part of columns (n, m, 3, k) across the rays (n, m, 3)."""
+    across: Array = columns - _along(rays, columns)
+    return across
 
 
 def _root(covariance: Array) -> Array:

@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import Field
 
 from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, Track
-from fluoromap.geometry import Camera
 from fluoromap.monoplane.catheter_lengths import catheter_lengths
 from fluoromap.monoplane.expected_motion import expected_motion
 from fluoromap.monoplane.gaussian_path import Evidence, PathPrior, estimate_gains, most_probable, surprise
@@ -63,7 +62,7 @@ class MotionPrior:
         )
 
     name: ClassVar[str] = "motion-prior"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
 
     def __init__(self, params: MotionPrior.Params) -> None:
         self._params = params
@@ -77,7 +76,7 @@ class MotionPrior:
             NO_A_PRIORI where no electrode has one; VIEW_MIRRORED where the view fits the cycle only as a mirror image.
         """
         electrodes = gather_electrodes(view)
-        p = self._params
+        p = self._params.of_study(view.variation)
         expected = expected_motion(
             view, electrodes, p.mapping_motion_sd_mm, p.other_motion_sd_mm, p.beat_sd_mm, p.gantry_angle_sd_deg
         )
@@ -85,7 +84,7 @@ class MotionPrior:
         baseline = view.camera.back_project(electrodes.pixels_uv, view.camera.depth_mm(expected.mean_mm))
         baseline = np.where(electrodes.visible[..., None], baseline, expected.mean_mm)
         windows = tuple(_windows(electrodes.phases))
-        run = _Run(view, electrodes, baseline, covariance.rays)
+        run = _Run(view, electrodes, baseline, covariance.rays, expected.mean_mm, expected.common_mm2)
         trusted = self._trusted_pixels(run, [(frames, covariance.window(frames)) for frames in windows])
         n, m = electrodes.visible.shape
         positions, joint = baseline.copy(), np.zeros((n, 3 * m, 3 * m))
@@ -166,15 +165,22 @@ class MotionPrior:
         blocks = np.einsum("nmimj->nmij", joint.reshape(n, m, 3, m, 3))
         across = np.eye(3) - run.rays[..., :, None] * run.rays[..., None, :]
         # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
-        gantry = gantry_angle_covariance_mm2(positions, self._params.gantry_angle_sd_deg)
-        gantry = across @ (gantry + self._params.isocentre_sd_mm**2 * np.eye(3)) @ across
+        study, isocentre = self._params.of_study(run.view.variation), run.view.camera.isocentre_world_mm
+        gantry = gantry_angle_covariance_mm2(positions - isocentre, study.gantry_angle_sd_deg)
+        gantry = gantry + study.isocentre_sd_mm**2 * np.eye(3)
+        if any(Reason.TABLE_MOVED in point.reasons for point in electrodes.a_priori):
+            # Nothing shows whether this view or the other one has the table's true place.
+            gantry = gantry + run.common_mm2
+        gantry = across @ gantry @ across
         absolute = blocks + gantry
         relative = self._relative(run, positions, joint, absolute, across)
         shown = electrodes.visible[..., None]
         by_electrode = []
         for index, interrupted in enumerate(electrodes.interrupted()):
             own = [Reason.PRIOR_GATE] if gated[:, index].any() else []
-            by_electrode.append((*reasons, *own, *([Reason.TRACK_INTERRUPTED] if interrupted else [])))
+            if interrupted:
+                own.append(Reason.TRACK_INTERRUPTED)
+            by_electrode.append(tuple(dict.fromkeys((*electrodes.a_priori[index].reasons, *reasons, *own))))
         return Track(
             labels=electrodes.labels,
             located=electrodes.visible,
@@ -201,23 +207,36 @@ class MotionPrior:
         parts = joint.reshape(n, m, 3, m, 3)
         own = np.einsum("nka,naibj,nkb->nkij", weights, parts, weights, optimize=True)
         apart = positions - np.einsum("na,nai->ni", mean, positions)[:, None]
-        turned = across @ gantry_angle_covariance_mm2(apart, self._params.gantry_angle_sd_deg) @ across
+        angle_sd_deg = self._params.of_study(run.view.variation).gantry_angle_sd_deg
+        turned = across @ gantry_angle_covariance_mm2(apart, angle_sd_deg) @ across
         relative: Array = np.where((count > 0)[:, None, None, None], own + turned, absolute)
         return relative
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One run with its baseline (n, m, 3) and the unit rays (n, m, 3) through the expected positions."""
+    """One run with its baseline (n, m, 3), expected positions (n, m, 3) and the unit rays (n, m, 3) through these.
+
+    common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times.
+    """
 
     view: MonoplaneView
     electrodes: ViewElectrodes
     baseline_mm: Array
     rays: Array
+    expected_mm: Array
+    common_mm2: Array
 
     def evidence(self, frames: slice, used: BoolArray) -> Evidence:
-        electrodes = self.electrodes
-        lengths = catheter_lengths(self.view.catalogue, electrodes.labels, self.baseline_mm[frames])
+        electrodes, view = self.electrodes, self.view
+        # Without a cycle, two views saw the distances at diastole only: other sites' motion stretches a catheter.
+        located = self.expected_mm[frames]
+        if view.cycle is None:
+            located = np.broadcast_to(electrodes.a_priori_mm, located.shape)
+        moments = len(view.cycle.phases) if view.cycle is not None else 1
+        variances = np.trace(electrodes.covariance_px2[electrodes.visible], axis1=1, axis2=2) / 2
+        pixel_sd_mm = float(np.sqrt(np.median(variances))) / view.camera.px_per_mm
+        lengths = catheter_lengths(view.catalogue, electrodes.a_priori, located, moments, pixel_sd_mm)
         return Evidence(
             self.view.camera, electrodes.pixels_uv[frames], electrodes.covariance_px2[frames], used, lengths
         )
@@ -234,7 +253,7 @@ class _Run:
         camera = self.view.camera
         flipped = camera.matrix.copy()
         flipped[0] = 2 * camera.principal_point_uv[0] * camera.matrix[2] - camera.matrix[0]
-        return replace(self, view=replace(self.view, camera=Camera(flipped, camera.rows, camera.columns)))
+        return replace(self, view=replace(self.view, camera=replace(camera, matrix=flipped)))
 
 
 def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Array:

@@ -90,7 +90,9 @@ def reference_origins(track: Track, site: LocatedSite, catheter: str, others_mm:
     return FrameOrigins(mean, np.ones_like(same_frame), borrowed, same_frame)
 
 
-def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigins) -> Iterator[Sample]:
+def track_samples(
+    track: Track, index: int, camera: Camera, origins: FrameOrigins, doubts: tuple[Reason, ...] = ()
+) -> Iterator[Sample]:
     """Return the samples of one electrode, one for each frame.
 
     Where the origin is the reference of the same frame, the covariance is that of the difference, if the solver gives it:
@@ -105,8 +107,10 @@ def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigin
         Camera of the tracked view.
     origins : FrameOrigins
         For all frames of the track.
+    doubts : tuple of Reason
+        Reasons of the electrode's point at its site: they apply to the track too.
     """
-    doubts = track.reasons[index]
+    doubts = (*track.reasons[index], *doubts)
     source = camera.source_world_mm
     for frame, located in enumerate(track.located[:, index]):
         if not located:
@@ -124,7 +128,7 @@ def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigin
         origin = origins.positions_mm[frame]
         yield Sample(
             frame + 1, position - origin, track.baseline_mm[frame, index] - origin, covariance, along, lateral, pixel,
-            grade_of(covariance), tuple(dict.fromkeys(reasons)),
+            grade_of(covariance, reasons), tuple(dict.fromkeys(reasons)),
         )  # fmt: skip
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import chi2
@@ -12,18 +13,16 @@ from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite,
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.estimate import Estimate, Method
-from fluoromap.triangulator.self_calibration import GantryBelief
+from fluoromap.triangulator.self_calibration import StudyBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
 from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
-from fluoromap.triangulator.table_motion import Jump
+from fluoromap.triangulator.table_motion import Jump, jump_source
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
     UncertaintyParams,
-    effect_px,
     error_sources,
-    jacobians,
     pixel_noise_px2,
     relative_covariance_mm2,
     visible_breathing,
@@ -39,14 +38,20 @@ DOUBTFUL_BELOW = 1e-5
 class SiteLocator:
     """The method and assumptions that locate the sites of one study.
 
-    wrong_spacings : catheters whose catalogue entry contradicts the study.
+    spacing_limit_mm : electrode spacings farther than this from the catalogue's are reported. gap_doubts : catheters whose
+    catalogue entry contradicts the study, with the reason.
     """
 
     method: Method
-    params: UncertaintyParams
     catalogue: Catalogue
-    gantry: GantryBelief
-    wrong_spacings: frozenset[str] = frozenset()
+    belief: StudyBelief
+    spacing_limit_mm: float
+    gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
+
+    @property
+    def params(self) -> UncertaintyParams:
+        """The parameters with this study's breathing and beats."""
+        return self.belief.params
 
     def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
         """Locate a site in 3D.
@@ -57,30 +62,32 @@ class SiteLocator:
             The site, its diastole for the error budget, and sentences for the report. None where no plausible position
             agrees with both views.
         """
-        cameras = self.gantry.cameras((site.camera_a, site.camera_b))
+        cameras = self.belief.gantry.cameras((site.camera_a, site.camera_b))
         rest = site.diastole.a.phase if site.diastole.a.phase is not None else site.diastole.b.phase
         moments = cycle_moments(site.cycle, cameras, self.method) if rest is not None else None
         moment = self._moment(site.diastole, cameras, moments, jump)
         if moment is None:
             return None
-        points, reference_mm = self._points(site, moment, cameras)
+        doubts = tuple(dict.fromkeys(reason for reason, holds in (
+            (Reason.TABLE_MOVED, jump is not None or self.belief.doubt is Reason.TABLE_MOVED),
+            (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
+        ) if holds))  # fmt: skip
+        points, reference_mm = self._points(site, moment, cameras, doubts)
         if site.alternative is not None:
             other = self._moment(site.alternative.diastole, cameras, moments, jump)
             if other is not None:
-                others, other_mm = self._points(site, other, cameras)
+                others, other_mm = self._points(site, other, cameras, doubts)
                 shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
                 by_label = {(point.catheter, point.electrode): point for point in others}
                 points = add_alternative(points, by_label, shift, site.alternative.probability)
         cycle = None
         if moments is not None and rest is not None:
             cycle = locate_cycle(
-                moments, rest, cameras, self.catalogue, self.params, self.method, self.gantry.covariance
+                moments, rest, cameras, self.catalogue, self.params, self.method, self.belief.gantry.covariance, jump
             )
         reasons = [reason for reason, holds in (
             (Reason.NO_REFERENCE, reference_mm is None),
             (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
-            (Reason.TABLE_MOVED, jump is not None),
-            (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1),
         ) if holds]  # fmt: skip
         answer = LocatedSite(
             site=site.site,
@@ -91,7 +98,8 @@ class SiteLocator:
             points=points,
             reference_mm=reference_mm,
             cycle=cycle,
-            reasons=tuple(reasons),
+            reasons=(*reasons, *doubts),
+            variation=self.belief.variation,
         )
         return answer, moment, _breathing_note(site.site, moment) if jump is None else []
 
@@ -107,10 +115,10 @@ class SiteLocator:
             cycle.motion(np.array(phase), phase, pixels.labels) if cycle is not None and phase is not None else None
         )
         sources = error_sources(
-            cameras, start, pixels.labels, self.catalogue, self.params, self.gantry.covariance, motion
+            cameras, start, pixels.labels, self.catalogue, self.params, self.belief.gantry.covariance, motion
         )  # fmt: skip
         if jump is not None:
-            sources = (*sources, _jump_source(cameras, start, jump))
+            sources = (*sources, jump_source(cameras, start, jump))
         if self.method.estimates_breathing:
             pixels = widen_strays(cameras, pixels, start, sources)
         noise = pixel_noise_px2(pixels.covariances)
@@ -134,15 +142,15 @@ class SiteLocator:
         return Moment(pixels, found, sources, noise, errors, residuals.reshape(-1, 2, 2), breathing_mm, inflation)
 
     def _points(
-        self, site: MatchedSite, moment: Moment, cameras: Cameras
+        self, site: MatchedSite, moment: Moment, cameras: Cameras, site_doubts: tuple[Reason, ...]
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
         """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
         pixels, points = moment.pixels, moment.found.points_mm
         joint = moment.inflation * moment.found.covariance_mm2(moment.errors_px2)
         reference = [i for i, (catheter, _) in enumerate(pixels.labels) if catheter == self.catalogue.reference]
         reference_mm = points[reference].mean(axis=0) if reference else None
-        mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.params.spacing_limit_mm)
-        doubts: dict[str, list[Reason]] = {name: [Reason.SPACING_MISMATCH] for name in self.wrong_spacings}
+        mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.spacing_limit_mm)
+        doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
             doubts.setdefault(catheter, []).append(reason)
         angles = _ray_angles_deg(cameras, pixels)
@@ -159,7 +167,7 @@ class SiteLocator:
                 ray_angle_deg=float(angles[i]),
                 reasons=tuple(
                     dict.fromkeys((
-                        *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []),
+                        *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
                     ))
                 ),
             )
@@ -190,16 +198,6 @@ class Moment:
 
 def _plausible(points_mm: Array) -> bool:
     return bool(np.isfinite(points_mm).all() and np.abs(points_mm).max() < FAR_MM)
-
-
-def _jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
-    """Return the error source of a jump, in either direction.
-
-    Either view may show the true place.
-    """
-    own, none = jump.displacement_mm[:, None], np.zeros((3, 1))
-    effect = effect_px(jacobians(cameras, points_mm), *((own, none) if jump.view == "a" else (none, own)))
-    return ErrorSource(effect, np.eye(1), ("breathing",))
 
 
 def _breathing_note(site: str, moment: Moment) -> list[str]:

@@ -6,17 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t
 
 from fluoromap.contracts import Array, View
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import ErrorSource, UncertaintyParams, effect_px, jacobians
 
 FEWEST_SITES = 3
 """Fewest sites from which the heart's usual place can be estimated."""
 _BEYOND_SD = 4.5
-_LEAST_MM = 4.0
+_LEAST_MM = 3.0
 _SLIP_MM = 4.0
+_LEAST_BREATHING = 0.1
+"""Least breathing, as a share of the assumed one, that the scatter of a few sites can show."""
+_CHANCE = 5e-4
+_MAD_TO_SD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +51,33 @@ def table_jumps(
     if len(sites) < FEWEST_SITES:
         return [None] * len(sites)
     usual = _usual_places(sites, resting)
-    return [_site_jump(cameras, pixels, usual, params) for cameras, pixels, _ in sites]
+    found = [_displacements(cameras, pixels, usual) for cameras, pixels, _ in sites]
+    scale, common = _breathing_scale(sites, found, params)
+    # Only the head-feet direction shows how far this heart breathes.
+    own = params.model_copy(update={"respiration_head_feet_sd_mm": scale * params.respiration_head_feet_sd_mm})
+    # Few sites show their scatter inaccurately: Student's distribution instead of the normal one.
+    limit = max(_BEYOND_SD, float(t.isf(_CHANCE, len(sites) - 1)))
+    return _with_boundary([
+        None if moved is None else _site_jump(cameras, moved, common, own, limit)
+        for (cameras, *_), moved in zip(sites, found, strict=True)
+    ])  # fmt: skip
+
+
+def _with_boundary(jumps: list[Jump | None]) -> list[Jump | None]:
+    """Return the jumps with the sites at which a lasting move may have happened.
+
+    The table may move between the two runs of a site and stay there. If view b differs at the first sites, the move may have
+    happened at the next site; if view a differs at the last sites, at the site before them.
+    """
+    found = list(jumps)
+    first = next((k for k, jump in enumerate(jumps) if jump is None or jump.view != "b"), len(jumps))
+    if 0 < first < len(jumps) and jumps[first] is None:
+        found[first] = jumps[first - 1]
+    last = next((k for k, jump in enumerate(reversed(jumps)) if jump is None or jump.view != "a"), len(jumps))
+    before = len(jumps) - last - 1
+    if 0 < last < len(jumps) and jumps[before] is None:
+        found[before] = jumps[before + 1]
+    return found
 
 
 def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]:
@@ -69,6 +100,17 @@ def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]
     return notes
 
 
+def jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
+    """Return the error source of a jump.
+
+    Either view may show the true place, and a view does not show the jump along its rays. So each view may be displaced in
+    any direction by as much as the jump.
+    """
+    in_a, in_b = np.eye(3, 6), np.eye(3, 6, 3)
+    variance = float(jump.displacement_mm @ jump.displacement_mm) / 2
+    return ErrorSource(effect_px(jacobians(cameras, points_mm), in_a, in_b), variance * np.eye(6), ("breathing",) * 6)
+
+
 def _usual_places(
     sites: Sequence[tuple[Cameras, TwoViewPixels, Array]], resting: frozenset[str]
 ) -> dict[tuple[str, int], Array]:
@@ -80,11 +122,14 @@ def _usual_places(
     return {label: np.median(places, axis=0) for label, places in by_label.items() if len(places) >= FEWEST_SITES}
 
 
-def _site_jump(
-    cameras: Cameras, pixels: TwoViewPixels, usual: dict[tuple[str, int], Array], params: UncertaintyParams
-) -> Jump | None:
+def _displacements(
+    cameras: Cameras, pixels: TwoViewPixels, usual: dict[tuple[str, int], Array]
+) -> tuple[Array, Array] | None:
+    """Return the displacements of the resting catheters in view a and b.
+
+    Each is (3,), from their usual places and across the view's rays. None where the site shows no resting catheter.
+    """
     found: list[Array] = []
-    strange: list[bool] = []
     for camera, uv in zip(cameras, pixels.pixels, strict=True):
         moved: dict[str, list[Array]] = {}
         for label, pixel in zip(pixels.labels, uv, strict=True):
@@ -93,19 +138,59 @@ def _site_jump(
                 moved.setdefault(label[0], []).append(inverse @ (pixel - camera.project(usual[label])))
         if not moved:
             return None
-        common = _common_displacement(np.array([np.mean(own, axis=0) for own in moved.values()]))
-        found.append(common)
-        strange.append(_exceeds_breathing(common, camera, params))
-    # Only a displacement along this direction is visible in both views.
+        found.append(_common_displacement(np.array([np.mean(own, axis=0) for own in moved.values()])))
+    return found[0], found[1]
+
+
+def _shared_axis(cameras: Cameras) -> Array:
+    """Return the unit direction (3,) along which both views show a displacement."""
     shared = np.cross(cameras[0].axis_world, cameras[1].axis_world)
-    shared /= np.linalg.norm(shared)
-    apart = shared * float(shared @ (found[0] - found[1]))
-    if all(strange) and not _exceeds_breathing(apart / np.sqrt(2), None, params):
-        return None
-    if not any(strange):
-        return None
-    view = int(np.linalg.norm(found[1]) > np.linalg.norm(found[0])) if all(strange) else strange.index(True)
-    return Jump("b" if view else "a", found[view])
+    unit: Array = shared / np.linalg.norm(shared)
+    return unit
+
+
+def _breathing_scale(
+    sites: Sequence[tuple[Cameras, TwoViewPixels, Array]],
+    found: Sequence[tuple[Array, Array] | None],
+    params: UncertaintyParams,
+) -> tuple[float, float]:
+    """Return this heart's breathing and the median difference of its views.
+
+    The breathing is a share of the assumed one, at most 1; the difference is in mm. Breathing displaces the views against each
+    other. A moved table is rare, so that the median deviation ignores it.
+    """
+    apart, sd = [], []
+    for (cameras, *_), moved in zip(sites, found, strict=True):
+        if moved is not None:
+            shared = _shared_axis(cameras)
+            apart.append(float(shared @ (moved[0] - moved[1])))
+            sd.append(np.sqrt(2 * float(shared @ params.respiration_covariance_mm2() @ shared)))
+    if not apart or not np.mean(sd) > 0:
+        return 1.0, 0.0
+    common = float(np.median(apart))
+    deviation = _MAD_TO_SD * float(np.median(np.abs(np.array(apart) - common)))
+    return float(np.clip(deviation / np.mean(sd), _LEAST_BREATHING, 1.0)), common
+
+
+def _site_jump(
+    cameras: Cameras, moved: tuple[Array, Array], common_mm: float, params: UncertaintyParams, limit_sd: float
+) -> Jump | None:
+    """Return the jump of a site, or None.
+
+    ``moved`` are its displacements in both views; ``common_mm`` is the views' usual difference.
+    """
+    shared = _shared_axis(cameras)
+    along = [float(shared @ one) for one in moved]
+    disagree = _exceeds_breathing(shared * (along[0] - along[1] - common_mm) / np.sqrt(2), None, params, limit_sd)
+    strange = [_exceeds_breathing(one, camera, params) for one, camera in zip(moved, cameras, strict=True)]
+    if not disagree:
+        # Displaced alike in both views: the table moved before both runs, or the heart lies elsewhere. That does no harm.
+        alike = all(_exceeds_breathing(shared * one, None, params) for one in along)
+        if alike or all(strange) or not any(strange):
+            return None
+    farther = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
+    view = farther if strange[0] == strange[1] else strange.index(True)
+    return Jump("b" if view else "a", moved[view])
 
 
 def _common_displacement(displacements_mm: Array) -> Array:
@@ -119,7 +204,9 @@ def _common_displacement(displacements_mm: Array) -> Array:
     return np.asarray(displacements_mm[np.argmin(np.linalg.norm(displacements_mm, axis=1))])
 
 
-def _exceeds_breathing(displacement_mm: Array, camera: Camera | None, params: UncertaintyParams) -> bool:
+def _exceeds_breathing(
+    displacement_mm: Array, camera: Camera | None, params: UncertaintyParams, limit_sd: float = _BEYOND_SD
+) -> bool:
     """Return True where breathing and a beat do not explain a displacement.
 
     With a camera, only the part across its central ray counts.
@@ -132,4 +219,4 @@ def _exceeds_breathing(displacement_mm: Array, camera: Camera | None, params: Un
     else:
         inverse = np.linalg.inv(spread)
     sds = float(np.sqrt(displacement_mm @ inverse @ displacement_mm))
-    return sds > _BEYOND_SD and float(np.linalg.norm(displacement_mm)) > _LEAST_MM
+    return sds > limit_sd and float(np.linalg.norm(displacement_mm)) > _LEAST_MM

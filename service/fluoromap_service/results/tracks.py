@@ -106,5 +106,6 @@ def _site(
             continue
         track, camera, frames = result.track, site.camera(result.view), origin.frames(result.track, site)
         for index, (catheter, electrode) in enumerate(track.labels):
-            samples = track_samples(track, index, camera, frames)
+            reference = None if origin.origin is Origin.ISOCENTRE else origin.catheter
+            samples = track_samples(track, index, camera, frames, site.reasons_of(catheter, electrode, reference))
             yield ElectrodeSamples(stage.subject, result.view, catheter, electrode, stage.plugin, samples)

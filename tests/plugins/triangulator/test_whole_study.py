@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap.contracts import (
+    CHI2_95_3D,
     Array,
     Grade,
     MatchedSite,
@@ -129,11 +130,14 @@ def test_a_gantry_wrong_by_one_degree_and_two_millimetres_is_found_and_reported(
         true_turn = Rotation.from_matrix(displaced[:3, :3]).as_rotvec(degrees=True)
         assert found.rotation_deg == pytest.approx(true_turn, abs=0.6)
         points, true = errors(answer, by_site)
-        assert rms(points - true) <= 1.0
+        # The catalogue's gaps are not exact, so that no gap shows an offset along a ray.
+        assert rms(points - true) <= 1.5
         left.append(rms(aligned(points, true) - true))
         true_b = Camera(CAMERAS[1].matrix @ displaced, 512, 512)
         apart = answer.sites[0].camera_b.project(true) - true_b.project(true)
-        assert np.abs(apart).mean() < np.abs(CAMERAS[1].project(true) - true_b.project(true)).mean() / 2
+        before = np.abs(CAMERAS[1].project(true) - true_b.project(true))
+        # View b's camera is right along the axis that both views show. Nothing shows an offset across it.
+        assert np.abs(apart)[:, 1].mean() < before[:, 1].mean() / 2
         (note,) = answer.notes
         assert "degrees" in note
         assert "mm" in note
@@ -244,3 +248,66 @@ def test_a_heart_displaced_in_both_views_is_no_moved_table() -> None:
     by_site[3] = {name: at + np.array([12.0, -12.0, 5.0]) for name, at in by_site[3].items()}
     answer = located(matched_sites(by_site, np.random.default_rng(9)))
     assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
+
+
+@pytest.mark.parametrize(("error_mm", "contradicted"), [(0.0, False), (0.3, False), (0.5, True)])
+def test_a_tip_off_the_catalogue_by_more_than_its_error_is_a_contradiction(error_mm: float, contradicted: bool) -> None:
+    by_site = electrodes(14, sites=8)
+    for points in by_site:
+        at = points["mapping"] = points["mapping"].copy()
+        at[0] += error_mm * (at[0] - at[1]) / np.linalg.norm(at[0] - at[1])
+    answer = located(matched_sites(by_site, np.random.default_rng(14)))
+    for site in answer.sites:
+        for point in site.points:
+            expected = contradicted and point.catheter == "mapping"
+            assert (Reason.CATALOGUE_CONTRADICTED in point.reasons) == expected
+            assert Reason.SPACING_MISMATCH not in point.reasons
+    assert any("contradict the description" in note for note in answer.notes) == contradicted
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23])
+def test_gaps_wrong_alike_at_all_sites_do_not_correct_a_right_header(seed: int) -> None:
+    """Every catheter is bent: its last chord is 0.3 mm shorter than the catalogue's arc."""
+    by_site = electrodes(seed)
+    for points in by_site:
+        for name, at in points.items():
+            points[name] = at = at.copy()
+            at[3] += 0.3 * (at[2] - at[3]) / np.linalg.norm(at[2] - at[3])
+    answer = located(matched_sites(by_site, np.random.default_rng(seed)))
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+
+
+def test_a_gantry_that_no_electrode_shows_is_in_the_ellipsoids() -> None:
+    """A header wrong by 1 degree and 2 mm in both views: the common displacement stays, and the ellipsoids contain it."""
+    inside = []
+    for seed in range(31, 43):
+        by_site = electrodes(seed)
+        rng = np.random.default_rng(seed)
+        turns = [turn(1.0, 2.0, 10 * seed + view) for view in (0, 1)]
+        sites = []
+        for index, points in enumerate(by_site):
+            a, b = (
+                observation(Camera(camera.matrix @ of_view, 512, 512), points, rng)
+                for camera, of_view in zip(CAMERAS, turns, strict=True)
+            )
+            pair = PhasePair(0.8, a, b)
+            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+        answer = located(tuple(sites))
+        found, true = errors(answer, by_site)
+        covariances = np.array([point.covariance_mm2 for site in answer.sites for point in site.points])
+        apart = found - true
+        distance = np.einsum("ni,ni->n", apart, np.linalg.solve(covariances, apart[..., None])[..., 0])
+        inside.append((distance <= CHI2_95_3D).mean())
+        assert rms(aligned(found, true) - true) <= 0.3
+    # With the stated gantry alone, 0 to 43 % were inside.
+    assert np.mean(inside) > 0.8
+
+
+def test_a_table_displaced_between_all_runs_of_the_two_views_is_suspected() -> None:
+    by_site = electrodes(16, sites=8)
+    shifts = dict.fromkeys(range(8), np.array([8.0, 0.0, 25.0]))
+    answer = located(matched_sites(by_site, np.random.default_rng(16), shifts=shifts))
+    for site in answer.sites:
+        assert {Reason.TABLE_MOVED, Reason.GEOMETRY_DOUBTFUL} & set(site.reasons)
+        assert all(grade_of(point.covariance_mm2, point.reasons) is Grade.C for point in site.points)
