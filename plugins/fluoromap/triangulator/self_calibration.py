@@ -144,7 +144,7 @@ def calibrate(
     offset_mm = float(np.linalg.norm(found[3:]))
     shifted = offset_mm > FARTHEST_OFFSET_MM and float(distance[:3].sum()) < float(distance[3:].sum())
     doubt = Reason.TABLE_MOVED if shifted else Reason.GEOMETRY_DOUBTFUL
-    if float(distance.sum()) > FARTHEST_CHI2 or _misfit(rows) > STILL_MISFIT:
+    if float(distance.sum()) > FARTHEST_CHI2 or _misfit(rows, mixture.scale) > STILL_MISFIT:
         # Something else is wrong, such as a mirrored image, a moved table or runs of another study.
         covariance = as_header.covariance + LARGEST_MULTIPLE**2 * usual
         return kept, _belief(GantryBelief(np.eye(4), covariance), mixture.scale, params, doubt)
@@ -226,12 +226,12 @@ def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
     return _Mixture(mean, covariance, HeartScale(breathing, beats), float(logsumexp(evidence) - exact))
 
 
-def _misfit(rows: Sequence[SiteEquations]) -> float:
+def _misfit(rows: Sequence[SiteEquations], scale: HeartScale) -> float:
     """Return the mean squared misfit an equation.
 
     It is 1 where pixels, breathing and beats explain the residuals.
     """
-    total = sum(float(one.residual @ np.linalg.solve(one.covariance(HeartScale()), one.residual)) for one in rows)
+    total = sum(float(one.residual @ np.linalg.solve(one.covariance(scale), one.residual)) for one in rows)
     return total / sum(len(one.residual) for one in rows)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array
-from fluoromap.triangulator.estimate import separate_gain, triangulate_maximum_likelihood
+from fluoromap.triangulator.estimate import separate_gain, triangulate_unweighted
 from fluoromap.triangulator.spacing import neighbours
 from fluoromap.triangulator.stray_electrodes import epipolar_rows
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
@@ -128,7 +128,7 @@ def site_equations(
     params: UncertaintyParams,
 ) -> SiteEquations:
     """Return a site's equations: epipolar distances, then those of the ``gaps`` that the site shows."""
-    points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
+    points = triangulate_unweighted(cameras, pixels)
     n = len(points)
     combine = epipolar_rows(cameras, points)
     residual = combine @ pixels.residuals_px(cameras, points)

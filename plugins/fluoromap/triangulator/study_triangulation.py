@@ -21,7 +21,7 @@ from fluoromap.contracts import (
 from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
-from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_maximum_likelihood
+from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
 from fluoromap.triangulator.self_calibration import calibrate, header_belief
 from fluoromap.triangulator.site_locator import Moment, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
@@ -138,7 +138,7 @@ def _first_look(
     Points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise.
     """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
+    points = triangulate_unweighted(cameras, pixels)
     widest = LARGEST_MULTIPLE**2 * params.gantry_covariance()
     sources = error_sources(cameras, points, pixels.labels, catalogue, params, widest, None)
     pixels = widen_strays(cameras, pixels, points, sources)

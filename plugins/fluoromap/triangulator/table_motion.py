@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import logsumexp
+from scipy.stats import norm
 
 from fluoromap.contracts import Array, View
 from fluoromap.geometry import Camera
+from fluoromap.triangulator.study_equations import HeartScale
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import ErrorSource, UncertaintyParams, effect_px, jacobians
 
@@ -18,10 +20,12 @@ FEWEST_SITES = 3
 _BEYOND_SD = 4.5
 _LEAST_MM = 3.0
 _SLIP_MM = 4.0
-_LEAST_BREATHING = 0.1
-"""Least breathing, as a share of the assumed one, that the scatter of a few sites can show."""
-_CHANCE = 5e-4
-_MAD_TO_SD = 1.4826
+_JUMP_SHARE, _JUMP_SD_MM = 0.02, 15.0
+"""Share of the sites between whose runs the table moves, and how far along one axis."""
+_CERTAIN = 0.95
+"""Probability of a jump above which it is reported."""
+_BREATHING_SHARES = np.geomspace(0.05, 2.0, 20)
+"""Breathing of a heart as multiples of the assumed one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +56,12 @@ def table_jumps(
         return [None] * len(sites)
     usual = _usual_places(sites, resting)
     found = [_displacements(cameras, pixels, usual) for cameras, pixels, _ in sites]
-    scale, common = _breathing_scale(sites, found, params)
+    scale, jumped = _views_apart(sites, found, params)
     # Only the head-feet direction shows how far this heart breathes.
     own = params.model_copy(update={"respiration_head_feet_sd_mm": scale * params.respiration_head_feet_sd_mm})
-    # Few sites show their scatter inaccurately: Student's distribution instead of the normal one.
-    limit = max(_BEYOND_SD, float(t.isf(_CHANCE, len(sites) - 1)))
     return _with_boundary([
-        None if moved is None else _site_jump(cameras, moved, common, own, limit)
-        for (cameras, *_), moved in zip(sites, found, strict=True)
+        None if moved is None else _site_jump(cameras, moved, disagree, own, params)
+        for (cameras, *_), moved, disagree in zip(sites, found, jumped, strict=True)
     ])  # fmt: skip
 
 
@@ -149,43 +151,57 @@ def _shared_axis(cameras: Cameras) -> Array:
     return unit
 
 
-def _breathing_scale(
+def _views_apart(
     sites: Sequence[tuple[Cameras, TwoViewPixels, Array]],
     found: Sequence[tuple[Array, Array] | None],
     params: UncertaintyParams,
-) -> tuple[float, float]:
-    """Return this heart's breathing and the median difference of its views.
+) -> tuple[float, list[bool]]:
+    """Return this heart's breathing and, for each site, True where a jump and no breath displaced its views.
 
-    The breathing is a share of the assumed one, at most 1; the difference is in mm. Breathing displaces the views against each
-    other. A moved table is rare, so that the median deviation ignores it.
+    The breathing is a multiple of the assumed one. Breathing displaces the views of every site against each other; a moved
+    table displaces those of a few sites, and farther. The sites together show the breathing, but a few sites show it
+    inaccurately. So every breathing counts with its probability.
     """
-    apart, sd = [], []
-    for (cameras, *_), moved in zip(sites, found, strict=True):
-        if moved is not None:
-            shared = _shared_axis(cameras)
-            apart.append(float(shared @ (moved[0] - moved[1])))
-            sd.append(np.sqrt(2 * float(shared @ params.respiration_covariance_mm2() @ shared)))
-    if not apart or not np.mean(sd) > 0:
-        return 1.0, 0.0
-    common = float(np.median(apart))
-    deviation = _MAD_TO_SD * float(np.median(np.abs(np.array(apart) - common)))
-    return float(np.clip(deviation / np.mean(sd), _LEAST_BREATHING, 1.0)), common
+    known = [index for index, moved in enumerate(found) if moved is not None]
+    jumped = [False] * len(sites)
+    if not known:
+        return 1.0, jumped
+    apart, variance = [], []
+    for index in known:
+        (cameras, *_), moved = sites[index], found[index]
+        assert moved is not None
+        shared = _shared_axis(cameras)
+        apart.append(float(shared @ (moved[0] - moved[1])))
+        variance.append(2 * float(shared @ params.respiration_covariance_mm2() @ shared))
+    from_usual = np.array(apart) - np.median(apart)
+    spread = np.square(_BREATHING_SHARES)[:, None] * np.array(variance) + 2 * params.beat_sd_mm**2
+    breath = np.log(1 - _JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread))
+    jump = np.log(_JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread + _JUMP_SD_MM**2))
+    either = np.logaddexp(breath, jump)
+    evidence = either.sum(axis=1) + [HeartScale(share, 1.0).log_prior for share in _BREATHING_SHARES]
+    weights = np.exp(evidence - logsumexp(evidence))
+    certain = (weights @ np.exp(jump - either) > _CERTAIN) & (np.abs(from_usual) / np.sqrt(2) > _LEAST_MM)
+    for index, one in zip(known, certain, strict=True):
+        jumped[index] = bool(one)
+    return float(np.sqrt(weights @ np.square(_BREATHING_SHARES))), jumped
 
 
 def _site_jump(
-    cameras: Cameras, moved: tuple[Array, Array], common_mm: float, params: UncertaintyParams, limit_sd: float
+    cameras: Cameras, moved: tuple[Array, Array], disagree: bool, own: UncertaintyParams, params: UncertaintyParams
 ) -> Jump | None:
     """Return the jump of a site, or None.
 
-    ``moved`` are its displacements in both views; ``common_mm`` is the views' usual difference.
+    ``moved`` are its displacements in both views. ``disagree``: they jumped against each other. ``own`` has this heart's
+    breathing, ``params`` the assumed one.
     """
     shared = _shared_axis(cameras)
-    along = [float(shared @ one) for one in moved]
-    disagree = _exceeds_breathing(shared * (along[0] - along[1] - common_mm) / np.sqrt(2), None, params, limit_sd)
-    strange = [_exceeds_breathing(one, camera, params) for one, camera in zip(moved, cameras, strict=True)]
+    strange = [
+        _exceeds_breathing(one - shared * (shared @ one), camera, params)
+        for one, camera in zip(moved, cameras, strict=True)
+    ]
     if not disagree:
         # Displaced alike in both views: the table moved before both runs, or the heart lies elsewhere. That does no harm.
-        alike = all(_exceeds_breathing(shared * one, None, params) for one in along)
+        alike = all(_exceeds_breathing(shared * float(shared @ one), None, own) for one in moved)
         if alike or all(strange) or not any(strange):
             return None
     farther = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
@@ -204,9 +220,7 @@ def _common_displacement(displacements_mm: Array) -> Array:
     return np.asarray(displacements_mm[np.argmin(np.linalg.norm(displacements_mm, axis=1))])
 
 
-def _exceeds_breathing(
-    displacement_mm: Array, camera: Camera | None, params: UncertaintyParams, limit_sd: float = _BEYOND_SD
-) -> bool:
+def _exceeds_breathing(displacement_mm: Array, camera: Camera | None, params: UncertaintyParams) -> bool:
     """Return True where breathing and a beat do not explain a displacement.
 
     With a camera, only the part across its central ray counts.
@@ -219,4 +233,4 @@ def _exceeds_breathing(
     else:
         inverse = np.linalg.inv(spread)
     sds = float(np.sqrt(displacement_mm @ inverse @ displacement_mm))
-    return sds > limit_sd and float(np.linalg.norm(displacement_mm)) > _LEAST_MM
+    return sds > _BEYOND_SD and float(np.linalg.norm(displacement_mm)) > _LEAST_MM
