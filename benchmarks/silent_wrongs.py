@@ -37,6 +37,7 @@ from fluoromap.contracts import (
 )
 from fluoromap.matching import match_study
 from fluoromap.monoplane.motion_prior import MotionPrior
+from fluoromap.monoplane.track_samples import in_study
 from fluoromap.phantom.clinical_study import ClinicalRun, ClinicalSite, ClinicalStudy, simulate_conditions
 from fluoromap.phantom.conditions import PROPERTIES, Conditions, Property
 from fluoromap.reasons import Reason
@@ -185,9 +186,11 @@ def score_track(
 ) -> None:  # fmt: skip
     sums, reference = score.tracks, study.catalogue.reference
     try:
-        track = MotionPrior(MotionPrior.Params()).track(monoplane_view(study, matched, site, located, view), Silent())
+        seen = monoplane_view(study, matched, site, located, view)
+        track = MotionPrior(MotionPrior.Params()).track(seen, Silent())
     except Refusal:
         return
+    track = in_study(track, seen.camera, reference, site.variation)
     frames = slice(0, MOST_FRAMES)
     truth = np.stack([run.points_mm[name][frames, number - 1] for name, number in track.labels], axis=1)
     error = track.positions_mm[frames] - truth
@@ -233,11 +236,10 @@ def monoplane_view(
         catalogue=study.catalogue,
         frame_times_ms=matched.frame_times_b_ms if view else matched.frame_times_a_ms,
         observations=matched.track_b if view else matched.track_a,
-        a_priori=site.points,
+        a_priori=site.a_priori,
         a_priori_frame=site.frame_b if view else site.frame_a,
         cycle=site.cycle,
         others=() if site.cycle else tuple(one.cycle for one in located.sites if one.cycle),
-        variation=site.variation,
     )
 
 

@@ -450,13 +450,13 @@ class StudyVariation:
     """Variation that a study shows, as multiples of the assumed standard deviations.
 
     breathing : between runs. beats : of a catheter's place from beat to beat. gantry_angle, gantry_offset : remaining error of
-    the gantry.
+    the gantry. The defaults hold where no study shows anything: any heart, and the root mean square over all kinds of gantry.
     """
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry_angle: float = 1.0
-    gantry_offset: float = 1.0
+    gantry_angle: float = 1.458
+    gantry_offset: float = 2.269
 
 
 @dataclass(frozen=True, eq=False)
@@ -464,7 +464,8 @@ class LocatedSite:
     """A site in 3D: points at diastole, cycle and final cameras (self-calibrated or not).
 
     frame_a, frame_b : the diastolic frames. reference_mm : (3,) the reference catheter's mean, None where not located.
-    variation : of the study that contains the site.
+    variation : of the study that contains the site. a_priori : the points with the covariances of any gantry and any heart;
+    cycle has these too. A correction at another site changes neither, so that no track has to be computed again.
     """
 
     site: str
@@ -477,6 +478,7 @@ class LocatedSite:
     cycle: SiteCycle | None
     reasons: tuple[Reason, ...] = ()
     variation: StudyVariation = StudyVariation()
+    a_priori: tuple[ElectrodePoint, ...] = ()
 
     def __post_init__(self) -> None:
         if self.reference_mm is not None:
@@ -571,7 +573,7 @@ class MonoplaneView:
 
     frame_times_ms : (n,). observations : one per frame, in order. a_priori : points known from two views, valid in
     ``a_priori_frame``. cycle : the site's own biplane cycle or None. others : cycles of other sites, empty when ``cycle``
-    is valid. variation : of the study.
+    is valid.
     """
 
     site: str
@@ -584,13 +586,32 @@ class MonoplaneView:
     a_priori_frame: int
     cycle: SiteCycle | None
     others: tuple[SiteCycle, ...]
-    variation: StudyVariation = StudyVariation()
 
     def __post_init__(self) -> None:
         n = len(self.observations)
         object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (n,), "frame_times_ms"))
         if not 0 <= self.a_priori_frame < n:
             raise ValueError(f"a_priori_frame is {self.a_priori_frame}, but the run has {n} frames")
+
+
+@dataclass(frozen=True, eq=False)
+class StudyShares:
+    """Shares of a track's covariances that grow and shrink with the variation of its study.
+
+    depth_mm2, relative_depth_mm2 : (4, n, m) variance along the ray from breathing, beats, gantry angle and gantry offset, in
+    the order of :class:`StudyVariation`. The second is that of positions less the reference's mean. angle_sd_rad, offset_sd_mm :
+    error of this view's gantry, which displaces the electrodes across its rays. All have the default variation.
+    """
+
+    depth_mm2: Array
+    relative_depth_mm2: Array
+    angle_sd_rad: float
+    offset_sd_mm: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "depth_mm2", frozen(self.depth_mm2, (4, None, None), "depth_mm2"))
+        relative = frozen(self.relative_depth_mm2, self.depth_mm2.shape, "relative_depth_mm2")
+        object.__setattr__(self, "relative_depth_mm2", relative)
 
 
 @dataclass(frozen=True, eq=False)
@@ -601,7 +622,8 @@ class Track:
     arrays contain 0 there. positions_mm, baseline_mm : (n, m, 3), the baseline being the plain back-projection at the
     prior's depth. covariance_mm2 : (n, m, 3, 3), from the isocentre. relative_covariance_mm2 : (n, m, 3, 3) of the position
     less the mean of the reference catheter's electrodes in the same frame; None where the solver does not compute it.
-    pixels_uv : (n, m, 2) observed. reasons : one tuple for each electrode.
+    pixels_uv : (n, m, 2) observed. reasons : one tuple for each electrode. shares : None where the solver does not state them.
+    The covariances have the default variation; :func:`fluoromap.monoplane.track_samples.in_study` brings them to the study's.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -612,6 +634,7 @@ class Track:
     pixels_uv: Array
     reasons: tuple[tuple[Reason, ...], ...]
     relative_covariance_mm2: Array | None = None
+    shares: StudyShares | None = None
 
     def __post_init__(self) -> None:
         m = len(self.labels)

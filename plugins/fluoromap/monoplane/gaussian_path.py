@@ -27,14 +27,15 @@ class PathPrior:
 
     mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. unseen_mm : (n, m, 3, q) deviations
     along the rays that no view shows: they belong to the covariance alone. parts : (q,) the part of each column; the columns
-    of part p > 0 are multiplied by the square root of its gain. white_mm2 : (n, 3 m, 3 m) covariance of
-    each frame's own deviation.
+    of part p > 0 are multiplied by the square root of its gain. causes : (q,) the cause of each column. white_mm2 :
+    (n, 3 m, 3 m) covariance of each frame's own deviation.
     """
 
     mean_mm: Array
     columns_mm: Array
     unseen_mm: Array
     parts: IntArray
+    causes: IntArray
     white_mm2: Array
 
     def variance_mm2(self, gains: Array, parts: Sequence[int], directions: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,7 +21,7 @@ from fluoromap.triangulator.table_motion import Jump, jump_source
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
-    UncertaintyParams,
+    Motion,
     error_sources,
     pixel_noise_px2,
     relative_covariance_mm2,
@@ -38,20 +38,18 @@ DOUBTFUL_BELOW = 1e-5
 class SiteLocator:
     """The method and assumptions that locate the sites of one study.
 
-    spacing_limit_mm : electrode spacings farther than this from the catalogue's are reported. gap_doubts : catheters whose
-    catalogue entry contradicts the study, with the reason.
+    belief : of the study. any_study : the belief where no study shows anything. Positions, cycles and a-priori points depend
+    on that belief and on the cameras alone, so that a correction at one site changes no other. spacing_limit_mm : electrode
+    spacings farther than this from the catalogue's are reported. gap_doubts : catheters whose catalogue entry contradicts the
+    study, with the reason.
     """
 
     method: Method
     catalogue: Catalogue
     belief: StudyBelief
+    any_study: StudyBelief
     spacing_limit_mm: float
     gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
-
-    @property
-    def params(self) -> UncertaintyParams:
-        """The parameters with this study's breathing and beats."""
-        return self.belief.params
 
     def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
         """Locate a site in 3D.
@@ -72,19 +70,24 @@ class SiteLocator:
             (Reason.TABLE_MOVED, jump is not None or self.belief.doubt is Reason.TABLE_MOVED),
             (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
         ) if holds))  # fmt: skip
-        points, reference_mm = self._points(site, moment, cameras, doubts)
-        if site.alternative is not None:
-            other = self._moment(site.alternative.diastole, cameras, moments, jump)
-            if other is not None:
-                others, other_mm = self._points(site, other, cameras, doubts)
-                shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
-                by_label = {(point.catheter, point.electrode): point for point in others}
-                points = add_alternative(points, by_label, shift, site.alternative.probability)
+        other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
+        points, reference_mm = self._points(site, moment, moment.joint_mm2, cameras, doubts)
+        a_priori, _ = self._points(site, moment, moment.any_joint_mm2, cameras, doubts)
+        if site.alternative is not None and other is not None:
+            others, other_mm = self._points(site, other, other.joint_mm2, cameras, doubts)
+            any_others, _ = self._points(site, other, other.any_joint_mm2, cameras, doubts)
+            shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
+            p = site.alternative.probability
+            points, a_priori = (
+                add_alternative(points, others, shift, p),
+                add_alternative(a_priori, any_others, shift, p),
+            )
         cycle = None
         if moments is not None and rest is not None:
             cycle = locate_cycle(
-                moments, rest, cameras, self.catalogue, self.params, self.method, self.belief.gantry.covariance, jump
-            )
+                moments, rest, cameras, self.catalogue, self.any_study.params, self.method,
+                self.any_study.gantry.covariance, jump,
+            )  # fmt: skip
         reasons = [reason for reason, holds in (
             (Reason.NO_REFERENCE, reference_mm is None),
             (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
@@ -100,6 +103,7 @@ class SiteLocator:
             cycle=cycle,
             reasons=(*reasons, *doubts),
             variation=self.belief.variation,
+            a_priori=a_priori,
         )
         return answer, moment, _breathing_note(site.site, moment) if jump is None else []
 
@@ -114,39 +118,51 @@ class SiteLocator:
         motion = (
             cycle.motion(np.array(phase), phase, pixels.labels) if cycle is not None and phase is not None else None
         )
-        sources = error_sources(
-            cameras, start, pixels.labels, self.catalogue, self.params, self.belief.gantry.covariance, motion
-        )  # fmt: skip
-        if jump is not None:
-            sources = (*sources, jump_source(cameras, start, jump))
+        sources, any_sources = (
+            self._sources(belief, cameras, start, pixels.labels, motion, jump)
+            for belief in (self.belief, self.any_study)
+        )
         if self.method.estimates_breathing:
-            pixels = widen_strays(cameras, pixels, start, sources)
+            pixels = widen_strays(cameras, pixels, start, any_sources)
         noise = pixel_noise_px2(pixels.covariances)
-        errors = noise + sum(source.pixels_px2() for source in sources)
-        breathing = visible_breathing(cameras, start, self.params)
+        errors, any_errors = (
+            noise + sum(source.pixels_px2() for source in own) for own in (sources, any_sources)
+        )  # fmt: skip
+        breathing = visible_breathing(cameras, start, self.any_study.params)
         found = self.method.estimate(cameras, pixels, start, noise + breathing.pixels_px2())
         if not _plausible(found.points_mm):
             return None
         residuals = pixels.residuals_px(cameras, found.points_mm)
-        breathing_mm, inflation = 0.0, 1.0
+        breathing_mm, inflation, any_inflation = 0.0, 1.0, 1.0
         if self.method.estimates_breathing:
             # Epipolar residuals do not depend on the pixels' weights: no displacement of an electrode changes them.
             rows = epipolar_rows(cameras, found.points_mm)
-            apart, free = rows @ residuals, len(start)
-            misfit = float(apart @ np.linalg.solve(rows @ errors @ rows.T, apart))
+            inflation, any_inflation = (_inflation(rows, residuals, own) for own in (errors, any_errors))
             gain = breathing.covariance @ breathing.effect_px.T @ np.linalg.inv(noise + breathing.pixels_px2())
             breathing_mm = float((gain @ residuals)[0])
             residuals = residuals - breathing.effect_px[:, 0] * breathing_mm
-            if chi2.sf(misfit, free) < DOUBTFUL_BELOW:
-                inflation = misfit / free
-        return Moment(pixels, found, sources, noise, errors, residuals.reshape(-1, 2, 2), breathing_mm, inflation)
+        return Moment(
+            pixels, found, sources, noise, residuals.reshape(-1, 2, 2), breathing_mm, inflation,
+            inflation * found.covariance_mm2(errors), any_inflation * found.covariance_mm2(any_errors),
+        )  # fmt: skip
+
+    def _sources(
+        self, belief: StudyBelief, cameras: Cameras, points_mm: Array, labels: Sequence[tuple[str, int]],
+        motion: Motion | None, jump: Jump | None,
+    ) -> tuple[ErrorSource, ...]:  # fmt: skip
+        sources = error_sources(
+            cameras, points_mm, labels, self.catalogue, belief.params, belief.gantry.covariance, motion
+        )
+        return sources if jump is None else (*sources, jump_source(cameras, points_mm, jump))
 
     def _points(
-        self, site: MatchedSite, moment: Moment, cameras: Cameras, site_doubts: tuple[Reason, ...]
+        self, site: MatchedSite, moment: Moment, joint: Array, cameras: Cameras, site_doubts: tuple[Reason, ...]
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
-        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
+        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located.
+
+        ``joint`` (N, 3, N, 3) is the covariance of all electrodes.
+        """
         pixels, points = moment.pixels, moment.found.points_mm
-        joint = moment.inflation * moment.found.covariance_mm2(moment.errors_px2)
         reference = [i for i, (catheter, _) in enumerate(pixels.labels) if catheter == self.catalogue.reference]
         reference_mm = points[reference].mean(axis=0) if reference else None
         mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.spacing_limit_mm)
@@ -180,20 +196,31 @@ class SiteLocator:
 class Moment:
     """A site at diastole: N electrodes in 3D with their sources of error.
 
-    noise_px2 : (4 N, 4 N) covariance from pixel noise. errors_px2 : (4 N, 4 N) covariance from all sources.
-    residuals_px : (N, 2 views, 2), without the displacement of the heart between the runs. breathing_mm : half of that
-    displacement, as far as the views show it. inflation : misfit over its expected value where chance does not explain
-    it, else 1.
+    noise_px2 : (4 N, 4 N) covariance from pixel noise. residuals_px : (N, 2 views, 2), without the displacement of the heart
+    between the runs. breathing_mm : half of that displacement, as far as the views show it. inflation : misfit over its
+    expected value where chance does not explain it, else 1. joint_mm2, any_joint_mm2 : (N, 3, N, 3) covariance of all
+    electrodes, in this study and in any study.
     """
 
     pixels: TwoViewPixels
     found: Estimate
     sources: tuple[ErrorSource, ...]
     noise_px2: Array
-    errors_px2: Array
     residuals_px: Array
     breathing_mm: float
     inflation: float
+    joint_mm2: Array
+    any_joint_mm2: Array
+
+
+def _inflation(rows: Array, residuals_px: Array, errors_px2: Array) -> float:
+    """Return the misfit of the epipolar distances over its expected value where chance does not explain it, else 1.
+
+    ``rows`` (N, 4 N) combine the pixels to epipolar distances.
+    """
+    apart = rows @ residuals_px
+    misfit = float(apart @ np.linalg.solve(rows @ errors_px2 @ rows.T, apart))
+    return misfit / len(rows) if chi2.sf(misfit, len(rows)) < DOUBTFUL_BELOW else 1.0
 
 
 def _plausible(points_mm: Array) -> bool:

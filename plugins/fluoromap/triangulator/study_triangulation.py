@@ -47,7 +47,8 @@ def locate_study(
     Sites whose views are too close together or whose mapping catheter is missing are rejected.
     """
     usable, rejected, notes = _usable_sites(sites, catalogue)
-    locator = SiteLocator(method, catalogue, header_belief(params), params.spacing_limit_mm)
+    header = header_belief(params)
+    locator = SiteLocator(method, catalogue, header, header, params.spacing_limit_mm)
     return _locate_sites([(site, None, locator) for site in usable], context, rejected, notes, None)
 
 
@@ -88,7 +89,7 @@ def calibrate_and_locate(
     work = []
     for i, (site, jump) in enumerate(zip(usable, jumps, strict=True)):
         own = belief if i in same_gantry else header
-        work.append((site, jump, SiteLocator(method, catalogue, own, params.spacing_limit_mm, gap_doubts)))
+        work.append((site, jump, SiteLocator(method, catalogue, own, header, params.spacing_limit_mm, gap_doubts)))
     return _locate_sites(work, context, rejected, notes, calibration)
 
 
