@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
+from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Calibration, StudyVariation
@@ -19,6 +20,7 @@ from fluoromap.reasons import Reason
 from fluoromap.triangulator.study_equations import (
     GANTRY_UNKNOWNS,
     GAP_SD_MM,
+    HEART_SCALES,
     HeartScale,
     Information,
     SiteEquations,
@@ -42,6 +44,10 @@ FARTHEST_OFFSET_MM = 6.0
 """Largest offset of one view against the other that a gantry can have; a larger one is a moved table."""
 STILL_MISFIT = 2.0
 """Misfit an equation (1 is expected) above which the calibrated gantry does not explain the electrodes either."""
+LEAST_AGREEING = 0.7
+"""Share of the sites that must agree with some gantry and some heart, for the others to be left out."""
+UNEXPLAINED_BELOW = 1e-6
+"""Probability of a site's misfit by chance below which its electrodes are wrong."""
 _STEPS = 4
 _NEGLIGIBLE = 9.0
 """Difference of log evidence beyond which a kind of heart counts as ruled out."""
@@ -120,8 +126,13 @@ def calibrate(
     def equations(gantry: GantryBelief) -> list[SiteEquations]:
         return [site_equations(gantry.cameras(nominal), pixels, catalogue, gaps, params) for nominal, pixels in sites]
 
-    rows = equations(GantryBelief(np.eye(4), usual))
     unknowns = GANTRY_UNKNOWNS + len(gaps)
+    rows = equations(GantryBelief(np.eye(4), usual))
+    agree = [_is_explained(one, usual, len(gaps)) for one in rows]
+    if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
+        # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.
+        sites = [site for site, explained in zip(sites, agree, strict=True) if explained]
+        rows = [one for one, explained in zip(rows, agree, strict=True) if explained]
     mixture = _weigh(information(rows, np.zeros(unknowns)), usual, len(gaps))
     noise = float(np.sqrt(np.mean(np.concatenate([one.pixel_variance for one in rows]))))
     before = _epipolar_rms_px(rows, mixture, np.zeros(unknowns), params)
@@ -190,30 +201,41 @@ class _Mixture:
         return moment
 
 
+def _prior(multiples: Array, usual: Array, gaps: int) -> Array:
+    """Return the covariance (u, u) of the unknowns before the study, with these multiples (14,) of the usual gantry."""
+    whole = np.zeros((GANTRY_UNKNOWNS + gaps,) * 2)
+    whole[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] = multiples[:, None] * usual * multiples
+    whole[GANTRY_UNKNOWNS:, GANTRY_UNKNOWNS:] = GAP_SD_MM**2 * np.eye(gaps)
+    return whole
+
+
+def _is_explained(row: SiteEquations, usual: Array, gaps: int) -> bool:
+    """Return True where the worst gantry and the most irregular heart explain a site."""
+    prior = _prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE), usual, gaps)
+    worst = HeartScale(max(one.breathing for one in HEART_SCALES), max(one.beats for one in HEART_SCALES))
+    covariance = row.covariance(worst) + row.slope @ prior @ row.slope.T
+    misfit = float(row.residual @ np.linalg.solve(covariance, row.residual))
+    return bool(chi2.sf(misfit, len(row.residual)) >= UNEXPLAINED_BELOW)
+
+
 def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
     """Weigh all kinds of gantry and heart by their evidence.
 
     No electrode shows an error that both views share, so each kind of gantry keeps its own prior there.
     """
-
-    def prior(scale: Array) -> Array:
-        whole = np.zeros((GANTRY_UNKNOWNS + gaps,) * 2)
-        whole[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] = scale[:, None] * usual * scale
-        whole[GANTRY_UNKNOWNS:, GANTRY_UNKNOWNS:] = GAP_SD_MM**2 * np.eye(gaps)
-        return whole
-
-    widest = prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE))
+    widest = _prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE), usual, gaps)
     best = max(heart.log_evidence(widest) for heart in hearts)
     plausible = [heart for heart in hearts if heart.log_evidence(widest) > best - _NEGLIGIBLE]
     kinds = [
         (heart, of_gantry, float(np.log(kind.share)) + heart.log_evidence(of_gantry))
         for kind in GANTRY_KINDS
-        for of_gantry in [prior(kind.multiples)]
+        for of_gantry in [_prior(kind.multiples, usual, gaps)]
         for heart in plausible
     ]
     evidence = np.array([one for *_, one in kinds])
     weights = np.exp(evidence - logsumexp(evidence))
-    exact = logsumexp([heart.log_evidence(prior(np.zeros(GANTRY_UNKNOWNS))) for heart in hearts])
+    no_error = _prior(np.zeros(GANTRY_UNKNOWNS), usual, gaps)
+    exact = logsumexp([heart.log_evidence(no_error) for heart in hearts])
     likely = [(kind, weight) for kind, weight in zip(kinds, weights, strict=True) if weight > 1e-4]
     total = sum(weight for _, weight in likely)
     answers = [(heart.posterior(of_gantry), weight / total) for (heart, of_gantry, _), weight in likely]

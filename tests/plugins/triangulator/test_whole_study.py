@@ -197,6 +197,29 @@ def test_breathing_is_no_fault_of_the_study_where_pixels_are_known_unequally_wel
             assert grade_of(point.relative_covariance_mm2, point.reasons) in (Grade.A, Grade.B)
 
 
+@pytest.mark.parametrize("seed", [61, 62, 63])
+def test_a_site_with_wrong_electrodes_leaves_the_uncertainty_of_the_others(seed: int) -> None:
+    by_site = electrodes(seed, sites=8)
+    sites = list(matched_sites(by_site, np.random.default_rng(seed)))
+    before = located(tuple(sites))
+    view = sites[2].diastole.b
+    chains = [
+        replace(chain, pixels_uv=chain.pixels_uv + np.array([[0, 20], [0, 0], [0, 0], [0, -20]]))
+        for chain in view.chains
+    ]
+    wrong = replace(view, chains=tuple(chains))
+    sites[2] = replace(sites[2], diastole=replace(sites[2].diastole, b=wrong))
+    answer = located(tuple(sites))
+    assert Reason.GEOMETRY_DOUBTFUL in answer.sites[2].reasons
+    for index in (0, 1, 3, 4, 5, 6, 7):
+        assert Reason.GEOMETRY_DOUBTFUL not in answer.sites[index].reasons
+        ratios = [
+            np.trace(point.covariance_mm2) / np.trace(known.covariance_mm2)
+            for point, known in zip(answer.sites[index].points, before.sites[index].points, strict=True)
+        ]
+        assert max(ratios) < 1.3
+
+
 def test_a_difference_that_no_gantry_explains_is_not_corrected_but_doubted() -> None:
     by_site = electrodes(6)
     upside_down = np.diag([1.0, 1.0, -1.0, 1.0])
