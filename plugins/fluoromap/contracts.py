@@ -503,8 +503,9 @@ class LocatedSite:
         return tuple(dict.fromkeys((*own, *self.reasons, *origin)))
 
     def doubts_about(self, catheter: str) -> tuple[Reason, ...]:
-        """Return the reasons of a catheter's points that limit the grade."""
-        reasons = (reason for point in self.points if point.catheter == catheter for reason in point.reasons)
+        """Return the reasons of a catheter's points, and of the whole site, that limit the grade."""
+        own = [reason for point in self.points if point.catheter == catheter for reason in point.reasons]
+        reasons = (*own, *self.reasons)
         return tuple(dict.fromkeys(reason for reason in reasons if reason in AT_BEST_C))
 
     def camera(self, view: View) -> Camera:
