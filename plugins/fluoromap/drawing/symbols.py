@@ -25,7 +25,7 @@ def is_outlier(site: SurfaceSite) -> bool:
 
 
 def is_doubtful(site: SurfaceSite) -> bool:
-    """Return True where the time, the position or the catheter's name of a site is in doubt."""
+    """Return True where a site's time, position or catheter is in doubt."""
     return is_outlier(site) or not AT_BEST_C.isdisjoint(site.reasons)
 
 

@@ -120,7 +120,9 @@ class MotionCovariance:
         )
 
     def _parts(self, frames: slice) -> Iterator[tuple[int, int, bool, Array]]:
-        """Yield each part, its cause, whether the view shows its depth, and its columns (n, m, 3, k).
+        """Yield part, cause, True where the view shows its depth, and columns.
+
+        The columns are (n, m, 3, k).
 
         A view shows the depth of a beat by its motion across the rays, and the depth of a tilt by the catheter's lengths. It
         does not show the depth of a catheter as a whole, nor that of breathing: 1 mm changes the size of the image by 0.2 %.
@@ -163,7 +165,7 @@ class MotionCovariance:
             yield from self._free(frames)
 
     def _common_shares(self) -> tuple[float, float, float]:
-        """Return the shares of breathing, isocentre and the rest in the common displacement along the view's axis."""
+        """Return the shares of breathing, isocentre and others in the common depth."""
         p, axis = self._params, self._axis
         common = float(axis @ self._expected.common_mm2 @ axis)
         if common <= 0:

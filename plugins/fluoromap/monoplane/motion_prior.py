@@ -219,13 +219,17 @@ class MotionPrior:
         )
 
     def _relative(self, positions: Array, joint: Array, weights: Array, across: Array) -> Array:
-        """Return the covariance (n, m, 3, 3) of positions less the reference's mean, which ``weights`` (n, m, m) take."""
+        """Return the covariance (n, m, 3, 3) of positions less the reference's mean.
+
+        ``weights`` (n, m, m) subtract that mean.
+        """
         n, m = positions.shape[:2]
         parts = joint.reshape(n, m, 3, m, 3)
         own = np.einsum("nka,naibj,nkb->nkij", weights, parts, weights, optimize=True)
         apart = np.einsum("nka,nai->nki", weights, positions)
-        turned: Array = across @ gantry_angle_covariance_mm2(apart, self._params.gantry_angle_sd_deg) @ across
-        return own + turned
+        turned = across @ gantry_angle_covariance_mm2(apart, self._params.gantry_angle_sd_deg) @ across
+        relative: Array = own + turned
+        return relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,9 +285,9 @@ def _from_reference(electrodes: ViewElectrodes, reference: str) -> tuple[Array, 
 
 
 def _depth_by_cause(prior: PathPrior, gains: Array, rays: Array, outside: BoolArray) -> Array:
-    """Return the joint covariance (4, n, m, m) of depths that no view shows, from each cause that the study scales.
+    """Return the covariance (4, n, m, m) of unseen depths from each cause.
 
-    Electrodes ``outside`` (n, m) are independent of the others.
+    The study scales these causes. Electrodes ``outside`` (n, m) are independent of the others.
     """
     along = np.einsum("nmi,nmiq->nmq", rays, prior.unseen_mm) * np.sqrt(gains)[prior.parts]
     joint = np.stack([

@@ -134,7 +134,10 @@ def in_study(track: Track, camera: Camera, reference: str, variation: StudyVaria
 
 
 def _turned_mm2(points_mm: Array) -> Array:
-    """Return the covariance (..., 3, 3) of points (..., 3) from a rotation with unit variance about every axis, mm^2."""
+    """Return the covariance (..., 3, 3) of turned points (..., 3), mm^2.
+
+    The rotation has unit variance about every axis.
+    """
     squares = (points_mm**2).sum(axis=-1)[..., None, None] * np.eye(3)
     covariance: Array = squares - points_mm[..., :, None] * points_mm[..., None, :]
     return covariance

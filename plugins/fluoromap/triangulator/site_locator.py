@@ -214,9 +214,9 @@ class Moment:
 
 
 def _inflation(rows: Array, residuals_px: Array, errors_px2: Array) -> float:
-    """Return the misfit of the epipolar distances over its expected value where chance does not explain it, else 1.
+    """Return the misfit of the epipolar distances over its expected value.
 
-    ``rows`` (N, 4 N) combine the pixels to epipolar distances.
+    It is 1 where chance explains the misfit. ``rows`` (N, 4 N) combine the pixels to epipolar distances.
     """
     apart = rows @ residuals_px
     misfit = float(apart @ np.linalg.solve(rows @ errors_px2 @ rows.T, apart))

@@ -156,9 +156,9 @@ def _views_apart(
     found: Sequence[tuple[Array, Array] | None],
     params: UncertaintyParams,
 ) -> tuple[float, list[bool]]:
-    """Return this heart's breathing and, for each site, True where a jump and no breath displaced its views.
+    """Return this heart's breathing, and True for each site that jumped.
 
-    The breathing is a multiple of the assumed one. Breathing displaces the views of every site against each other; a moved
+    A jump displaces the two views of a site farther than a breath does. The breathing is a multiple of the assumed one. Breathing displaces the views of every site against each other; a moved
     table displaces those of a few sites, and farther. The sites together show the breathing, but a few sites show it
     inaccurately. So every breathing counts with its probability.
     """

@@ -156,7 +156,10 @@ def test_breathing_between_the_runs_is_not_taken_for_a_wrong_gantry() -> None:
 
 
 def unequal_pixels(sites: tuple[MatchedSite, ...], rng: np.random.Generator) -> tuple[MatchedSite, ...]:
-    """Return the sites with pixels that a segmenter knows unequally well: some to 0.06 px, some to 0.8 px."""
+    """Return the sites with pixels that are known unequally well.
+
+    Some are known to 0.06 px, some to 0.8 px.
+    """
     found = []
     for site in sites:
         views = []
