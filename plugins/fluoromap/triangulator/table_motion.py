@@ -158,9 +158,9 @@ def _views_apart(
 ) -> tuple[float, list[bool]]:
     """Return this heart's breathing, and True for each site that jumped.
 
-    A jump displaces the two views of a site farther than a breath does. The breathing is a multiple of the assumed one. Breathing displaces the views of every site against each other; a moved
-    table displaces those of a few sites, and farther. The sites together show the breathing, but a few sites show it
-    inaccurately. So every breathing counts with its probability.
+    A jump displaces the two views of a site farther than a breath does. The breathing is a multiple of the assumed one. Breathing
+    displaces the views of every site against each other; a moved table displaces those of a few sites. A few sites show the
+    breathing inaccurately, so every breathing counts with its probability.
     """
     known = [index for index, moved in enumerate(found) if moved is not None]
     jumped = [False] * len(sites)
