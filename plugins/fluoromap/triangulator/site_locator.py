@@ -67,7 +67,7 @@ class SiteLocator:
         if moment is None:
             return None
         doubts = tuple(dict.fromkeys(reason for reason, holds in (
-            (Reason.TABLE_MOVED, jump is not None or self.belief.doubt is Reason.TABLE_MOVED),
+            (Reason.TABLE_MOVED, (jump is not None and jump.is_certain) or self.belief.doubt is Reason.TABLE_MOVED),
             (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
         ) if holds))  # fmt: skip
         other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
@@ -105,7 +105,7 @@ class SiteLocator:
             variation=self.belief.variation,
             a_priori=a_priori,
         )
-        return answer, moment, _breathing_note(site.site, moment) if jump is None else []
+        return answer, moment, [] if jump is not None and jump.is_certain else _breathing_note(site.site, moment)
 
     def _moment(
         self, pair: PhasePair, cameras: Cameras, cycle: CycleMoments | None, jump: Jump | None

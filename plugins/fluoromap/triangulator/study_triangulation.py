@@ -76,7 +76,8 @@ def calibrate_and_locate(
         rejected += [RejectedSite(site.site, reasons) for site in usable]
         return Triangulation((), tuple(rejected), tuple(notes))
     same_gantry = _same_gantry(usable)
-    unmoved = [first[i][:2] for i in same_gantry if jumps[i] is None]
+    is_certain = [jump is not None and jump.is_certain for jump in jumps]
+    unmoved = [first[i][:2] for i in same_gantry if not is_certain[i]]
     calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
     if calibration is not None and calibration.applied:
         notes.append(_calibration_note(calibration))

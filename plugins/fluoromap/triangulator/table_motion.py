@@ -22,18 +22,27 @@ _LEAST_MM = 3.0
 _SLIP_MM = 4.0
 _JUMP_SHARE, _JUMP_SD_MM = 0.02, 15.0
 """Share of the sites between whose runs the table moves, and how far along one axis."""
-_CERTAIN = 0.95
-"""Probability of a jump above which it is reported."""
+CERTAIN, _POSSIBLE = 0.95, 0.05
+"""Probabilities of a jump above which it is reported, and above which it counts in the ellipsoids."""
 _BREATHING_SHARES = np.geomspace(0.05, 2.0, 20)
 """Breathing of a heart as multiples of the assumed one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Jump:
-    """A displacement of the heart in one view of a site: ``displacement_mm`` (3,), world, across that view's rays."""
+    """A displacement of the heart in one view of a site.
+
+    displacement_mm : (3,) world, across that view's rays. probability : that it is no breath. A certain jump is reported; a
+    possible one widens the ellipsoids of its site.
+    """
 
     view: View
     displacement_mm: Array
+    probability: float = 1.0
+
+    @property
+    def is_certain(self) -> bool:
+        return self.probability >= CERTAIN
 
 
 def table_jumps(
@@ -56,12 +65,12 @@ def table_jumps(
         return [None] * len(sites)
     usual = _usual_places(sites, resting)
     found = [_displacements(cameras, pixels, usual) for cameras, pixels, _ in sites]
-    scale, jumped = _views_apart(sites, found, params)
+    scale, probabilities = _views_apart(sites, found, params)
     # Only the head-feet direction shows how far this heart breathes.
     own = params.model_copy(update={"respiration_head_feet_sd_mm": scale * params.respiration_head_feet_sd_mm})
     return _with_boundary([
-        None if moved is None else _site_jump(cameras, moved, disagree, own, params)
-        for (cameras, *_), moved, disagree in zip(sites, found, jumped, strict=True)
+        None if moved is None else _site_jump(cameras, moved, probability, own, params)
+        for (cameras, *_), moved, probability in zip(sites, found, probabilities, strict=True)
     ])  # fmt: skip
 
 
@@ -72,22 +81,24 @@ def _with_boundary(jumps: list[Jump | None]) -> list[Jump | None]:
     happened at the next site; if view a differs at the last sites, at the site before them.
     """
     found = list(jumps)
-    first = next((k for k, jump in enumerate(jumps) if jump is None or jump.view != "b"), len(jumps))
-    if 0 < first < len(jumps) and jumps[first] is None:
+    views = [jump.view if jump is not None and jump.is_certain else None for jump in jumps]
+    first = next((k for k, view in enumerate(views) if view != "b"), len(jumps))
+    if 0 < first < len(jumps) and views[first] is None:
         found[first] = jumps[first - 1]
-    last = next((k for k, jump in enumerate(reversed(jumps)) if jump is None or jump.view != "a"), len(jumps))
+    last = next((k for k, view in enumerate(reversed(views)) if view != "a"), len(jumps))
     before = len(jumps) - last - 1
-    if 0 < last < len(jumps) and jumps[before] is None:
+    if 0 < last < len(jumps) and views[before] is None:
         found[before] = jumps[before + 1]
     return found
 
 
 def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]:
-    """Return a sentence for each view that jumped.
+    """Return a sentence for each view that certainly jumped.
 
     It says at which sites, and how far.
     """
     notes = []
+    jumps = [jump if jump is not None and jump.is_certain else None for jump in jumps]
     for view in ("a", "b"):
         at = [index for index, jump in enumerate(jumps) if jump is not None and jump.view == view]
         if not at:
@@ -106,10 +117,10 @@ def jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
     """Return the error source of a jump.
 
     Either view may show the true place, and a view does not show the jump along its rays. So each view may be displaced in
-    any direction by as much as the jump.
+    any direction by as much as the jump. The variance of a possible jump is its expected value.
     """
     in_a, in_b = np.eye(3, 6), np.eye(3, 6, 3)
-    variance = float(jump.displacement_mm @ jump.displacement_mm) / 2
+    variance = jump.probability * float(jump.displacement_mm @ jump.displacement_mm) / 2
     return ErrorSource(effect_px(jacobians(cameras, points_mm), in_a, in_b), variance * np.eye(6), ("breathing",) * 6)
 
 
@@ -155,17 +166,17 @@ def _views_apart(
     sites: Sequence[tuple[Cameras, TwoViewPixels, Array]],
     found: Sequence[tuple[Array, Array] | None],
     params: UncertaintyParams,
-) -> tuple[float, list[bool]]:
-    """Return this heart's breathing, and True for each site that jumped.
+) -> tuple[float, list[float]]:
+    """Return this heart's breathing, and each site's probability of a jump.
 
     A jump displaces the two views of a site farther than a breath does. The breathing is a multiple of the assumed one. Breathing
     displaces the views of every site against each other; a moved table displaces those of a few sites. A few sites show the
     breathing inaccurately, so every breathing counts with its probability.
     """
     known = [index for index, moved in enumerate(found) if moved is not None]
-    jumped = [False] * len(sites)
+    probabilities = [0.0] * len(sites)
     if not known:
-        return 1.0, jumped
+        return 1.0, probabilities
     apart, variance = [], []
     for index in known:
         (cameras, *_), moved = sites[index], found[index]
@@ -180,31 +191,31 @@ def _views_apart(
     either = np.logaddexp(breath, jump)
     evidence = either.sum(axis=1) + [HeartScale(share, 1.0).log_prior for share in _BREATHING_SHARES]
     weights = np.exp(evidence - logsumexp(evidence))
-    certain = (weights @ np.exp(jump - either) > _CERTAIN) & (np.abs(from_usual) / np.sqrt(2) > _LEAST_MM)
-    for index, one in zip(known, certain, strict=True):
-        jumped[index] = bool(one)
-    return float(np.sqrt(weights @ np.square(_BREATHING_SHARES))), jumped
+    far = np.abs(from_usual) / np.sqrt(2) > _LEAST_MM
+    for index, probability in zip(known, far * (weights @ np.exp(jump - either)), strict=True):
+        probabilities[index] = float(probability)
+    return float(np.sqrt(weights @ np.square(_BREATHING_SHARES))), probabilities
 
 
 def _site_jump(
-    cameras: Cameras, moved: tuple[Array, Array], disagree: bool, own: UncertaintyParams, params: UncertaintyParams
+    cameras: Cameras, moved: tuple[Array, Array], probability: float, own: UncertaintyParams, params: UncertaintyParams
 ) -> Jump | None:
     """Return the jump of a site, or None.
 
-    ``moved`` are its displacements in both views. ``disagree``: they jumped against each other. ``own`` has this heart's
-    breathing, ``params`` the assumed one.
+    ``moved`` are its displacements in both views; they jumped against each other with this ``probability``. ``own`` has this
+    heart's breathing, ``params`` the assumed one.
     """
     shared = _shared_axis(cameras)
     strange = [
         _exceeds_breathing(one - shared * (shared @ one), camera, params)
         for one, camera in zip(moved, cameras, strict=True)
     ]
-    if not disagree:
+    farther = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
+    if probability < CERTAIN:
         # Displaced alike in both views: the table moved before both runs, or the heart lies elsewhere. That does no harm.
         alike = all(_exceeds_breathing(shared * float(shared @ one), None, own) for one in moved)
         if alike or all(strange) or not any(strange):
-            return None
-    farther = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
+            return Jump("b" if farther else "a", moved[farther], probability) if probability > _POSSIBLE else None
     view = farther if strange[0] == strange[1] else strange.index(True)
     return Jump("b" if view else "a", moved[view])
 
