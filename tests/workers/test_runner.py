@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,12 @@ from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Event, Job, JobState, StageRow, StageState, Study
 from fluoromap_workers import runner, tasks
 from fluoromap_workers.stage_inputs import Work
+
+
+@dataclass(frozen=True)
+class _Answer:
+    text: str = ""
+    number: int = 0
 
 
 @pytest.fixture
@@ -39,7 +46,7 @@ def stage(data_dir: Path) -> int:
 
 
 def _run(stage: int, monkeypatch: pytest.MonkeyPatch, compute: Callable[[Context], Any]) -> StageRow:
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, compute, str))
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, _Answer, compute, str))
     runner.run(stage, "test")
     with reading() as session:
         return session.get_one(StageRow, stage)
@@ -53,10 +60,10 @@ def _raises(error: Exception) -> Callable[[Any], Any]:
 
 
 def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = _run(stage, monkeypatch, lambda context: ("answer", 42))
+    row = _run(stage, monkeypatch, lambda context: _Answer("answer", 42))
     assert row.state == StageState.DONE
     assert row.result is not None
-    assert decode(tuple[str, int], files.path_of(row.result).read_bytes()) == ("answer", 42)  # type: ignore[arg-type]
+    assert decode(_Answer, files.path_of(row.result).read_bytes()) == _Answer("answer", 42)
     with reading() as session:
         assert session.get_one(Job, "j").state == JobState.SUCCEEDED
 
@@ -77,7 +84,7 @@ def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monk
                 state=state,
             )
             session.add(row)
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, tuple, lambda context: (), str))
+    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, _Answer, lambda context: _Answer(), str))
     # Nobody else hears of what got ready.
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
     tasks.run_stage(stage)
@@ -106,9 +113,11 @@ def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.M
     computed = []
 
     def work(held: Claim) -> Work:
-        return Work(
-            keys[held.stage_id] * 64, tuple, lambda context: (computed.append(held.stage_id), held.stage_id), str
-        )
+        def compute(context: Context) -> _Answer:
+            computed.append(held.stage_id)
+            return _Answer(number=held.stage_id)
+
+        return Work(keys[held.stage_id] * 64, _Answer, compute, str)
 
     monkeypatch.setattr(runner, "_prepare", work)
     runner.run(stage, "test")
@@ -142,7 +151,7 @@ def test_a_stage_that_cannot_be_prepared_does_not_keep_the_worker_from_the_other
     def work(held: Claim) -> Work:
         if held.stage_id == broken:
             raise ValueError("a stored result is damaged")
-        return Work("0" * 64, tuple, lambda context: (), str)
+        return Work("0" * 64, _Answer, lambda context: _Answer(), str)
 
     monkeypatch.setattr(runner, "_prepare", work)
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
@@ -168,7 +177,7 @@ def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files, "keep", full)
-    row = _run(stage, monkeypatch, lambda context: ())
+    row = _run(stage, monkeypatch, lambda context: _Answer())
     assert row.state == StageState.RUNNING
     assert row.lease_until is not None
     assert list((files.path_of("00").parent.parent / "incoming").iterdir()) == []
@@ -179,7 +188,7 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
         raise RuntimeError("a name that must stay secret")
 
     monkeypatch.setattr(files, "keep", broken)
-    row = _run(stage, monkeypatch, lambda context: ())
+    row = _run(stage, monkeypatch, lambda context: _Answer())
     assert row.state == StageState.FAILED
     assert row.error is not None
     assert row.error["code"] == "internal"
@@ -188,7 +197,7 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
 
 def test_a_reused_result_is_not_copied(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     (again,) = _more_stages(1)
-    monkeypatch.setattr(runner, "_prepare", lambda claim: Work("0" * 64, tuple, lambda context: (1,), str))
+    monkeypatch.setattr(runner, "_prepare", lambda claim: Work("0" * 64, _Answer, lambda context: _Answer("", 1), str))
     runner.run(stage, "test")
     with reading() as session:
         path = files.path_of(str(session.get_one(StageRow, stage).result))
@@ -209,21 +218,21 @@ def test_a_refusal_is_a_result_like_any_other(stage: int, monkeypatch: pytest.Mo
     def refuse(context: Context) -> Any:
         raise Refusal(Reason.NO_ELECTRODES, "Nothing to see.")
 
-    work = Work("0" * 64, tuple, refuse, lambda refusal: (str(refusal.reason), str(refusal)))
+    work = Work("0" * 64, _Answer, refuse, lambda refusal: _Answer(f"{refusal.reason}: {refusal}"))
     monkeypatch.setattr(runner, "_prepare", lambda claim: work)
     runner.run(stage, "test")
     with reading() as session:
         row = session.get_one(StageRow, stage)
     assert row.state == StageState.DONE
     content = files.path_of(str(row.result)).read_bytes()
-    assert decode(tuple[str, str], content) == ("no_electrodes", "Nothing to see.")  # type: ignore[arg-type]
+    assert decode(_Answer, content) == _Answer("no_electrodes: Nothing to see.")
 
 
 def test_a_result_that_comes_late_is_thrown_away(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def overtaken(context: Context) -> tuple[str]:
+    def overtaken(context: Context) -> _Answer:
         with writing() as session:
             session.get_one(StageRow, stage).attempt += 1
-        return ("late",)
+        return _Answer("late")
 
     row = _run(stage, monkeypatch, overtaken)
     assert row.state == StageState.RUNNING

@@ -1,8 +1,9 @@
 """Stage results as bytes and back, exactly: equal values give equal bytes.
 
 A stored result has three parts: eight bytes with the length of the second part, a MessagePack tree, and the numbers of all
-arrays. In the tree a dataclass is the list of its fields, and an array is the number of its pool and its place there. A pool
-holds the arrays of one type and shape, each different one once. So thousands of small arrays cost little to read.
+arrays. The tree holds columns: all values of one field of all dataclasses of one kind lie together, and an array is its
+number. Arrays of one type and shape lie together too, each different one once. So reading a value costs no Python call of
+its own, and thousands of small arrays cost little.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ import dataclasses
 import functools
 import gc
 import hashlib
+import itertools
 import math
 import types
 import typing
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from operator import attrgetter
-from typing import Any, cast
+from typing import Any, NoReturn, Protocol, cast
 
 import msgspec
 import numpy as np
@@ -26,52 +29,16 @@ from numpy.typing import NDArray
 
 T = typing.TypeVar("T")
 
-Encoder = Callable[[Any, "_Pools"], Any]
-Decoder = Callable[[Any, list[NDArray[Any]]], Any]
+LAYOUT = 2
+"""The number of the layout of stored bytes. It is part of every form, so that results of another one are computed again."""
 
 _ALIGNMENT = 8
+_PLAIN = frozenset({str, int, float, bool, types.NoneType})
 _pack, _unpack = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder()
 
 
 class StoredOtherwise(ValueError):
     """The bytes are no stored result of this kind, or another version of the contracts stored them."""
-
-
-class _Pools:
-    """The arrays of one value, gathered by type and shape."""
-
-    def __init__(self) -> None:
-        self._pools: dict[tuple[str, tuple[int, ...]], tuple[int, dict[bytes, int]]] = {}
-
-    def add(self, array: NDArray[Any]) -> tuple[int, int]:
-        """Add an array; return the number of its pool and its place there."""
-        key = array.dtype.char, array.shape
-        if key not in self._pools:
-            if array.dtype.kind not in "biuf":
-                raise TypeError(f"a result holds an array of {array.dtype}, which is never stored")
-            self._pools[key] = len(self._pools), {}
-        number, places = self._pools[key]
-        return number, places.setdefault(array.tobytes(), len(places))
-
-    def described(self) -> list[tuple[str, tuple[int, ...], int]]:
-        """Return type, shape and length of each pool."""
-        return [(np.dtype(char).str, shape, len(places)) for (char, shape), (_, places) in self._pools.items()]
-
-    def numbers(self) -> bytes:
-        """Return the numbers of all pools, each pool padded to whole words.
-
-        Raises
-        ------
-        ValueError
-            When one of them is not finite.
-        """
-        parts = []
-        for (char, _), (_, places) in self._pools.items():
-            content = b"".join(places)
-            if np.dtype(char).kind == "f" and not np.isfinite(np.frombuffer(content, char)).all():
-                raise ValueError("the result holds a number that is not finite")
-            parts.append(_padded(content))
-        return b"".join(parts)
 
 
 def encode(value: Any) -> bytes:
@@ -84,12 +51,14 @@ def encode(value: Any) -> bytes:
     TypeError
         When it holds anything else, which would not come back as it was.
     """
-    pools = _Pools()
     kind = type(value)
+    if not dataclasses.is_dataclass(kind):
+        _refuse(kind)
+    arrays = _Arrays()
     with _without_collector():
-        (tree,) = _encode_all((value,), pools)
-        head = _pack.encode((form_of(kind), pools.described(), tree))
-    return len(head).to_bytes(_ALIGNMENT, "little") + _padded(head) + pools.numbers()
+        tree = _column(cast(Hashable, kind)).encode([value], arrays)
+        head = _pack.encode((form_of(kind), arrays.described(), tree))
+    return len(head).to_bytes(_ALIGNMENT, "little") + _padded(head) + arrays.numbers()
 
 
 def decode(kind: type[T], content: bytes) -> T:
@@ -106,25 +75,19 @@ def decode(kind: type[T], content: bytes) -> T:
         end = _ALIGNMENT + int.from_bytes(content[:_ALIGNMENT], "little")
         with _without_collector():
             form, described, tree = _unpack.decode(content[_ALIGNMENT:end])
-        if form != form_of(kind):
-            raise StoredOtherwise(f"another version of the contracts stored this {kind}")
-        pools, start = [], _whole(end)
-        for dtype, shape, length in described:
-            pool = np.frombuffer(content, dtype, length * math.prod(shape), start)
-            pools.append(pool.reshape(length, *shape))
-            start += _whole(pool.nbytes)
-        with _without_collector():
-            decoder = _decoder(cast(Hashable, kind))
-            decoded: T = tree if decoder is None else decoder(tree, pools)
-    except (msgspec.DecodeError, TypeError, ValueError, IndexError) as error:
+            if form != form_of(kind):
+                raise StoredOtherwise(f"another version of the contracts stored this {kind}")
+            arrays = _stored_arrays(described, content, _whole(end))
+            (decoded,) = _column(cast(Hashable, kind)).decode(tree, arrays)
+    except (msgspec.DecodeError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise StoredOtherwise(f"these bytes are no stored {kind}") from error
-    return decoded
+    return cast(T, decoded)
 
 
 def form_of(kind: type[Any]) -> str:
-    """Return the hash of a type's form, which changes when a contract does.
+    """Return the hash of a type's form, which changes when a contract or the layout does.
 
-    The form is the names and types of its fields, and those of all dataclasses in it.
+    The form is the layout, the names and types of its fields, and those of all dataclasses in it.
     """
     return _form_of(cast(Hashable, kind))
 
@@ -144,7 +107,7 @@ def _form_of(kind: Any) -> str:
                 visit(hints[field.name])
 
     visit(kind)
-    return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
 
 
 def _whole(length: int) -> int:
@@ -170,91 +133,238 @@ def _without_collector() -> Iterator[None]:
             gc.enable()
 
 
-class _Encoders(dict[type, Encoder | None]):
-    """Type -> its encoder, made at the first value of the type; None where MessagePack holds the value unchanged."""
-
-    def __missing__(self, kind: type) -> Encoder | None:
-        self[kind] = made = self._encoder(kind)
-        return made
-
-    def _encoder(self, kind: type) -> Encoder | None:
-        if dataclasses.is_dataclass(kind):
-            members = attrgetter(*(field.name for field in dataclasses.fields(kind)))
-            if len(dataclasses.fields(kind)) == 1:
-                return lambda value, pools: _encode_all((members(value),), pools)
-            return lambda value, pools: _encode_all(members(value), pools)
-        if issubclass(kind, np.ndarray):
-            return lambda value, pools: pools.add(value)
-        if issubclass(kind, np.generic):
-            return lambda value, pools: _encode_all((value.item(),), pools)[0]
-        if issubclass(kind, Enum):
-            return lambda value, pools: value.value
-        if issubclass(kind, tuple | list):
-            return _encode_all
-        if issubclass(kind, float):
-            return _finite
-        if issubclass(kind, str | int | types.NoneType):
-            return None
-        raise TypeError(f"a result holds a {kind.__name__}, which is never stored")
+def _refuse(kind: type) -> NoReturn:
+    raise TypeError(f"a result holds a {kind.__name__}, which is never stored")
 
 
-_encoders = _Encoders()
+def _check_types(values: Iterable[Any], *allowed: type) -> None:
+    for kind in set(map(type, values)):
+        if not issubclass(kind, allowed):
+            _refuse(kind)
 
 
-def _encode_all(values: Iterable[Any], pools: _Pools) -> list[Any]:
-    encoders = _encoders
-    return [value if (encoder := encoders[type(value)]) is None else encoder(value, pools) for value in values]
-
-
-def _finite(value: float, pools: _Pools) -> float:
-    if not math.isfinite(value):
+def _check_finite(numbers: Iterable[float]) -> None:
+    if not all(map(math.isfinite, numbers)):
         raise ValueError("the result holds a number that is not finite")
-    return value
+
+
+# --- arrays ------------------------------------------------------------------------------------------------------------
+
+
+class _Arrays:
+    """The different arrays of one value, numbered as they come and gathered by type and shape."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[tuple[np.dtype[Any], tuple[int, ...], bytes], int] = {}
+
+    def add(self, array: NDArray[Any]) -> int:
+        """Add an array and return its number."""
+        return self._numbers.setdefault((array.dtype, array.shape, array.tobytes()), len(self._numbers))
+
+    @functools.cached_property
+    def _pools(self) -> dict[tuple[np.dtype[Any], tuple[int, ...]], tuple[list[int], list[bytes]]]:
+        pools: dict[tuple[np.dtype[Any], tuple[int, ...]], tuple[list[int], list[bytes]]] = {}
+        for (dtype, shape, content), number in self._numbers.items():
+            numbers, contents = pools.setdefault((dtype, shape), ([], []))
+            numbers.append(number)
+            contents.append(content)
+        return pools
+
+    def described(self) -> list[tuple[str, tuple[int, ...], list[int]]]:
+        """Return type, shape and the arrays' numbers for each pool.
+
+        Raises
+        ------
+        TypeError
+            When an array holds no real numbers.
+        """
+        for dtype, _ in self._pools:
+            if dtype.kind not in "biuf":
+                raise TypeError(f"a result holds an array of {dtype}, which is never stored")
+        return [(dtype.str, shape, numbers) for (dtype, shape), (numbers, _) in self._pools.items()]
+
+    def numbers(self) -> bytes:
+        """Return the numbers of all pools, each pool padded to whole words.
+
+        Raises
+        ------
+        ValueError
+            When one of them is not finite.
+        """
+        parts = []
+        for (dtype, _), (_, contents) in self._pools.items():
+            content = b"".join(contents)
+            if dtype.kind == "f" and not np.isfinite(np.frombuffer(content, dtype)).all():
+                raise ValueError("the result holds a number that is not finite")
+            parts.append(_padded(content))
+        return b"".join(parts)
+
+
+def _stored_arrays(described: Any, content: bytes, start: int) -> list[NDArray[Any]]:
+    """Return all arrays by their numbers; their values start at byte ``start``."""
+    by_number: dict[int, NDArray[Any]] = {}
+    for dtype, shape, numbers in described:
+        pool = np.frombuffer(content, dtype, len(numbers) * math.prod(shape), start)
+        by_number.update(zip(numbers, pool.reshape(len(numbers), *shape), strict=True))
+        start += _whole(pool.nbytes)
+    return [by_number[number] for number in range(len(by_number))]
+
+
+# --- columns -----------------------------------------------------------------------------------------------------------
+
+
+class _Column(Protocol):
+    """The values of one type as MessagePack, and back."""
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any: ...
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]: ...
 
 
 @functools.cache
-def _decoder(kind: Any) -> Decoder | None:
-    """Return the decoder of a type; None where MessagePack gives the value back unchanged."""
+def _column(kind: Any) -> _Column:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
-        present = _decoder(next(option for option in arguments if option is not type(None)))
-        return present and (lambda value, pools: None if value is None else present(value, pools))
+        present = _column(next(option for option in arguments if option is not type(None)))
+        return present if isinstance(present, _PlainColumn) else _OptionalColumn(present)
     if origin is np.ndarray:
-        return lambda value, pools: pools[value[0]][value[1]]
+        return _ArrayColumn()
     if origin is tuple:
-        return _tuple_decoder(arguments)
+        if arguments[1:] == (Ellipsis,):
+            return _SequenceColumn(_column(arguments[0]))
+        return _TupleColumn([_column(argument) for argument in arguments])
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        return _dataclass_decoder(kind)
+        return _DataclassColumn(kind)
     if isinstance(kind, type) and issubclass(kind, Enum):
-        members = {member.value: member for member in kind}
-        return lambda value, pools: members[value]
-    return None
+        return _EnumColumn(kind)
+    return _PlainColumn()
 
 
-def _tuple_decoder(arguments: tuple[Any, ...]) -> Decoder:
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        each = _decoder(arguments[0])
-        if each is None:
-            return lambda value, pools: tuple(value)
-        return lambda value, pools: tuple([each(item, pools) for item in value])
-    decoders = [_decoder(argument) for argument in arguments]
-    return lambda value, pools: tuple(
-        [item if decoder is None else decoder(item, pools) for decoder, item in zip(decoders, value, strict=True)]
-    )
+class _PlainColumn:
+    """Numbers, strings, truth values and None, which MessagePack holds unchanged."""
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        kinds = set(map(type, values))
+        for kind in kinds - _PLAIN:
+            if not issubclass(kind, np.generic):
+                _refuse(kind)
+            values = [value.item() if isinstance(value, np.generic) else value for value in values]
+            return self.encode(values, arrays)
+        if float in kinds:
+            _check_finite(values if len(kinds) == 1 else [value for value in values if type(value) is float])
+        return values
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        return cast(list[Any], stored)
 
 
-def _dataclass_decoder(kind: type) -> Decoder:
-    build, put = object.__new__, object.__setattr__
-    fields: list[tuple[str, Decoder | None]] = []
+class _EnumColumn:
+    """Members of one enum, by their values."""
 
-    def decoded(value: Any, pools: list[NDArray[Any]]) -> Any:
-        if not fields:
-            # A dataclass may hold others of its own kind, so its fields are looked up at the first value.
-            hints = typing.get_type_hints(kind)
-            fields.extend((field.name, _decoder(hints[field.name])) for field in dataclasses.fields(kind))
-        made: Any = build(kind)
-        for (name, decoder), item in zip(fields, value, strict=True):
-            put(made, name, item if decoder is None else decoder(item, pools))
+    def __init__(self, kind: type[Enum]) -> None:
+        self._kind = kind
+        self._members = {member.value: member for member in kind}
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        _check_types(values, self._kind)
+        return [value.value for value in values]
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        return [self._members[value] for value in stored]
+
+
+class _ArrayColumn:
+    """Arrays, by their numbers."""
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        _check_types(values, np.ndarray)
+        return list(map(arrays.add, values))
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        return [arrays[number] for number in stored]
+
+
+class _OptionalColumn:
+    """Values that may be missing: which are there, and these."""
+
+    def __init__(self, present: _Column) -> None:
+        self._present = present
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        there = [value is not None for value in values]
+        return there, self._present.encode([value for value in values if value is not None], arrays)
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        there, present = stored
+        following = iter(self._present.decode(present, arrays))
+        return [next(following) if is_there else None for is_there in there]
+
+
+class _SequenceColumn:
+    """Tuples of any length: their lengths, and the members of all of them in one column."""
+
+    def __init__(self, member: _Column) -> None:
+        self._member = member
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        _check_types(values, tuple, list)
+        return list(map(len, values)), self._member.encode(list(itertools.chain.from_iterable(values)), arrays)
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        lengths, members = stored
+        following = iter(self._member.decode(members, arrays))
+        return [tuple(itertools.islice(following, length)) for length in lengths]
+
+
+class _TupleColumn:
+    """Tuples with the same types at the same places: one column for each place."""
+
+    def __init__(self, places: Sequence[_Column]) -> None:
+        self._places = places
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        _check_types(values, tuple, list)
+        columns = list(zip(*values, strict=True)) or [()] * len(self._places)
+        return [place.encode(column, arrays) for place, column in zip(self._places, columns, strict=True)]
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        columns = [place.decode(column, arrays) for place, column in zip(self._places, stored, strict=True)]
+        return list(zip(*columns, strict=True))
+
+
+class _DataclassColumn:
+    """Dataclasses of one kind: their number, and one column for each field."""
+
+    def __init__(self, kind: type) -> None:
+        self._kind = kind
+
+    @functools.cached_property
+    def _fields(self) -> list[tuple[str, _Column]]:
+        # A dataclass may hold others of its own kind, so its fields are looked up at the first value.
+        hints = typing.get_type_hints(self._kind)
+        return [(field.name, _column(hints[field.name])) for field in dataclasses.fields(cast(Any, self._kind))]
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        if not values:
+            return 0, []
+        for kind in set(map(type, values)) - {self._kind}:
+            _refuse(kind)
+        return len(values), [
+            column.encode(list(map(attrgetter(name), values)), arrays) for name, column in self._fields
+        ]
+
+    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+        count, columns = stored
+        made = list(map(object.__new__, itertools.repeat(cast(Any, self._kind), count)))
+        if made:
+            for (name, column), items in zip(self._fields, columns, strict=True):
+                _set_all(made, name, column.decode(items, arrays))
         return made
 
-    return decoded
+
+def _set_all(objects: Sequence[Any], name: str, values: Sequence[Any]) -> None:
+    """Set one field of many dataclasses, which may be frozen."""
+    if len(objects) != len(values):
+        raise ValueError(f"there are {len(values)} values of {name} for {len(objects)} objects")
+    put: Callable[[Any, str, Any], None] = object.__setattr__
+    deque(map(put, objects, itertools.repeat(name), values), maxlen=0)

@@ -69,6 +69,13 @@ RELATIVE_COVARIANCE_A = np.diag([0.49, 0.01, 0.01])
 """The same less the reference of the same frame, by solvers that state it."""
 
 
+@dataclass(frozen=True)
+class _Segmented:
+    """The result of a segment stage that no route reads; it differs from run to run."""
+
+    uid: str
+
+
 @dataclass
 class FinishedStudy:
     """``S01`` is located and followed, ``S02`` could not be located, ``S03`` was not ready when the job was made."""
@@ -105,7 +112,7 @@ class FinishedStudy:
 
     def segmented(self) -> None:
         for uid in self.uids.values():
-            self.end("segment", uid, ("of", uid))
+            self.end("segment", uid, _Segmented(uid))
 
     def matched(self) -> None:
         self.segmented()

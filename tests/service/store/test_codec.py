@@ -13,7 +13,30 @@ from hypothesis import strategies as st
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
-from fluoromap_service.store.codec import decode, encode
+from fluoromap_service.store.codec import StoredOtherwise, decode, encode
+
+
+@dataclasses.dataclass(frozen=True)
+class _Number:
+    number: float
+    text: str = "NaN"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Numbers:
+    numbers: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class _Texts:
+    texts: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tree:
+    label: str | None
+    branches: "tuple[_Tree, ...]" = ()
+    pairs: tuple[tuple[str, Array | None], ...] = ()
 
 
 def _segmentation() -> Segmentation:
@@ -54,14 +77,16 @@ def test_empty_arrays_and_missing_values_keep_their_shape() -> None:
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("holder", [lambda number: (number,), np.array, np.float64])
+@pytest.mark.parametrize(
+    "holder", [_Number, lambda number: _Number(np.float64(number)), lambda number: _Numbers(np.array(number))]
+)
 def test_what_is_not_a_number_is_refused(number: float, holder: Callable[[float], Any]) -> None:
     with pytest.raises(ValueError, match="finite"):
-        encode((holder(number), "NaN"))
+        encode(holder(number))
 
 
 def test_a_text_may_say_that_something_is_not_a_number() -> None:
-    assert decode(tuple[str, ...], encode(("NaN", "-Infinity"))) == ("NaN", "-Infinity")  # type: ignore[arg-type]
+    assert decode(_Texts, encode(_Texts(("NaN", "-Infinity")))) == _Texts(("NaN", "-Infinity"))
 
 
 @pytest.mark.parametrize(
@@ -72,11 +97,41 @@ def test_a_text_may_say_that_something_is_not_a_number() -> None:
     ],
 )  # fmt: skip
 def test_what_would_not_come_back_as_it_was_is_refused(value: Any) -> None:
-    with pytest.raises(TypeError, match="never stored"):
-        encode((1.5, value))
+    for holder in (_Number(value), _Numbers(value), _Texts((value,)), _Tree(None, (value,)), value):
+        with pytest.raises(TypeError, match="never stored"):
+            encode(holder)
+
+
+@pytest.mark.parametrize("number", [np.float64(0.1), np.int32(7), np.bool_(True)])
+def test_a_number_of_numpy_comes_back_as_one_of_python(number: Any) -> None:
+    after = decode(_Number, encode(_Number(number))).number
+    assert after == number.item()
+    assert type(after) is type(number.item())
+
+
+def test_equal_arrays_are_stored_once() -> None:
+    once = encode(_Tree(None, pairs=(("a", np.arange(1000.0)),)))
+    twice = encode(_Tree(None, pairs=(("a", np.arange(1000.0)), ("b", np.arange(1000.0)))))
+    assert len(twice) < len(once) + 100
+
+
+def test_a_tree_of_its_own_kind_comes_back() -> None:
+    leaf = _Tree("leaf", pairs=(("none", None), ("some", np.arange(3, dtype=">i2"))))
+    before = _Tree(None, (leaf, _Tree("empty"), _Tree("twig", (leaf,))))
+    after = decode(_Tree, encode(before))
+    assert encode(after) == encode(before)
+    assert [branch.label for branch in after.branches] == ["leaf", "empty", "twig"]
+    assert after.branches[2].branches[0].pairs[0] == ("none", None)
+    np.testing.assert_array_equal(after.branches[0].pairs[1][1], [0, 1, 2])
+
+
+@pytest.mark.parametrize("cut", [0, 4, 8, 20, 200, -1])
+def test_bytes_that_are_cut_off_are_no_stored_result(cut: int) -> None:
+    with pytest.raises(StoredOtherwise):
+        decode(Segmentation, encode(_segmentation())[:cut])
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
 def test_numbers_come_back_bit_for_bit(numbers: list[float]) -> None:
     before = np.array(numbers)
-    assert decode(Array, encode(before)).tobytes() == before.tobytes()  # type: ignore[arg-type]
+    assert decode(_Numbers, encode(_Numbers(before))).numbers.tobytes() == before.tobytes()
