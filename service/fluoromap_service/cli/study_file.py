@@ -14,7 +14,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.registry import DEFAULTS, UnknownPlugin, plugin
 from fluoromap_service.api.study.catheters import CatheterIn, Line
 from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
-from fluoromap_service.api.study.instances import GantryPatch
+from fluoromap_service.api.study.gantry import GantryPatch
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.problem import Problem
 from fluoromap_service.study.catheters import catalogue_with_roles
@@ -64,7 +64,7 @@ class StudyFile(BaseModel):
 
     @property
     def default_gantry(self) -> dict[str, Any]:
-        """The geometry of runs whose header lacks it, as ``PATCH`` of an instance takes it."""
+        """The geometry of runs whose header lacks it, as ``PATCH`` of the study takes it."""
         return self.gantry.model_dump(mode="json", exclude_none=True)
 
 

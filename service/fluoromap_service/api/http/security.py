@@ -13,9 +13,10 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from fluoromap_service import auth
-from fluoromap_service.api.http.problems import answer
+from fluoromap_service.api.http.problems import DATABASE_AWAY, answer, database_away
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
+from fluoromap_service.settings import settings
 
 OPEN_PATHS = frozenset({"/v1/health", "/v1/ready"})
 """The paths that answer without a token."""
@@ -42,6 +43,9 @@ class Doorkeeper:
             _demand(caller, Scope.READ if scope.get("method") in _READING else Scope.WRITE)
         except Problem as problem:
             await answer(problem)(scope, receive, send)
+            return
+        except DATABASE_AWAY as error:
+            await answer(database_away(error))(scope, receive, send)
             return
         scope.setdefault("state", {})["caller"] = caller
         await self._app(scope, receive, send)
@@ -81,7 +85,8 @@ def _check_local(connection: HTTPConnection) -> None:
     if name is None or not auth.is_loopback(name):
         raise Problem(403, "foreign_host", "Without tokens this service answers only under localhost or 127.0.0.1.")
     origin = connection.headers.get("origin")
-    if origin is not None and origin.lower() != f"{connection.scope['scheme']}://{host}".lower():
+    own = f"{connection.scope['scheme']}://{host}".lower()
+    if origin is not None and origin.lower() not in (own, *settings().allowed_origins):
         raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
 
 
