@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 import shutil
@@ -342,7 +341,7 @@ def test_a_job_of_another_version_of_a_plugin_is_not_computed(
     installed = pipeline.plugin
 
     def older(kind: Kind, name: str) -> Plugin:
-        return dataclasses.replace(installed(kind, name), version="0")
+        return replace(installed(kind, name), version="0")
 
     monkeypatch.setattr(pipeline, "plugin", older)
     job = _job(service, sent)
