@@ -148,11 +148,20 @@ def site_equations(
         residual = np.concatenate([residual, length - [gap for _, _, gap, _ in known]])
         errors[n + np.arange(len(known)), [row[3] for row in known]] = 1.0
     none = np.zeros((GANTRY_UNKNOWNS, GANTRY_UNKNOWNS))
-    sources = error_sources(cameras, points, pixels.labels, catalogue, params, none, None)
-    fixed = combine @ pixel_noise_px2(pixels.covariances) @ combine.T
+    # An electrode's own bend is no beat. Where pixels are known well, it would hide how far whole catheters move.
+    of_beats, of_bend = (
+        error_sources(cameras, points, pixels.labels, catalogue, params.model_copy(update={other: 0.0}), none, None)
+        for other in ("bend_sd_mm", "beat_sd_mm")
+    )
+    noise = pixel_noise_px2(pixels.covariances)
+    fixed = combine @ noise @ combine.T
     fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
     parts = {share: np.zeros_like(fixed) for share in _SCALED}
-    for source in sources:
+    for source in of_bend:
+        if "phase_mismatch" in source.shares:
+            effect = combine @ source.effect_px
+            fixed += effect @ source.covariance @ effect.T
+    for source in of_beats:
         for share in parts.keys() & source.shares:
             effect = combine @ source.effect_px
             parts[share] += effect @ source.covariance @ effect.T
@@ -160,7 +169,7 @@ def site_equations(
     slope = np.concatenate([combine @ gantry_effect_px(cameras, jacobian, points), errors], axis=1)
     return SiteEquations(
         residual, slope, fixed, parts["breathing"], parts["phase_mismatch"], combine @ breathing_effect_px(jacobian), n,
-        np.diagonal(fixed)[:n],
+        np.diagonal(combine @ noise @ combine.T)[:n],
     )  # fmt: skip
 
 

@@ -129,7 +129,6 @@ class UncertaintyParams(BaseModel, extra="forbid"):
                 "respiration_other_sd_mm": breathing * self.respiration_other_sd_mm,
                 "respiration_drift_sd_mm": breathing * self.respiration_drift_sd_mm,
                 "beat_sd_mm": beats * self.beat_sd_mm,
-                "bend_sd_mm": beats * self.bend_sd_mm,
             }
         )
 

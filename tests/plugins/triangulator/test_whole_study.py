@@ -251,6 +251,23 @@ def test_beats_that_displace_catheters_are_no_doubt_where_pixels_are_known_unequ
     assert not any(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in answer.sites)
 
 
+@pytest.mark.parametrize("seed", [71, 72, 73])
+def test_pixels_known_well_do_not_hide_how_far_whole_catheters_move(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    follows = np.linspace(1.0, 0.5, 4)[:, None]
+    by_site, sites = electrodes(seed), []
+    for site in matched_sites(by_site, rng, noise_px=0.05):
+        views = []
+        for camera, view in zip(CAMERAS, (site.diastole.a, site.diastole.b), strict=True):
+            chains = [
+                replace(chain, pixels_uv=chain.pixels_uv + follows * rng.normal(0, 0.25 * camera.px_per_mm, 2))
+                for chain in view.chains
+            ]
+            views.append(replace(view, chains=tuple(chains)))
+        sites.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+    assert located(tuple(sites)).sites[0].variation.beats > 0.75
+
+
 def test_a_study_whose_catheters_are_all_described_wrongly_is_refused_with_the_cause() -> None:
     by_site = electrodes(7, sites=6)
     wider = tuple(
