@@ -25,6 +25,8 @@ from fluoromap.geometry import Camera, camera_from_gantry
 from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
+from fluoromap.triangulator.study_equations import site_equations
+from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
@@ -266,6 +268,16 @@ def test_pixels_known_well_do_not_hide_how_far_whole_catheters_move(seed: int) -
             views.append(replace(view, chains=tuple(chains)))
         sites.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
     assert located(tuple(sites)).sites[0].variation.beats > 0.75
+
+
+def test_an_electrodes_own_bend_is_no_beat() -> None:
+    """It does not grow with the beats, else precise pixels would show calm beats where whole catheters move."""
+    (site,) = matched_sites(electrodes(74, sites=1), np.random.default_rng(74))
+    params = UncertaintyParams(beat_sd_mm=0.0)
+    equations = site_equations(CAMERAS, pixels_in_both_views(site.diastole), DEFAULT_CATALOGUE, (), params)
+    assert (equations.beats == 0).all()
+    assert np.linalg.eigvalsh(equations.fixed - np.diag(equations.pixel_variance)).min() > 0
+    assert params.scaled(1.0, 2.0).bend_sd_mm == params.bend_sd_mm
 
 
 def test_a_study_whose_catheters_are_all_described_wrongly_is_refused_with_the_cause() -> None:
