@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,6 +13,7 @@ from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite,
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.estimate import Estimate, Method
+from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.self_calibration import StudyBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
@@ -41,7 +42,8 @@ class SiteLocator:
     belief : of the study. any_study : the belief where no study shows anything. Positions, cycles and a-priori points depend
     on that belief and on the cameras alone, so that a correction at one site changes no other. spacing_limit_mm : electrode
     spacings farther than this from the catalogue's are reported. gap_doubts : catheters whose catalogue entry contradicts the
-    study, with the reason.
+    study, with the reason. origin : of the study, where sites locate different electrodes of the reference catheter; otherwise
+    the mean of a site's own electrodes is its origin.
     """
 
     method: Method
@@ -50,6 +52,7 @@ class SiteLocator:
     any_study: StudyBelief
     spacing_limit_mm: float
     gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
+    origin: ReferenceOrigin | None = None
 
     def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
         """Locate a site in 3D.
@@ -72,10 +75,12 @@ class SiteLocator:
         ) if holds))  # fmt: skip
         other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
         points, reference_mm = self._points(site, moment, moment.joint_mm2, cameras, doubts)
-        a_priori, _ = self._points(site, moment, moment.any_joint_mm2, cameras, doubts)
+        # The study's origin depends on the other sites.
+        alone = replace(self, origin=None)
+        a_priori, _ = alone._points(site, moment, moment.any_joint_mm2, cameras, doubts)
         if site.alternative is not None and other is not None:
             others, other_mm = self._points(site, other, other.joint_mm2, cameras, doubts)
-            any_others, _ = self._points(site, other, other.any_joint_mm2, cameras, doubts)
+            any_others, _ = alone._points(site, other, other.any_joint_mm2, cameras, doubts)
             shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
             p = site.alternative.probability
             points, a_priori = (
@@ -163,8 +168,16 @@ class SiteLocator:
         ``joint`` (N, 3, N, 3) is the covariance of all electrodes.
         """
         pixels, points = moment.pixels, moment.found.points_mm
-        reference = [i for i, (catheter, _) in enumerate(pixels.labels) if catheter == self.catalogue.reference]
-        reference_mm = points[reference].mean(axis=0) if reference else None
+        reference = [
+            i
+            for i, (catheter, electrode) in enumerate(pixels.labels)
+            if catheter == self.catalogue.reference and (self.origin is None or electrode in self.origin.offsets_mm)
+        ]
+        reference_mm, added_mm2 = (points[reference].mean(axis=0) if reference else None), np.zeros((3, 3))
+        if self.origin is not None and reference:
+            by_offsets = self.origin.from_electrodes([pixels.labels[i][1] for i in reference], points[reference])
+            assert by_offsets is not None, "these electrodes have offsets"
+            reference_mm, added_mm2 = by_offsets
         mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.spacing_limit_mm)
         doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
@@ -178,7 +191,9 @@ class SiteLocator:
                 position_mm=points[i],
                 covariance_mm2=joint[i, :, i],
                 relative_mm=None if reference_mm is None else points[i] - reference_mm,
-                relative_covariance_mm2=relative_covariance_mm2(joint, i, reference) if reference else None,
+                relative_covariance_mm2=(
+                    relative_covariance_mm2(joint, i, reference) + added_mm2 if reference else None
+                ),
                 residual_px=(float(residuals[i, 0]), float(residuals[i, 1])),
                 ray_angle_deg=float(angles[i]),
                 reasons=tuple(
