@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -120,8 +121,9 @@ def track_chains(
     seed : FrameChains, optional
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
     accepts : TrackJudge, optional
-        Decides about each track of four or more frames. Where it rejects one, the run is tracked again without the track's chains,
-        twice at most. An accepted track has chains in half of the frames. All tracks are accepted by default.
+        Decides about each track of four or more frames, and of half of the frames in short runs. Where it rejects one, the run is
+        tracked again without the track's chains, twice at most. An accepted track has chains in half of the frames. All tracks are
+        accepted by default.
 
     Returns
     -------
@@ -204,7 +206,7 @@ def _accepted(
 
     A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
     """
-    judged = min(_JUDGED_FRAMES, len(found))
+    judged = min(_JUDGED_FRAMES, math.ceil(_ACCEPTED_AT_LEAST * len(found)))
     for attempt in range(_MOST_RETRIES + 1):
         wrong = [
             track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)

@@ -20,6 +20,8 @@ _OWN_CELLS, _MEAN_CELLS, _NEXT_FRAME_CELLS = 1, 2, 3
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
 _REACH_PX = 6.0
 _LOOSE_PX = 3.0
+_LEAST_SHARE = 0.5
+"""Least likeness of the frame itself, as a share of what it has when all frames of the mean show the catheter alike."""
 
 
 @dataclass(slots=True, eq=False)
@@ -60,38 +62,39 @@ class FrameSearch:
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image; see :class:`~fluoromap.segmenter.run_segmentation.Detector`."""
-        mean = _mean([x, *beside]) if beside and self._noisy else None
+        first, second = (beside, ()) if self._noisy else ((), beside)
         if self.shares and frame == self._complete + 1:
-            entry = self._search(x, mean, frame, _NEXT_FRAME_CELLS)
+            entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= self._chains:
                 return entry
-        entry = self._search(x, mean, frame, _OWN_CELLS)
+        entry = self._search(x, first, frame, _OWN_CELLS)
         if beside and (len(entry.chains) < self.catheters or entry.manual_needed is not None):
-            if mean is None:
-                mean = _mean([x, *beside])
-                other = self._search(x, mean, frame, _OWN_CELLS)
-                self._noisy = len(other.chains) > len(entry.chains)
-            else:
-                other = self._search(x, None, frame, _OWN_CELLS)
+            other = self._search(x, second, frame, _OWN_CELLS)
             if len(other.chains) > len(entry.chains):
-                entry = other
+                entry, self._noisy = other, True
         if entry.manual_needed is None:
             self._complete, self._chains = frame, len(entry.chains)
         return entry
 
-    def _search(self, x: Image, mean: Image | None, frame: int, reach_cells: int) -> FrameChains:
-        """Search the image, or the mean and then the image again for the chains of the mean."""
+    def _search(self, x: Image, beside: Sequence[Image], frame: int, reach_cells: int) -> FrameChains:
+        """Search the image; with images beside it, search their mean and find its chains again in the image."""
         self.detector.forget_image()
         self.network.reach_cells = reach_cells
-        entry = self.detector.find_chains(x if mean is None else mean, frame)
-        if mean is not None:
+        mean: Image = np.mean([x, *beside], axis=0, dtype=np.float32) if beside else x
+        entry = self.detector.find_chains(mean, frame)
+        if beside:
+            in_mean = self.detector.image_evidence(mean).likeness
             self.network.reach_cells = max(reach_cells, _MEAN_CELLS)
+            in_frame = self.detector.image_evidence(x).likeness
             chains: list[Chain] = []
             for chain in entry.chains:
                 # The frame is part of the mean: its place there is no independent measurement.
                 loose = replace(chain, covariance_px2=chain.covariance_px2 + _LOOSE_PX**2 * np.eye(2))
                 again = self.detector.find_again(x, loose, np.zeros(2), _REACH_PX, chains)
-                chains += [] if again is None else [again]
+                # The mean has less noise, so the same catheter has more contrast over noise there.
+                least = _LEAST_SHARE * np.mean(in_mean.at(chain.pixels_uv)) / np.sqrt(1 + len(beside))
+                if again is not None and np.mean(in_frame.at(again.pixels_uv)) >= least:
+                    chains.append(again)
             entry = FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
         self.network.reach_cells = _OWN_CELLS
         return entry
@@ -103,8 +106,3 @@ class FrameSearch:
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""
         return self.detector.shows_extra_catheter(x, chains)
-
-
-def _mean(images: Sequence[Image]) -> Image:
-    mean: Image = np.mean(images, axis=0, dtype=np.float32)
-    return mean
