@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -24,6 +25,9 @@ class Settings(BaseSettings):
     )
     host: str = Field("127.0.0.1", description="Address the API listens on.")
     port: int = Field(8000, ge=0, le=65535, description="Port the API listens on.")
+    cors_origins: str = Field(
+        "", description="Web pages that browsers let use the API, as origins with spaces between; empty: none."
+    )
     max_upload_bytes: int = Field(4 * 2**30, gt=0, description="Largest request body accepted, in bytes.")
     workers: int = Field(
         len(os.sched_getaffinity(0)), ge=1, description="Stages that one worker runs at the same time."
@@ -40,6 +44,21 @@ class Settings(BaseSettings):
         5.0, gt=0, description="Time after which an unclaimed stage is announced again, in seconds."
     )
     max_attempts: int = Field(3, ge=1, description="How often a stage is tried when its worker dies.")
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _only_origins(cls, value: str) -> str:
+        for origin in value.split():
+            if not re.fullmatch(r"https?://[^/\s*?#]+", origin):
+                raise ValueError(
+                    f"{origin!r} is no origin; write scheme, host and port only, as https://viewer.example:8443"
+                )
+        return value
+
+    @property
+    def allowed_origins(self) -> tuple[str, ...]:
+        """The origins of other web pages that may use the API, without any by default."""
+        return tuple(self.cors_origins.lower().split())
 
     @property
     def effective_database_url(self) -> str:

@@ -2,5 +2,5 @@
 
 from typing import Final
 
-VERSION: Final[str] = "1"
+VERSION: Final[str] = "2"
 """Raise it when the file of the same map changes: files that the service keeps are then written again."""

@@ -96,8 +96,9 @@ def _electric(chamber: ChamberMap, vertices_mm: Array, shift_mm: Array) -> dict[
         "names": names,
         "include": np.ones((len(sites), 1)),
         "sampleFrequency": SAMPLES_PER_S,
-        "electrodeNames_bip": _cells([""] * len(sites)),
-        "electrodeNames_uni": _cells([""] * len(sites)),
+        # Not empty: an empty text reads back as an array, which openep-py cannot make a text.
+        "electrodeNames_bip": _cells(["unknown"] * len(sites)),
+        "electrodeNames_uni": np.full((len(sites), 2), "unknown", dtype=object),
         "egmX": position_mm,
         "egmUniX": np.stack([position_mm, position_mm], axis=2),
         "egmSurfX": surface_mm,

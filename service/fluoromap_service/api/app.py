@@ -7,18 +7,30 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
 import structlog
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware.cors import CORSMiddleware
 
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.body_limit import BodyLimit
+from fluoromap_service.api.http.query_names import check_query_names
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, plugins
-from fluoromap_service.api.study import activation_times, electrodes, electrograms, frames, instances, sites, studies
+from fluoromap_service.api.study import (
+    activation_times,
+    catheter_types,
+    electrodes,
+    electrograms,
+    frames,
+    instances,
+    sites,
+    studies,
+)
 from fluoromap_service.jobs import queue
 from fluoromap_service.settings import settings
 
@@ -26,6 +38,7 @@ SWEEP_SECONDS = 1.0
 
 ROUTERS = (
     studies.router,
+    catheter_types.router,
     instances.router,
     frames.router,
     electrodes.router,
@@ -58,6 +71,8 @@ def create_app() -> FastAPI:
         redoc_url=None,
         openapi_url=None,
         redirect_slashes=False,
+        dependencies=[Depends(check_query_names)],
+        generate_unique_id_function=_operation_id,
         lifespan=_lifespan,
     )
     problems.install(app)
@@ -70,7 +85,24 @@ def create_app() -> FastAPI:
 
     app.add_middleware(BodyLimit)
     app.add_middleware(Doorkeeper)
+    if settings().cors_origins:
+        # The outermost layer: a browser asks for permission without a token, and reads refusals too.
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings().allowed_origins,
+            allow_methods=["GET", "POST", "PUT", "PATCH", "DELETE"],
+            allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "If-None-Match", "Last-Event-ID"],
+            expose_headers=["Location", "Link", "ETag", "Retry-After", "Idempotency-Replayed", "Content-Disposition"],
+        )
     return app
+
+
+def _operation_id(route: APIRoute) -> str:
+    """Return the name of a route's function.
+
+    Generators of clients name their calls after it.
+    """
+    return route.name
 
 
 @asynccontextmanager

@@ -14,7 +14,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.registry import DEFAULTS, UnknownPlugin, plugin
 from fluoromap_service.api.study.catheters import CatheterIn, Line
 from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
-from fluoromap_service.api.study.instances import GantryPatch
+from fluoromap_service.api.study.gantry import GantryPatch
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.problem import Problem
 from fluoromap_service.study.catheters import catalogue_with_roles

@@ -14,6 +14,7 @@ from fluoromap_service.dicom.codestream import Pixels, decode, largest_codestrea
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.facts import InstanceFacts, Pair
 from fluoromap_service.dicom.header import read_header, truncation_problem
+from fluoromap_service.dicom.inflation import open_dicom
 from fluoromap_service.dicom.pixel_layout import NATIVE, PixelLayout, pixel_layout
 
 
@@ -21,7 +22,7 @@ class DicomFrames:
     """A :class:`fluoromap.contracts.FrameSource` over one file.
 
     It knows the place of each frame in the file, and decodes a frame when it is asked for. It keeps no file open, so that it
-    can go to another thread or process.
+    can go to another thread or process. A deflated file is inflated once for an iteration, and for each single frame.
     """
 
     def __init__(self, path: Path, layout: PixelLayout) -> None:
@@ -47,11 +48,11 @@ class DicomFrames:
         """
         if not 0 <= index < len(self):
             raise IndexError(f"the run has {len(self)} frames")
-        with self._path.open("rb") as file:
+        with open_dicom(self._path) as file:
             return read_frame(file, self._layout, index)
 
     def __iter__(self) -> Iterator[Pixels]:
-        with self._path.open("rb") as file:
+        with open_dicom(self._path) as file:
             for index in range(len(self)):
                 yield read_frame(file, self._layout, index)
 
@@ -64,7 +65,7 @@ def open_frames(path: Path, facts: InstanceFacts) -> DicomFrames:
     Problem
         ``pixel_data_mismatch`` when the file no longer fits the facts.
     """
-    with path.open("rb") as file:
+    with open_dicom(path) as file:
         layout = pixel_layout(file, read_header(file), [])
     if (layout.frames, layout.rows, layout.columns) != (facts.frames, facts.rows, facts.columns):
         raise dicom_problem(
@@ -78,6 +79,8 @@ def open_frames(path: Path, facts: InstanceFacts) -> DicomFrames:
 def read_frame(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
     """Return the stored pixels of one frame of an open file."""
     if layout.transfer_syntax in NATIVE:
+        if layout.big_endian_words:
+            return _read_big_endian(file, layout, index)
         pixels: Pixels = np.empty((layout.rows, layout.columns), dtype=f"<u{layout.bits_allocated // 8}")
         ((offset, _),) = layout.extents[index]
         file.seek(offset)
@@ -96,6 +99,20 @@ def read_frame(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
         file.seek(offset)
         pieces.append(file.read(length))
     return decode(layout, b"".join(pieces))
+
+
+def _read_big_endian(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
+    ((offset, length),) = layout.extents[index]
+    # A frame with an odd number of bytes begins or ends within a word.
+    before = offset % 2
+    whole_words = before + length + (before + length) % 2
+    file.seek(offset - before)
+    content = file.read(whole_words)
+    if len(content) < whole_words:
+        raise truncation_problem("PixelData")
+    data = np.frombuffer(content, dtype="<u2").byteswap().view(np.uint8)[before : before + length]
+    pixels: Pixels = data.view(f"<u{layout.bits_allocated // 8}").reshape(layout.rows, layout.columns)
+    return pixels
 
 
 def frame_to_8bit(pixels: Pixels, facts: InstanceFacts, window: Pair | None = None) -> NDArray[np.uint8]:

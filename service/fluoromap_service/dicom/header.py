@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BufferedReader
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from pydicom import config
 from pydicom.datadict import tag_for_keyword
@@ -16,7 +16,6 @@ from pydicom.dataset import Dataset
 from pydicom.filereader import read_dataset
 from pydicom.tag import BaseTag, Tag
 from pydicom.uid import (
-    DeflatedExplicitVRLittleEndian,
     ExplicitVRBigEndian,
     ImplicitVRLittleEndian,
 )
@@ -32,6 +31,10 @@ HEADER_BYTES = 16 * 2**20
 HEADER_READS = 250_000
 SEQUENCE_ITEMS = 50_000
 UNDEFINED_LENGTH = 0xFFFFFFFF
+_ITEM_TAG = {True: b"\xfe\xff\x00\xe0", False: b"\xff\xfe\xe0\x00"}
+"""Bytes of the tag that begins an item of a sequence; keys: whether the byte order is little endian."""
+
+Result = TypeVar("Result")
 
 _PIXEL_DATA = 0x7FE00010
 _FRAME_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
@@ -102,10 +105,11 @@ _WANTED: list[BaseTag | int] = [
 
 @dataclass(frozen=True, slots=True)
 class PixelElement:
-    """The place of the top-level PixelData value in the file: offset and announced length in bytes."""
+    """The place of the top-level PixelData value in the file: offset and announced length in bytes; and its VR."""
 
     offset: int
     length: int
+    vr: str = "OW"
 
 
 class Header:
@@ -216,7 +220,7 @@ class Header:
         if (
             isinstance(raw, RawDataElement)
             and raw.value is not None
-            and raw.value.count(b"\xfe\xff\x00\xe0") > SEQUENCE_ITEMS
+            and raw.value.count(_ITEM_TAG[raw.is_little_endian]) > SEQUENCE_ITEMS
         ):
             raise dicom_problem(
                 DicomCode.HEADER_TOO_LARGE, f"{keyword} has too many items; export the run again.", keyword
@@ -307,18 +311,33 @@ def read_header(file: BufferedReader) -> Header:
     Parameters
     ----------
     file : binary file
-        Open for reading and seeking.
+        As :func:`fluoromap_service.dicom.inflation.open_dicom` opens it.
 
     Raises
     ------
     Problem
-        ``not_dicom``, ``no_part10_header``, ``malformed``, ``truncated``, ``header_too_large``. ``undecodable`` for transfer
-        syntaxes whose header needs unbounded memory.
+        ``not_dicom``, ``no_part10_header``, ``malformed``, ``truncated``, ``header_too_large``.
 
     References
     ----------
     PS3.10 section 7.1 (file meta information), PS3.5 chapter 7 (data elements).
     """
+    return _bounded(file, _parse)
+
+
+def data_set_start(file: BufferedReader) -> tuple[str, int]:
+    """Return the transfer syntax, and the place of the data set after the file meta information.
+
+    Raises
+    ------
+    Problem
+        As :func:`read_header`.
+    """
+    return _bounded(file, lambda reader, size: (_transfer_syntax(reader), reader.tell()))
+
+
+def _bounded(file: BufferedReader, parse: Callable[[_BoundedReader, int], Result]) -> Result:
+    """Call ``parse`` with a bounded reader after the preamble, and the size of the file."""
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     start = file.read(132)
@@ -326,7 +345,7 @@ def read_header(file: BufferedReader) -> Header:
         raise _no_preamble(start)
     reader = _BoundedReader(file)
     try:
-        return _parse(reader, size)
+        return parse(reader, size)
     except Problem:
         raise
     except Exception as error:
@@ -337,7 +356,7 @@ def read_header(file: BufferedReader) -> Header:
         raise dicom_problem(DicomCode.MALFORMED, "The DICOM header is damaged; export the run again.") from error
 
 
-def _parse(reader: _BoundedReader, size: int) -> Header:
+def _transfer_syntax(reader: _BoundedReader) -> str:
     stream = cast(Any, reader)
     syntax_tag = _tag("TransferSyntaxUID")
     meta = read_dataset(
@@ -350,26 +369,28 @@ def _parse(reader: _BoundedReader, size: int) -> Header:
             "The file meta information has no TransferSyntaxUID; export the run again.",
             "TransferSyntaxUID",
         )
-    if syntax in (DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian):
-        name = "Deflated" if syntax == DeflatedExplicitVRLittleEndian else "Big Endian"
-        raise dicom_problem(
-            DicomCode.UNDECODABLE,
-            f"The {name} Explicit VR transfer syntax is not supported; send Explicit VR Little Endian.",
-            "TransferSyntaxUID",
-        )
+    return syntax
 
+
+def _parse(reader: _BoundedReader, size: int) -> Header:
+    stream = cast(Any, reader)
+    syntax = _transfer_syntax(reader)
     found: list[PixelElement] = []
 
     def at_pixel_data(tag: BaseTag, vr: str | None, length: int) -> bool:
         if tag == _PIXEL_DATA:
-            found.append(PixelElement(reader.tell(), length))
+            found.append(PixelElement(reader.tell(), length, vr or "OW"))
             return True
         if length != UNDEFINED_LENGTH and reader.tell() + length > size:
             raise truncation_problem()
         return False
 
     dataset = read_dataset(
-        stream, syntax == ImplicitVRLittleEndian, True, stop_when=at_pixel_data, specific_tags=_WANTED
+        stream,
+        syntax == ImplicitVRLittleEndian,
+        syntax != ExplicitVRBigEndian,
+        stop_when=at_pixel_data,
+        specific_tags=_WANTED,
     )
     return Header(dataset, syntax, found[-1] if found else None, size)
 

@@ -16,7 +16,14 @@ from fluoromap_service.problem import Problem
 LARGEST_SIDE = 8192
 MOST_FRAMES = 20_000
 
-NATIVE = frozenset({uid.ExplicitVRLittleEndian, uid.ImplicitVRLittleEndian})
+NATIVE = frozenset(
+    {
+        uid.ExplicitVRLittleEndian,
+        uid.ImplicitVRLittleEndian,
+        uid.DeflatedExplicitVRLittleEndian,
+        uid.ExplicitVRBigEndian,
+    }
+)
 JPEG = frozenset({uid.JPEGBaseline8Bit, uid.JPEGExtended12Bit, uid.JPEGLossless, uid.JPEGLosslessSV1})
 JPEG_LS = frozenset({uid.JPEGLSLossless, uid.JPEGLSNearLossless})
 JPEG_2000 = frozenset({uid.JPEG2000Lossless, uid.JPEG2000})
@@ -42,6 +49,9 @@ class PixelLayout:
     transfer_syntax : str
     extents : tuple of tuple of Extent
         For each frame its pieces of the file, in order.
+    big_endian_words : bool
+        Whether the bytes of each 16-bit word lie in the other order, also where a word holds two 8-bit pixels
+        (PS3.5 section A.3 and annex D).
     """
 
     rows: int
@@ -51,6 +61,7 @@ class PixelLayout:
     bits_stored: int
     transfer_syntax: str
     extents: tuple[tuple[Extent, ...], ...]
+    big_endian_words: bool = False
 
     @property
     def frame_bytes(self) -> int:
@@ -94,7 +105,8 @@ def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarn
     else:
         fragments = _fragments(file, header)
         extents = _group(file, fragments, frames, syntax, warnings)
-    return PixelLayout(rows, columns, frames, bits_allocated, bits_stored, syntax, extents)
+    swapped = syntax == uid.ExplicitVRBigEndian and (bits_allocated == 16 or element.vr == "OW")
+    return PixelLayout(rows, columns, frames, bits_allocated, bits_stored, syntax, extents, swapped)
 
 
 def _size(header: Header) -> tuple[int, int, int]:

@@ -20,6 +20,7 @@ from fluoromap_service.dicom.facts import HeaderWarning, InstanceFacts, Plane, i
 from fluoromap_service.dicom.frames import read_frame
 from fluoromap_service.dicom.header import Header, read_header
 from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
+from fluoromap_service.dicom.inflation import open_dicom
 from fluoromap_service.dicom.pixel_layout import PixelLayout, pixel_layout
 from fluoromap_service.dicom.positioner import (
     gantry_facts,
@@ -62,7 +63,7 @@ def read_instance(path: Path) -> InstanceFacts:
     OSError
         When the file cannot be opened.
     """
-    with path.open("rb") as file:
+    with open_dicom(path) as file:
         header = read_header(file)
         _check_kind(header)
         warnings: list[HeaderWarning] = []

@@ -55,6 +55,11 @@ def mesh_dependencies(map_sha256: str, mesh_format: str, origin: Origin) -> Depe
     }
 
 
+def map_picture_dependencies(map_sha256: str) -> Dependencies:
+    """Return the dependencies of the picture of the map from six sides."""
+    return {"kind": "map_picture", "drawing": drawing.VERSION, "map": map_sha256}
+
+
 def report_dependencies(
     template_sha256: str, job_version: int, label: str | None, guessed_sites: tuple[str, ...]
 ) -> Dependencies:

@@ -6,7 +6,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap.reasons import Reason
 from fluoromap_service.store.models import Job
-from fluoromap_service.study.sites import binding_of
+from fluoromap_service.study.binding import binding_of
 
 
 def sites_by_row_order(session: Session, job: Job) -> tuple[str, ...]:

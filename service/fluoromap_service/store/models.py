@@ -94,6 +94,7 @@ class Study(Base):
     catheters: Mapped[list[Any]]
     reference: Mapped[str] = mapped_column(String(64))
     mapping: Mapped[str] = mapped_column(String(64))
+    gantry: Mapped[Json] = mapped_column(default=dict)  # completes the headers of all runs
     created: Mapped[float] = mapped_column(default=db_now(), index=True)
     updated: Mapped[float] = mapped_column(default=db_now(), onupdate=db_now())
 

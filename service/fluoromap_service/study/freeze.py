@@ -12,10 +12,10 @@ from fluoromap.registry import DEFAULTS, Kind, UnknownPlugin, plugin
 from fluoromap_service.dicom.facts import Point
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Study
-from fluoromap_service.study import corrections, sites
+from fluoromap_service.study import corrections
+from fluoromap_service.study.binding import BoundSite, binding_of
 from fluoromap_service.study.catheters import catheters_of
-from fluoromap_service.study.instances import StudyRun, effective_gantry, runs_of
-from fluoromap_service.study.sites import BoundSite
+from fluoromap_service.study.instances import StudyRun, runs_of
 from fluoromap_service.study.snapshot import (
     CorrectedElectrode,
     PluginSnapshot,
@@ -51,6 +51,10 @@ class PipelineRequest(BaseModel):
     fuser: StageRequest = StageRequest()
 
 
+# A typed member for each kind of plugin, so that clients see them; the registry knows the kinds.
+assert tuple(PipelineRequest.model_fields) == tuple(DEFAULTS)
+
+
 def freeze(
     session: Session, study: Study, pipeline: PipelineRequest, view: Literal["a", "b", "both"] = "both"
 ) -> Snapshot:
@@ -66,7 +70,7 @@ def freeze(
     """
     plugins = _plugin_snapshots(pipeline)
     study = lock(session, study.id)
-    binding = sites.binding_of(session, study.id)
+    binding = binding_of(session, study.id)
     unmatched = [
         site for site in binding.sites if site.view_a is None and site.view_b is None and site.lat_ms is not None
     ]
@@ -177,7 +181,7 @@ def _place(site: BoundSite) -> str:
 def _run_snapshot(
     run: StudyRun, by_hand: dict[int, tuple[CorrectedElectrode, ...]], table_offset_mm: Point | None
 ) -> RunSnapshot:
-    gantry = effective_gantry(run.facts, run.link.gantry)
+    gantry = run.geometry
     assert gantry is not None, "a ready site's runs have their geometry"
     if table_offset_mm is not None:
         gantry = gantry.model_copy(update={"table_offset_mm": table_offset_mm})

@@ -16,7 +16,17 @@ from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import writing
-from fluoromap_service.store.models import ENDED_JOB, Correction, File, Instance, Job, Rendering, Site, StudyInstance
+from fluoromap_service.store.models import (
+    ENDED_JOB,
+    Correction,
+    File,
+    Instance,
+    Job,
+    Rendering,
+    Site,
+    Study,
+    StudyInstance,
+)
 from fluoromap_service.study.snapshot import GantrySnapshot
 
 GANTRY_KEYWORDS = {
@@ -31,11 +41,12 @@ GANTRY_KEYWORDS = {
 
 @dataclass(frozen=True, eq=False)
 class StudyRun:
-    """One run of a study: the study's reference to it, the instance and its facts."""
+    """One run of a study: the study's reference to it, the instance, its facts, and the study's own gantry values."""
 
     link: StudyInstance
     instance: Instance
     facts: InstanceFacts
+    defaults: dict[str, Any]
 
     @property
     def uid(self) -> str:
@@ -44,33 +55,33 @@ class StudyRun:
 
     @property
     def gantry(self) -> dict[str, Any]:
-        """Effective gantry values; None where unknown."""
-        return gantry_values(self.facts, self.link.gantry)[0]
+        """Effective gantry values: the run's own, else the header's, else the study's; None where unknown."""
+        header = {field: getattr(self.facts, field) for field in GANTRY_KEYWORDS}
+        return {
+            field: next(
+                (
+                    source[field]
+                    for source in (self.link.gantry, header, self.defaults)
+                    if source.get(field) is not None
+                ),
+                None,
+            )
+            for field in GANTRY_KEYWORDS
+        }
 
     @property
     def missing(self) -> list[str]:
         """DICOM keywords of the gantry values that are unknown."""
-        return gantry_values(self.facts, self.link.gantry)[1]
+        return [GANTRY_KEYWORDS[field] for field, value in self.gantry.items() if value is None]
 
-
-def gantry_values(facts: InstanceFacts, override: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return the effective gantry values and the DICOM keywords of the missing ones.
-
-    The study's values complete and override the header's.
-    """
-    values = {
-        field: override[field] if override.get(field) is not None else getattr(facts, field)
-        for field in GANTRY_KEYWORDS
-    }
-    return values, [keyword for field, keyword in GANTRY_KEYWORDS.items() if values[field] is None]
-
-
-def effective_gantry(facts: InstanceFacts, override: dict[str, Any]) -> GantrySnapshot | None:
-    """Return the run's whole geometry; None while a value is missing."""
-    values, missing = gantry_values(facts, override)
-    if missing:
-        return None
-    return GantrySnapshot(**values, rows=facts.rows, columns=facts.columns, image_axes=_image_axes(facts, values))
+    @property
+    def geometry(self) -> GantrySnapshot | None:
+        """The run's whole geometry; None while a value is missing."""
+        values, facts = self.gantry, self.facts
+        if None in values.values():
+            return None
+        axes = _image_axes(facts, values)
+        return GantrySnapshot(**values, rows=facts.rows, columns=facts.columns, image_axes=axes)
 
 
 def _image_axes(facts: InstanceFacts, values: dict[str, Any]) -> ImageAxes:
@@ -84,14 +95,17 @@ def _image_axes(facts: InstanceFacts, values: dict[str, Any]) -> ImageAxes:
 def runs_of(session: Session, study_id: str) -> list[StudyRun]:
     """Return all runs of a study in the order of arrival."""
     query = (
-        select(StudyInstance, Instance)
+        select(StudyInstance, Instance, Study.gantry)
         .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
+        .join(Study, Study.id == StudyInstance.study_id)
         .where(StudyInstance.study_id == study_id)
         .order_by(StudyInstance.id)
     )
-    return [
-        StudyRun(link, instance, InstanceFacts.from_json(instance.facts)) for link, instance in session.execute(query)
-    ]
+    return [_run(*row) for row in session.execute(query)]
+
+
+def _run(link: StudyInstance, instance: Instance, defaults: dict[str, Any]) -> StudyRun:
+    return StudyRun(link, instance, InstanceFacts.from_json(instance.facts), defaults)
 
 
 def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
@@ -103,13 +117,14 @@ def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
         404 when the study has no such run.
     """
     row = session.execute(
-        select(StudyInstance, Instance)
+        select(StudyInstance, Instance, Study.gantry)
         .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
+        .join(Study, Study.id == StudyInstance.study_id)
         .where(StudyInstance.study_id == study_id, StudyInstance.sop_instance_uid == uid)
     ).first()
     if row is None:
         raise not_found("instance in this study")
-    return StudyRun(row[0], row[1], InstanceFacts.from_json(row[1].facts))
+    return _run(*row)
 
 
 def add(

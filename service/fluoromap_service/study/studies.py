@@ -23,7 +23,7 @@ def create(
     catalogue: Catalogue = DEFAULT_CATALOGUE,
 ) -> Study:
     """Add a study and return it."""
-    study = Study(id=uuid.uuid4().hex, label=label, chamber=chamber, notes=notes)
+    study = Study(id=uuid.uuid4().hex, label=label, chamber=chamber, notes=notes, gantry={})
     set_catalogue(study, catalogue)
     session.add(study)
     session.flush()

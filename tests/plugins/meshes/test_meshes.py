@@ -196,6 +196,18 @@ def test_openep_has_every_field_that_its_python_reader_asks_for(sparse_ball):
     for name in ("time", "force", "axialangle", "lateralangle", "position"):
         assert np.size(original["force"][name]) == 0
     electric, sites = read["electric"], len(sparse_ball.sites)
+    for name in ("electrodeNames_bip", "electrodeNames_uni", "names", "tags"):
+        assert (electric[name].astype(str) != "").all()
+    assert electric["electrodeNames_uni"].shape == (sites, 2)
+    for name in ("egm", "egmUni", "egmX", "egmUniX", "egmRef", "ecg", "egmSurfX", "barDirection"):
+        assert np.isfinite(electric[name].astype(float)).all()
+    for name in ("woi", "mapAnnot", "referenceAnnot"):
+        assert len(electric["annotations"][name].astype(int)) == sites
+    for name in ("time", "value"):
+        assert [float(value) for value in electric["impedances"][name]]
+    assert read["surface"]["triRep"]["Triangulation"].astype(int).min() == 1
+    for name, columns in (("act_bip", 2), ("uni_imp_frc", 3)):
+        assert len(read["surface"][name].T.astype(float)) == columns
     for name in ("egm", "egmUni", "egmRef", "ecg"):
         assert len(electric[name]) == sites
         assert np.isfinite(electric[name]).all()

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.encaps import encapsulate
-from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
+from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
 from fluoromap.geometry import Gantry
 from fluoromap_service.dicom import write_cine
@@ -96,7 +96,11 @@ def make_xa(tmp_path: Path) -> MakeXa:
             dataset.BitsAllocated, dataset.BitsStored, dataset.HighBit = bits, bits, bits - 1
             dataset.FrameTime = 40
             if fragments is None:
-                dataset.add_new(0x7FE00010, "OW", frames.tobytes() + b"\0" * (frames.nbytes % 2))
+                value = frames.tobytes() + b"\0" * (frames.nbytes % 2)
+                if syntax == ExplicitVRBigEndian:
+                    # pydicom writes words as they are given.
+                    value = np.frombuffer(value, "<u2").byteswap().tobytes()
+                dataset.add_new(0x7FE00010, "OW", value)
             else:
                 dataset.PixelData = encapsulate(fragments, has_bot=offset_table)
                 dataset["PixelData"].is_undefined_length = True

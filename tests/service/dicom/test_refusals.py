@@ -28,7 +28,7 @@ from pydicom.uid import (
     XRay3DAngiographicImageStorage,
 )
 
-from fluoromap_service.dicom import DicomCode, dicom_problem, read_instance
+from fluoromap_service.dicom import DicomCode, dicom_problem, inflation, read_instance
 from fluoromap_service.problem import Problem
 
 MakeXa = Callable[..., Path]
@@ -181,10 +181,26 @@ def test_transfer_syntaxes_nobody_decodes(make_xa: MakeXa, syntax: str) -> None:
     assert pydicom.uid.UID(syntax).name in str(problem)
 
 
-@pytest.mark.parametrize("syntax", [DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian])
-def test_syntaxes_refused_before_their_header_is_read(make_xa: MakeXa, syntax: str) -> None:
-    problem = refusal(with_syntax(make_xa(FRAMES), ExplicitVRLittleEndian, syntax))
-    assert (problem.code, problem.status) == (DicomCode.UNDECODABLE, 422)
+def test_deflated_data_that_is_none(make_xa: MakeXa) -> None:
+    problem = refusal(with_syntax(make_xa(FRAMES), ExplicitVRLittleEndian, DeflatedExplicitVRLittleEndian))
+    assert (problem.code, problem.status) == (DicomCode.MALFORMED, 400)
+
+
+def test_deflated_data_that_ends_too_early(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES, syntax=DeflatedExplicitVRLittleEndian)
+    path.write_bytes(path.read_bytes()[:-40])
+    assert refusal(path).code is DicomCode.TRUNCATED
+
+
+def test_deflated_data_without_end_fills_no_disk(make_xa: MakeXa, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inflation, "SMALL_BYTES", 2**16)
+    path = make_xa(np.zeros((40, 64, 1024), np.uint8), syntax=DeflatedExplicitVRLittleEndian)
+    assert refusal(path).code is DicomCode.HEADER_TOO_LARGE
+
+
+def test_little_endian_data_announced_as_big_endian(make_xa: MakeXa) -> None:
+    problem = refusal(with_syntax(make_xa(FRAMES), ExplicitVRLittleEndian, ExplicitVRBigEndian))
+    assert problem.status == 400
 
 
 def test_twelve_bit_jpeg_extended(make_xa: MakeXa) -> None:

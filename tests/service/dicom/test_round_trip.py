@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from pydicom.pixels.encoders.base import get_encoder
-from pydicom.uid import JPEGLSLossless, RLELossless
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, JPEGLSLossless, RLELossless
 
 from fluoromap.contracts import FrameSource
 from fluoromap.geometry import Gantry
@@ -228,6 +228,21 @@ def test_implicit_and_padded(make_xa: MakeXa) -> None:
         facts = read_instance(path)
         assert facts.warnings == ()
         np.testing.assert_array_equal(open_frames(path, facts)[0], frames[0])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("syntax", [DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian])
+def test_syntaxes_of_old_archives(make_xa: MakeXa, syntax: str, dtype: type) -> None:
+    """Frames of an odd number of pixels: a word of two pixels may belong to two frames."""
+    frames = np.random.default_rng(4).integers(0, 250, (3, 5, 7)).astype(dtype)
+    frames[:, 0, 0] = np.iinfo(dtype).max
+    path = make_xa(frames, syntax=syntax, PositionerPrimaryAngle="-32.5", RWavePointer=[1, 3])
+    facts = read_instance(path)
+    assert (facts.transfer_syntax, facts.primary_deg, facts.r_wave_frames) == (syntax, -32.5, (0, 2))
+    opened = open_frames(path, facts)
+    np.testing.assert_array_equal(np.stack(list(opened)), frames)
+    np.testing.assert_array_equal(opened[1], frames[1])
+    np.testing.assert_array_equal(pydicom.dcmread(path).pixel_array, frames)
 
 
 def test_more_pixel_data_than_announced(make_xa: MakeXa) -> None:

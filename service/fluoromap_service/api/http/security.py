@@ -16,6 +16,7 @@ from fluoromap_service import auth
 from fluoromap_service.api.http.problems import answer
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
+from fluoromap_service.settings import settings
 
 OPEN_PATHS = frozenset({"/v1/health", "/v1/ready"})
 """The paths that answer without a token."""
@@ -81,7 +82,8 @@ def _check_local(connection: HTTPConnection) -> None:
     if name is None or not auth.is_loopback(name):
         raise Problem(403, "foreign_host", "Without tokens this service answers only under localhost or 127.0.0.1.")
     origin = connection.headers.get("origin")
-    if origin is not None and origin.lower() != f"{connection.scope['scheme']}://{host}".lower():
+    own = f"{connection.scope['scheme']}://{host}".lower()
+    if origin is not None and origin.lower() not in (own, *settings().allowed_origins):
         raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
 
 

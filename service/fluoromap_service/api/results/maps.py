@@ -8,17 +8,22 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap.contracts import Array, ChamberMap, SurfaceSite
+from fluoromap.drawing.map_picture import draw_map_views
+from fluoromap.drawing.png import encode_png
 from fluoromap.reasons import Reason
 from fluoromap_service.api.http.etags import file_response, is_known, not_modified
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position
+from fluoromap_service.results.dependencies import map_picture_dependencies
 from fluoromap_service.results.finished import job_of
 from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.mesh_files import MESH_MEDIA_TYPES, MeshFormat, mesh_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.store.engine import reading
+from fluoromap_service.store.renderings import kept_rendering
 
 router = APIRouter(tags=["results"])
 
@@ -182,7 +187,42 @@ def get_map(
     return activation_map(finished, origin)
 
 
-_MESHES = {media: {"schema": {"type": "string", "format": "binary"}} for media in MESH_MEDIA_TYPES.values()}
+def _map_picture(chamber: ChamberMap) -> bytes:
+    return encode_png(draw_map_views(chamber))
+
+
+@router.get(
+    "/v1/jobs/{job_id}/map.png",
+    summary="Activation map from six sides",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "The picture.",
+        },
+        304: {"description": "Unchanged since the ETag sent."},
+        **responses(401, 403, 404, 409, 422, 429),
+    },
+)
+def get_map_picture(job_id: JobId, request: Request, caller: Reader) -> Response:
+    """Return a picture of the map from six sides.
+
+    It has sites, isochrones and the colour bar in ms.
+    """
+    with reading() as session:
+        finished = map_of(session, job_of(session, job_id))
+    picture = kept_rendering(
+        job_id,
+        map_picture_dependencies(finished.sha256),
+        lambda: run_in_pool(Task.DRAW_PICTURE, _map_picture, finished.chamber),
+    )
+    return file_response(request, picture.path, picture.sha256, "image/png", f"map-{job_id}.png", inline=True)
+
+
+_MESHES = {
+    media: {"schema": {"type": "string"} if media.startswith("text/") else {"type": "string", "format": "binary"}}
+    for media in MESH_MEDIA_TYPES.values()
+}
 
 
 @router.get(

@@ -9,7 +9,7 @@ from starlette.concurrency import run_in_threadpool
 from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Writer
-from fluoromap_service.api.study.csv_input import activation_times, csv_text
+from fluoromap_service.api.study.csv_input import activation_times, csv_body, csv_text
 from fluoromap_service.store.engine import writing
 from fluoromap_service.study import sites, studies
 
@@ -28,14 +28,7 @@ class TableOut(BaseModel):
 @router.put(
     "/activation-times",
     responses=responses(400, 401, 403, 404, 413, 415, 422),
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {
-                "text/csv": {"schema": {"type": "string"}, "example": "site,lat_ms\nS01,12.5\nS02,41\n"},
-            },
-        }
-    },
+    openapi_extra=csv_body("site,lat_ms\nS01,12.5\nS02,41\n"),
 )
 async def put_activation_times(study_id: StudyId, request: Request, caller: Writer) -> TableOut:
     """Replace the activation-time table: `site,lat_ms` and optionally `view_a,view_b`; all or nothing.

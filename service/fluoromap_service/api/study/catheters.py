@@ -10,6 +10,8 @@ from fluoromap.catheters import CATHETER_TYPES, Catheter, catheter_type
 
 Line = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")]
 """Text of one line that is not blank."""
+MOST_CATHETERS = 6
+MOST_ELECTRODES = 20
 Millimetres = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 
 _EXAMPLES: list[JsonValue] = [
@@ -27,7 +29,7 @@ class CatheterIn(BaseModel):
     type: str | None = Field(
         None, max_length=64, description=f"Instead of electrodes and lengths, one of: {', '.join(CATHETER_TYPES)}."
     )
-    electrodes: int | None = Field(None, ge=2, le=64)
+    electrodes: int | None = Field(None, ge=2, le=MOST_ELECTRODES)
     spacing_mm: list[Millimetres] | None = Field(
         None, description="From electrode centre to electrode centre along the shaft, from the tip on."
     )

@@ -6,6 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from fastapi import Request
@@ -17,6 +18,7 @@ from fluoromap_service.study.sites import ActivationTime, is_site_name
 
 LARGEST_LAT_MS = 10_000.0
 _MOST_ERRORS = 100
+_LONGEST_NAME = 40
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d{1,3})?")
 
 Errors = list[tuple[str, str]]
@@ -26,6 +28,8 @@ Rows = list[tuple[int, dict[str, str]]]
 async def csv_text(request: Request) -> str:
     """Return the body of a request as text.
 
+    Clients made by a generator call every file ``application/octet-stream``; such a body is read as a table too.
+
     Raises
     ------
     Problem
@@ -33,7 +37,7 @@ async def csv_text(request: Request) -> str:
     """
     kind, options = parse_options_header(request.headers.get("content-type"))
     charset = options.get(b"charset", b"utf-8").lower()
-    if kind != b"text/csv" or charset not in (b"utf-8", b"utf8", b"us-ascii"):
+    if kind not in (b"text/csv", b"application/octet-stream") or charset not in (b"utf-8", b"utf8", b"us-ascii"):
         raise Problem(415, "unsupported_media_type", "Send the table as text/csv in UTF-8.")
     try:
         return (await request.body()).decode("utf-8-sig")
@@ -101,8 +105,11 @@ def _rows(text: str, required: Sequence[str], optional: Sequence[str], errors: E
         for row, record in enumerate(records, start=1)
         if any(cell.strip() for cell in record)
     ]
-    header = [name.lower() for name in numbered[0][1]] if numbered else []
-    _check_header(header, numbered[0][0] if numbered else 1, required, optional)
+    names = numbered[0][1] if numbered else []
+    header = [name.lower() for name in names]
+    _check_header(names, numbered[0][0] if numbered else 1, required, optional)
+    if len(numbered) == 1:
+        errors.append((f"row {numbered[0][0]}", "no row follows the header; add the rows"))
     rows: Rows = []
     for row, cells in numbered[1:]:
         if len(cells) != len(header):
@@ -113,17 +120,24 @@ def _rows(text: str, required: Sequence[str], optional: Sequence[str], errors: E
     return rows
 
 
-def _check_header(header: list[str], row: int, required: Sequence[str], optional: Sequence[str]) -> None:
+def _check_header(names: list[str], row: int, required: Sequence[str], optional: Sequence[str]) -> None:
     errors: Errors = []
+    header = [name.lower() for name in names]
     for name in required:
         if name not in header:
             errors.append((f"row {row}", f"column {name} is missing"))
     for number, name in enumerate(header, start=1):
         if name not in (*required, *optional):
-            errors.append((f"row {row}", f"column {number} is unknown; known are {', '.join((*required, *optional))}"))
+            known = ", ".join((*required, *optional))
+            errors.append((f"row {row}, column {_shown(names[number - 1]) or number}", f"unknown column; use {known}"))
         elif name in header[: number - 1]:
             errors.append((f"row {row}", f"column {name} appears twice"))
     _raise_if_wrong(errors)
+
+
+def _shown(name: str) -> str:
+    """Return the beginning of a column's name for a message, without control characters."""
+    return "".join(character for character in name[:_LONGEST_NAME] if character.isprintable())
 
 
 def _number(text: str, where: str, errors: Errors) -> float | None:
@@ -139,3 +153,15 @@ def _raise_if_wrong(errors: Errors) -> None:
         mistakes = f"{len(errors)} mistake{'s' if len(errors) > 1 else ''}"
         detail = f"The table has {mistakes}, so the service stored nothing of it; correct it and send it again."
         raise Problem(422, "invalid_table", detail, errors[:_MOST_ERRORS])
+
+
+def csv_body(example: str) -> dict[str, Any]:
+    """Return the OpenAPI entry of a request body that is a table.
+
+    Generators of clients know ``application/octet-stream``; few of them know ``text/csv``.
+    """
+    content = {
+        "text/csv": {"schema": {"type": "string"}, "example": example},
+        "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+    }
+    return {"requestBody": {"required": True, "content": content}}

@@ -10,7 +10,7 @@ from fluoromap.electrogram import UnusableElectrogram, activation_time
 from fluoromap_service.api.http.paths import SiteName, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Writer
-from fluoromap_service.api.study.csv_input import csv_text, electrogram
+from fluoromap_service.api.study.csv_input import csv_body, csv_text, electrogram
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies
@@ -31,17 +31,7 @@ class ElectrogramOut(BaseModel):
 @router.put(
     "/electrograms/{site}",
     responses=responses(400, 401, 403, 404, 413, 415, 422),
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {
-                "text/csv": {
-                    "schema": {"type": "string"},
-                    "example": "time_ms,reference,mapping\n0,0.01,0.02\n1,0.01,0.02\n",
-                }
-            },
-        }
-    },
+    openapi_extra=csv_body("time_ms,reference,mapping\n0,0.01,0.02\n1,0.01,0.02\n"),
 )
 async def put_electrogram(
     study_id: StudyId,

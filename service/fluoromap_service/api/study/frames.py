@@ -24,7 +24,13 @@ router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"]
 @router.get(
     "/{uid}/frames/{n}.png",
     response_class=Response,
-    responses={200: {"content": {"image/png": {}}, "description": "The frame."}, **responses(401, 403, 404, 422, 429)},
+    responses={
+        200: {
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "The frame.",
+        },
+        **responses(401, 403, 404, 422, 429),
+    },
 )
 def get_frame(
     study_id: StudyId,

@@ -11,7 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap.geometry import LEAST_SOURCE_MM
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
@@ -19,31 +18,19 @@ from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
+from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_run_gantry
 from fluoromap_service.api.study.uploads import Part, receive
 from fluoromap_service.dicom import InstanceFacts, read_instance
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
 from fluoromap_service.study import instances, sites, studies
+from fluoromap_service.study.binding import BoundSite, binding_of, views_of
 from fluoromap_service.study.instances import StudyRun
-from fluoromap_service.study.sites import BoundSite
 
 router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
 
-Spacing = Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)]
 SITE = "Mapping site of all runs of the request."
-
-
-class GantryOut(BaseModel):
-    """Effective gantry: the header's values, which PATCH completes and overrides; null where unknown."""
-
-    primary_deg: float | None = Field(description="LAO positive, RAO negative.", examples=[-90.0])
-    secondary_deg: float | None = Field(description="Cranial positive, caudal negative.", examples=[0.0])
-    source_detector_mm: float | None = Field(examples=[1000.0])
-    source_isocentre_mm: float | None = Field(examples=[750.0])
-    pixel_spacing_mm: list[float] | None = Field(
-        description="[row, column] spacing at the detector (ImagerPixelSpacing).", examples=[[0.3, 0.3]]
-    )
 
 
 class InstanceOut(BaseModel):
@@ -58,7 +45,7 @@ class InstanceOut(BaseModel):
     frame_time_ms: float | None = Field(description="Null for a single frame.", examples=[16.7])
     acquired: str | None = Field(examples=["2026-03-01T09:30:00.000Z"])
     plane: Literal["single", "A", "B"]
-    gantry: GantryOut
+    gantry: GantryOut = Field(description="The values in use: the run's own, else the header's, else the study's.")
     missing: list[str] = Field(
         description="DICOM keywords to complete by PATCH.", examples=[["DistanceSourceToDetector"]]
     )
@@ -76,17 +63,6 @@ class UploadOut(BaseModel):
     )
 
 
-class GantryPatch(BaseModel):
-    """Gantry values that complete or override the header's; null returns to the header's value."""
-
-    model_config = ConfigDict(extra="forbid")
-    primary_deg: float | None = Field(None, ge=-180, le=180, allow_inf_nan=False)
-    secondary_deg: float | None = Field(None, ge=-90, le=90, allow_inf_nan=False)
-    source_detector_mm: float | None = Field(None, ge=LEAST_SOURCE_MM, le=3000, allow_inf_nan=False)
-    source_isocentre_mm: float | None = Field(None, ge=LEAST_SOURCE_MM, le=3000, allow_inf_nan=False)
-    pixel_spacing_mm: tuple[Spacing, Spacing] | None = None
-
-
 class InstancePatch(BaseModel):
     """Changes of a run; a member that is left out stays."""
 
@@ -97,7 +73,7 @@ class InstancePatch(BaseModel):
     site: str | None = Field(
         None, description="Moves the run to this site; null takes the run out of every site.", max_length=64
     )
-    gantry: GantryPatch | None = None
+    gantry: GantryPatch | None = Field(None, description="Overrides the header; null returns to the header's values.")
 
 
 def instance_shape(run: StudyRun, views: dict[str, tuple[BoundSite, str]]) -> InstanceOut:
@@ -230,7 +206,7 @@ def _of_part(problem: Problem, number: int) -> Problem:
 
 
 def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, Any]]:
-    views = sites.views_of(sites.binding_of(session, study.id))
+    views = views_of(binding_of(session, study.id))
     runs = {run.uid: run for run in instances.runs_of(session, study.id)}
     return [instance_shape(runs[uid], views).model_dump() for uid in dict.fromkeys(uids)]
 
@@ -240,14 +216,14 @@ def list_instances(study_id: StudyId, pages: Pages, caller: Reader) -> Page[Inst
     """List the study's runs in the order of arrival."""
     with reading() as session:
         study = studies.get(session, study_id)
-        views = sites.views_of(sites.binding_of(session, study.id))
+        views = views_of(binding_of(session, study.id))
         runs = instances.runs_of(session, study_id)
         return pages.page_of_all(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
 
 
 def _one(session: Session, study: Study, uid: str) -> InstanceOut:
     run = instances.run_of(session, study.id, uid)
-    return instance_shape(run, sites.views_of(sites.binding_of(session, study.id)))
+    return instance_shape(run, views_of(binding_of(session, study.id)))
 
 
 @router.get("/{uid}", responses=responses(401, 403, 404, 422))
@@ -266,31 +242,10 @@ def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, ca
         if "site" in body.model_fields_set:
             sites.move_run(session, study, run, body.site)
         if "gantry" in body.model_fields_set:
-            changes = {} if body.gantry is None else body.gantry.model_dump(mode="json", exclude_unset=True)
-            before = {} if body.gantry is None else run.link.gantry
-            run.link.gantry = {name: value for name, value in {**before, **changes}.items() if value is not None}
-            _check_gantry(run)
+            run.link.gantry = changed_gantry(run.link.gantry, body.gantry)
+            check_run_gantry(run)
         session.flush()
         return _one(session, study, uid)
-
-
-def _check_gantry(run: StudyRun) -> None:
-    detector, isocentre = run.gantry["source_detector_mm"], run.gantry["source_isocentre_mm"]
-    if detector is not None and isocentre is not None and isocentre >= detector:
-        places = [("body.gantry.source_isocentre_mm", "the isocentre lies between source and detector")]
-        raise Problem(422, "invalid_gantry", "These gantry values contradict each other; see 'errors'.", places)
-    gantry = instances.effective_gantry(run.facts, run.link.gantry)
-    if gantry is None:
-        return
-    try:
-        gantry.position()
-    except ValueError as error:
-        raise Problem(
-            422,
-            "invalid_gantry",
-            "These gantry values contradict each other; see 'errors'.",
-            [("body.gantry", str(error))],
-        ) from None
 
 
 @router.delete("/{uid}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409, 422))

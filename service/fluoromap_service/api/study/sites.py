@@ -14,7 +14,7 @@ from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies
-from fluoromap_service.study.sites import BoundSite
+from fluoromap_service.study.binding import BoundSite, binding_of, site_of
 
 router = APIRouter(prefix="/v1/studies/{study_id}/sites", tags=["sites"])
 
@@ -80,7 +80,7 @@ def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]
     The pairs of runs that have no name yet follow.
     """
     with reading() as session:
-        binding = sites.binding_of(session, studies.get(session, study_id).id)
+        binding = binding_of(session, studies.get(session, study_id).id)
         return pages.page_of_all((*binding.sites, *binding.pairs), _shape, lambda site: site.site or f"/{site.pair}")
 
 
@@ -88,7 +88,7 @@ def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]
 def get_site(study_id: StudyId, site: SiteName, caller: Reader) -> SiteOut:
     """Return one site."""
     with reading() as session:
-        return _shape(sites.site_of(session, studies.get(session, study_id), site))
+        return _shape(site_of(session, studies.get(session, study_id), site))
 
 
 @router.put("/{site}", responses=responses(400, 401, 403, 404, 422))
@@ -110,4 +110,4 @@ def put_site(study_id: StudyId, site: SiteName, body: SitePut, caller: Writer) -
             row.lat_ms, row.lat_sd_ms = body.lat_ms, None
             row.lat_by = None if body.lat_ms is None else "explicit"
         sites.put_views(session, study, site, views)
-        return _shape(sites.site_of(session, study, site, also_empty=True))
+        return _shape(site_of(session, study, site, also_empty=True))

@@ -14,7 +14,8 @@ from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339
-from fluoromap_service.api.study.catheters import CatheterIn, Line
+from fluoromap_service.api.study.catheters import MOST_CATHETERS, CatheterIn, Line
+from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry, check_run_gantry
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
@@ -26,7 +27,7 @@ from fluoromap_service.study.catheters import (
     catheters_of,
     set_catalogue,
 )
-from fluoromap_service.study.instances import unlink_unreferenced
+from fluoromap_service.study.instances import runs_of, unlink_unreferenced
 
 router = APIRouter(prefix="/v1/studies", tags=["studies"])
 
@@ -41,7 +42,7 @@ class StudyIn(BaseModel):
     label: Line = Field(min_length=1, max_length=200, description="Your own name for the study; no patient name.")
     chamber: Line | None = Field(None, max_length=100)
     catheters: list[CatheterIn] | None = Field(
-        None, max_length=32, description="Default: reference, pacing and mapping, 4 electrodes each."
+        None, max_length=MOST_CATHETERS, description="Default: reference, pacing and mapping, 4 electrodes each."
     )
     reference: Line | None = Field(
         None,
@@ -57,9 +58,12 @@ class StudyPatch(BaseModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"notes": "pacing from the apex"}]})
     label: Line | None = Field(None, min_length=1, max_length=200)
     chamber: Line | None = Field(None, max_length=100)
-    catheters: list[CatheterIn] | None = Field(None, max_length=32)
+    catheters: list[CatheterIn] | None = Field(None, max_length=MOST_CATHETERS)
     reference: Line | None = Field(None, max_length=64)
     notes: str | None = Field(None, max_length=10_000)
+    gantry: GantryPatch | None = Field(
+        None, description="Values for all runs whose headers lack them; null removes these values."
+    )
 
 
 class StudyOut(BaseModel):
@@ -72,6 +76,7 @@ class StudyOut(BaseModel):
     reference: str = Field(examples=["reference"])
     mapping: str = Field(description="The catheter whose tip maps.", examples=["mapping"])
     notes: str | None = Field(examples=[None])
+    gantry: GantryOut = Field(description="Values for all runs whose headers lack them.")
     created: str = Field(examples=["2026-03-01T09:30:00.000Z"])
     updated: str = Field(examples=["2026-03-01T09:30:00.000Z"])
 
@@ -85,6 +90,7 @@ def _shape(study: Study) -> StudyOut:
         reference=study.reference,
         mapping=study.mapping,
         notes=study.notes,
+        gantry=GantryOut(**{name: study.gantry.get(name) for name in GantryOut.model_fields}),
         created=rfc3339(study.created),
         updated=rfc3339(study.updated),
     )
@@ -134,6 +140,12 @@ def change_study(study_id: StudyId, body: StudyPatch, caller: Writer) -> StudyOu
             catalogue = _changed_catalogue(study, body)
             _check_corrections(session, study, catalogue)
             set_catalogue(study, catalogue)
+        if "gantry" in changes:
+            study.gantry = changed_gantry(study.gantry, body.gantry)
+            session.flush()
+            check_gantry(study.gantry)
+            for run in runs_of(session, study_id):
+                check_run_gantry(run)
         session.flush()
         session.refresh(study)
         return _shape(study)

@@ -40,7 +40,9 @@ def test_tables_as_programs_write_them(service: TestClient, study_path: str, tex
 
 
 BAD = {
-    "unknown column": ("site,lat_ms,lat_s\nA,1,2\n", "row 1"),
+    "unknown column": ("site,lat_ms,lat_s\nA,1,2\n", "row 1, column lat_s"),
+    "column without a name": ("site,lat_ms,\nA,1,2\n", "row 1, column 3"),
+    "header without rows": ("site,lat_ms\n", "row 1"),
     "missing column": ("site,time\nA,1\n", "row 1"),
     "column twice": ("site,lat_ms,lat_ms\nA,1,2\n", "row 1"),
     "empty": ("", "row 1"),
@@ -134,7 +136,7 @@ def test_an_electrogram_gives_the_activation_time(service: TestClient, study_pat
     ("content", "code"),
     [
         ("time_ms,reference,mapping\n0,0,0\n1,0,0\n", "unusable_electrogram"),
-        ("time_ms,reference,mapping\n", "unusable_electrogram"),
+        ("time_ms,reference,mapping\n", "invalid_table"),
         ("time_ms,reference,mapping\n0,0,x\n", "invalid_table"),
         ("time_ms,reference\n0,0\n", "invalid_table"),
     ],

@@ -15,7 +15,8 @@ from fluoromap.geometry import camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.study import sites, studies
+from fluoromap_service.study import studies
+from fluoromap_service.study.binding import site_of
 from fluoromap_service.study.freeze import PipelineRequest, freeze
 from fluoromap_service.study.snapshot import Snapshot
 
@@ -214,7 +215,7 @@ def test_a_binding_that_cannot_be(service: TestClient, study_path: str, upload: 
 
 def _reasons(study_path: str, site: str) -> tuple[Reason, ...]:
     with reading() as session:
-        return sites.site_of(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
+        return site_of(session, studies.get(session, study_path.rsplit("/", 1)[1]), site).reasons
 
 
 def test_what_makes_a_site_unusable(service: TestClient, study_path: str, upload: Upload, tmp_path: Path) -> None:

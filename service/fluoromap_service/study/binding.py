@@ -1,0 +1,248 @@
+"""The runs of each mapping site, as a job would take them: the pairing rules applied to the rows of the store."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
+from fluoromap.reasons import Reason
+from fluoromap_service.problem import not_found
+from fluoromap_service.store.models import Site, Study
+from fluoromap_service.study import pairing
+from fluoromap_service.study.instances import StudyRun, runs_of
+from fluoromap_service.study.pairing import Pairing, SiteRuns
+
+
+@dataclass(frozen=True, slots=True)
+class BoundSite:
+    """A site as a job would take it, or a pair of runs that nobody has named yet.
+
+    Parameters
+    ----------
+    site : str or None
+        None for a pair without a name.
+    pair : int or None
+        Number of such a pair, counted from 1 in the order of acquisition.
+    lat_ms, lat_sd_ms : float or None
+        Activation time and its standard deviation, where known.
+    view_a, view_b : str or None
+        SOP Instance UIDs; a is the run nearer to lateral unless somebody named the views.
+    bound_by : str or None
+        "explicit", "csv", "upload", "order" or "time"; None without runs.
+    missing : tuple of str
+        Of "site", "lat_ms", "view_a", "view_b", "gantry:view_a", "gantry:view_b".
+    warnings : tuple of str
+    doubts : tuple of Reason
+        Why the positions of a pair that a job can use deserve less trust.
+    unusable : Reason or None
+        Why a job cannot use the pair although nothing is missing.
+    angle_deg : float or None
+        Between the two views' rays, folded to 0..90.
+    """
+
+    site: str | None
+    lat_ms: float | None
+    lat_sd_ms: float | None
+    view_a: str | None
+    view_b: str | None
+    bound_by: str | None
+    missing: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    unusable: Reason | None = None
+    angle_deg: float | None = None
+    pair: int | None = None
+    doubts: tuple[Reason, ...] = ()
+
+    @property
+    def ready(self) -> bool:
+        """Whether a job can use the site."""
+        return not self.missing and self.unusable is None
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """The reasons why a job rejects this site; empty when it is ready."""
+        found = [Reason.ONE_VIEW_ONLY] if {"view_a", "view_b"} & set(self.missing) else []
+        if any(item.startswith("gantry:") for item in self.missing):
+            found.append(Reason.NO_GEOMETRY)
+        if "lat_ms" in self.missing:
+            found.append(Reason.NO_ACTIVATION_TIME)
+        if self.unusable is not None:
+            found.append(self.unusable)
+        return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """A study's sites with their runs, in the order of first mention, and its pairs without a name by acquisition time."""
+
+    sites: tuple[BoundSite, ...]
+    pairs: tuple[BoundSite, ...]
+
+    @property
+    def by_row_order(self) -> tuple[BoundSite, ...]:
+        """The sites whose runs are a guess by row order that nobody has confirmed."""
+        return tuple(site for site in self.sites if site.bound_by == "order")
+
+
+def rows_of(session: Session, study_id: str) -> list[Site]:
+    """Return all rows of a study's sites in the order of first mention."""
+    return list(session.scalars(select(Site).where(Site.study_id == study_id).order_by(Site.id)))
+
+
+def binding_of(session: Session, study_id: str, *, also: str | None = None) -> Binding:
+    """Return which runs belong to which site of a study.
+
+    The rules are those of :mod:`pairing`. A site without runs and facts is left out, unless ``also`` is its name.
+    """
+    runs = runs_of(session, study_id)
+    with_runs = {run.link.site for run in runs} | {also}
+    rows = [row for row in rows_of(session, study_id) if row.name in with_runs or not _is_empty(row)]
+    paired, with_geometry = _pairing(rows, runs), _with_geometry(runs)
+    sites = tuple(_bound(row, paired.sites[row.name], with_geometry) for row in rows)
+    pairs = tuple(
+        _unnamed(number, pairing.lateral_first(*pair), with_geometry)
+        for number, pair in enumerate(paired.unnamed, start=1)
+    )
+    return Binding(sites, pairs)
+
+
+def _pairing(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Pairing:
+    """Apply the pairing rules to the rows of the store."""
+    return pairing.pair_runs([_site_value(row) for row in rows], [_run_value(run) for run in runs])
+
+
+def _site_value(row: Site) -> pairing.Site:
+    return pairing.Site(
+        name=row.name,
+        csv_row=row.csv_row,
+        explicit_a=row.explicit_a,
+        explicit_b=row.explicit_b,
+        csv_a=row.csv_a,
+        csv_b=row.csv_b,
+        ordered_a=row.ordered_a,
+        ordered_b=row.ordered_b,
+    )
+
+
+def _run_value(run: StudyRun) -> pairing.Run:
+    primary, secondary = run.gantry["primary_deg"], run.gantry["secondary_deg"]
+    return pairing.Run(
+        uid=run.uid,
+        arrival=run.link.id,
+        direction=None if primary is None or secondary is None else pairing.central_ray(primary, secondary),
+        acquired=run.facts.acquired,
+        table_origin=run.facts.table_origin,
+        series_number=run.facts.series_number,
+        file_name=run.link.file_name,
+        site=run.link.site,
+        site_by=run.link.site_by,
+    )
+
+
+def _with_geometry(runs: Sequence[StudyRun]) -> set[str]:
+    return {run.uid for run in runs if run.geometry is not None}
+
+
+def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
+    missing = () if row.lat_ms is not None else ("lat_ms",)
+    unusable, angle_deg = _pair_check(runs)
+    doubts = _doubts(runs)
+    warnings = [str(Reason.PAIRED_BY_ORDER)] if runs.bound_by == "order" else []
+    warnings += [str(reason) for reason in (*doubts, *([] if unusable is None else [unusable]))]
+    return BoundSite(
+        site=row.name,
+        lat_ms=row.lat_ms,
+        lat_sd_ms=row.lat_sd_ms,
+        view_a=runs.a.uid if runs.a else None,
+        view_b=runs.b.uid if runs.b else None,
+        bound_by=runs.bound_by,
+        missing=(*missing, *_missing_runs(runs, with_geometry)),
+        warnings=tuple(warnings),
+        unusable=unusable,
+        angle_deg=angle_deg,
+        doubts=doubts,
+    )
+
+
+def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundSite:
+    runs = SiteRuns(*pair)
+    unusable, angle_deg = _pair_check(runs)
+    doubts = _doubts(runs)
+    return BoundSite(
+        site=None,
+        lat_ms=None,
+        lat_sd_ms=None,
+        view_a=pair[0].uid,
+        view_b=pair[1].uid,
+        bound_by="time",
+        missing=("site", "lat_ms", *_missing_runs(runs, with_geometry)),
+        warnings=tuple(str(reason) for reason in (*doubts, *([] if unusable is None else [unusable]))),
+        unusable=unusable,
+        angle_deg=angle_deg,
+        pair=number,
+        doubts=doubts,
+    )
+
+
+def _is_empty(row: Site) -> bool:
+    """Return whether nothing is known of a site but its name.
+
+    Such a row stays when a table that named the site was replaced.
+    """
+    return all(fact is None for fact in (row.lat_ms, row.csv_row, row.explicit_a, row.explicit_b))
+
+
+def _missing_runs(runs: SiteRuns, with_geometry: set[str]) -> list[str]:
+    views = (("view_a", runs.a), ("view_b", runs.b))
+    missing = [view for view, run in views if run is None]
+    return missing + [f"gantry:{view}" for view, run in views if run is not None and run.uid not in with_geometry]
+
+
+def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
+    """Return why a job cannot use a pair, and the rays' angle."""
+    if runs.a is None or runs.b is None:
+        return None, None
+    angle_deg = pairing.view_angle_deg(runs.a, runs.b)
+    if angle_deg is not None and angle_deg < PARALLEL_BELOW_DEG:
+        return Reason.VIEWS_PARALLEL, angle_deg
+    return None, angle_deg
+
+
+def _doubts(runs: SiteRuns) -> tuple[Reason, ...]:
+    """Return why the positions of a usable pair deserve less trust."""
+    if runs.a is None or runs.b is None or pairing.tables_comparable(runs.a, runs.b):
+        return ()
+    return (Reason.TABLE_MOVED,)
+
+
+def site_of(session: Session, study: Study, name: str, *, also_empty: bool = False) -> BoundSite:
+    """Return one site of a study.
+
+    ``also_empty``: even when nothing is known of it but its name.
+
+    Raises
+    ------
+    Problem
+        404 when there is none of that name.
+    """
+    for site in binding_of(session, study.id, also=name if also_empty else None).sites:
+        if site.site == name:
+            return site
+    raise not_found("site in this study")
+
+
+def views_of(binding: Binding) -> dict[str, tuple[BoundSite, str]]:
+    """Return site and view of each bound run, by SOP Instance UID.
+
+    The view is "a" or "b". The site may be a pair without a name.
+    """
+    found: dict[str, tuple[BoundSite, str]] = {}
+    for site in (*binding.sites, *binding.pairs):
+        for view, uid in (("a", site.view_a), ("b", site.view_b)):
+            if uid is not None:
+                found[uid] = (site, view)
+    return found
