@@ -20,14 +20,17 @@ from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
-from fluoromap_service.api.service import health, plugins
+from fluoromap_service.api.service import health, pages, plugins, reasons
 from fluoromap_service.api.study import (
     activation_times,
     catheter_types,
+    cine,
     electrodes,
     electrograms,
+    epipolar,
     frames,
     instances,
+    run_electrodes,
     sites,
     studies,
 )
@@ -41,7 +44,10 @@ ROUTERS = (
     catheter_types.router,
     instances.router,
     frames.router,
+    cine.router,
+    epipolar.router,
     electrodes.router,
+    run_electrodes.router,
     activation_times.router,
     electrograms.router,
     sites.router,
@@ -54,7 +60,9 @@ ROUTERS = (
     report.router,
     archive.router,
     plugins.router,
+    reasons.router,
     health.router,
+    pages.router,
 )
 
 log = structlog.get_logger(__name__)
