@@ -20,7 +20,7 @@ from fluoromap_service.problem import not_found
 
 router = APIRouter(include_in_schema=False)
 
-WEB = Path(fluoromap_service.__file__).resolve().parent / "web"
+ASSETS = Path(fluoromap_service.__file__).resolve().parent / "web" / "assets"
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
@@ -44,16 +44,10 @@ class Asset:
     etag: str
 
 
-_FOLDERS = {"three/": WEB / "three", "": WEB / "assets"}
-"""Start of an asset's name -> its folder; the longer start comes first."""
-
-
 def asset(name: str) -> Asset | None:
     """Return a file of the pages; None when there is no such file."""
-    prefix = next(start for start in _FOLDERS if name.startswith(start))
-    folder = _FOLDERS[prefix]
-    path = (folder / name.removeprefix(prefix)).resolve()
-    if not (path.is_relative_to(folder) and path.suffix in MEDIA_TYPES and path.is_file()):
+    path = (ASSETS / name).resolve()
+    if not (path.is_relative_to(ASSETS) and path.suffix in MEDIA_TYPES and path.is_file()):
         return None
     return _read(path, path.stat().st_mtime_ns)
 

@@ -19,7 +19,7 @@ export function parameterForm(schema) {
   return form;
 }
 
-/** A property without reference and without the alternative null. @param {any} schema @param {any} property */
+/** A property without reference and without the alternative null. @param {any} schema @param {any} property @returns {any} */
 function resolved(schema, property) {
   const parts = property.anyOf?.filter((/** @type {any} */ each) => each.type !== "null") ?? property.allOf ?? [];
   const inner = property.$ref ? schema.$defs?.[property.$ref.split("/").pop()] : parts.length ? resolved(schema, parts[0]) : null;
