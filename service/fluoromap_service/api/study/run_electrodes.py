@@ -29,7 +29,7 @@ class FrameElectrodes(BaseModel):
 def get_run_electrodes(study_id: StudyId, uid: InstanceUid, caller: Reader) -> list[FrameElectrodes]:
     """Return the electrodes of each frame that has any.
 
-    They are those set by hand, else those that the newest job detected.
+    A catheter that a person marked in a frame is as marked; the others are as the newest job detected them.
     """
     with reading() as session:
         instances.run_of(session, study_id, uid)
@@ -39,6 +39,10 @@ def get_run_electrodes(study_id: StudyId, uid: InstanceUid, caller: Reader) -> l
             for number, detected in enumerate(detections_of_run(session, study_id, uid), start=1)
             if detected
         }
-    for number, electrodes in by_hand.items():
-        frames[number] = [ElectrodeOut(**electrode.model_dump(), source="manual") for electrode in electrodes]
+    for number, marked in by_hand.items():
+        names = {electrode.catheter for electrode in marked}
+        frames[number] = [
+            *(electrode for electrode in frames.get(number, []) if electrode.catheter not in names),
+            *(ElectrodeOut(**electrode.model_dump(), source="manual") for electrode in marked),
+        ]
     return [FrameElectrodes(frame=number, electrodes=frames[number]) for number in sorted(frames)]

@@ -3,7 +3,7 @@ import * as THREE from "../three/three.module.js";
 
 /** @type {[string, number, number, number][]} */
 const ENDS = [["Left", 1, 0, 0], ["Right", -1, 0, 0], ["Back", 0, 1, 0], ["Front", 0, -1, 0], ["Head", 0, 0, 1], ["Feet", 0, 0, -1]];
-const SIZE = 110;
+const SIZE = 130;
 
 /** @param {HTMLCanvasElement} canvas @param {THREE.Camera} camera */
 export function drawOrientation(canvas, camera) {

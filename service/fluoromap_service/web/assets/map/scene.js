@@ -102,12 +102,12 @@ export class MapScene extends EventTarget {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     /** @type {number[][]} */
     const taken = [];
-    this.map.sites.forEach((site, k) => {
+    const nearFirst = this.map.sites.map((site, k) => ({ site, k, far: this.#isBehind(site) })).sort((a, b) => Number(a.far) - Number(b.far));
+    nearFirst.forEach(({ site, k, far }) => {
       const label = this.names[k];
       const dot = this.dots[k];
       if (!label || !dot) return;
       const at = dot.position.clone().project(camera);
-      const far = this.#isBehind(site);
       const chosen = site.site === this.chosen;
       label.className = chosen ? "chosen" : far ? "far" : "";
       const x = ((at.x + 1) / 2) * width + 8;

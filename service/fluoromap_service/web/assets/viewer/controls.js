@@ -62,7 +62,8 @@ export function control(view, onPen) {
     if (ended.kind === "move" && ended.moved && ended.electrode?.catheter) {
       view.set(ended.electrode.catheter, ended.electrode.electrode, u, v);
     } else if (ended.kind === "mark" && !ended.moved) {
-      view.set(view.pen.catheter, view.pen.next, u, v);
+      if (view.pen.next === 1) view.begin(view.pen.catheter, u, v);
+      else view.set(view.pen.catheter, view.pen.next, u, v);
       onPen("marked");
     }
     view.draw();

@@ -39,9 +39,17 @@ export class Marks extends EventTarget {
     return [...this.frames.keys()].filter((frame) => this.isManual(frame)).sort((a, b) => a - b);
   }
 
-  /** Replace the electrodes of a frame. @param {number} frame @param {Electrode[]} electrodes */
-  change(frame, electrodes) {
-    const after = electrodes.filter((each) => each.catheter !== null).map((each) => ({ ...each, source: /** @type {const} */ ("manual") }));
+  /**
+   * Replace one catheter's electrodes in a frame. The other catheters stay as they are, so that a wrong name that nobody looked
+   * at is not taken for a person's word.
+   *
+   * @param {number} frame
+   * @param {string} catheter
+   * @param {Electrode[]} electrodes Of this catheter.
+   */
+  change(frame, catheter, electrodes) {
+    const others = this.of(frame).filter((each) => each.catheter !== catheter);
+    const after = [...others, ...electrodes.map((each) => ({ ...each, catheter, source: /** @type {const} */ ("manual") }))];
     this.done.push({ frame, before: this.of(frame), after });
     this.undone = [];
     return this.#put(frame, after);
@@ -72,11 +80,11 @@ export class Marks extends EventTarget {
   #put(frame, electrodes) {
     this.frames.set(frame, electrodes);
     this.dispatchEvent(new Event("changed"));
-    const manual = electrodes.some((each) => each.source === "manual");
+    const manual = electrodes.filter((each) => each.source === "manual");
     const address = `${this.path}/frames/${frame}/electrodes`;
     // One request after the other: the last change has to be the last that the service stores.
     this.stored = this.stored.catch(() => undefined).then(async () => {
-      if (manual) await send("PUT", address, electrodes);
+      if (manual.length) await send("PUT", address, manual);
       else this.frames.set(frame, await send("DELETE", address));
       this.dispatchEvent(new Event("changed"));
       this.dispatchEvent(new Event("stored"));

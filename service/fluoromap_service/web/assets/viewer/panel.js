@@ -97,11 +97,12 @@ export function viewerPanel(state, compute) {
     /** @type {[string, string][]} */
     const choices = state.sites.map((each, index) => [String(index), each.site ? `site ${each.site}` : `pair ${each.pair}`]);
     state.runs.forEach((run, index) => bound.has(run.sop_instance_uid) || choices.push([String(-1 - index), `run ${index + 1} without site`]));
-    const before = site.value;
+    const wanted = state.sites.findIndex((each) => each.site !== null && each.site === state.chosen);
+    const before = site.value || (wanted < 0 ? "" : String(wanted));
     site.replaceChildren(...select(choices, "").children);
     site.value = choices.some(([value]) => value === before) ? before : (choices[0]?.[0] ?? "");
     const now = [state.sites[Number(site.value)]?.view_a, state.sites[Number(site.value)]?.view_b].filter(Boolean).join();
-    if (site.value !== before || now !== views.map((view) => view.run.sop_instance_uid).join()) open();
+    if (!views.length || site.value !== before || now !== views.map((view) => view.run.sop_instance_uid).join()) open();
   };
 
   site.addEventListener("change", open);

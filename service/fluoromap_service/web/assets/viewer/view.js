@@ -139,17 +139,24 @@ export class View extends EventTarget {
 
   /** Set or move an electrode. @param {string} catheter @param {number} electrode @param {number} u @param {number} v */
   set(catheter, electrode, u, v) {
-    const kept = this.marks.of(this.frame).filter((each) => each.catheter !== catheter || each.electrode !== electrode);
+    const kept = this.marks.of(this.frame).filter((each) => each.catheter === catheter && each.electrode !== electrode);
     const u_px = Math.min(this.run.columns - 0.5, Math.max(-0.5, u));
     const v_px = Math.min(this.run.rows - 0.5, Math.max(-0.5, v));
-    return this.#store(() => this.marks.change(this.frame, [...kept, { catheter, electrode, u_px, v_px, sd_px: 1, source: "manual" }]));
+    return this.#store(() => this.marks.change(this.frame, catheter, [...kept, { catheter, electrode, u_px, v_px, sd_px: 1, source: "manual" }]));
+  }
+
+  /** Begin a catheter anew with its first electrode. @param {string} catheter @param {number} u @param {number} v */
+  begin(catheter, u, v) {
+    return this.#store(() => this.marks.change(this.frame, catheter, [{ catheter, electrode: 1, u_px: u, v_px: v, sd_px: 1, source: "manual" }]));
   }
 
   /** @param {Electrode} electrode */
   remove(electrode) {
-    const kept = this.marks.of(this.frame).filter((each) => each !== electrode && keyOf(each) !== keyOf(electrode));
+    const { catheter } = electrode;
+    if (catheter === null) return undefined;
+    const kept = this.marks.of(this.frame).filter((each) => each.catheter === catheter && each.electrode !== electrode.electrode);
     this.chosen = null;
-    return this.#store(() => (kept.length ? this.marks.change(this.frame, kept) : this.marks.reset(this.frame)));
+    return this.#store(() => this.marks.change(this.frame, catheter, kept));
   }
 
   resetFrame() {
