@@ -11,7 +11,7 @@ export function fusedViews(jobId, overlays, frames) {
     const last = frames.get(overlay.sop_instance_uid) ?? overlay.frame;
     const image = element("img", { alt: `The map over view ${overlay.view} of site ${overlay.site}`, src: overlay.href });
     const caption = element("span", {}, `view ${overlay.view}, frame ${overlay.frame} (diastole)`);
-    const slider = element("input", { type: "range", min: 1, max: last, value: overlay.frame, "aria-label": `Frame of view ${overlay.view}` });
+    const slider = element("input", { type: "range", min: 1, max: last, value: overlay.frame, "aria-label": `Frame of the map over view ${overlay.view}` });
     slider.addEventListener("change", () => {
       image.src = `${overlay.href}?frame=${slider.value}`;
       caption.textContent = `view ${overlay.view}, frame ${slider.value}${Number(slider.value) === overlay.frame ? " (diastole)" : ""}`;
