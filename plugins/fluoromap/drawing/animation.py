@@ -56,7 +56,10 @@ def draw_propagation(
 
 
 def _palette(picture: Image.Image, bands: Colours) -> Image.Image:
-    """Return an image whose palette has the bands' colours (k, 3) and the picture's most important other colours."""
+    """Return an image with the palette of the pictures.
+
+    It has the bands' colours (k, 3) unchanged, and the most important other colours of the picture.
+    """
     free = COLOURS - len(bands)
     others = picture.quantize(free, dither=Image.Dither.NONE).getpalette() or []
     palette = Image.new("P", (1, 1))

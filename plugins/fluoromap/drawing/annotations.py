@@ -20,7 +20,7 @@ _LEAST_SHARE = 0.35
 
 
 def direction_text(camera: Camera) -> str:
-    """Return the direction of a view as the C-arm displays it, for example ``LAO 45 CRA 20``."""
+    """Return the direction of a view, for example ``LAO 45 CRA 20``."""
     x, y, z = camera.axis_world.tolist()
     primary, secondary = math.degrees(math.atan2(x, -y)), math.degrees(math.asin(max(-1.0, min(1.0, z))))
     words = ["AP"] if abs(primary) < 0.5 else [f"{'LAO' if primary > 0 else 'RAO'} {abs(primary):.0f}"]
@@ -46,7 +46,10 @@ def image_directions(camera: Camera) -> tuple[Array, Array]:
 
 
 def annotation_boxes(picture: tuple[int, int], size: int, caption: str) -> list[Box]:
-    """Return the places of caption and legend in a picture (width, height), which labels of sites avoid."""
+    """Return the places of caption and legend in a picture (width, height).
+
+    Labels of sites avoid them.
+    """
     width, height = picture
     reach = max(text_size(caption, size)[0], text_size(LEGEND, _small(size))[0])
     return [(0.0, height - 3.4 * size, min(width, reach + 1.5 * size), float(height))]

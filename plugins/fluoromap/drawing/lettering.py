@@ -39,7 +39,10 @@ def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, in
 
 
 def line_with_squares(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, ink: RGB) -> None:
-    """Draw a text centred on a point; each ``²`` is a small raised 2, which Pillow's typeface lacks."""
+    """Draw a text with squares, centred on a point.
+
+    Each ``²`` is a small raised 2, because Pillow's typeface lacks the sign.
+    """
     small = round(0.65 * size)
     parts = text.split("²")
     widths = [font(size).getlength(part) for part in parts]

@@ -35,7 +35,10 @@ def detected_electrodes(session: Session, study_id: str, uid: str, frame: int) -
 
 
 def detections_of_run(session: Session, study_id: str, uid: str) -> list[list[DetectedElectrode]]:
-    """Return the electrodes of every frame as the newest job detected them; an empty list without such a job."""
+    """Return the electrodes of every frame as the newest job detected them.
+
+    Without such a job the list is empty.
+    """
     stage = _newest_segmentation(session, study_id, uid)
     if stage is None:
         return []

@@ -22,7 +22,7 @@ REACH_MM = 150.0
 
 
 def epipolar_line(session: Session, study_id: str, uid: str, other: str, pixel_uv: Array) -> Array:
-    """Return the two ends (2, 2) of a pixel's epipolar line in the other run, in stored pixels.
+    """Return the ends (2, 2) of a pixel's epipolar line in stored pixels.
 
     The cameras are those of the newest job that located a site by these two runs, which contain the self-calibration. Without
     such a job they follow from the gantry of each run.

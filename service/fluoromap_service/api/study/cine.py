@@ -39,8 +39,9 @@ def get_frames(
     first: Annotated[int, Query(ge=1, description="First frame, counted from 1.")] = 1,
     count: Annotated[int, Query(ge=1, le=10_000, description="Most frames to send.")] = 10_000,
 ) -> Response:
-    """Return frames one after the other, one byte a pixel, row by row, in stored pixels; 0 is black.
+    """Return many frames of a run.
 
+    They follow one after the other, one byte a pixel, row by row, in stored pixels; 0 is black.
     The answer holds at most 16 MiB, so it may have fewer frames than asked for: divide its length by rows times columns, and
     ask again from the next frame on. All frames have the same window.
     """
