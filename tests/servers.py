@@ -56,6 +56,24 @@ def redis(folder: Path) -> str:
     return os.environ.get("FLUOROMAP_TEST_REDIS_URL") or _shared(folder, "redis", _start_redis)
 
 
+def handed_over(folder: Path, kind: str) -> tuple[list[str], dict[str, Any]]:
+    """End a session's server, so that the caller can start it alone.
+
+    ``kind`` is "postgresql" or "redis".
+
+    Returns
+    -------
+    tuple of (list of str, dict)
+        The server's command, and the options of ``subprocess.Popen``.
+    """
+    note = folder / f"{kind}.json"
+    server = json.loads(note.read_text())
+    note.unlink()
+    os.kill(server["pid"], signal.SIGINT)
+    _wait_until(lambda: not _alive(server["pid"]), f"the test server {kind} did not stop; end it by hand")
+    return server["command"], server["options"]
+
+
 def stop(folder: Path) -> None:
     """Stop the servers of a session and remove its folder."""
     for note in folder.glob("*.json"):
@@ -76,19 +94,19 @@ def free_port() -> int:
         return port
 
 
-def _shared(folder: Path, kind: str, start: Callable[[Path], tuple[str, int]]) -> str:
+def _shared(folder: Path, kind: str, start: Callable[[Path], tuple[str, dict[str, Any]]]) -> str:
     note = folder / f"{kind}.json"
     with (folder / f"{kind}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not note.exists():
-            url, pid = start(folder)
-            note.write_text(json.dumps({"url": url, "pid": pid}))
+            url, server = start(folder)
+            note.write_text(json.dumps({"url": url, **server}))
     url = json.loads(note.read_text())["url"]
     assert isinstance(url, str)
     return url
 
 
-def _start_postgresql(folder: Path) -> tuple[str, int]:
+def _start_postgresql(folder: Path) -> tuple[str, dict[str, Any]]:
     home = folder / "postgresql"
     home.mkdir()
     programs = _postgresql_programs()
@@ -110,11 +128,11 @@ def _start_postgresql(folder: Path) -> tuple[str, int]:
         options = ("fsync=off", "max_connections=200", "listen_addresses=127.0.0.1", "unix_socket_directories=")
         return [programs / "postgres", "-D", data, "-p", str(port), *(f"-c{option}" for option in options)]
 
-    port, pid = _launch(launch, _SSL_REQUEST, home, environment, as_user)
-    return f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres", pid
+    port, server = _launch(launch, _SSL_REQUEST, home, environment, as_user)
+    return f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres", server
 
 
-def _start_redis(folder: Path) -> tuple[str, int]:
+def _start_redis(folder: Path) -> tuple[str, dict[str, Any]]:
     home = folder / "redis"
     home.mkdir()
     program = _redis_program()
@@ -123,8 +141,8 @@ def _start_redis(folder: Path) -> tuple[str, int]:
         options = ("--bind", "127.0.0.1", "--dir", home, "--save", "", "--appendonly", "no", "--databases", "4096")
         return [program, "--port", str(port), *options]
 
-    port, pid = _launch(launch, b"PING\r\n", home, {"PATH": "/usr/bin:/bin", "HOME": str(home)}, {})
-    return f"redis://127.0.0.1:{port}", pid
+    port, server = _launch(launch, b"PING\r\n", home, {"PATH": "/usr/bin:/bin", "HOME": str(home)}, {})
+    return f"redis://127.0.0.1:{port}", server
 
 
 def _launch(
@@ -133,24 +151,27 @@ def _launch(
     home: Path,
     environment: dict[str, str],
     as_user: dict[str, Any],
-) -> tuple[int, int]:
+) -> tuple[int, dict[str, Any]]:
     """Start a server on a free port and wait until it answers a greeting.
 
-    Another program can take the port first; then the server ends and another port is tried.
+    Another program can take the port first; then the server ends and another port is tried. Return the port, and process id,
+    command and options of the server.
     """
+    options = {"env": environment, "cwd": str(home), **as_user}
     for _ in range(_ATTEMPTS):
         port = free_port()
+        command = [str(argument) for argument in arguments(port)]
         # In a session of its own the server outlives the pytest process that started it.
         server = subprocess.Popen(
-            arguments(port), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env=environment, cwd=home, start_new_session=True, **as_user,
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            start_new_session=True, **options,
         )  # fmt: skip
         _wait_until(
             lambda server=server, port=port: server.poll() is not None or _answers(port, greeting),
             "a test server did not answer in time; try its command by hand",
         )
         if server.poll() is None:
-            return port, server.pid
+            return port, {"pid": server.pid, "command": command, "options": options}
     raise RuntimeError(f"a test server ended at its start, {_ATTEMPTS} times; try its command by hand")
 
 

@@ -16,7 +16,7 @@ import yaml
 
 from fluoromap.reasons import Reason
 from fluoromap_service.cli.app import program
-from fluoromap_service.jobs.queue import celery_app
+from fluoromap_service.jobs.queue import DRAIN_SECONDS
 from fluoromap_service.settings import Settings
 
 TOP = Path(__file__).parent.parent
@@ -90,9 +90,10 @@ def test_long_running_services_are_watched_and_may_end_their_work() -> None:
     for name in ("postgres", "redis", "api", "worker"):
         assert "healthcheck" in SERVICES[name]
         assert SERVICES[name]["restart"] == "unless-stopped"
-    assert (
-        int(SERVICES["worker"]["stop_grace_period"].removesuffix("s")) > celery_app().conf.worker_soft_shutdown_timeout
-    )
+    assert int(SERVICES["worker"]["stop_grace_period"].removesuffix("s")) > DRAIN_SECONDS
+    program, *arguments = SERVICES["worker"]["healthcheck"]["test"][1:]
+    assert program == "fluoromap"
+    _parse(arguments)
 
 
 def test_image_does_not_run_as_root_and_starts_a_command() -> None:

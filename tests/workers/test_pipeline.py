@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import shutil
@@ -19,8 +20,11 @@ from fluoromap.contracts import Context, Marks, Refusal, Run, Segmentation
 from fluoromap.fuser.smooth_surface import SmoothSurface
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.reasons import Reason
+from fluoromap.registry import Kind, Plugin
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
+from fluoromap_service.jobs import pipeline
+from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
@@ -234,6 +238,44 @@ def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
         assert (refused.status_code, refused.json()["code"]) == (409, "no_map")
         assert refused.json()["reasons"] == [str(reason)]
         assert refused.json()["detail"] == "The plugin says why."
+
+
+RETURNED = {
+    "segmenter": (CatheterChain, "segment", "catheter-chain returned NoneType, expected Segmentation"),
+    "triangulator": (MaximumLikelihood, "triangulate", "maximum-likelihood returned NoneType, expected Triangulation"),
+    "monoplane": (MotionPrior, "track", "motion-prior returned NoneType, expected Track"),
+    "fuser": (SmoothSurface, "fuse", "smooth-surface returned NoneType, expected ChamberMap"),
+}
+
+
+@pytest.mark.parametrize("kind", RETURNED)
+def test_a_plugin_that_returns_nothing_fails_in_its_own_stage(
+    service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    plugin, method, sentence = RETURNED[kind]
+    monkeypatch.setattr(plugin, method, lambda *inputs: None)
+    failed = [row for row in _job(service, sent)["stages"] if row["state"] == "failed"]
+    assert {STAGES[row["name"]].kind for row in failed} == {kind}
+    for row in failed:
+        assert row["error"]["code"] == "plugin_failed"
+        assert sentence in row["error"]["detail"]
+
+
+def test_a_job_of_another_version_of_a_plugin_is_not_computed(
+    service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that was not upgraded together with the API would store its results under the wrong version."""
+    installed = pipeline.plugin
+
+    def older(kind: Kind, name: str) -> Plugin:
+        return dataclasses.replace(installed(kind, name), version="0")
+
+    monkeypatch.setattr(pipeline, "plugin", older)
+    job = _job(service, sent)
+    assert job["state"] == "failed"
+    failed = [row for row in job["stages"] if row["state"] == "failed"]
+    assert {(row["name"], row["error"]["code"]) for row in failed} == {("segment", "plugin_changed")}
+    assert "version 0" in failed[0]["error"]["detail"]
 
 
 def test_a_real_cine_without_electrodes_is_rejected_and_the_job_succeeds(

@@ -19,7 +19,7 @@ from fluoromap_service.store.codec import decode
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Event, Job, JobState, StageRow, StageState, Study
 from fluoromap_workers import runner, tasks
-from fluoromap_workers.stage_inputs import Work
+from fluoromap_workers.stage_inputs import PluginChanged, Work
 
 
 @dataclass(frozen=True)
@@ -170,6 +170,12 @@ def test_a_plugin_that_raises_fails_its_stage_in_its_own_words(
     assert row.error is not None
     assert row.error["code"] == "plugin_failed"
     assert str(error) in row.error["detail"]
+
+
+def test_a_plugin_of_another_version_is_not_run(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = _run(stage, monkeypatch, _raises(PluginChanged("The job was made with version 1.")))
+    assert row.state == StageState.FAILED
+    assert row.error == {"code": "plugin_changed", "detail": "The job was made with version 1."}
 
 
 def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, Protocol
 
 import structlog
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 from structlog.typing import FilteringBoundLogger as BoundLogger
 
-from fluoromap.contracts import Refusal, StageStopped
+from fluoromap.contracts import Context, Refusal, StageStopped
 from fluoromap_service.jobs import job_life
 from fluoromap_service.jobs.job_life import Claim, StoredResult
 from fluoromap_service.jobs.stage_results import load_file, remember
@@ -20,20 +21,60 @@ from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
 from fluoromap_workers.heartbeat import Heartbeat
-from fluoromap_workers.stage_inputs import Work, prepare
+from fluoromap_workers.stage_inputs import PluginChanged, Work, prepare
 
 LONGEST_MESSAGE = 500
 
 
 class PluginFailed(Exception):
-    """The plugin raised. The message reaches the reader of the job."""
+    """The plugin raised, or another version of it is installed.
+
+    ``error`` is the error of the stage, with its code. It reaches the reader of the job.
+    """
+
+    def __init__(self, error: dict[str, str]) -> None:
+        super().__init__(error["detail"])
+        self.error = error
 
 
 log = structlog.get_logger(__name__)
 
 
-def run(stage_id: int, worker: str) -> str | None:
-    """Claim a stage, run its plugin and store the result.
+class Place(Protocol):
+    """A process in which stages run."""
+
+    def is_ready(self) -> bool:
+        """Return whether a stage may be claimed for this place."""
+
+    def run(self, held: Claim) -> None:
+        """Run a claimed stage until it has ended or waits for another attempt."""
+
+    def finish_known(self, job_id: str) -> None:
+        """End all ready stages of a job whose results are stored."""
+
+
+class ThisProcess:
+    """The calling process as a place for stages: jobs that run at once, and tests."""
+
+    def is_ready(self) -> bool:
+        return True
+
+    def run(self, held: Claim) -> None:
+        with Heartbeat(held) as heartbeat:
+            work(held, heartbeat)
+            if heartbeat.cancelled:
+                with writing() as session:
+                    job_life.stopped(session, held)
+
+    def finish_known(self, job_id: str) -> None:
+        finish_known(job_id)
+
+
+THIS_PROCESS = ThisProcess()
+
+
+def run(stage_id: int, worker: str, place: Place = THIS_PROCESS) -> str | None:
+    """Claim a stage for a worker, run its plugin and store the result.
 
     Returns
     -------
@@ -44,29 +85,40 @@ def run(stage_id: int, worker: str) -> str | None:
         held = job_life.claim(session, stage_id, worker)
     if held is None:
         return None
+    place.run(held)
+    return held.job_id
+
+
+def work(held: Claim, context: Context) -> None:
+    """Run a claimed stage and store its end.
+
+    A stage that stops because nobody wants it stays claimed.
+    """
     bound = log.bind(job=held.job_id, stage=held.name, attempt=held.attempt)
     bound.info("stage_started")
-    with Heartbeat(held) as heartbeat:
-        try:
-            _run(held, heartbeat, bound)
-        except StageStopped:
-            if heartbeat.cancelled:
-                with writing() as session:
-                    job_life.stopped(session, held)
-            bound.info("stage_stopped")
-        except (OperationalError, OSError) as error:
-            # The machine failed, not the plugin: the lease runs out and another attempt follows.
-            bound.warning("stage_interrupted", error=type(error).__name__)
-        except PluginFailed as failure:
-            bound.warning("stage_failed", exc_info=failure.__cause__)
-            with writing() as session:
-                job_life.fail(session, held, {"code": "plugin_failed", "detail": str(failure)})
-        except Exception as error:
-            bound.error("stage_broken", error=type(error).__name__, exc_info=error)
-            detail = "The service could not prepare or store the work of this stage. Look at the worker's log."
-            with writing() as session:
-                job_life.fail(session, held, {"code": "internal", "detail": detail})
-    return held.job_id
+    try:
+        _run(held, context, bound)
+    except StageStopped:
+        bound.info("stage_stopped")
+    except (OperationalError, InterfaceError, PoolTimeout, OSError) as error:
+        # The machine failed, not the plugin: the lease runs out and another attempt follows.
+        bound.warning("stage_interrupted", error=type(error).__name__)
+    except PluginFailed as failure:
+        bound.warning("stage_failed", exc_info=failure.__cause__)
+        _fail(held, failure.error, bound)
+    except Exception as error:
+        bound.error("stage_broken", error=type(error).__name__, exc_info=error)
+        detail = "The service could not prepare or store the work of this stage. Look at the worker's log."
+        _fail(held, {"code": "internal", "detail": detail}, bound)
+
+
+def _fail(held: Claim, error: dict[str, str], bound: BoundLogger) -> None:
+    try:
+        with writing() as session:
+            job_life.fail(session, held, error)
+    except SQLAlchemyError as away:
+        # The lease runs out, and another attempt fails in the same way.
+        bound.warning("failure_not_stored", error=type(away).__name__)
 
 
 def finish_known(job_id: str) -> None:
@@ -87,7 +139,7 @@ def finish_known(job_id: str) -> None:
         log.warning("nothing_finished_at_once", job=job_id, error=type(error).__name__)
 
 
-def _run(held: Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
+def _run(held: Claim, context: Context, bound: BoundLogger) -> None:
     work = _prepare(held)
     stored = _stored(work)
     if stored is not None:
@@ -96,9 +148,9 @@ def _run(held: Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
         if taken:
             bound.info("stage_done", reused=True)
             return
-    result, content = _computed(held, work, heartbeat)
+    result, content = _computed(held, work, context)
     rows = tuple(work.rows(result)) if work.rows else ()
-    heartbeat.check()
+    context.check()
     with files.incoming() as path, writing() as session:
         path.write_bytes(content)
         sha256 = files.keep(session, path)
@@ -109,19 +161,21 @@ def _run(held: Claim, heartbeat: Heartbeat, bound: BoundLogger) -> None:
     bound.info("stage_done", reused=False)
 
 
-def _computed(held: Claim, work: Work, heartbeat: Heartbeat) -> tuple[Any, bytes]:
+def _computed(held: Claim, work: Work, context: Context) -> tuple[Any, bytes]:
     try:
         try:
-            result = work.compute(heartbeat)
+            result = work.compute(context)
         except Refusal as refusal:
             result = work.refused(refusal)
         return result, encode(result)
     except StageStopped:
         raise
+    except PluginChanged as error:
+        raise PluginFailed({"code": "plugin_changed", "detail": str(error)}) from error
     except Exception as error:
         message = " ".join(str(error).split()) or "no message"
         sentence = f"The stage {held.name!r} failed: {type(error).__name__}: {message}"
-        raise PluginFailed(sentence[:LONGEST_MESSAGE]) from error
+        raise PluginFailed({"code": "plugin_failed", "detail": sentence[:LONGEST_MESSAGE]}) from error
 
 
 def _prepare(claim: Claim) -> Work:

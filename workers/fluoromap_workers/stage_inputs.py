@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
     Chain,
+    ChamberMap,
     Context,
     ElectrodePoint,
     FrameChains,
@@ -29,6 +30,7 @@ from fluoromap.contracts import (
     RejectedSite,
     Run,
     Segmentation,
+    Track,
     Triangulation,
     View,
 )
@@ -38,7 +40,7 @@ from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
 from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
-from fluoromap_service.jobs.pipeline import STAGES, StageName, plugin_of
+from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_version, plugin_of
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, stage_of, stages_of
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode, form_of
@@ -48,8 +50,14 @@ from fluoromap_workers.point_rows import point_rows
 
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
+Result = TypeVar("Result")
+
 # A process matches the same study after every correction: sites that did not change are compared once.
 _SITE_COMPARISONS = SiteComparisons()
+
+
+class PluginChanged(Exception):
+    """The worker has another version of a plugin than the job was frozen with; a result would carry the wrong version."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +105,41 @@ class StoredJob:
 
 
 def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
-    """Gather the inputs of a stage that may begin."""
-    return _PREPARE[STAGES[claim.name].name](StoredJob(session, claim.job_id, snapshot), claim.subject)
+    """Gather the inputs of a stage that may begin.
+
+    The stage compares the plugin's version before it computes. A stored result needs no plugin.
+    """
+    stage = STAGES[claim.name]
+    work = _PREPARE[stage.name](StoredJob(session, claim.job_id, snapshot), claim.subject)
+
+    def compute(context: Context) -> Any:
+        _require_version(stage, snapshot)
+        return work.compute(context)
+
+    return replace(work, compute=compute)
+
+
+def _require_version(stage: Stage, snapshot: Snapshot) -> None:
+    frozen = plugin_of(stage, snapshot)
+    installed = installed_version(stage, frozen.name)
+    if installed != frozen.version:
+        raise PluginChanged(
+            f"The job was made with version {frozen.version} of {frozen.name!r}, and this worker has version {installed}. "
+            "Start a new job, or install the same version on every machine."
+        )
+
+
+def _returned(result: Any, expected: type[Result], name: str) -> Result:
+    """Return a plugin's result, checked before anything is stored.
+
+    Raises
+    ------
+    TypeError
+        When it is of another type.
+    """
+    if not isinstance(result, expected):
+        raise TypeError(f"{name} returned {type(result).__name__}, expected {expected.__name__}")
+    return result
 
 
 def _segment(job: StoredJob, uid: str) -> Work:
@@ -111,7 +152,11 @@ def _segment(job: StoredJob, uid: str) -> Work:
     def compute(context: Context) -> Segmentation:
         frames = open_frames(files.path_of(run.sha256), facts)
         shown = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
-        return build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
+        found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
+        found = _returned(found, Segmentation, plugin.name)
+        if len(found.frames) != facts.frames:
+            raise ValueError(f"{plugin.name} returned {len(found.frames)} frames, expected {facts.frames}")
+        return found
 
     def refused(refusal: Refusal) -> Segmentation:
         frames = tuple(FrameChains(frame, (), refusal.reason) for frame in range(facts.frames))
@@ -176,6 +221,7 @@ def _triangulate(job: StoredJob, study: str) -> Work:
     def compute(context: Context) -> Triangulation:
         matching = load(Matching, match)
         located = build_triangulator(plugin.name, plugin.params).triangulate(matching.sites, catalogue, context)
+        located = _returned(located, Triangulation, plugin.name)
         sites = tuple(
             replace(site, reasons=tuple(dict.fromkeys((*site.reasons, *doubts.get(site.site, ())))))
             for site in located.sites
@@ -201,7 +247,8 @@ def _fuse(job: StoredJob, study: str) -> Work:
     origin = map_origin(triangulation)
 
     def compute(context: Context) -> MapResult:
-        return MapResult(build_fuser(plugin.name, plugin.params).fuse(sites, context), None, "", origin)
+        chamber = build_fuser(plugin.name, plugin.params).fuse(sites, context)
+        return MapResult(_returned(chamber, ChamberMap, plugin.name), None, "", origin)
 
     def refused(refusal: Refusal) -> MapResult:
         return MapResult(None, refusal.reason, str(refusal), origin)
@@ -227,7 +274,8 @@ def _monoplane(job: StoredJob, name: str) -> Work:
             solver = build_monoplane(plugin.name, plugin.params)
             # One view may support a track where the other does not.
             try:
-                tracks.append(ViewTrack(view.view, solver.track(view, context), None, ""))
+                track = _returned(solver.track(view, context), Track, plugin.name)
+                tracks.append(ViewTrack(view.view, track, None, ""))
             except Refusal as refusal:
                 tracks.append(ViewTrack(view.view, None, refusal.reason, str(refusal)))
         return SiteTracks(name, tuple(tracks))

@@ -1,27 +1,37 @@
-"""The one task that Celery registers, and the sweeper that each worker runs."""
+"""The one task that Celery registers, and what each worker starts beside it: its processes and its sweeper."""
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import os
+import queue as waiting_line
 import socket
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import structlog
 from celery import bootsteps, shared_task
-from celery.signals import celeryd_init, worker_process_init
+from celery.signals import celeryd_init, worker_shutting_down
 from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap_service.jobs import job_life, queue
-from fluoromap_service.store.engine import forget_connections, reading, writing
-from fluoromap_workers.pool_child import limit_memory, warm_up
-from fluoromap_workers.runner import finish_known, run
+from fluoromap_service.jobs.stall import StallWatch
+from fluoromap_service.settings import settings
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_workers.drain import Drain
+from fluoromap_workers.runner import THIS_PROCESS, Place, run
+from fluoromap_workers.stage_process import StageProcess
 
 SWEEP_SECONDS = 1.0
+STALLED_EXIT_CODE = 75
+"""EX_TEMPFAIL of <sysexits.h>: another start may help."""
 
 log = structlog.get_logger(__name__)
+
+_drain = Drain()
+_all_processes: list[StageProcess] = []
+_free_processes: waiting_line.LifoQueue[StageProcess] = waiting_line.LifoQueue()
 
 
 @shared_task(name=queue.RUN_STAGE)  # type: ignore[untyped-decorator,unused-ignore]
@@ -31,41 +41,79 @@ def run_stage(stage_id: int) -> None:
     A stage that cannot be claimed is left alone. After a stage, this worker runs the stages of the same job that are ready, and
     does not wait for their messages. A message that arrives later finds its stage claimed.
     """
+    try:
+        with _place() as place:
+            _run_stages(stage_id, place)
+    except SQLAlchemyError as error:
+        if settings().eager:
+            raise
+        # The stage stays ready, and is announced again.
+        log.warning("stage_not_claimed", stage=stage_id, error=type(error).__name__)
+
+
+@contextmanager
+def _place() -> Iterator[Place]:
+    """Give a place to run stages.
+
+    It is this process when jobs run at once, else one of the worker's processes.
+    """
+    if settings().eager:
+        yield THIS_PROCESS
+        return
+    process = _free_processes.get()
+    try:
+        yield process
+    finally:
+        _free_processes.put(process)
+
+
+def _run_stages(stage_id: int, place: Place) -> None:
     worker = f"{socket.gethostname()}:{os.getpid()}"
     end = time.monotonic() + queue.STAYS_SECONDS
-    job = run(stage_id, worker)
+    if not place.is_ready():
+        return
+    job = run(stage_id, worker, place)
     if job is None:
         return
-    finish_known(job)
+    place.finish_known(job)
     queue.publish_due()
-    while time.monotonic() <= end:
+    while time.monotonic() <= end and place.is_ready():
         with reading() as session:
             waiting = job_life.ready(session, job)
-        if not waiting or run(waiting[0].stage_id, worker) is None:
+        if not waiting or run(waiting[0].stage_id, worker, place) is None:
             return
         queue.publish_due()
 
 
-@worker_process_init.connect
-def prepare_child(**_: Any) -> None:
-    """Make a pool child ready for its first stage.
+class Processes(bootsteps.StartStopStep):  # type: ignore[misc]
+    """The worker's stage processes, started with it and ended after its threads."""
 
-    It gets its own connections and bounded memory, loads the plugins and compiles the kernels.
-    """
-    forget_connections()
-    limit_memory()
-    warm_up()
-    # The loaded code stays. Else the collector would walk through it again while a stage makes its small objects.
-    gc.freeze()
+    requires = frozenset({"celery.worker.components:Pool"})
+
+    def start(self, parent: Any) -> None:
+        for _ in range(settings().workers):
+            process = StageProcess(_drain)
+            process.start()
+            _all_processes.append(process)
+            _free_processes.put(process)
+
+    def terminate(self, parent: Any) -> None:
+        for process in _all_processes:
+            process.kill()
 
 
 class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
-    """Sweeps every second from the worker's own timer, and stores that the worker lives."""
+    """Sweeps every second from the worker's own timer, and stores that the worker lives.
+
+    It ends the worker when stages wait and nobody runs one: then the worker no longer takes messages. The supervisor or the
+    container restarts it.
+    """
 
     requires = frozenset({"celery.worker.components:Timer"})
 
     def __init__(self, parent: Any, **options: Any) -> None:
         self.entry: Any = None
+        self._stall = StallWatch()
 
     def start(self, parent: Any) -> None:
         self.entry = parent.timer.call_repeatedly(SWEEP_SECONDS, self.sweep, (parent.hostname,))
@@ -76,13 +124,32 @@ class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
 
     def sweep(self, name: str) -> None:
         # The worker outlives a database that is away for a moment: the next sweep finds it again.
-        with contextlib.suppress(SQLAlchemyError):
+        try:
             with writing() as session:
                 job_life.worker_seen(session, name)
             queue.sweep()
+            with reading() as session:
+                stalled = self._stall.look(session)
+        except SQLAlchemyError:
+            self._stall.reset()
+            return
+        # At the very first start a process compiles its kernels before it takes a stage.
+        if any(process.is_starting for process in _all_processes):
+            self._stall.reset()
+            return
+        if stalled and not _drain.begun:
+            log.error("worker_stalled")
+            # The threads may wait for ever; the processes end with this one.
+            os._exit(STALLED_EXIT_CODE)
 
 
 @celeryd_init.connect
-def add_sweeper(instance: Any, **_: Any) -> None:
-    """Give the worker that starts a sweeper."""
-    instance.app.steps["worker"].add(Sweeper)
+def add_steps(instance: Any, **_: Any) -> None:
+    """Give the worker that starts its processes and a sweeper."""
+    instance.app.steps["worker"].update({Processes, Sweeper})
+
+
+@worker_shutting_down.connect
+def begin_drain(**_: Any) -> None:
+    """Take no new stage; the running ones get ``DRAIN_SECONDS``."""
+    _drain.begin()

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 import structlog
 from fastapi import Depends, FastAPI
-from fastapi.responses import JSONResponse
+from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
@@ -21,6 +21,7 @@ from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, pages, plugins, reasons
+from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
     activation_times,
     catheter_types,
@@ -91,6 +92,10 @@ def create_app() -> FastAPI:
     def openapi(caller: Reader) -> JSONResponse:
         return JSONResponse(document(app))
 
+    @app.get("/docs", include_in_schema=False)
+    def docs(caller: Reader) -> HTMLResponse:
+        return HTMLResponse(api_page(document(app)))
+
     app.add_middleware(BodyLimit)
     app.add_middleware(Doorkeeper)
     if settings().cors_origins:
@@ -139,6 +144,7 @@ async def _sweep() -> None:
     while True:
         try:
             await run_in_threadpool(queue.sweep)
+            await run_in_threadpool(health.watch_queue)
             failing = False
         except Exception as error:
             # The database may come back: log the first failure only.

@@ -87,9 +87,9 @@ class Client:
         """Return the sites of a study, then its pairs of runs without a name."""
         return self._all(f"/v1/studies/{study}/sites")
 
-    def complete_gantry(self, study: str, uid: str, gantry: Mapping[str, Any]) -> None:
-        """Set gantry values of a run."""
-        self._json("PATCH", f"/v1/studies/{study}/instances/{uid}", json={"gantry": gantry})
+    def complete_gantry(self, study: str, gantry: Mapping[str, Any]) -> None:
+        """Set gantry values for all runs of a study whose headers lack them."""
+        self._json("PATCH", f"/v1/studies/{study}", json={"gantry": gantry})
 
     def put_site(self, study: str, site: str, change: Mapping[str, Any]) -> None:
         """Set the activation time or the runs of a site."""

@@ -5,9 +5,24 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from fluoromap_service.parent_process import end_with_parent
 from fluoromap_service.settings import settings
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+SUPERVISOR = "FLUOROMAP_SUPERVISOR"
+"""Variable with the process id of the supervisor that started this program."""
+
+
+def end_with_supervisor() -> None:
+    """Let this process end when its supervisor has ended.
+
+    Without a supervisor do nothing.
+    """
+    supervisor = os.environ.pop(SUPERVISOR, None)
+    if supervisor is not None:
+        end_with_parent(int(supervisor))
 
 
 def limit_threads() -> None:

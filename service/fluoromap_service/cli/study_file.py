@@ -64,7 +64,7 @@ class StudyFile(BaseModel):
 
     @property
     def default_gantry(self) -> dict[str, Any]:
-        """The geometry of runs whose header lacks it, as ``PATCH`` of an instance takes it."""
+        """The geometry of runs whose header lacks it, as ``PATCH`` of the study takes it."""
         return self.gantry.model_dump(mode="json", exclude_none=True)
 
 

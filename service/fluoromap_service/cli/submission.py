@@ -175,15 +175,12 @@ def upload(client: Client, files: StudyFiles, label: str, progress: Progress) ->
 
 
 def _complete_geometry(client: Client, study: str, files: StudyFiles) -> None:
-    """Give each run the default geometry for the values that its header lacks."""
-    defaults = files.settings.default_gantry
-    for run in client.instances(study):
-        missing = {name: value for name, value in defaults.items() if run["gantry"][name] is None}
-        if missing:
-            try:
-                client.complete_gantry(study, run["sop_instance_uid"], missing)
-            except CommandFailed as failure:
-                raise CommandFailed(f"{files.folder / NAME}: gantry does not fit a run's header: {failure}") from None
+    """Give the study the default geometry, for the values that headers lack."""
+    if files.settings.default_gantry:
+        try:
+            client.complete_gantry(study, files.settings.default_gantry)
+        except CommandFailed as failure:
+            raise CommandFailed(f"{files.folder / NAME}: gantry does not fit a run's header: {failure}") from None
 
 
 def _bind_sites(client: Client, study: str, files: StudyFiles, uids: Mapping[Path, str]) -> None:

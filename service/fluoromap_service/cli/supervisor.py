@@ -19,16 +19,22 @@ from typing import IO
 
 import httpx
 
+from fluoromap_service.cli.environment import SUPERVISOR
 from fluoromap_service.cli.failures import CommandFailed
+from fluoromap_service.cli.folder_lock import only_one
 
 STOP_SECONDS = 30.0
 """Longest time that the children get to stop."""
 READY_SECONDS = 180.0
 """Longest time until the service must be ready. The first start compiles kernels."""
 LONGEST_BACKOFF_SECONDS = 30.0
-"""Longest wait before a worker that dies again and again is restarted."""
+"""Longest wait before a child that dies again and again is restarted."""
 STEADY_SECONDS = 60.0
-"""A worker that dies after this time is restarted at once."""
+"""A child that dies after this time is restarted at once. A younger one may be silent, because it still starts."""
+LOOK_SECONDS = 2.0
+"""Time between two looks at a running service."""
+SILENT_SECONDS = 30.0
+"""An API that gives no answer for this time hangs."""
 
 
 def program() -> str:
@@ -80,13 +86,15 @@ class _Child:
 
     def start(self) -> None:
         output: IO[bytes] | None = self.log.open("ab") if self.log else None
+        # The child ends with this process, even when this process is killed.
+        environment = self.environment | {SUPERVISOR: str(os.getpid())}
         # In a session of its own the child does not receive Ctrl-C. The supervisor receives it and stops the children in order.
         self.process = subprocess.Popen(
             [program(), *self.arguments],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,
-            env=self.environment,
+            env=environment,
             start_new_session=True,
         )
         if output is not None:
@@ -95,8 +103,34 @@ class _Child:
         self.restart_at = None
 
     @property
+    def name(self) -> str:
+        return self.arguments[0]
+
+    @property
     def alive(self) -> bool:
         return self.process.poll() is None
+
+    @property
+    def steady(self) -> bool:
+        return time.monotonic() - self.start_time > STEADY_SECONDS
+
+    def restart_when_dead(self) -> None:
+        """Start a dead child again.
+
+        It starts at once when it had lived long, else after a longer and longer time.
+        """
+        if self.alive:
+            return
+        now = time.monotonic()
+        if self.restart_at is None:
+            # The processes that a dead child left behind would work beside the new ones.
+            self.kill_group()
+            self.deaths = 1 if self.steady else self.deaths + 1
+            delay = 0.0 if self.deaths == 1 else min(2.0 ** (self.deaths - 2), LONGEST_BACKOFF_SECONDS)
+            self.restart_at = now + delay
+            print(f"fluoromap: the {self.name} died; starting it again in {delay:.0f} s", file=sys.stderr, flush=True)
+        if now >= self.restart_at:
+            self.start()
 
     def kill_group(self) -> None:
         with suppress(ProcessLookupError):
@@ -105,7 +139,7 @@ class _Child:
 
 
 class Supervisor:
-    """The parent of the API and the worker: it starts both, restarts a dead worker and stops both.
+    """The parent of the API and the worker: it starts both, restarts each when it dies or hangs, and stops both.
 
     Parameters
     ----------
@@ -122,6 +156,8 @@ class Supervisor:
         self._worker = _Child(["worker"], log_folder and log_folder / "worker.log", settings)
         self._api = _Child(["api"], log_folder and log_folder / "api.log", settings)
         self._log_folder = log_folder
+        self._was_ready = False
+        self._next_look = self._last_answer = 0.0
         # An IPv6 address has brackets in a URL.
         address = f"[{host}]" if ":" in host else host
         self.url = f"http://{address}:{port}"
@@ -150,37 +186,48 @@ class Supervisor:
                 self.check_children()
                 with suppress(httpx.HTTPError):
                     if client.get(f"{self.url}/v1/ready").status_code == 200:
+                        self._was_ready = True
                         return
                 time.sleep(0.1)
         if not (stop and stop.is_set()):
             raise CommandFailed(f"The service was not ready within {READY_SECONDS:.0f} s; {self._where_to_look()}.")
 
     def check_children(self) -> None:
-        """Check the children once and restart a dead worker.
-
-        A worker that dies again and again is restarted after a longer and longer time.
+        """Check the children once and restart a dead one.
 
         Raises
         ------
         CommandFailed
-            When the API has ended.
+            When the API ends before the service was ready: another start would end in the same way.
         """
-        if not self._api.alive:
+        if not self._was_ready and not self._api.alive:
             raise CommandFailed(f"The API ended unexpectedly; {self._where_to_look()}.")
-        worker = self._worker
-        if worker.alive:
-            return
+        for child in (self._api, self._worker):
+            child.restart_when_dead()
+
+    def check_service(self) -> None:
+        """Look at the running service every ``LOOK_SECONDS``, and kill a child that hangs.
+
+        The next :meth:`check_children` starts it again. A worker hangs when it gives no sign of life while the database answers.
+        A worker that lives and takes no stage ends itself.
+        """
         now = time.monotonic()
-        if worker.restart_at is None:
-            # The pool processes of a dead worker would compute beside the new worker.
-            worker.kill_group()
-            steady = now - worker.start_time > STEADY_SECONDS
-            worker.deaths = 1 if steady else worker.deaths + 1
-            delay = 0.0 if worker.deaths == 1 else min(2.0 ** (worker.deaths - 2), LONGEST_BACKOFF_SECONDS)
-            worker.restart_at = now + delay
-            print(f"fluoromap: the worker died; starting it again in {delay:.0f} s", file=sys.stderr, flush=True)
-        if now >= worker.restart_at:
-            worker.start()
+        if now < self._next_look:
+            return
+        self._next_look = now + LOOK_SECONDS
+        with httpx.Client(base_url=self.url, trust_env=False, timeout=5) as client, suppress(httpx.HTTPError):
+            client.get("/v1/health")
+            self._last_answer = time.monotonic()
+            checks = {check["name"]: check["ok"] for check in client.get("/v1/ready").json()["checks"]}
+            if checks["database"] and not checks["worker"]:
+                self._kill_hanging(self._worker)
+        if time.monotonic() - max(self._last_answer, self._api.start_time) > SILENT_SECONDS:
+            self._kill_hanging(self._api)
+
+    def _kill_hanging(self, child: _Child) -> None:
+        if child.steady and child.alive:
+            print(f"fluoromap: the {child.name} hangs; killing it", file=sys.stderr, flush=True)
+            child.kill_group()
 
     def stop(self) -> None:
         """Ask both children to stop, wait up to STOP_SECONDS, then kill them."""
@@ -221,6 +268,7 @@ def run_until_stopped(supervisor: Supervisor, stop: threading.Event, on_ready: C
             on_ready()
         while not stop.wait(0.2):
             supervisor.check_children()
+            supervisor.check_service()
     finally:
         supervisor.stop()
 
@@ -253,9 +301,13 @@ def private_service(data_dir: Path) -> Iterator[str]:
     Raises
     ------
     CommandFailed
-        When the database cannot be made or the service is not ready in time.
+        When another service runs on the folder, the database cannot be made or the service is not ready in time.
     """
-    data_dir.mkdir(parents=True, exist_ok=True)
+    with only_one(data_dir):
+        yield from _served(data_dir)
+
+
+def _served(data_dir: Path) -> Iterator[str]:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
     environment["FLUOROMAP_DATA_DIR"] = str(data_dir.resolve())
     migration = subprocess.run(
@@ -284,7 +336,5 @@ def private_service(data_dir: Path) -> Iterator[str]:
 
 
 def _watch(supervisor: Supervisor, stop: threading.Event) -> None:
-    # A client of a dead API fails by its own connection error.
-    with suppress(CommandFailed):
-        while not stop.wait(0.2):
-            supervisor.check_children()
+    while not stop.wait(0.2):
+        supervisor.check_children()

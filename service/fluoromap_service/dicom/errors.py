@@ -25,7 +25,7 @@ class DicomCode(StrEnum):
     PIXEL_DATA_MISMATCH = "pixel_data_mismatch"
     """Pixel data is whole but contradicts NumberOfFrames, Rows, Columns or BitsAllocated (400)."""
     HEADER_TOO_LARGE = "header_too_large"
-    """The attributes before the pixel data exceed every sensible size (413)."""
+    """The attributes before the pixel data, or an inflated data set, exceed every sensible size (413)."""
     FRAME_TOO_LARGE = "frame_too_large"
     """Rows or Columns exceed 8192 (413)."""
     TOO_MANY_FRAMES = "too_many_frames"

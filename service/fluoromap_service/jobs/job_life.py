@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, or_, select, update
+from sqlalchemy import Row, func, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
@@ -31,6 +31,10 @@ from fluoromap_service.store.models import (
 from fluoromap_service.study.snapshot import Snapshot
 
 LONGEST_REPUBLISH_SECONDS = 60.0
+WORKER_SECONDS = 30.0
+"""A worker that is silent for longer counts as dead."""
+CLOCK_TOLERANCE_SECONDS = 1.0
+"""A stored time that lies further in the future comes from before the clock was set back."""
 _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
@@ -95,6 +99,8 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
         StageRow.published.is_(None),
         StageRow.published < db_now() - StageRow.publications * wait,
         StageRow.published < db_now() - LONGEST_REPUBLISH_SECONDS,
+        # Somebody has set the clock back.
+        StageRow.published > db_now() + CLOCK_TOLERANCE_SECONDS,
     )
     query = select(StageRow.id).where(StageRow.state == StageState.READY, due).order_by(StageRow.id).limit(limit)
     ids = list(session.scalars(query.with_for_update(skip_locked=True)))
@@ -171,8 +177,12 @@ def beat(session: Session, held: Claim, progress: float) -> Literal["alive", "ca
     if alive is None:
         return "lost"
     _report_stage(session, held.job_id, alive)
-    cancelled = session.scalar(select(Job.cancel_requested).where(Job.id == held.job_id))
-    return "cancelled" if cancelled else "alive"
+    return "cancelled" if cancel_requested(session, held.job_id) else "alive"
+
+
+def cancel_requested(session: Session, job_id: str) -> bool:
+    """Return whether somebody asked the job to stop."""
+    return bool(session.scalar(select(Job.cancel_requested).where(Job.id == job_id)))
 
 
 def finish(session: Session, held: Claim, result: StoredResult, *, reused: bool) -> bool:
@@ -218,12 +228,30 @@ def cancel(session: Session, job_id: str) -> bool:
     return True
 
 
+def give_back(session: Session, held: Claim) -> None:
+    """Free a stage whose process has died or must end.
+
+    :func:`reap` does the same after the end of a lease.
+    """
+    job = _lock(session, held.job_id)
+    stage = session.scalar(select(StageRow).where(*_held(held)))
+    if stage is not None:
+        _free(session, job, stage)
+
+
 def reap(session: Session) -> int:
     """Free the stages whose workers fell silent and return how many.
 
     This is the retry after a crash. A stage whose worker crashed becomes ready, so that a worker can try again. It fails after
     its last attempt. It is cancelled when somebody has cancelled the job.
     """
+    longest = db_now() + settings().lease_seconds
+    # Such a lease was given before the clock was set back. A worker that lives extends it again.
+    session.execute(
+        update(StageRow)
+        .where(StageRow.state == StageState.RUNNING, StageRow.lease_until > longest + CLOCK_TOLERANCE_SECONDS)
+        .values(lease_until=longest)
+    )
     expired = session.execute(
         select(StageRow.id, StageRow.job_id)
         .where(StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now())
@@ -235,29 +263,35 @@ def reap(session: Session) -> int:
         if free is None:
             continue
         job = _lock(session, job_id)
-        stage = session.get_one(StageRow, stage_id, populate_existing=True)
-        still_silent = session.scalar(
-            select(StageRow.id).where(
-                StageRow.id == stage_id, StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now()
-            )
+        stage = session.scalar(
+            select(StageRow)
+            .where(StageRow.id == stage_id, StageRow.state == StageState.RUNNING, StageRow.lease_until < db_now())
+            .execution_options(populate_existing=True)
         )
-        if still_silent is None:
-            continue
-        if job.cancel_requested:
-            stage.state = StageState.CANCELLED
-        elif stage.attempt >= settings().max_attempts:
-            stage.state = StageState.FAILED
-            stage.error = {
-                "code": "worker_lost",
-                "detail": f"This stage began {stage.attempt} times and never ended: the worker died, ran out of time or could not "
-                "store the result. Look at the worker's log, memory and disk, then start a new job.",
-            }
-        else:
-            stage.state = StageState.READY
-        stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
-        _report_stage(session, job_id, stage)
-        _settle(session, job)
+        if stage is not None:
+            _free(session, job, stage)
     return len(expired)
+
+
+def _free(session: Session, job: Job, stage: StageRow) -> None:
+    """End an attempt that gave no result.
+
+    The stage is ready for another attempt, cancelled, or failed after the last one.
+    """
+    if job.cancel_requested:
+        stage.state = StageState.CANCELLED
+    elif stage.attempt >= settings().max_attempts:
+        stage.state = StageState.FAILED
+        stage.error = {
+            "code": "worker_lost",
+            "detail": f"This stage began {stage.attempt} times and never ended: the worker died, ran out of memory or could not "
+            "store the result. Look at the worker's log, memory and disk, then start a new job.",
+        }
+    else:
+        stage.state = StageState.READY
+    stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
+    _report_stage(session, job.id, stage)
+    _settle(session, job)
 
 
 def worker_seen(session: Session, name: str) -> None:
@@ -268,6 +302,17 @@ def worker_seen(session: Session, name: str) -> None:
         session.add(WorkerSeen(name=name, seen=now))
     else:
         row.seen = now
+
+
+def living_workers(session: Session, name: str | None = None) -> int:
+    """Return how many workers gave a recent sign of life.
+
+    Recent means within ``WORKER_SECONDS``. With ``name`` only the worker of that name counts.
+    """
+    # A time in the future comes from before the clock was set back.
+    alive = WorkerSeen.seen.between(db_now() - WORKER_SECONDS, db_now() + WORKER_SECONDS)
+    query = select(func.count()).select_from(WorkerSeen).where(alive)
+    return session.scalar(query if name is None else query.where(WorkerSeen.name == name)) or 0
 
 
 def _held(held: Claim) -> tuple[Any, ...]:

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from fluoromap import matching
 from fluoromap.contracts import Matching, Segmentation, Triangulation
-from fluoromap.registry import Kind
+from fluoromap.registry import Kind, plugin
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks
 from fluoromap_service.study.snapshot import PluginSnapshot, Snapshot
 
@@ -64,8 +64,19 @@ def plugin_of(stage: Stage, snapshot: Snapshot) -> PluginSnapshot:
     """Return the plugin that computes a stage of a job, with its version and parameters."""
     if stage.kind is None:
         return PluginSnapshot(name="fluoromap", version=matching.VERSION, params={})
-    plugin: PluginSnapshot = getattr(snapshot, stage.kind)
-    return plugin
+    frozen: PluginSnapshot = getattr(snapshot, stage.kind)
+    return frozen
+
+
+def installed_version(stage: Stage, name: str) -> str | None:
+    """Return the version of a stage's plugin that this process would run.
+
+    Raises
+    ------
+    UnknownPlugin
+        When it is not installed, or does not load.
+    """
+    return matching.VERSION if stage.kind is None else plugin(stage.kind, name).version
 
 
 def subjects_of(stage: Stage, snapshot: Snapshot) -> list[str]:

@@ -19,6 +19,9 @@ RUN_STAGE = "fluoromap.run_stage"
 STAYS_SECONDS = 10
 """How long a worker takes stages of one job before it takes those of others."""
 
+DRAIN_SECONDS = 20
+"""How long a worker that must end waits for its running stages before it gives them back."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -52,17 +55,14 @@ def celery_app() -> Celery:
         task_acks_late=False,
         task_serializer="json",
         accept_content=["json"],
-        # A worker may begin its last stage of a job at the end of this time.
-        task_time_limit=configured.stage_seconds + STAYS_SECONDS,
         worker_prefetch_multiplier=1,
-        # A child that replaces a dead one compiles its kernels first. Celery's default would kill it after 4 s, again and again.
-        worker_proc_alive_timeout=180,
+        # Each thread runs its stages in a process of its own.
+        worker_pool="threads",
         worker_concurrency=configured.workers,
-        worker_max_memory_per_child=configured.worker_memory_mib * 1024 // 2,
+        worker_consumer="fluoromap_workers.message_consumer:MessageConsumer",
         worker_send_task_events=False,
         worker_hijack_root_logger=False,
         worker_redirect_stdouts=False,
-        worker_soft_shutdown_timeout=20,
         broker_connection_retry_on_startup=True,
         broker_transport_options=_transport_options(url),
     )

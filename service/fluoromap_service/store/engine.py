@@ -55,11 +55,6 @@ def engine() -> Engine:
     return _engine(settings().effective_database_url)
 
 
-def forget_connections() -> None:
-    """Drop the connections that a fork inherited; the parent's side stays open."""
-    engine().dispose(close=False)
-
-
 @contextmanager
 def reading() -> Iterator[Session]:
     """Open a transaction that only reads.

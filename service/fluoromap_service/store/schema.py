@@ -9,8 +9,11 @@ from contextlib import contextmanager
 
 from alembic import command
 from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, text
 
+from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import engine
 
@@ -38,8 +41,33 @@ def upgrade() -> None:
     """
     config = configuration()
     with _alone() as connection:
+        _refuse_newer(connection, config)
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
+
+
+def check() -> None:
+    """Check that the database has the tables of this version.
+
+    Raises
+    ------
+    Problem
+        503 ``schema_newer`` or ``schema_outdated``; the sentence says what to do.
+    """
+    config = configuration()
+    with engine().connect() as connection:
+        _refuse_newer(connection, config)
+        current = set(MigrationContext.configure(connection).get_current_heads())
+    if current != set(ScriptDirectory.from_config(config).get_heads()):
+        detail = "The database lacks the tables of this version; run 'fluoromap db upgrade' first."
+        raise Problem(503, "schema_outdated", detail)
+
+
+def _refuse_newer(connection: Connection, config: Config) -> None:
+    known = {revision.revision for revision in ScriptDirectory.from_config(config).walk_revisions()}
+    if not set(MigrationContext.configure(connection).get_current_heads()) <= known:
+        detail = "A newer version of fluoromap made this database; install that version, or restore an older backup."
+        raise Problem(503, "schema_newer", detail)
 
 
 @contextmanager

@@ -39,6 +39,15 @@ GANTRY_KEYWORDS = {
 """Gantry fields and their DICOM keywords."""
 
 
+DISTANCES = ("source_detector_mm", "source_isocentre_mm")
+
+
+def is_behind_detector(gantry: dict[str, Any]) -> bool:
+    """Return whether gantry values put the isocentre on or behind the detector."""
+    detector, isocentre = (gantry.get(field) for field in DISTANCES)
+    return detector is not None and isocentre is not None and isocentre >= detector
+
+
 @dataclass(frozen=True, eq=False)
 class StudyRun:
     """One run of a study: the study's reference to it, the instance, its facts, and the study's own gantry values."""
@@ -55,17 +64,21 @@ class StudyRun:
 
     @property
     def gantry(self) -> dict[str, Any]:
-        """Effective gantry values: the run's own, else the header's, else the study's; None where unknown."""
+        """Effective gantry values: the run's own, else the header's, else the study's; None where unknown.
+
+        The study's distances do not count for a run whose isocentre they would put behind the detector.
+        """
+        values = self.gantry_with(self.defaults)
+        if not is_behind_detector(values):
+            return values
+        return self.gantry_with({field: value for field, value in self.defaults.items() if field not in DISTANCES})
+
+    def gantry_with(self, defaults: dict[str, Any]) -> dict[str, Any]:
+        """Return the gantry values with these defaults for the values that the run lacks."""
         header = {field: getattr(self.facts, field) for field in GANTRY_KEYWORDS}
+        sources = (self.link.gantry, header, defaults)
         return {
-            field: next(
-                (
-                    source[field]
-                    for source in (self.link.gantry, header, self.defaults)
-                    if source.get(field) is not None
-                ),
-                None,
-            )
+            field: next((source[field] for source in sources if source.get(field) is not None), None)
             for field in GANTRY_KEYWORDS
         }
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import pytest
 from program import Program, one_sentence
+
+from fluoromap_service.jobs import job_life
+from fluoromap_service.store.engine import writing
 
 
 def test_token_is_shown_once_and_never_listed(fluoromap: Program) -> None:
@@ -77,3 +81,16 @@ def test_plugins_are_listed(fluoromap: Program) -> None:
     assert answer.returncode == 0
     for name in ("four-step", "maximum-likelihood", "motion-prior", "convex-hull"):
         assert name in answer.stdout
+
+
+@pytest.mark.parametrize("command", ["api", "worker"])
+def test_no_service_without_tables(fluoromap: Program, command: str) -> None:
+    assert "db upgrade" in one_sentence(fluoromap(command))
+
+
+def test_worker_check_fails_without_a_sign_of_life(fluoromap: Program) -> None:
+    assert fluoromap("db", "upgrade").returncode == 0
+    assert "sign of life" in one_sentence(fluoromap("worker", "--check"))
+    with writing() as session:
+        job_life.worker_seen(session, f"fluoromap@{socket.gethostname()}")
+    assert fluoromap("worker", "--check").returncode == 0

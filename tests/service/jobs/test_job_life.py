@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select, update
 
-from fluoromap_service.jobs import job_life
+from fluoromap_service.jobs import job_life, stall
 from fluoromap_service.settings import settings
 from fluoromap_service.store import files
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import engine, reading, writing
-from fluoromap_service.store.models import Base, Event, Job, JobState, StageRow, StageState, Study
+from fluoromap_service.store.models import Base, Event, Job, JobState, StageRow, StageState, Study, WorkerSeen
 from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
     GantrySnapshot,
@@ -283,3 +283,87 @@ def test_every_change_is_an_event_in_order(job: str) -> None:
     assert len(stages) == len(_stage_ids(job))
     for states in stages.values():
         assert [state for state, _ in itertools.groupby(states)][-2:] == ["running", "done"]
+
+
+def _move_clock_back(seconds: float) -> None:
+    """Move all stored times of the queue into the future.
+
+    The effect is the same as when somebody sets the database's clock back.
+    """
+    with writing() as session:
+        session.execute(
+            update(StageRow).values(lease_until=StageRow.lease_until + seconds, published=StageRow.published + seconds)
+        )
+
+
+def test_a_dead_workers_stage_is_freed_although_the_clock_was_set_back(job: str) -> None:
+    stage = _stage_ids(job, "segment")[0]
+    held = _claim(stage)
+    assert held is not None
+    _move_clock_back(3600)
+    with writing() as session:
+        assert job_life.reap(session) == 0
+    with reading() as session:
+        lease = session.get_one(StageRow, stage).lease_until
+        now = session.scalar(select(db_now()))
+    assert lease is not None
+    assert now is not None
+    assert lease <= now + settings().lease_seconds
+    # The worker lives and keeps its claim.
+    with writing() as session:
+        assert job_life.beat(session, held, 0.5) == "alive"
+    _silence(stage)
+    with writing() as session:
+        assert job_life.reap(session) == 1
+
+
+def test_a_lost_announcement_is_repeated_although_the_clock_was_set_back(job: str) -> None:
+    with writing() as session:
+        assert job_life.take_due(session)
+    _move_clock_back(3600)
+    with writing() as session:
+        assert sorted(job_life.take_due(session)) == _stage_ids(job, "segment")
+
+
+def test_a_stage_that_is_given_back_is_ready_at_once(job: str) -> None:
+    stage = _stage_ids(job, "segment")[0]
+    held = _claim(stage)
+    assert held is not None
+    with writing() as session:
+        job_life.give_back(session, held)
+    assert stage in _stage_ids(job, "segment", StageState.READY)
+    # A claim that was lost gives nothing back.
+    assert _claim(stage) is not None
+    with writing() as session:
+        job_life.give_back(session, held)
+    assert stage in _stage_ids(job, "segment", StageState.RUNNING)
+
+
+def test_a_worker_lives_while_it_gives_signs_of_life(job: str) -> None:
+    with writing() as session:
+        job_life.worker_seen(session, "first")
+        assert (job_life.living_workers(session), job_life.living_workers(session, "second")) == (1, 0)
+    for seconds in (-3600, 3600):
+        with writing() as session:
+            session.execute(update(WorkerSeen).values(seen=db_now() + seconds))
+            assert job_life.living_workers(session) == 0
+
+
+def test_ready_stages_that_nobody_runs_are_a_stall(job: str) -> None:
+    clock = itertools.count(0.0, 15.0)
+    watch = stall.StallWatch(clock.__next__)
+    assert stall.stall_seconds() == 20
+
+    def look() -> bool:
+        with reading() as session:
+            return watch.look(session)
+
+    assert [look() for _ in range(3)] == [False, False, True]
+    held = _claim(_stage_ids(job, "segment")[0])
+    assert [look(), look()] == [False, False]
+    assert held is not None
+    with writing() as session:
+        job_life.beat(session, held, 0.5)
+    assert [look(), look()] == [False, False]
+    watch.reset()
+    assert [look(), look()] == [False, True]

@@ -14,6 +14,7 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, select, text
 
+from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import engine as store_engine
 from fluoromap_service.store import schema
@@ -97,3 +98,16 @@ def test_rows_of_the_first_schema_stay(database: str) -> None:
         assert session.get_one(File, "f" * 64)
         assert session.scalars(select(StudyInstance.sop_instance_uid)).all() == ["1.2.3"]
         assert session.scalars(select(Correction.frame)).all() == [4]
+
+
+@pytest.mark.usefixtures("database")
+def test_missing_and_newer_tables_are_refused_in_a_sentence() -> None:
+    with pytest.raises(Problem, match="db upgrade"):
+        schema.check()
+    schema.upgrade()
+    schema.check()
+    with engine().begin() as connection:
+        connection.execution_options(writes=True).execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    for refuse in (schema.check, schema.upgrade):
+        with pytest.raises(Problem, match="newer version"):
+            refuse()

@@ -10,7 +10,8 @@ from typing import Any
 from fastapi import Request, Response
 
 MEDIA_TYPE = "text/csv"
-_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+"""Beginnings of a formula by OWASP's list, full-width signs too."""
 
 
 def wants_csv(request: Request) -> bool:

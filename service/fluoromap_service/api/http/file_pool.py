@@ -6,6 +6,7 @@ A decoder may crash, hang or take too much memory. Then only one process of this
 from __future__ import annotations
 
 import multiprocessing
+import os
 import resource
 import threading
 from collections.abc import Callable
@@ -92,7 +93,7 @@ def _running() -> ProcessPoolExecutor:
             # Not a plain fork: the API has threads, and a child would inherit their locks locked.
             context = multiprocessing.get_context("forkserver")
             context.set_forkserver_preload(list(_PRELOADED))
-            fresh = ProcessPoolExecutor(PROCESSES, context, _limit_memory, (settings().worker_memory_mib,))
+            fresh = ProcessPoolExecutor(PROCESSES, context, _prepare_process, (settings().worker_memory_mib,))
             # Imports take seconds on a busy machine; the time limit of the first request begins after them.
             try:
                 fresh.submit(_do_nothing).result(START_SECONDS)
@@ -124,6 +125,19 @@ def _kill(pool: ProcessPoolExecutor) -> None:
     for process in list((pool._processes or {}).values()):
         process.kill()
     pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _prepare_process(mib: int) -> None:
+    _limit_memory(mib)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when the service has ended, however it ended."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _limit_memory(mib: int) -> None:

@@ -10,7 +10,8 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
-from sqlalchemy.exc import DataError
+from sqlalchemy.exc import DataError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from fluoromap_service.problem import Problem
@@ -76,6 +77,24 @@ _CODES = {
 """Codes of errors that the framework raises."""
 
 
+DATABASE_AWAY = (OperationalError, InterfaceError, PoolTimeout)
+"""The errors of a database that cannot be reached, is locked, or has no free connection."""
+
+DATABASE_RETRY_SECONDS = 5
+
+
+def database_away(error: Exception) -> Problem:
+    """Return the 503 for a database that gave no answer.
+
+    Log one line, without the address of the database.
+    """
+    log.warning("database_unavailable", error=type(error).__name__)
+    return Problem(
+        503, "database_unavailable", "The database does not answer or is locked; nothing was changed. Send the request again.",
+        headers={"Retry-After": str(DATABASE_RETRY_SECONDS)},
+    )  # fmt: skip
+
+
 def install(app: FastAPI) -> None:
     """Make every error of the application a problem document."""
 
@@ -113,6 +132,12 @@ def install(app: FastAPI) -> None:
     async def value_out_of_range(request: Request, error: DataError) -> JSONResponse:
         detail = "The request contains a NUL character or a number out of range; remove it."
         return answer(Problem(422, "invalid", detail))
+
+    async def unavailable(request: Request, error: Exception) -> JSONResponse:
+        return answer(database_away(error))
+
+    for kind in DATABASE_AWAY:
+        app.add_exception_handler(kind, unavailable)
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:

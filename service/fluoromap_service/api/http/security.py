@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from fluoromap_service import auth
-from fluoromap_service.api.http.problems import answer
+from fluoromap_service.api.http.problems import DATABASE_AWAY, answer, database_away
 from fluoromap_service.api.http.session import session_token
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
@@ -52,6 +52,9 @@ class Doorkeeper:
                 await RedirectResponse(SIGN_IN, 303)(scope, receive, send)
                 return
             await answer(problem)(scope, receive, send)
+            return
+        except DATABASE_AWAY as error:
+            await answer(database_away(error))(scope, receive, send)
             return
         scope.setdefault("state", {})["caller"] = caller
         await self._app(scope, receive, send)

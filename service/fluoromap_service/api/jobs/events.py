@@ -11,8 +11,9 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
 
+from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.paths import JobId
-from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.problems import DATABASE_AWAY, responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of
@@ -67,18 +68,22 @@ async def follow_job(
     """Send the events `job` (state, error) and `stage` (name, subject, state, attempt, progress, reused).
 
     The stream begins with the first event of the job, or after `Last-Event-ID`. Comments keep the connection open. The stream
-    ends after the job.
+    ends after the job. It ends earlier when the service ends; then connect again with `Last-Event-ID`.
     """
     sent: set[int] = set()
     newest = after
     while True:
-        ended, found = await run_in_threadpool(_new_events, job_id, max(after, newest - OVERLAP))
+        try:
+            ended, found = await run_in_threadpool(_new_events, job_id, max(after, newest - OVERLAP))
+        except DATABASE_AWAY:
+            # The status is sent already. The stream goes on when the database is back.
+            ended, found = False, []
         for event in found:
             if event.id not in sent:
                 sent.add(event.id)
                 newest = max(newest, event.id)
                 yield ServerSentEvent(data=event.data, event=event.kind, id=str(event.id))
-        if ended:
+        if ended or stopping.begun():
             return
         await asyncio.sleep(POLL_SECONDS)
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
+from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import Page, Pages
@@ -132,7 +133,7 @@ async def get_job(
     state, etag = first_state, _ = await run_in_threadpool(_state, job_id)
     conditional = "if-none-match" in request.headers
     end = time.monotonic() + wait
-    while state not in ENDED_JOB and time.monotonic() < end:
+    while state not in ENDED_JOB and time.monotonic() < end and not stopping.begun():
         if (not is_known(request, etag)) if conditional else (state != first_state):
             break
         await asyncio.sleep(min(POLL_SECONDS, max(end - time.monotonic(), 0.0)))

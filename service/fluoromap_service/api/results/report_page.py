@@ -44,6 +44,7 @@ from fluoromap_service.results.origins import Origin
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
+from fluoromap_service.study.snapshot import SiteSnapshot
 
 WEB = Path(__file__).parents[2] / "web"
 BINDINGS = {
@@ -51,6 +52,7 @@ BINDINGS = {
     "csv": "named in the table of activation times",
     "upload": "named at the upload",
     "order": "row order: a guess until somebody confirms it",
+    "confirmed": "row order, confirmed by a person after the job",
 }
 """Rule that bound a site's runs -> its words in the report."""
 JPEG_QUALITY = 88
@@ -89,6 +91,7 @@ def _values(job_id: str) -> dict[str, Any]:
         points = points_of(session, job, Origin.REFERENCE) if triangulation else []
         tracked = triangulation is not None and _all_tracked(session, job_id)
         study = session.get(Study, job.study_id)
+        guessed = sites_by_row_order(session, job)
         rows = tips(points, snapshot.mapping, chamber)
         electrode_rows = electrodes(points)
         track_rows = tracks(read_tracks(session, job, Origin.REFERENCE), snapshot.mapping) if tracked else []
@@ -109,12 +112,16 @@ def _values(job_id: str) -> dict[str, Any]:
             "budget": budget_rows(triangulation.budget) if triangulation else [],
             "calibration": calibration_line(triangulation.calibration) if triangulation else None,
             "notes": triangulation.notes if triangulation else (),
-            "bindings": [(site.site, BINDINGS[site.bound_by]) for site in snapshot.sites],
-            "guessed": sites_by_row_order(session, job),
+            "bindings": [(site.site, BINDINGS[_rule(site, guessed)]) for site in snapshot.sites],
+            "guessed": guessed,
             "plugins": [(kind, getattr(snapshot, kind)) for kind in get_args(Kind)],
             "catheters": snapshot.catheters,
             "runs": sorted(snapshot.runs.items()),
         }
+
+
+def _rule(site: SiteSnapshot, guessed: tuple[str, ...]) -> str:
+    return "confirmed" if site.bound_by == "order" and site.site not in guessed else site.bound_by
 
 
 def _all_tracked(session: Session, job_id: str) -> bool:

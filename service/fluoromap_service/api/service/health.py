@@ -8,21 +8,23 @@ from typing import Literal
 import structlog
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import func, select
+from sqlalchemy import select
 
-from fluoromap_service.jobs import queue
+from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.jobs.stall import StallWatch, stall_seconds
 from fluoromap_service.settings import settings
 from fluoromap_service.store import files
-from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import Job, WorkerSeen
+from fluoromap_service.store.models import Job
 
 router = APIRouter(tags=["service"])
 
-WORKER_SECONDS = 30.0
-"""A worker that is silent for longer counts as dead."""
+_stall = StallWatch()
 
 log = structlog.get_logger(__name__)
+
+
+CheckName = Literal["database", "broker", "files", "worker", "queue"]
 
 
 class Health(BaseModel):
@@ -34,7 +36,7 @@ class Health(BaseModel):
 class Check(BaseModel):
     """One part that the service needs."""
 
-    name: Literal["database", "broker", "files", "worker"]
+    name: CheckName
     ok: bool
     detail: str = Field(description="The next step when it is not ok.")
 
@@ -73,13 +75,26 @@ def _worker() -> str:
     if settings().eager:
         return ""
     with reading() as session:
-        alive = session.scalar(
-            select(func.count()).select_from(WorkerSeen).where(WorkerSeen.seen > db_now() - WORKER_SECONDS)
-        )
+        alive = job_life.living_workers(session)
     return "" if alive else "No worker gave a sign of life in the last 30 s; start one with 'fluoromap worker'."
 
 
-_CHECKS: dict[Literal["database", "broker", "files", "worker"], tuple[Callable[[], str], str]] = {
+def watch_queue() -> bool:
+    """Look at the queue, and return whether stages wait that nobody runs.
+
+    The service calls it every second, so that the answer does not depend on how often somebody asks.
+    """
+    with reading() as session:
+        return _stall.look(session)
+
+
+def _queue() -> str:
+    if settings().eager or not watch_queue():
+        return ""
+    return f"Stages are ready, and for {stall_seconds():.0f} s no stage began or ran; start the workers again."
+
+
+_CHECKS: dict[CheckName, tuple[Callable[[], str], str]] = {
     "database": (
         _database,
         "The database does not answer or lacks its tables; check its URL, run 'fluoromap db upgrade'.",
@@ -87,6 +102,7 @@ _CHECKS: dict[Literal["database", "broker", "files", "worker"], tuple[Callable[[
     "broker": (_broker, "The message broker does not answer; check its URL."),
     "files": (_files, "The files cannot be written; check the data folder's permissions and free space."),
     "worker": (_worker, "The state of the workers is unknown while the database does not answer; see its check."),
+    "queue": (_queue, "The state of the queue is unknown while the database does not answer; see its check."),
 }
 
 
@@ -106,7 +122,10 @@ async def health() -> Health:
     responses={503: {"model": Readiness, "description": "A part is missing; the checks name it."}},
 )
 def ready(response: Response) -> Readiness:
-    """Report whether database, broker, files and a worker are ready; open to all."""
+    """Report whether database, broker, files, a worker and the queue are ready.
+
+    It is open to all.
+    """
     checks = []
     for name, (check, failure) in _CHECKS.items():
         try:

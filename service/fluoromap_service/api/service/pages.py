@@ -82,12 +82,6 @@ def get_study_page(study_id: str, request: Request, caller: Reader) -> Response:
     return _send(request, "study.html")
 
 
-@router.get("/docs")
-def get_docs_page(request: Request, caller: Reader) -> Response:
-    """Return the page of the API."""
-    return _send(request, "docs.html")
-
-
 @router.get(SIGN_IN)
 def get_sign_in_page(request: Request) -> Response:
     """Return the page that asks for a token."""

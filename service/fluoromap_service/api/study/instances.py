@@ -18,7 +18,7 @@ from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
-from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_run_gantry
+from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
 from fluoromap_service.api.study.uploads import Part, receive
 from fluoromap_service.dicom import InstanceFacts, read_instance
 from fluoromap_service.problem import Problem
@@ -243,7 +243,7 @@ def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, ca
             sites.move_run(session, study, run, body.site)
         if "gantry" in body.model_fields_set:
             run.link.gantry = changed_gantry(run.link.gantry, body.gantry)
-            check_run_gantry(run)
+            check_gantry(run.gantry_with({}))
         session.flush()
         return _one(session, study, uid)
 

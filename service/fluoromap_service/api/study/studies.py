@@ -15,7 +15,7 @@ from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339
 from fluoromap_service.api.study.catheters import MOST_CATHETERS, CatheterIn, Line
-from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry, check_run_gantry
+from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
@@ -145,7 +145,7 @@ def change_study(study_id: StudyId, body: StudyPatch, caller: Writer) -> StudyOu
             session.flush()
             check_gantry(study.gantry)
             for run in runs_of(session, study_id):
-                check_run_gantry(run)
+                check_gantry(run.gantry_with(study.gantry))
         session.flush()
         session.refresh(study)
         return _shape(study)

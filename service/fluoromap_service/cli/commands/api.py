@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from types import FrameType
+
 import typer
 import uvicorn
 
 from fluoromap_service import auth, logs
 from fluoromap_service.api.app import create_app
+from fluoromap_service.api.http import stopping
 from fluoromap_service.cli.database_failures import explain_database_failures
-from fluoromap_service.cli.environment import apply_options, keep_compiled_kernels
+from fluoromap_service.cli.environment import apply_options, end_with_supervisor, keep_compiled_kernels
+from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir, Host, Port
 from fluoromap_service.settings import settings
+from fluoromap_service.store import schema
 
 STOP_SECONDS = 5
-"""Time that open requests get at the end. An event stream never ends by itself."""
+"""Time that open requests get at the end."""
 
 app = typer.Typer(add_completion=False)
 
@@ -21,16 +27,35 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     """Run the API alone."""
+    end_with_supervisor()
     apply_options(host, port, data_dir)
     keep_compiled_kernels()
     logs.configure()
     with explain_database_failures():
+        schema.check()
         auth.check_may_start(settings().host)
-    uvicorn.run(
-        create_app(),
+    service = create_app()
+    config = uvicorn.Config(
+        service,
         host=settings().host,
         port=settings().port,
         log_level="warning",
         server_header=False,
         timeout_graceful_shutdown=STOP_SECONDS,
     )
+    server = _Server(config)
+    # Ctrl-C is the usual end.
+    with suppress(KeyboardInterrupt):
+        server.run()
+    if not server.started:
+        raise CommandFailed(
+            f"The API cannot listen on {settings().host} port {settings().port}; read its message above."
+        )
+
+
+class _Server(uvicorn.Server):
+    """A server that ends the answers which wait for a job as soon as it is asked to stop."""
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        stopping.begin()
+        super().handle_exit(sig, frame)

@@ -9,6 +9,7 @@ import typer
 from fluoromap_service import auth
 from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options
+from fluoromap_service.cli.folder_lock import only_one
 from fluoromap_service.cli.options import DataDir, Host, Port
 from fluoromap_service.cli.supervisor import Supervisor, check_port, run_until_stopped, stop_on_signals
 from fluoromap_service.settings import settings
@@ -21,19 +22,20 @@ app = typer.Typer(add_completion=False)
 def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     """Run the API and a worker.
 
-    By default they use SQLite and files, no server. A worker that dies is started again.
+    By default they use SQLite and files, no server. A part that dies or hangs is started again.
     """
     apply_options(host, port, data_dir)
     host, port = settings().host, settings().port
-    with explain_database_failures():
-        schema.upgrade()
-        auth.check_may_start(host)
-        has_token = auth.any_token()
-    check_port(host, port)
-    supervisor = Supervisor(host, port, os.environ)
-    typer.echo(f"fluoromap: starting with the data in {settings().data_dir}")
-    if not has_token:
-        typer.echo("fluoromap: open to every user of this machine, because no access token exists yet")
-    run_until_stopped(
-        supervisor, stop_on_signals(), lambda: typer.echo(f"fluoromap: ready at {supervisor.url}; Ctrl-C ends it")
-    )
+    with only_one(settings().data_dir):
+        with explain_database_failures():
+            schema.upgrade()
+            auth.check_may_start(host)
+            has_token = auth.any_token()
+        check_port(host, port)
+        supervisor = Supervisor(host, port, os.environ)
+        typer.echo(f"fluoromap: starting with the data in {settings().data_dir}")
+        if not has_token:
+            typer.echo("fluoromap: open to every user of this machine, because no access token exists yet")
+        run_until_stopped(
+            supervisor, stop_on_signals(), lambda: typer.echo(f"fluoromap: ready at {supervisor.url}; Ctrl-C ends it")
+        )

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from finished_study import FinishedStudy
+from sqlalchemy.exc import OperationalError
 
+from fluoromap_service.api.http import stopping
 from fluoromap_service.api.jobs import events as event_routes
 
 
@@ -90,6 +92,33 @@ def test_what_is_committed_late_is_not_lost(
     expected = {event["id"] for event in _stream(client, study)}
     monkeypatch.setattr(event_routes, "_new_events", delayed)
     assert {event["id"] for event in _stream(client, study)} == expected
+
+
+def test_the_stream_outlives_a_database_that_is_away_for_a_moment(
+    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study.finish()
+    expected = _stream(client, study)
+    news = event_routes._new_events
+    looks: list[int] = []
+
+    def away(job_id: str, after: int) -> Any:
+        looks.append(after)
+        if len(looks) < 3:
+            raise OperationalError("SELECT", {}, Exception("the connection is closed"))
+        return news(job_id, after)
+
+    monkeypatch.setattr(event_routes, "_new_events", away)
+    assert _stream(client, study) == expected
+
+
+def test_the_stream_of_a_running_job_ends_with_the_service(
+    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stopping, "_stopping", threading.Event())
+    stopping.begin()
+    events = _stream(client, study)
+    assert events[-1]["data"]["state"] == "queued"
 
 
 @pytest.mark.parametrize("value", ["abc", "-1", "1" * 30])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,9 @@ from fastapi.testclient import TestClient
 from finished_study import FinishedStudy
 
 from fluoromap import registry
+from fluoromap_service.api.service import health
 from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.jobs.stall import StallWatch
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import WorkerSeen
@@ -40,7 +43,7 @@ def test_ready_with_jobs_running_inside_the_service(client: TestClient) -> None:
     answer = client.get("/v1/ready")
     assert answer.status_code == 200
     assert [(check["name"], check["ok"]) for check in answer.json()["checks"]] == [
-        ("database", True), ("broker", True), ("files", True), ("worker", True),
+        ("database", True), ("broker", True), ("files", True), ("worker", True), ("queue", True),
     ]  # fmt: skip
 
 
@@ -54,13 +57,26 @@ def test_not_ready_without_a_worker(client: TestClient, monkeypatch: pytest.Monk
     # The process keeps its Celery application: this test gets another one, so that later tests keep theirs.
     monkeypatch.setattr(queue, "celery_app", functools.cache(queue.celery_app.__wrapped__))
     settings.cache_clear()
-    assert _checks(client) == (503, {"database": True, "broker": True, "files": True, "worker": False})
+    assert _checks(client) == (503, {"database": True, "broker": True, "files": True, "worker": False, "queue": True})
     with writing() as session:
         job_life.worker_seen(session, "worker")
     assert _checks(client)[0] == 200
     with writing() as session:
         session.get_one(WorkerSeen, "worker").seen -= 60
     assert _checks(client)[0] == 503
+
+
+def test_not_ready_while_nobody_runs_the_ready_stages(
+    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FLUOROMAP_BROKER_URL", "")
+    monkeypatch.setattr(queue, "celery_app", functools.cache(queue.celery_app.__wrapped__))
+    settings.cache_clear()
+    clock = itertools.count(0.0, 15.0)
+    monkeypatch.setattr(health, "_stall", StallWatch(clock.__next__))
+    with writing() as session:
+        job_life.worker_seen(session, "worker")
+    assert [_checks(client)[0] for _ in range(3)] == [200, 200, 503]
 
 
 def test_not_ready_without_files(client: TestClient, data_dir: Path) -> None:

@@ -98,3 +98,16 @@ def test_a_default_that_contradicts_a_header_is_refused(service: TestClient, stu
     answer = _patch(service, study_path, {"source_isocentre_mm": 1010})
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_gantry")
     assert service.get(study_path).json()["gantry"]["source_isocentre_mm"] is None
+
+
+def test_a_default_does_not_count_for_a_later_run_that_it_contradicts(
+    service: TestClient, study_path: str, tmp_path: Path
+) -> None:
+    assert _patch(service, study_path, {"source_isocentre_mm": 1010}).status_code == 200
+    lacking = {"DistanceSourceToPatient": None, "EstimatedRadiographicMagnificationFactor": None}
+    content = edited(small_run(tmp_path, 1, 0.0), **lacking)
+    answer = service.post(f"{study_path}/instances", content=content, headers={"Content-Type": "application/dicom"})
+    (run,) = answer.json()["instances"]
+    assert (run["missing"], run["gantry"]["source_isocentre_mm"]) == (["DistanceSourceToPatient"], None)
+    path = f"{study_path}/instances/{run['sop_instance_uid']}"
+    assert _patch(service, path, {"source_isocentre_mm": 760}).json()["missing"] == []
