@@ -2,7 +2,6 @@
 import { get } from "../shared/api.js";
 import { attempt, element, field, select } from "../shared/elements.js";
 import { warningWords } from "../shared/words.js";
-import { mapPanel } from "../map/panel.js";
 import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
 import { fusedViews } from "./fused-views.js";
@@ -19,7 +18,9 @@ export function resultsPanel(state, correct) {
 
   /** @param {Job} job */
   const show = async (job) => {
-    const [points, map, overlays, reasons] = await Promise.all([
+    // The library of 3D is large: the page is ready before it arrives.
+    const [{ mapPanel }, points, map, overlays, reasons] = await Promise.all([
+      import("../map/panel.js"),
       get(`/v1/jobs/${job.id}/points`), get(`/v1/jobs/${job.id}/map`).catch((error) => error),
       get(`/v1/jobs/${job.id}/overlays`).catch(() => ({ overlays: [] })), get("/v1/reasons"),
     ]);

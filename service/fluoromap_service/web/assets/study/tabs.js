@@ -44,6 +44,7 @@ export function tabs(place, panels) {
     entries.get(next)?.tab.focus();
     event.preventDefault();
   });
+  addEventListener("hashchange", () => entries.has(location.hash.slice(1)) && show(location.hash.slice(1)));
   const wanted = location.hash.slice(1);
   show(entries.has(wanted) ? wanted : (panels[0]?.[0] ?? ""));
   return show;
