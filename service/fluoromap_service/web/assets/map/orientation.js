@@ -25,8 +25,8 @@ export function drawOrientation(canvas, camera) {
     context.moveTo(SIZE / 2, SIZE / 2);
     context.lineTo(x, y);
     context.stroke();
-    // An axis towards or away from the eye has no place for its word.
-    if (Math.abs(at.z) > 0.9) continue;
+    // An axis towards or away from the eye has no place for its word, and a far end may lie behind a near one.
+    if (Math.abs(at.z) > 0.9 || at.z < -0.3) continue;
     context.lineWidth = 3;
     context.strokeStyle = "rgba(255,255,255,.9)";
     context.strokeText(word, SIZE / 2 + at.x * 44, SIZE / 2 - at.y * 44);
