@@ -66,4 +66,4 @@ def test_keys_play_and_step_the_cine(page: Any, filled_study: str) -> None:
     page.keyboard.press("End")
     page.get_by_text("3 / 3").wait_for()
     page.keyboard.press(" ")
-    page.get_by_role("button", name="Play view a").get_by_text("Pause").wait_for()
+    page.get_by_role("button", name="Pause view a").wait_for()

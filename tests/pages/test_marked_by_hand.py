@@ -97,7 +97,6 @@ def test_electrodes_of_real_frames_marked_from_the_tip(
         assert [each["source"] for each in stored] == ["manual"] * 8
 
     page.get_by_role("button", name="Compute the map again").click()
-    page.locator("#panel-compute").get_by_role("button", name="Compute the map").click()
     page.get_by_text("The computation has ended").wait_for()
     page.get_by_role("tab", name="4 Map and results").click()
     # One site makes no surface; the page says so, and what it knows about the site.

@@ -1,6 +1,8 @@
 /** Follows a job by its event stream; the browser reconnects by itself. */
 import { get } from "../shared/api.js";
 
+const RETRY_MS = 2000;
+
 /**
  * @param {import("../shared/types.js").Job} job
  * @param {(job: import("../shared/types.js").Job) => void} onChange
@@ -9,6 +11,10 @@ import { get } from "../shared/api.js";
 export function follow(job, onChange) {
   return new Promise((resolve) => {
     const source = new EventSource(`/v1/jobs/${job.id}/events`);
+    source.addEventListener("error", () => {
+      // The browser gives up after a refusal, for example while the service starts again.
+      if (source.readyState === EventSource.CLOSED) setTimeout(() => resolve(follow(job, onChange)), RETRY_MS);
+    });
     const stages = new Map(job.stages.map((stage) => [`${stage.name}/${stage.subject}`, stage]));
     source.addEventListener("stage", (event) => {
       const news = JSON.parse(event.data);

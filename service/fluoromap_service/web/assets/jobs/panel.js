@@ -90,6 +90,7 @@ export function jobPanel(state, showMap) {
     const job = await send("POST", `${state.path}/jobs`, { pipeline, view: view.value });
     await watch(job);
   };
+  state.addEventListener("compute", () => start.disabled || attempt(run));
   state.addEventListener("changed", () => {
     const [newest] = state.jobs;
     if (!newest || current.children.length) return;

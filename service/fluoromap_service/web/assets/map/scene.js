@@ -42,6 +42,7 @@ export class MapScene extends EventTarget {
     this.dots = map.sites.map((site) => this.#dot(site, sphere.radius));
     this.names = map.sites.map((site) => this.#name(site));
     this.orbit = new Orbit(this.canvas, sphere.center.clone(), sphere.radius, () => this.draw());
+    this.canvas.addEventListener("click", (event) => this.#pick(event));
     this.recolour();
     new ResizeObserver(() => this.fit()).observe(place);
     this.fit();
@@ -118,6 +119,21 @@ export class MapScene extends EventTarget {
       dot.scale.setScalar(chosen ? 1.6 : 1);
     });
     this.canvas.dataset["drawn"] = "yes";
+  }
+
+  /** Choose the site under the pointer: the event `chosen` has its name. @param {MouseEvent} event */
+  #pick(event) {
+    const box = this.canvas.getBoundingClientRect();
+    let [name, nearest] = ["", 16];
+    this.map.sites.forEach((site, k) => {
+      const at = this.dots[k]?.position.clone().project(this.orbit.camera);
+      if (!at || this.#isBehind(site)) return;
+      const distance = Math.hypot(((at.x + 1) / 2) * box.width - (event.clientX - box.left), ((1 - at.y) / 2) * box.height - (event.clientY - box.top));
+      if (distance < nearest) [name, nearest] = [site.site, distance];
+    });
+    if (!name) return;
+    this.choose(name);
+    this.dispatchEvent(new CustomEvent("chosen", { detail: name }));
   }
 
   /** Whether the wall hides a site. @param {import("../shared/types.js").MapSite} site */

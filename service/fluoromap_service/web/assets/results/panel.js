@@ -38,7 +38,10 @@ export function resultsPanel(state, correct) {
       fused.replaceChildren(own.length ? fusedViews(job.id, own, frames) : element("p", { class: "soft" }, "Choose a located site in the table to see the map over its fluoroscopy."));
     };
     state.addEventListener("chosen", choose);
-    chamber.addEventListener("made", choose);
+    chamber.addEventListener("made", () => {
+      chamber.scene.addEventListener("chosen", (/** @type {CustomEvent} */ event) => state.choose(event.detail));
+      choose();
+    });
     if (!tips.some((/** @type {any} */ tip) => tip.site === state.chosen)) state.chosen = hasMap ? (map.earliest[0]?.site ?? null) : null;
     choose();
     const warnings = hasMap ? map.warnings.map((/** @type {string} */ code) => element("li", {}, sentences.get(code) ?? warningWords(code))) : [];

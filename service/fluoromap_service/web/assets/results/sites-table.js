@@ -22,7 +22,7 @@ export function resultSites(tips, earliest, sentences, onChoose, onCorrect) {
       element("td", { class: "figure" }, number(tip.lat_ms, 0)),
       element("td", { class: "figure" }, tip === first ? "earliest" : distance ? `${number(distance.mm, 1)} (${number(distance.low, 1)} to ${number(distance.high, 1)})` : "–"),
       element("td", {}, tip.grade === "rejected" ? element("span", { class: "badge", "data-state": "failed" }, "not located") : `grade ${tip.grade}`),
-      element("td", {}, ...words.map((sentence) => element("div", {}, sentence)), words.length ? button("Correct it", () => onCorrect(tip.site), { "aria-label": `Correct site ${tip.site}` }) : null));
+      element("td", {}, ...words.map((sentence) => element("div", {}, sentence)), words.length ? button("Correct it", () => onCorrect(tip.site), { "aria-label": `Correct it: site ${tip.site}` }) : null));
   });
   return element("section", {},
     element("h2", {}, "Sites"),

@@ -9,7 +9,8 @@ import { tabs } from "./tabs.js";
 import { viewerPanel } from "../viewer/panel.js";
 
 /**
- * The study as its panels share it. `changed` fires after each change of runs or sites, `job` when a job has ended.
+ * The study as its panels share it. `changed` fires after each change of runs or sites, `job` when a job has ended, `compute`
+ * when a person asks for a new job, `chosen` when a person chooses another site.
  */
 export class StudyState extends EventTarget {
   /** @param {import("../shared/types.js").Study} study */
@@ -54,9 +55,14 @@ await attempt(async () => {
   byId("top").append(header(element("span", { "aria-current": "page" }, study.label)));
   byId("title").textContent = study.label;
   document.title = `${study.label} – fluoromap`;
+  // After a correction there is nothing to choose: the third step starts at once.
+  const compute = () => {
+    show("compute");
+    state.dispatchEvent(new Event("compute"));
+  };
   const show = tabs(byId("content"), [
     ["runs", "1 Runs and times", () => runsPanel(state, () => show("electrodes"), () => show("compute"))],
-    ["electrodes", "2 Look and correct", () => viewerPanel(state, () => show("compute"))],
+    ["electrodes", "2 Look and correct", () => viewerPanel(state, compute)],
     ["compute", "3 Compute", () => jobPanel(state, () => show("map"))],
     ["map", "4 Map and results", () => resultsPanel(state, () => show("electrodes"))],
   ]);

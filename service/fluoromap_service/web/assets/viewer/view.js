@@ -75,6 +75,7 @@ export class View extends EventTarget {
     if (playing === this.playing) return;
     this.playing = playing;
     this.playButton.textContent = playing ? "Pause" : "Play";
+    this.playButton.setAttribute("aria-label", `${this.playButton.textContent} view ${this.letter}`);
     const every = this.run.frame_time_ms ?? 66;
     let last = performance.now();
     /** @param {number} now */
