@@ -65,8 +65,9 @@ export class Orbit {
   /** @param {number} width @param {number} height */
   fit(width, height) {
     this.camera.aspect = width / height;
-    // A narrow picture shows the whole chamber too.
-    this.camera.fov = width < height ? (2 * Math.atan(Math.tan(Math.PI / 12) * (height / width)) * 180) / Math.PI : 30;
+    // A narrow picture shows the whole chamber too, beside the colour bar.
+    const narrow = Math.max(1, 1.55 / this.camera.aspect);
+    this.camera.fov = (2 * Math.atan(Math.tan(Math.PI / 12) * narrow) * 180) / Math.PI;
     this.camera.updateProjectionMatrix();
   }
 }
