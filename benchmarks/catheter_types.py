@@ -24,9 +24,12 @@ from fluoromap.training.appearance import take_picture
 from fluoromap.training.distractors import draw_distractors
 from fluoromap.training.drawing import Canvas
 from fluoromap.training.drawn_catheters import design_of, draw_catheter
+from fluoromap.training.exposure import Exposure
 
 SIZE_PX = 512
 FRAMES = 3
+METAL = 0.4, 2.3
+"""Range of the electrodes' attenuation, log units."""
 CATALOGUES = {
     "2 quadripolar, ablation": ("quadripolar-2-5-2", "quadripolar-2-5-2", "ablation-4"),
     "decapolar, hexapolar, ablation": ("decapolar-2-5-2", "hexapolar-2-5-2", "ablation-4"),
@@ -74,10 +77,13 @@ def _scene(random: np.random.Generator, catheters: tuple[Catheter, ...], missing
     px_per_mm = float(random.uniform(3.0, 4.4))
     canvas = Canvas.empty(SIZE_PX)
     draw_distractors(random, canvas, px_per_mm)
-    places = {one.name: draw_catheter(random, canvas, px_per_mm, design_of(one))[:, :2] for one in catheters}
-    body = anatomy(random, SIZE_PX, px_per_mm)
-    key = int(random.integers(2**31))
-    pictures = [take_picture(np.random.default_rng(key), canvas.depth, body).pixels] * FRAMES
+    places = {one.name: draw_catheter(random, canvas, px_per_mm, design_of(one), METAL)[:, :2] for one in catheters}
+    exposure = Exposure(
+        photons=float(random.uniform(300.0, 5000.0)), scatter=float(random.uniform(0.0, 1.0)), metal=METAL, detector=1.0,
+        grain_px=0.6, gain=1.2, frontal=False, plain=False,
+    )  # fmt: skip
+    body = anatomy(random, SIZE_PX, px_per_mm, exposure.frontal)
+    pictures = [take_picture(random, canvas.depth, body, exposure).pixels] * FRAMES
     listed = tuple(one for number, one in enumerate(catheters) if number != missing)
     labels = {
         one.name: {

@@ -142,7 +142,7 @@ def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:
     if given.draw:
         given.draw.mkdir(parents=True, exist_ok=True)
         for index in range(0, len(entries), max(1, len(entries) // 4)):
-            picture = _drawn(one.run.frames[index], entries[index].chains, one.labels[index])
+            picture = drawn(one.run.frames[index], entries[index].chains, one.labels[index])
             picture.save(given.draw / f"{name}_{one.name}_{index}.png")
 
 
@@ -179,7 +179,7 @@ def score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDA
     return np.array([len(pairs), len(there) - len(pairs), len(seen) - len(pairs), len(named), numbered])
 
 
-def _drawn(pixels: NDArray[np.generic], chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> Image.Image:
+def drawn(pixels: NDArray[np.generic], chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> Image.Image:
     grey = pixels.astype(np.float64)
     low, high = np.percentile(grey, [0.5, 99.5])
     level = (np.clip((grey - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)

@@ -199,7 +199,7 @@ def _gantries(width_mm: float) -> tuple[Gantry, Gantry]:
     return lateral, frontal
 
 
-def _as_jpeg(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
+def as_jpeg(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """Return a frame as a lab displays and stores it.
 
     The steps are logarithm, sharpening, 8 bit and JPEG of quality 85.
@@ -222,7 +222,7 @@ def _score_run(
     names: tuple[str, ...],
     displayed: bool = False,
 ) -> None:
-    in_memory = MemoryFrames([_as_jpeg(frame) for frame in simulated.frames] if displayed else simulated.frames)
+    in_memory = MemoryFrames([as_jpeg(frame) for frame in simulated.frames] if displayed else simulated.frames)
     gantry = simulated.gantry
     px_per_mm = gantry.source_detector_mm / gantry.source_isocentre_mm / gantry.pixel_spacing_mm[0]
     run = Run(in_memory, simulated.frame_times_ms, px_per_mm, DISPLAYED if displayed else FACTS)
@@ -252,7 +252,7 @@ def _score_run(
 
 def _score_rendered(table: Table, view: str, rendered: RenderedRun) -> None:
     """Score a decapolar and an ablation catheter, as 8 bit JPEG."""
-    in_memory = MemoryFrames([_as_jpeg(frame) for frame in rendered.frames])
+    in_memory = MemoryFrames([as_jpeg(frame) for frame in rendered.frames])
     run = Run(in_memory, rendered.times_ms, rendered.px_per_mm, DISPLAYED)
     for name in CHAINS:
         found = SEGMENTERS[name]().segment(run, DECAPOLAR_CATALOGUE, {}, Silent())

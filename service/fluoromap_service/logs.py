@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import sys
+from datetime import UTC, datetime
 
 import structlog
 
@@ -22,3 +25,17 @@ def configure() -> None:
         # Not sys.stderr: a test may replace it and close the replacement.
         logger_factory=structlog.PrintLoggerFactory(sys.__stderr__),
     )
+    handler = logging.StreamHandler(sys.__stderr__)
+    handler.setFormatter(_JsonFormatter())
+    logging.basicConfig(handlers=[handler], level=logging.WARNING, force=True)
+
+
+class _JsonFormatter(logging.Formatter):
+    """Lines of libraries in the form of our own."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line = {"event": "library", "logger": record.name, "level": record.levelname.lower()}
+        line |= {"message": record.getMessage(), "timestamp": datetime.fromtimestamp(record.created, UTC).isoformat()}
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line)

@@ -29,6 +29,12 @@ class Settings(BaseSettings):
         "", description="Web pages that browsers let use the API, as origins with spaces between; empty: none."
     )
     max_upload_bytes: int = Field(4 * 2**30, gt=0, description="Largest request body accepted, in bytes.")
+    min_free_mib: int = Field(
+        512, ge=0, description="Free space that requests may not fill, so that running jobs can end, in MiB."
+    )
+    retention_days: float = Field(
+        0.0, ge=0, description="Age at which a study without a change or job is deleted, in days; 0: never."
+    )
     workers: int = Field(
         len(os.sched_getaffinity(0)), ge=1, description="Stages that one worker runs at the same time."
     )

@@ -18,6 +18,7 @@ from fluoromap_service.jobs.stage_results import load_file, remember
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.files import BrokenFile
 from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
 from fluoromap_workers.heartbeat import Heartbeat
@@ -103,6 +104,10 @@ def work(held: Claim, context: Context) -> None:
     except (OperationalError, InterfaceError, PoolTimeout, OSError) as error:
         # The machine failed, not the plugin: the lease runs out and another attempt follows.
         bound.warning("stage_interrupted", error=type(error).__name__)
+    except BrokenFile as broken:
+        bound.error("broken_file", sha256=broken.sha256)
+        with writing() as session:
+            job_life.mend_input(session, held, broken.sha256)
     except PluginFailed as failure:
         bound.warning("stage_failed", exc_info=failure.__cause__)
         _fail(held, failure.error, bound)
@@ -168,7 +173,7 @@ def _computed(held: Claim, work: Work, context: Context) -> tuple[Any, bytes]:
         except Refusal as refusal:
             result = work.refused(refusal)
         return result, encode(result)
-    except StageStopped:
+    except (StageStopped, BrokenFile):
         raise
     except PluginChanged as error:
         raise PluginFailed({"code": "plugin_changed", "detail": str(error)}) from error
@@ -197,7 +202,7 @@ def _stored(work: Work) -> StoredResult | None:
     """Return the result that an earlier job stored for the same work."""
     with reading() as session:
         row = session.get(StageResult, work.key)
-    if row is None or not files.path_of(row.sha256).exists():
+    if row is None or not files.is_whole(row.sha256):
         return None
     return StoredResult(row.sha256, tuple(work.rows(load_file(work.kind, row.sha256))) if work.rows else ())
 

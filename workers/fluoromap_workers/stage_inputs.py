@@ -150,7 +150,7 @@ def _segment(job: StoredJob, uid: str) -> Work:
     plugin = job.snapshot.segmenter
 
     def compute(context: Context) -> Segmentation:
-        frames = open_frames(files.path_of(run.sha256), facts)
+        frames = open_frames(files.checked_path(run.sha256), facts)
         shown = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
         found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
         found = _returned(found, Segmentation, plugin.name)

@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 _STEP_MM = 0.4
 _BEND_MM = 25.0
+_TURNS = 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,31 @@ class Shaft:
         wanted = np.arange(0, length[-1], _STEP_MM)
         rest = np.stack([np.interp(wanted, length, curve[:, axis]) for axis in range(3)], axis=1)
         return cls(catheter, radius_mm, solid_tip, rest)
+
+    @classmethod
+    def around(cls, catheter: Catheter, radius_mm: float, centre: Array, normal: Array, entry: Array) -> Shaft:
+        """Make a shaft whose electrodes lie on a loop about ``centre``.
+
+        The loop has 0.85 turns across ``normal``; then the shaft bends to ``entry``. Each is (3,), mm.
+        """
+        normal = normal / np.linalg.norm(normal)
+        side = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+        side /= np.linalg.norm(side)
+        other = np.cross(normal, side)
+        round_mm = float(catheter.arc_lengths_mm[-1]) + 0.5 * catheter.tip_mm + catheter.ring_mm
+        loop_radius = round_mm / (2.0 * np.pi * _TURNS)
+        angles = np.linspace(0.0, 2.0 * np.pi * _TURNS, 400)[:, None]
+        loop = centre + loop_radius * (np.cos(angles) * side + np.sin(angles) * other)
+        leaving = np.cos(angles[-1]) * other - np.sin(angles[-1]) * side
+        back = normal if normal @ (entry - centre) > 0 else -normal
+        t = np.linspace(0, 1, 800)[1:, None]
+        start, behind, bow = loop[-1], loop[-1] + 15.0 * leaving, loop[-1] + 30.0 * back
+        shaft = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * behind + 3 * (1 - t) * t**2 * bow + t**3 * entry
+        curve = np.concatenate([loop, shaft])
+        length = arc_lengths_mm(curve[None])[0]
+        wanted = np.arange(0, length[-1], _STEP_MM)
+        rest = np.stack([np.interp(wanted, length, curve[:, axis]) for axis in range(3)], axis=1)
+        return cls(catheter, radius_mm, False, rest)
 
     def with_tip_displaced(self, displacement_mm: Array) -> Shaft:
         """Return the catheter with the resting place of its tip displaced by ``(3,)`` mm."""

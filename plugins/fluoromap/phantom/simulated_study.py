@@ -30,6 +30,7 @@ ACTIVATION_NOISE_MS = 1.0
 _INSTANTS = 3
 _MARGIN_PX = 20.0
 _ATTEMPTS = 12
+_MOST_CATHETERS = 6
 # Each purpose has an independent stream of random numbers.
 _ANATOMY, _GANTRY, _TIMES, _RUN, _BONES, _TISSUE, _PHOTONS = range(7)
 
@@ -72,6 +73,8 @@ class StudySpec:
         Largest shift of the heart to head or feet between runs; 0 means that the breath is held all the time.
     dose : float
         Photons a pixel, as a multiple of the appearance's.
+    catalogue : Catalogue
+        2 to 6 catheters, with the reference and the mapping catheter.
 
     Raises
     ------
@@ -90,6 +93,7 @@ class StudySpec:
     isocentre_error_mm: float = 0.0
     breathing_mm: float = 4.0
     dose: float = 1.0
+    catalogue: Catalogue = DEFAULT_CATALOGUE
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -110,6 +114,8 @@ class StudySpec:
             value = getattr(self, name)
             if not (math.isfinite(value) and 0 <= value <= 20):
                 raise ValueError(f"{name} must be between 0 and 20")
+        if len(self.catalogue.catheters) > _MOST_CATHETERS:
+            raise ValueError(f"the catalogue must have at most {_MOST_CATHETERS} catheters")
         if not (math.isfinite(self.dose) and 0.01 <= self.dose <= 100):
             raise ValueError("dose must be between 0.01 and 100")
 
@@ -205,8 +211,8 @@ def simulate_study(spec: StudySpec) -> SimulatedStudy:
         start = starts[1] + float(times_rng.uniform(90, 240))
         annotated = float(activation[index] + times_rng.normal(0, ACTIVATION_NOISE_MS))
         sites.append(_site(spec, anatomy, cameras, index, starts, (float(activation[index]), annotated)))
-    reference = _diastole_mm(anatomy.residents(0))[DEFAULT_CATALOGUE.reference].mean(axis=0)
-    return SimulatedStudy(spec, DEFAULT_CATALOGUE, anatomy.chamber, reference, anatomy.rate_hz, tuple(sites))
+    reference = _diastole_mm(anatomy.residents(0))[spec.catalogue.reference].mean(axis=0)
+    return SimulatedStudy(spec, spec.catalogue, anatomy.chamber, reference, anatomy.rate_hz, tuple(sites))
 
 
 def _true_camera(spec: StudySpec, view: int) -> Camera:
@@ -226,7 +232,7 @@ def _anatomy_in_field(spec: StudySpec, cameras: tuple[Camera, Camera]) -> Anatom
     rng = np.random.default_rng([spec.seed, _ANATOMY])
     breaths = np.array([[0.0, 0.0, -1.2], [0.0, 0.0, 1.2]]) * spec.breathing_mm
     for _ in range(_ATTEMPTS):
-        anatomy = draw_anatomy(spec.heart, spec.sites, rng)
+        anatomy = draw_anatomy(spec.heart, spec.sites, rng, spec.catalogue)
         points = np.concatenate([electrodes_over_cycle_mm(anatomy.residents(i), 8) for i in range(spec.sites)])
         points = points[..., None, :] + breaths
         inside = True
@@ -255,7 +261,7 @@ def _site(
     runs = tuple(_run(spec, cameras[view], exposures[view], times, index, view, starts[view]) for view in (0, 1))
     breathing = np.mean([e.breathing.at(times).mean(axis=0) for e in exposures], axis=0)
     diastole = _diastole_mm(residents)
-    origin = diastole[DEFAULT_CATALOGUE.reference].mean(axis=0)
+    origin = diastole[spec.catalogue.reference].mean(axis=0)
     truth = SiteTruth(
         MappingProxyType({name: _read_only(points + breathing) for name, points in diastole.items()}),
         MappingProxyType({name: _read_only(points - origin) for name, points in diastole.items()}),

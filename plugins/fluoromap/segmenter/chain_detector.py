@@ -138,7 +138,7 @@ class ChainDetector:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         fitted = [
             one
-            for one in fit_chains(x, points, linked, shaft_image, families, seen.pixel_noise, sure_candidates)
+            for one in fit_chains(x, points, linked, shaft_image, families, seen.position_noise, sure_candidates)
             if one.clearness >= self.acceptance.least_clearness
         ]
         floor = min(family.floor for family in families)
@@ -211,7 +211,7 @@ class ChainDetector:
             guess[None],
             family.catheter,
             self.px_per_mm,
-            seen.pixel_noise,
+            seen.position_noise,
             hidden[None],
             np.zeros((1, len(guess)), np.bool_),
         )
@@ -251,7 +251,7 @@ class ChainDetector:
         families = catheter_families(self.catalogue)
         shaft_image = self._shafts(seen)
         linked = link_candidates(points, weights, proposed.variance_px2[free], shaft_image, families)
-        fitted = fit_chains(x, points, linked, shaft_image, families, seen.pixel_noise)
+        fitted = fit_chains(x, points, linked, shaft_image, families, seen.position_noise)
         return any(one.clearness >= self.acceptance.extra_clearness for one in fitted)
 
     def _in_field(self, points_uv: Array) -> BoolArray:

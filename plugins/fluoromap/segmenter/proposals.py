@@ -65,7 +65,11 @@ class ImageEvidence(Protocol):
 
     @property
     def pixel_noise(self) -> float:
-        """Standard deviation of a pixel of the log image at half its size, from noise."""
+        """Standard deviation of a pixel of the log image at its ``reduction``, from noise: shafts are judged by it."""
+
+    @property
+    def position_noise(self) -> float:
+        """Standard deviation of a pixel of the log image at half its size: the noise that displaces electrodes."""
 
     @property
     def likeness(self) -> Likeness: ...

@@ -94,7 +94,8 @@ def refine(
     px_per_mm : float
         At the isocentre.
     noise : float
-        Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+        Standard deviation of a pixel of the log image at half its size, log units, see
+        :func:`~fluoromap.segmenter.log_image.pixel_noise`.
     hidden : (n, electrodes)
         Electrodes behind another catheter. They are put on the curve through the others and get the mean misfit of the
         others.

@@ -35,7 +35,7 @@ def design_of(catheter: Catheter) -> Design:
     """Return the design of a catalogue's catheter."""
     lengths = np.full(catheter.electrodes, catheter.ring_mm)
     lengths[0] = catheter.tip_mm
-    return Design(catheter.arc_lengths_mm + 0.5 * catheter.tip_mm, lengths)
+    return Design(catheter.arc_lengths_mm + 0.5 * catheter.tip_mm, lengths, catheter.is_circular)
 
 
 def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Design:

@@ -12,6 +12,7 @@ from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite,
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.estimate import Estimate, Method
+from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.self_calibration import GantryBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
@@ -39,7 +40,8 @@ DOUBTFUL_BELOW = 1e-5
 class SiteLocator:
     """The method and assumptions that locate the sites of one study.
 
-    wrong_spacings : catheters whose catalogue entry contradicts the study.
+    wrong_spacings : catheters whose catalogue entry contradicts the study. origin : of the study, where sites locate different
+    electrodes of the reference catheter; otherwise the mean of a site's own electrodes is its origin.
     """
 
     method: Method
@@ -47,6 +49,7 @@ class SiteLocator:
     catalogue: Catalogue
     gantry: GantryBelief
     wrong_spacings: frozenset[str] = frozenset()
+    origin: ReferenceOrigin | None = None
 
     def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
         """Locate a site in 3D.
@@ -139,8 +142,16 @@ class SiteLocator:
         """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
         pixels, points = moment.pixels, moment.found.points_mm
         joint = moment.inflation * moment.found.covariance_mm2(moment.errors_px2)
-        reference = [i for i, (catheter, _) in enumerate(pixels.labels) if catheter == self.catalogue.reference]
-        reference_mm = points[reference].mean(axis=0) if reference else None
+        reference = [
+            i
+            for i, (catheter, electrode) in enumerate(pixels.labels)
+            if catheter == self.catalogue.reference and (self.origin is None or electrode in self.origin.offsets_mm)
+        ]
+        reference_mm, added_mm2 = (points[reference].mean(axis=0) if reference else None), np.zeros((3, 3))
+        if self.origin is not None and reference:
+            by_offsets = self.origin.from_electrodes([pixels.labels[i][1] for i in reference], points[reference])
+            assert by_offsets is not None, "these electrodes have offsets"
+            reference_mm, added_mm2 = by_offsets
         mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.params.spacing_limit_mm)
         doubts: dict[str, list[Reason]] = {name: [Reason.SPACING_MISMATCH] for name in self.wrong_spacings}
         for catheter, reason in site.notes:
@@ -154,7 +165,9 @@ class SiteLocator:
                 position_mm=points[i],
                 covariance_mm2=joint[i, :, i],
                 relative_mm=None if reference_mm is None else points[i] - reference_mm,
-                relative_covariance_mm2=relative_covariance_mm2(joint, i, reference) if reference else None,
+                relative_covariance_mm2=(
+                    relative_covariance_mm2(joint, i, reference) + added_mm2 if reference else None
+                ),
                 residual_px=(float(residuals[i, 0]), float(residuals[i, 1])),
                 ray_angle_deg=float(angles[i]),
                 reasons=tuple(

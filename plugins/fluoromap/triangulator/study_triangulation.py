@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -22,6 +23,7 @@ from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_maximum_likelihood
+from fluoromap.triangulator.reference_origin import common_origin, deviates
 from fluoromap.triangulator.self_calibration import GANTRY_PRIOR, GantryBelief, calibrate
 from fluoromap.triangulator.site_locator import Moment, SiteLocator
 from fluoromap.triangulator.spacing import WrongGap, wrong_spacings
@@ -42,7 +44,7 @@ def locate_study(
     """
     usable, rejected, notes = _usable_sites(sites, catalogue)
     locator = SiteLocator(method, params, catalogue, GantryBelief(np.eye(4), params.gantry_covariance()))
-    return _locate_sites([(site, None, locator) for site in usable], context, rejected, notes, None)
+    return _locate_sites([(site, None, locator) for site in usable], catalogue, context, rejected, notes, None)
 
 
 def calibrate_and_locate(
@@ -74,7 +76,7 @@ def calibrate_and_locate(
         (site, jump, SiteLocator(method, params, catalogue, gantry if i in same_gantry else header, frozenset(wrong)))
         for i, (site, jump) in enumerate(zip(usable, jumps, strict=True))
     ]
-    return _locate_sites(work, context, rejected, notes, calibration)
+    return _locate_sites(work, catalogue, context, rejected, notes, calibration)
 
 
 def _usable_sites(
@@ -95,6 +97,7 @@ def _usable_sites(
 
 def _locate_sites(
     work: Sequence[tuple[MatchedSite, Jump | None, SiteLocator]],
+    catalogue: Catalogue,
     context: Context,
     rejected: list[RejectedSite],
     notes: list[str],
@@ -102,6 +105,7 @@ def _locate_sites(
 ) -> Triangulation:
     located: list[LocatedSite] = []
     moments: list[Moment] = []
+    used: list[tuple[MatchedSite, Jump | None, SiteLocator]] = []
     for index, (site, jump, locator) in enumerate(work):
         context.check()
         answer = locator.locate(site, jump)
@@ -109,10 +113,32 @@ def _locate_sites(
             rejected.append(RejectedSite(site.site, (Reason.PAIRING_FAILED,)))
         else:
             located.append(answer[0])
+            used.append((site, jump, locator))
             moments.append(answer[1])
             notes += answer[2]
         context.progress((index + 1) / len(work))
+    located = _from_one_origin(located, used, catalogue)
     return Triangulation(tuple(located), tuple(rejected), tuple(notes), calibration, _budget(moments))
+
+
+def _from_one_origin(
+    located: Sequence[LocatedSite],
+    work: Sequence[tuple[MatchedSite, Jump | None, SiteLocator]],
+    catalogue: Catalogue,
+) -> list[LocatedSite]:
+    """Give all sites the same origin.
+
+    Sites that show other electrodes of the reference catheter than most sites do are located again.
+    """
+    origin = common_origin(located, catalogue.reference)
+    same: list[LocatedSite] = []
+    for first, (site, jump, locator) in zip(located, work, strict=True):
+        if origin is not None and deviates(first, catalogue.reference, origin):
+            again = replace(locator, origin=origin).locate(site, jump)
+            assert again is not None, "the site was located before"
+            first = again[0]
+        same.append(first)
+    return same
 
 
 def _first_look(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
 import structlog
+from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, FastAPI
 from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.routing import APIRoute
@@ -15,12 +16,18 @@ from starlette.middleware.cors import CORSMiddleware
 
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.body_limit import BodyLimit
+from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
+from fluoromap_service.api.http.middleware.audit_trail import FLUSH_SECONDS, Acts, AuditTrail
+from fluoromap_service.api.http.middleware.disk_space import DiskSpace
+from fluoromap_service.api.http.middleware.request_body import RequestBody
+from fluoromap_service.api.http.middleware.security_headers import SecurityHeaders
 from fluoromap_service.api.http.query_names import check_query_names
 from fluoromap_service.api.http.security import Doorkeeper, Reader
+from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, maps, overlays, points, report, tracks
-from fluoromap_service.api.service import health, pages, plugins, reasons
+from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
     activation_times,
@@ -37,8 +44,10 @@ from fluoromap_service.api.study import (
 )
 from fluoromap_service.jobs import queue
 from fluoromap_service.settings import settings
+from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
+CLEAN_UP_SECONDS = 60.0
 
 ROUTERS = (
     studies.router,
@@ -63,6 +72,7 @@ ROUTERS = (
     plugins.router,
     reasons.router,
     health.router,
+    metrics.router,
     pages.router,
 )
 
@@ -84,6 +94,8 @@ def create_app() -> FastAPI:
         generate_unique_id_function=_operation_id,
         lifespan=_lifespan,
     )
+    acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
+    app.state.acts, app.state.counts, app.state.sign_ins = acts, counts, sign_ins
     problems.install(app)
     for router in ROUTERS:
         app.include_router(router)
@@ -96,10 +108,13 @@ def create_app() -> FastAPI:
     def docs(caller: Reader) -> HTMLResponse:
         return HTMLResponse(api_page(document(app)))
 
+    # The last one added is the outermost.
     app.add_middleware(BodyLimit)
-    app.add_middleware(Doorkeeper)
+    app.add_middleware(DiskSpace)
+    app.add_middleware(AuditTrail, acts=acts)
+    app.add_middleware(Doorkeeper, sign_ins=sign_ins)
     if settings().cors_origins:
-        # The outermost layer: a browser asks for permission without a token, and reads refusals too.
+        # Before the doorkeeper: a browser asks for permission without a token, and reads refusals too.
         app.add_middleware(
             CORSMiddleware,
             allow_origins=settings().allowed_origins,
@@ -107,6 +122,9 @@ def create_app() -> FastAPI:
             allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "If-None-Match", "Last-Event-ID"],
             expose_headers=["Location", "Link", "ETag", "Retry-After", "Idempotency-Replayed", "Content-Disposition"],
         )
+    app.add_middleware(RequestBody)
+    app.add_middleware(AccessLog, counts=counts)
+    app.add_middleware(SecurityHeaders)
     return app
 
 
@@ -120,7 +138,17 @@ def _operation_id(route: APIRoute) -> str:
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    tasks = [] if settings().eager else [asyncio.create_task(_sweep()), asyncio.create_task(_warm_up())]
+    acts: Acts = app.state.acts
+    tasks = [
+        asyncio.create_task(_repeat("audit_not_written", acts.flush, FLUSH_SECONDS)),
+        asyncio.create_task(_repeat("clean_up_failed", clean_up, CLEAN_UP_SECONDS)),
+    ]
+    if not settings().eager:
+        tasks += [
+            asyncio.create_task(_repeat("sweep_failed", queue.sweep, SWEEP_SECONDS)),
+            asyncio.create_task(_repeat("queue_not_watched", health.watch_queue, SWEEP_SECONDS)),
+            asyncio.create_task(_warm_up()),
+        ]
     try:
         yield
     finally:
@@ -128,27 +156,31 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
-        file_pool.close()
+        try:
+            await run_in_threadpool(acts.flush)
+        finally:
+            file_pool.close()
 
 
 async def _warm_up() -> None:
     await run_in_threadpool(file_pool.start)
 
 
-async def _sweep() -> None:
-    """Free the stages of dead workers and announce ready stages.
+async def _repeat(failure: str, act: Callable[[], object], seconds: float) -> None:
+    """Repeat an act as long as the service runs.
 
-    It repeats this as long as the service runs.
+    ``failure`` is the log event of an act that failed.
     """
     failing = False
+    # Threads of its own: work on the service itself must go on when all requests wait.
+    limiter = CapacityLimiter(1)
     while True:
         try:
-            await run_in_threadpool(queue.sweep)
-            await run_in_threadpool(health.watch_queue)
+            await to_thread.run_sync(act, limiter=limiter)
             failing = False
         except Exception as error:
             # The database may come back: log the first failure only.
             if not failing:
-                log.warning("sweep_failed", error=type(error).__name__)
+                log.warning(failure, error=type(error).__name__)
             failing = True
-        await asyncio.sleep(SWEEP_SECONDS)
+        await asyncio.sleep(seconds)

@@ -27,6 +27,10 @@ COMMANDS = {
     "worker": "Run a worker, which computes the stages of jobs.",
     "db": "Manage the database.",
     "token": "Manage access tokens.",
+    "backup": "Write database and files into one archive, while the service runs.",
+    "restore": "Bring a backup into an empty data folder.",
+    "check": "Check every stored file, and mend the store.",
+    "audit": "Read the audit trail: who did what to which study.",
     "plugins": "List the installed plugins, and why a broken plugin does not load.",
 }
 """Name of each command, and the first sentence of its help."""

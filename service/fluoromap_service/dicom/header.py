@@ -43,7 +43,9 @@ _FRAME_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequ
 _MACROS: dict[str, tuple[str, ...]] = {
     "PositionerPositionSequence": ("PositionerPrimaryAngle", "PositionerSecondaryAngle"),
     "XRayGeometrySequence": ("DistanceSourceToDetector", "DistanceSourceToIsocenter"),
-    "FramePixelDataPropertiesSequence": ("ImagerPixelSpacing", "PixelIntensityRelationship"),
+    "FramePixelDataPropertiesSequence": (
+        "ImagerPixelSpacing", "PixelIntensityRelationship", "PixelIntensityRelationshipSign",
+    ),
     "FieldOfViewSequence": (
         "FieldOfViewShape", "FieldOfViewDimensionsInFloat", "FieldOfViewRotation", "FieldOfViewHorizontalFlip",
     ),

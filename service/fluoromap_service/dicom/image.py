@@ -15,14 +15,17 @@ def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warni
 
     ``bits_stored`` is measured, because BitsStored (0028,0101) may be wrong. PixelIntensityRelationship (0028,1040) is LIN,
     LOG or DISP, PS3.3 C.8.7.1.1.2. GE also writes DRM: prepared for display, with a compressed dynamic range.
+    PixelIntensityRelationshipSign (0028,1041) is -1 where high values mean few photons, PS3.3 C.8.19.6.2. It counts before the
+    PhotometricInterpretation, which says how the picture is displayed.
     """
     relationship = header.text("PixelIntensityRelationship")
     if relationship not in ("LIN", "LOG", "DISP", "DRM"):
         warnings.append(HeaderWarning.PIXEL_INTENSITY_UNKNOWN)
+    sign = header.number("PixelIntensityRelationshipSign")
     return PixelFacts(
         logarithmic=relationship != "LIN",
         bits_stored=bits_stored,
-        monochrome1=header.text("PhotometricInterpretation") == "MONOCHROME1",
+        monochrome1=header.text("PhotometricInterpretation") == "MONOCHROME1" if sign not in (-1, 1) else sign == -1,
         shutter=_shutter(header, rows, columns, warnings),
     )
 

@@ -11,11 +11,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, func, or_, select, update
+from sqlalchemy import Row, delete, func, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
 from fluoromap_service.settings import settings
+from fluoromap_service.store import tally
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.models import (
     ENDED_JOB,
@@ -24,6 +25,7 @@ from fluoromap_service.store.models import (
     Event,
     Job,
     JobState,
+    Point,
     StageRow,
     StageState,
     WorkerSeen,
@@ -39,6 +41,15 @@ _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
 """Columns of a stage that its events report."""
+
+SECONDS_BUCKETS = (0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 1800.0)
+"""Upper limits of the histogram of stage durations, in seconds."""
+
+_INPUT_BROKEN = {
+    "code": "input_broken",
+    "detail": "A stored file that this stage reads is damaged. Upload the runs of this study again, then start a new job; "
+    "'fluoromap check' names the damaged files.",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +81,7 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
     )
     session.add(job)
     session.flush()
+    now = session.scalar(select(db_now()))
     ids: dict[StageName, list[int]] = {}
     for stage in PIPELINE:
         depends_on = [number for name in stage.depends_on for number in ids[name]]
@@ -78,6 +90,7 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
             StageRow(
                 job_id=job.id, name=stage.name, subject=subject, plugin=plugin.name, plugin_version=plugin.version,
                 depends_on=depends_on, state=StageState.PENDING if depends_on else StageState.READY,
+                ready_since=None if depends_on else now,
             )
             for subject in subjects_of(stage, snapshot)
         ]  # fmt: skip
@@ -151,6 +164,7 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
             state=StageState.RUNNING,
             attempt=StageRow.attempt + 1,
             lease_until=db_now() + settings().lease_seconds,
+            started=db_now(),
             worker=worker,
             progress=0.0,
         )
@@ -205,6 +219,47 @@ def fail(session: Session, held: Claim, error: dict[str, Any]) -> bool:
         return False
     _settle(session, job)
     return True
+
+
+def mend_input(session: Session, held: Claim, sha256: str) -> None:
+    """Compute a damaged input of a running stage again, or fail the stage.
+
+    A result of this job becomes ready again, and the stages after it wait for it. A run cannot be computed: the stage
+    fails and its error names the remedy.
+
+    Parameters
+    ----------
+    session : Session
+    held : Claim
+        The stage that met the damaged file.
+    sha256 : str
+        Address of the damaged file.
+    """
+    job = _lock(session, held.job_id)
+    rows = _stages(session, job.id)
+    own = next(row for row in rows if row.id == held.stage_id)
+    broken = [row for row in rows if row.state == StageState.DONE and row.result == sha256]
+    # Another stage may have met the same file first: then the input is being computed already.
+    inputs = {name for name in STAGES if own.name in after(STAGES[name].name)}
+    mending = any(row.name in inputs and row.state not in ENDED_STAGE for row in rows)
+    if not (broken or mending) or any(row.attempt >= settings().max_attempts for row in broken):
+        _end(session, held, StageState.FAILED, error=_INPUT_BROKEN)
+        _settle(session, job)
+        return
+    if not _end(session, held, StageState.PENDING, progress=0.0):
+        return
+    now = session.scalar(select(db_now()))
+    following = {name for row in broken for name in after(STAGES[row.name].name)}
+    for row in rows:
+        if row in broken or (row.name in following and row.state in (StageState.DONE, StageState.READY)):
+            row.state = StageState.READY if row in broken else StageState.PENDING
+            row.result, row.reused, row.progress, row.published, row.publications = None, False, 0.0, None, 0
+            row.ready_since = now if row in broken else None
+            _report_stage(session, job.id, row)
+    if any(row.name == "triangulate" and row.state in (StageState.READY, StageState.PENDING) for row in rows):
+        session.execute(delete(Point).where(Point.job_id == job.id))
+    session.flush()
+    _settle(session, job)
 
 
 def stopped(session: Session, held: Claim) -> None:
@@ -270,6 +325,7 @@ def reap(session: Session) -> int:
         )
         if stage is not None:
             _free(session, job, stage)
+            tally.add(session, {"leases_reaped": 1.0})
     return len(expired)
 
 
@@ -289,6 +345,7 @@ def _free(session: Session, job: Job, stage: StageRow) -> None:
         }
     else:
         stage.state = StageState.READY
+        stage.ready_since = session.scalar(select(db_now()))
     stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
     _report_stage(session, job.id, stage)
     _settle(session, job)
@@ -337,7 +394,20 @@ def _end(session: Session, held: Claim, state: StageState, **values: Any) -> boo
     if ended is None:
         return False
     _report_stage(session, held.job_id, ended)
+    if state in ENDED_STAGE:
+        _count(session, held, state)
     return True
+
+
+def _count(session: Session, held: Claim, state: StageState) -> None:
+    """Add the end of a stage to the sums that the metrics report."""
+    started = StageRow.started
+    seconds = session.scalar(select(db_now() - started).where(StageRow.id == held.stage_id)) or 0.0
+    bucket = next((limit for limit in SECONDS_BUCKETS if seconds <= limit), float("inf"))
+    counts = {f"stages|{held.name}|{state}": 1.0}
+    if state == StageState.DONE:
+        counts |= {f"stage_seconds|{held.name}": max(seconds, 0.0), f"stage_seconds_bucket|{held.name}|{bucket:g}": 1.0}
+    tally.add(session, counts)
 
 
 def _cancel_waiting(session: Session, job_id: str, states: Iterable[StageState], names: Iterable[str]) -> None:
@@ -364,16 +434,19 @@ def _settle(session: Session, job: Job) -> None:
         _cancel_waiting(session, job.id, (StageState.PENDING,), lost)
         rows = _stages(session, job.id)
     ended = {row.id for row in rows if row.state in ENDED_STAGE}
+    now = session.scalar(select(db_now()))
     for row in rows:
         if row.state == StageState.PENDING and set(row.depends_on) <= ended:
             row.state = StageState.READY
+            row.ready_since = now
             _report_stage(session, job.id, row)
     if len(ended) == len(rows):
         if job.cancel_requested:
             job.state = JobState.CANCELLED
         else:
             job.state = JobState.FAILED if broken else JobState.SUCCEEDED
-        job.finished = session.scalar(select(db_now()))
+        job.finished = now
+        tally.add(session, {f"jobs|{job.state}": 1.0})
         _report_job(session, job)
 
 

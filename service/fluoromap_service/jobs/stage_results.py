@@ -80,6 +80,8 @@ def load(kind: type[T], stage: StageRow) -> T:
         When the stage has no result.
     Problem
         409 ``result_outdated`` when another version of fluoromap stored it.
+    BrokenFile
+        When the stored file is missing or damaged.
     """
     if stage.result is None:
         raise ValueError(f"stage {stage.id} has no result")
@@ -92,13 +94,11 @@ def load_file(kind: type[T], sha256: str) -> T:
         known, size = _remembered.get(sha256, (None, 0))
     # Two kinds of results may have the same bytes.
     if not isinstance(known, kind):
-        content = files.path_of(sha256).read_bytes()
+        content = files.read(sha256)
         try:
             known, size = decode(kind, content), len(content)
         except StoredOtherwise:
-            sentence = (
-                "Another version of fluoromap stored this result, or its file is damaged. Start a new job to get it."
-            )
+            sentence = "Another version of fluoromap stored this result. Start a new job to get it."
             raise Problem(409, "result_outdated", sentence) from None
     remember(sha256, known, size)
     return known

@@ -54,13 +54,16 @@ def alternative_positions(
 
 
 def _alternative_reference_mm(site: LocatedSite, reference: str) -> Array | None:
-    """Return the reference catheter's mean (3,) under the other pairing.
+    """Return the reference catheter's origin (3,) under the other pairing.
 
     That pairing may move this catheter too.
     """
-    places = [
-        point.position_mm if point.alternative_mm is None else point.alternative_mm
+    if site.reference_mm is None:
+        return None
+    moves = [
+        np.zeros(3) if point.alternative_mm is None else point.alternative_mm - point.position_mm
         for point in site.points
         if point.catheter == reference
     ]
-    return np.mean(places, axis=0) if places else None
+    shifted: Array = site.reference_mm + np.mean(moves, axis=0)
+    return shifted

@@ -5,12 +5,16 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Engine, create_engine, event, make_url
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from fluoromap_service.settings import settings
+from fluoromap_service.store.disk import NoSpace
+from fluoromap_service.store.private_folder import make_private_file, make_private_folder
 
 BUSY_TIMEOUT_MS = 30_000
 POSTGRESQL = {
@@ -30,7 +34,10 @@ def _engine(url: str) -> Engine:
         return create_engine(
             url, pool_pre_ping=True, pool_size=10, max_overflow=20, hide_parameters=True, connect_args=POSTGRESQL
         )
-    settings().data_dir.mkdir(parents=True, exist_ok=True)
+    make_private_folder(settings().data_dir)
+    path = make_url(url).database
+    if path and path != ":memory:":
+        make_private_file(Path(path))
     engine = create_engine(
         url, hide_parameters=True, connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000}
     )
@@ -41,7 +48,9 @@ def _engine(url: str) -> Engine:
 
 def _on_sqlite_connect(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # the driver's own BEGIN is too late to lock for writing
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", f"busy_timeout={BUSY_TIMEOUT_MS}"):
+    # secure_delete: SQLite overwrites deleted rows with zeros; otherwise a deleted label could still be read in the file.
+    pragmas = "journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "secure_delete=ON"
+    for pragma in (*pragmas, f"busy_timeout={BUSY_TIMEOUT_MS}"):
         connection.execute(f"PRAGMA {pragma}")
 
 
@@ -53,6 +62,12 @@ def _on_sqlite_begin(connection: Connection) -> None:
 def engine() -> Engine:
     """Return the process's engine for the configured database."""
     return _engine(settings().effective_database_url)
+
+
+def forget_engine() -> None:
+    """Close all connections, so that the next one opens a database that was replaced."""
+    engine().dispose()
+    _engine.cache_clear()
 
 
 @contextmanager
@@ -70,6 +85,36 @@ def writing() -> Iterator[Session]:
     """Open a transaction that writes.
 
     It commits at the end and rolls back on any exception.
+
+    Raises
+    ------
+    NoSpace
+        When the disk of the database is full.
     """
-    with Session(engine().execution_options(writes=True), expire_on_commit=False) as session, session.begin():
-        yield session
+    try:
+        with Session(engine().execution_options(writes=True), expire_on_commit=False) as session, session.begin():
+            yield session
+    except OperationalError as error:
+        # SQLITE_FULL, and PostgreSQL's class 53100 disk_full
+        if "database or disk is full" in str(error.orig) or getattr(error.orig, "sqlstate", None) == "53100":
+            raise NoSpace from error
+        raise
+
+
+def empty_write_ahead_log() -> bool:
+    """Move SQLite's write-ahead log into the database and empty it.
+
+    Pages of deleted rows stay in the log until then. Return False when a reader prevents it now; PostgreSQL has its own
+    clean-up.
+    """
+    if engine().dialect.name != "sqlite":
+        return True
+    with engine().connect() as connection:
+        raw = connection.connection.driver_connection
+        assert raw is not None
+        raw.execute("PRAGMA busy_timeout=200")
+        try:
+            busy = raw.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
+        finally:
+            raw.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
+    return not busy

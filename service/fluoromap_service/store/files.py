@@ -1,16 +1,21 @@
 """Content-addressed files.
 
 The store writes a file under a temporary name, flushes it to disk, renames it to its hash and commits its row. So nobody sees
-a half-written file. A store on other media would need this interface and no more.
+a half-written file. A reader asks for a file by its hash and gets it only when the content still has that hash. A store on
+other media would need this interface and no more.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import tempfile
+import threading
+import time
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sqlalchemy import delete, exists, select, text
@@ -18,9 +23,26 @@ from sqlalchemy.orm import Session
 
 from fluoromap_service.settings import settings
 from fluoromap_service.store.models import File, Instance, Rendering, StageResult, StageRow
+from fluoromap_service.store.private_folder import make_private_folder
 
 CHUNK_BYTES = 1 << 20
+ABANDONED_SECONDS = 5.0
+"""Age of an incoming file without a lock at which nobody can be about to lock it."""
+_REMEMBERED_CHECKS = 4096
 _FILES_LOCK = 0x66696C65  # "file" in ASCII; any number that no other lock of this database uses
+_checked: OrderedDict[str, tuple[int, ...]] = OrderedDict()
+_checked_lock = threading.Lock()
+
+
+class BrokenFile(Exception):
+    """A stored file is missing, or its content no longer has the hash of its address."""
+
+    def __init__(self, sha256: str) -> None:
+        super().__init__(f"the stored file {sha256} is missing or damaged")
+        self.sha256 = sha256
+
+    def __reduce__(self) -> tuple[type[BrokenFile], tuple[str]]:
+        return BrokenFile, (self.sha256,)
 
 
 def path_of(sha256: str) -> Path:
@@ -34,15 +56,36 @@ def incoming() -> Iterator[Path]:
 
     The file is removed at the end unless it was kept.
     """
-    folder = settings().files_dir / "incoming"
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = incoming_folder()
+    make_private_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
     handle, name = tempfile.mkstemp(dir=folder)
-    os.close(handle)
     path = Path(name)
     try:
+        # The lock ends with this process, so that a clean-up recognises the files of a process that was killed.
+        fcntl.flock(handle, fcntl.LOCK_SH)
         yield path
     finally:
         path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def incoming_folder() -> Path:
+    """Return the folder of the files that have not arrived whole."""
+    return settings().files_dir / "incoming"
+
+
+def remove_abandoned() -> int:
+    """Remove the incoming files of processes that have died, and return how many."""
+    removed = 0
+    for path in incoming_folder().glob("*"):
+        with suppress(OSError), path.open("rb") as stream:
+            if time.time() - path.stat().st_mtime < ABANDONED_SECONDS:
+                continue
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+            removed += 1
+    return removed
 
 
 def sha256_of(path: Path) -> str:
@@ -52,6 +95,60 @@ def sha256_of(path: Path) -> str:
         while chunk := stream.read(CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()
+
+
+def is_whole(sha256: str) -> bool:
+    """Return whether a file exists and its content has the hash of its address.
+
+    A process reads a file again only when the file has changed since it last did so.
+    """
+    path = path_of(sha256)
+    try:
+        facts = path.stat()
+        state = facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
+        with _checked_lock:
+            if _checked.get(sha256) == state:
+                _checked.move_to_end(sha256)
+                return True
+        if sha256_of(path) != sha256:
+            return False
+    except FileNotFoundError:
+        return False
+    with _checked_lock:
+        _checked[sha256] = state
+        while len(_checked) > _REMEMBERED_CHECKS:
+            _checked.popitem(last=False)
+    return True
+
+
+def checked_path(sha256: str) -> Path:
+    """Return the path of a stored file whose content has been checked.
+
+    Raises
+    ------
+    BrokenFile
+        When the file is missing or its content has another hash.
+    """
+    if not is_whole(sha256):
+        raise BrokenFile(sha256)
+    return path_of(sha256)
+
+
+def read(sha256: str) -> bytes:
+    """Return the content of a stored file after a check of its hash.
+
+    Raises
+    ------
+    BrokenFile
+        When the file is missing or its content has another hash.
+    """
+    try:
+        content = path_of(sha256).read_bytes()
+    except FileNotFoundError:
+        raise BrokenFile(sha256) from None
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise BrokenFile(sha256)
+    return content
 
 
 def lock(session: Session) -> None:
@@ -67,21 +164,20 @@ def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
     """Move an incoming file to its content address; return its hash.
 
     The file's row is added. A caller that knows the hash gives it. Then the transaction does not read a long file
-    again.
+    again. A file that is already there is replaced, because it may be damaged.
     """
     sha256 = sha256 or sha256_of(path)
     lock(session)
     target = path_of(sha256)
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("rb") as stream:
-            os.fsync(stream.fileno())
-        path.replace(target)
-        folder = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+    path.replace(target)
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
     if session.get(File, sha256) is None:
         session.add(File(sha256=sha256))
         session.flush()

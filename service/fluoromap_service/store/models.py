@@ -6,6 +6,7 @@ from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import (
+    DDL,
     JSON,
     Boolean,
     Float,
@@ -16,6 +17,7 @@ from sqlalchemy import (
     String,
     Text,
     UniqueConstraint,
+    event,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
@@ -87,6 +89,7 @@ class Study(Base):
     """A mapping study: one rhythm of one patient."""
 
     __tablename__ = "study"
+    __table_args__ = (Index("ix_study_created_id", "created", "id"),)
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     label: Mapped[str] = mapped_column(String(200))
     chamber: Mapped[str | None] = mapped_column(String(100))
@@ -95,7 +98,7 @@ class Study(Base):
     reference: Mapped[str] = mapped_column(String(64))
     mapping: Mapped[str] = mapped_column(String(64))
     gantry: Mapped[Json] = mapped_column(default=dict)  # completes the headers of all runs
-    created: Mapped[float] = mapped_column(default=db_now(), index=True)
+    created: Mapped[float] = mapped_column(default=db_now())
     updated: Mapped[float] = mapped_column(default=db_now(), onupdate=db_now())
 
 
@@ -170,14 +173,18 @@ class Job(Base):
     """One run of the pipeline over a study, on a frozen snapshot."""
 
     __tablename__ = "job"
+    __table_args__ = (
+        Index("ix_job_created_id", "created", "id"),
+        Index("ix_job_study_created_id", "study_id", "created", "id"),
+    )
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
+    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"))
     state: Mapped[str] = mapped_column(String(10), index=True)
     version: Mapped[int] = mapped_column(default=0)  # every change raises it: ETag, and row lock at the end of a stage
     snapshot: Mapped[Json]
     cancel_requested: Mapped[bool] = mapped_column(Boolean, default=False)
     error: Mapped[Json | None]
-    created: Mapped[float] = mapped_column(default=db_now(), index=True)
+    created: Mapped[float] = mapped_column(default=db_now())
     started: Mapped[float | None]
     finished: Mapped[float | None]
 
@@ -199,6 +206,8 @@ class StageRow(Base):
     depends_on: Mapped[list[Any]]  # ids of stages that must have ended first
     state: Mapped[str] = mapped_column(String(10))
     attempt: Mapped[int] = mapped_column(default=0)
+    ready_since: Mapped[float | None]
+    started: Mapped[float | None]  # of the last attempt
     lease_until: Mapped[float | None]
     worker: Mapped[str | None] = mapped_column(String(100))
     published: Mapped[float | None]
@@ -274,7 +283,50 @@ class Idempotency(Base):
     status: Mapped[int | None] = mapped_column(Integer)  # None until the first request has its answer
     headers: Mapped[Json | None]
     body: Mapped[str | None] = mapped_column(Text)
+    study_id: Mapped[str | None] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), index=True)
     created: Mapped[float] = mapped_column(default=db_now(), index=True)
+
+
+class Tally(Base):
+    """A sum over the life of the installation, for the metrics."""
+
+    __tablename__ = "tally"
+    name: Mapped[str] = mapped_column(String(100), primary_key=True)
+    value: Mapped[float]
+
+
+class AuditEntry(Base):
+    """An entry of the audit trail. It outlives the study that it names, so nothing refers to other tables."""
+
+    __tablename__ = "audit"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    at: Mapped[float]
+    who: Mapped[str] = mapped_column(String(100))
+    what: Mapped[str] = mapped_column(String(200))
+    study: Mapped[str | None] = mapped_column(String(32), index=True)
+    job: Mapped[str | None] = mapped_column(String(32))
+    status: Mapped[int | None]
+    hash: Mapped[str] = mapped_column(String(64))
+
+
+APPEND_ONLY = {
+    "sqlite": [
+        f"CREATE TRIGGER audit_no_{verb} BEFORE {verb} ON audit BEGIN SELECT RAISE(ABORT, 'the audit trail is append-only'); END"
+        for verb in ("UPDATE", "DELETE")
+    ],
+    "postgresql": [
+        "CREATE FUNCTION audit_append_only() RETURNS trigger LANGUAGE plpgsql AS "
+        "$$ BEGIN RAISE EXCEPTION 'the audit trail is append-only'; END $$",
+        "CREATE TRIGGER audit_append_only BEFORE UPDATE OR DELETE OR TRUNCATE ON audit "
+        "FOR EACH STATEMENT EXECUTE FUNCTION audit_append_only()",
+    ],
+}
+"""The statements that make a database refuse to change the audit trail."""
+
+_ddl: Any = DDL  # SQLAlchemy gives it no types
+for _dialect, _statements in APPEND_ONLY.items():
+    for _statement in _statements:
+        event.listen(AuditEntry.__table__, "after_create", _ddl(_statement).execute_if(dialect=_dialect))
 
 
 class WorkerSeen(Base):

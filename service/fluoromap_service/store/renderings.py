@@ -61,6 +61,6 @@ def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], b
 def _find(key: str) -> KeptFile | None:
     with reading() as session:
         sha256 = session.scalar(select(Rendering.sha256).where(Rendering.key == key))
-    if sha256 is None or not files.path_of(sha256).exists():
+    if sha256 is None or not files.is_whole(sha256):
         return None
     return KeptFile(sha256, files.path_of(sha256))

@@ -74,7 +74,6 @@ def _refuse_newer(connection: Connection, config: Config) -> None:
 def _alone() -> Iterator[Connection]:
     """Open a connection and keep all other processes from migrating meanwhile."""
     if engine().dialect.name == "sqlite":
-        settings().data_dir.mkdir(parents=True, exist_ok=True)
         with (settings().data_dir / "migration.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             with engine().connect() as plain:

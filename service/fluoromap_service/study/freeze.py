@@ -161,6 +161,11 @@ def _no_ready_site(bound: Sequence[BoundSite]) -> Problem:
         if bound
         else "The study has no site yet; send its runs and its activation times first."
     )
+    if any(item.startswith("gantry:") for site in bound for item in site.missing):
+        detail += (
+            " Positions in millimetres need measured spacing, distances and angles; complete them by PATCH. Until then "
+            "GET .../instances/{uid}/frames/{n}/preview shows the electrodes at a scale that is found from the catheters."
+        )
     return Problem(422, "no_ready_site", detail, errors, extra={"sites": rows})
 
 

@@ -15,7 +15,7 @@ from fluoromap_service.dicom.facts import InstanceFacts
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
-from fluoromap_service.store.engine import writing
+from fluoromap_service.store.engine import empty_write_ahead_log, writing
 from fluoromap_service.store.models import (
     ENDED_JOB,
     Correction,
@@ -152,7 +152,7 @@ def add(
 ) -> bool:
     """Store an incoming file and refer to it from the study.
 
-    Return False when both exist already.
+    Return False when both exist already. The file is stored again in that case too, because the stored one may be damaged.
 
     Raises
     ------
@@ -168,8 +168,8 @@ def add(
             "The store has another file with the same SOP Instance UID; the sender must make a new UID for a changed file.",
             [("SOPInstanceUID", "already stored with other content")],
         )
+    files.keep(session, path, sha256=sha256)
     if known is None:
-        files.keep(session, path, sha256=sha256)
         session.add(
             Instance(
                 sop_instance_uid=facts.sop_instance_uid,
@@ -272,3 +272,4 @@ def unlink_unreferenced(hashes: Iterable[str]) -> None:
             files.lock(session)
             if session.get(File, sha256) is None:
                 files.path_of(sha256).unlink(missing_ok=True)
+    empty_write_ahead_log()

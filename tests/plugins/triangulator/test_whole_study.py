@@ -24,6 +24,7 @@ from fluoromap.geometry import Camera, camera_from_gantry
 from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
+from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
@@ -244,3 +245,59 @@ def test_a_heart_displaced_in_both_views_is_no_moved_table() -> None:
     by_site[3] = {name: at + np.array([12.0, -12.0, 5.0]) for name, at in by_site[3].items()}
     answer = located(matched_sites(by_site, np.random.default_rng(9)))
     assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
+
+
+def without(site: MatchedSite, catheter: str, hidden: tuple[int, ...]) -> MatchedSite:
+    """Return the site without some electrodes of a catheter in view a."""
+
+    def visible(chain: NamedChain) -> NamedChain:
+        kept = [k for k, number in enumerate(chain.electrodes) if chain.catheter != catheter or number not in hidden]
+        numbers = tuple(chain.electrodes[k] for k in kept)
+        return replace(
+            chain, electrodes=numbers, pixels_uv=chain.pixels_uv[kept], covariance_px2=chain.covariance_px2[kept]
+        )
+
+    seen = site.diastole.a
+    seen = replace(seen, chains=tuple(chain for old in seen.chains if (chain := visible(old)).electrodes))
+    return replace(site, diastole=replace(site.diastole, a=seen))
+
+
+@pytest.mark.parametrize("hidden", [(1, 2), (3, 4), (4,)])
+def test_a_site_that_hides_some_of_the_reference_has_the_same_origin_as_the_others(hidden: tuple[int, ...]) -> None:
+    by_site = electrodes(33, sites=6)
+    sites = list(matched_sites(by_site, np.random.default_rng(0)))
+    sites[2] = without(sites[2], "reference", hidden)
+    for index, site in enumerate(located(tuple(sites)).sites):
+        reference = by_site[index]["reference"].mean(axis=0)
+        tip = site.point("mapping", 1)
+        assert tip is not None
+        assert tip.relative_mm is not None
+        assert np.linalg.norm(tip.relative_mm - (by_site[index]["mapping"][0] - reference)) < 1.0
+        assert site.reference_mm is not None
+        assert np.linalg.norm(site.reference_mm - reference) < 1.0
+
+
+def test_a_site_that_hides_most_of_the_reference_moves_the_origin_of_no_other_site() -> None:
+    by_site = electrodes(33, sites=5)
+    sites = list(matched_sites(by_site, np.random.default_rng(0)))
+    plain = located(tuple(sites))
+    sites[4] = without(sites[4], "reference", (1, 2, 3))
+    found = located(tuple(sites))
+    for before, after in zip(plain.sites[:4], found.sites[:4], strict=True):
+        first, second = before.point("mapping", 1), after.point("mapping", 1)
+        assert first is not None
+        assert second is not None
+        np.testing.assert_allclose(first.relative_mm, second.relative_mm, atol=0.3)
+
+
+def test_offsets_of_some_electrodes_add_their_own_error_and_those_of_all_add_none() -> None:
+    offsets = {number: np.array([3.0 * number - 6.0, 0.0, 0.0]) for number in (1, 2, 3)}
+    origin = ReferenceOrigin(offsets, 0.25 * np.eye(3))
+    at = np.array([[10.0, 1.0, 1.0], [13.0, 1.0, 1.0], [16.0, 1.0, 1.0]])
+    place, added = origin.from_electrodes((1, 2, 3), at) or (None, None)
+    np.testing.assert_allclose(place, [13.0, 1.0, 1.0])
+    np.testing.assert_allclose(added, 0.0, atol=1e-12)
+    place, added = origin.from_electrodes((3,), at[2:]) or (None, None)
+    np.testing.assert_allclose(place, [13.0, 1.0, 1.0])
+    np.testing.assert_allclose(added, 0.25 * 2 / 3 * np.eye(3))
+    assert origin.from_electrodes((7,), at[:1]) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,12 +15,27 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, select, text
 
+from fluoromap_service import auth
+from fluoromap_service.jobs import job_life
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import engine as store_engine
 from fluoromap_service.store import schema
 from fluoromap_service.store.engine import engine, reading, writing
-from fluoromap_service.store.models import Base, Correction, File, Instance, Study, StudyInstance
+from fluoromap_service.store.models import (
+    Base,
+    Correction,
+    Event,
+    File,
+    Idempotency,
+    Instance,
+    Job,
+    Point,
+    Site,
+    Study,
+    StudyInstance,
+)
+from fluoromap_service.study import studies
 
 FIRST_ROWS = (
     f"INSERT INTO file VALUES ('{'f' * 64}', 10, 'application/dicom', 1.0)",
@@ -28,8 +44,19 @@ FIRST_ROWS = (
     "INSERT INTO study_instance (study_id, sop_instance_uid, gantry, added) VALUES ('s1', '1.2.3', '{}', 1.0)",
     "INSERT INTO mark (study_id, sop_instance_uid, frame, version, author, created)"
     " VALUES ('s1', '1.2.3', 4, 1, 'tester', 1.0)",
+    "INSERT INTO site (study_id, name, lat_ms, lat_by, csv_row) VALUES ('s1', 'S01', 41.5, 'csv', 1)",
+    "INSERT INTO job (id, study_id, state, version, manifest, cancel_requested, created, started)"
+    """ VALUES ('j1', 's1', 'running', 3, '{"runs": {"1.2.3": {"marks": {"4": []}}}}', FALSE, 2.0, 3.0)""",
+    "INSERT INTO stage (job_id, name, subject, plugin, plugin_version, depends_on, state, attempt, publications, progress,"
+    f" reused, result) VALUES ('j1', 'segment', '1.2.3', 'p', '1', '[]', 'ready', 1, 2, 0.5, FALSE, '{'f' * 64}')",
+    "INSERT INTO point (job_id, site, catheter, electrode, position_mm, grade, relative_grade, reasons)"
+    " VALUES ('j1', 'S01', 'mapping', 1, '[1, 2, 3]', 'A', 'A', '[]')",
+    "INSERT INTO event (job_id, kind, data, created) VALUES ('j1', 'job', '{}', 1.0)",
+    "INSERT INTO token (name, sha256, scopes, created)"
+    f" VALUES ('first', '{hashlib.sha256(b'secret').hexdigest()}', '[\"admin\"]', 1.0)",
+    "INSERT INTO idempotency (key, request_sha256, status, body, created) VALUES ('k', 'c', 201, 'label', 1.0)",
 )
-"""Rows of the first schema: a run in a study, with a corrected frame."""
+"""Rows of the first schema: a run in a study with a corrected frame, a running job, a token and a stored answer."""
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -85,12 +112,7 @@ def test_history_is_one_line() -> None:
 
 
 def test_rows_of_the_first_schema_stay(database: str) -> None:
-    config = schema.configuration()
-    with schema._alone() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0001")
-        for statement in FIRST_ROWS:
-            connection.execute(text(statement))
+    _make_first_schema()
     schema.upgrade()
     with reading() as session:
         instance = session.get_one(Instance, "1.2.3")
@@ -98,6 +120,43 @@ def test_rows_of_the_first_schema_stay(database: str) -> None:
         assert session.get_one(File, "f" * 64)
         assert session.scalars(select(StudyInstance.sop_instance_uid)).all() == ["1.2.3"]
         assert session.scalars(select(Correction.frame)).all() == [4]
+        site = session.scalars(select(Site)).one()
+        assert (site.name, site.lat_ms) == ("S01", 41.5)
+        job = session.get_one(Job, "j1")
+        assert (job.state, job.created, job.snapshot["runs"]["1.2.3"]["corrections"]) == ("running", 2.0, {"4": []})
+        assert session.scalars(select(Point.position_mm)).all() == [[1, 2, 3]]
+        assert session.scalars(select(Event.kind)).all() == ["job"]
+        # Such an answer named no study, so nothing could delete it with the study.
+        assert session.scalars(select(Idempotency.id)).all() == []
+    caller = auth.verify("secret")
+    assert caller is not None
+    assert caller.name == "first"
+
+
+@pytest.mark.usefixtures("database")
+def test_a_job_of_the_first_schema_goes_on() -> None:
+    _make_first_schema()
+    schema.upgrade()
+    with writing() as session:
+        (stage,) = job_life.ready(session, "j1")
+        held = job_life.claim(session, stage.stage_id, "tester")
+        assert held is not None
+        assert job_life.fail(session, held, {"code": "plugin_failed", "detail": "It failed."})
+    with reading() as session:
+        assert session.get_one(Job, "j1").state == "failed"
+    with writing() as session:
+        studies.remove(session, "s1")
+    with reading() as session:
+        assert session.scalars(select(Job.id)).all() == session.scalars(select(Study.id)).all() == []
+
+
+def _make_first_schema() -> None:
+    config = schema.configuration()
+    with schema._alone() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+        for statement in FIRST_ROWS:
+            connection.exec_driver_sql(statement)
 
 
 @pytest.mark.usefixtures("database")

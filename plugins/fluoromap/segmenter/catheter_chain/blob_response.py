@@ -32,6 +32,8 @@ class BlobResponse:
     noise : (3,) robust standard deviation of ``stack`` inside the field.
     smooth : (rows, columns) the reduced log image at the smallest scale.
     pixel_noise : standard deviation of a pixel of the reduced log image.
+    position_noise : the same of the image at half its size, whatever the reduction. Compression removes noise between
+    neighbouring pixels; at half the size it stays, and displaces electrodes.
     """
 
     stack: Image
@@ -39,6 +41,7 @@ class BlobResponse:
     noise: Array
     smooth: Image
     pixel_noise: float
+    position_noise: float
     reduction: int
     px_per_mm: float
 
@@ -67,9 +70,9 @@ class BlobResponse:
         for level in range(1, len(stack)):
             np.multiply(stack[level], np.float32(1.0 / noise[level]), out=other)
             np.maximum(best, other, out=best)
-        return cls(
-            stack, best, noise, smooth, pixel_noise(small, inside[::reduction, ::reduction]), reduction, px_per_mm
-        )
+        of_pixels = pixel_noise(small, inside[::reduction, ::reduction])
+        of_positions = of_pixels if reduction == 2 else max(of_pixels, _noise_at_half_size(x, inside))
+        return cls(stack, best, noise, smooth, of_pixels, of_positions, reduction, px_per_mm)
 
     @property
     def likeness(self) -> Likeness:
@@ -172,6 +175,11 @@ def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
         flat[2 * columns :], np.float32(0.5 * sigma**2), out.reshape(-1)[middle],
     )  # fmt: skip
     out[:, 0] = out[:, -1] = 0
+
+
+def _noise_at_half_size(x: Image, inside: BoolArray) -> float:
+    half = reduce_by(x, 2)
+    return pixel_noise(half, inside[: 2 * half.shape[0] : 2, : 2 * half.shape[1] : 2])
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

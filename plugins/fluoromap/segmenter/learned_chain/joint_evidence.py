@@ -55,6 +55,10 @@ class JointEvidence:
         return max(self.blobs.pixel_noise, self.least_noise)
 
     @property
+    def position_noise(self) -> float:
+        return max(self.blobs.position_noise, self.least_noise)
+
+    @property
     def likeness(self) -> Likeness:
         return self.blobs.likeness
 

@@ -20,6 +20,8 @@ from fluoromap_service.settings import settings
 
 PROCESSES = 2
 LONGEST_SECONDS = 20.0
+LONGEST_SEARCH_SECONDS = 90.0
+"""The first search of a process compiles its kernels."""
 START_SECONDS = 120.0
 LONGEST_WAIT_SECONDS = 60.0
 _PRELOADED = ("fluoromap_service.dicom", "fluoromap_service.results.fusion")
@@ -33,6 +35,12 @@ class Task(StrEnum):
 
     READ_FILE = "Reading this file"
     DRAW_PICTURE = "Drawing this picture"
+    FIND_ELECTRODES = "Finding the electrodes of this frame"
+
+    @property
+    def longest_seconds(self) -> float:
+        """Time limit of the task."""
+        return LONGEST_SEARCH_SECONDS if self is Task.FIND_ELECTRODES else LONGEST_SECONDS
 
 
 _lock = threading.Lock()
@@ -58,7 +66,7 @@ def run_in_pool(
         for _ in range(2):
             pool = _running()
             try:
-                return pool.submit(function, *arguments, **keywords).result(LONGEST_SECONDS)
+                return pool.submit(function, *arguments, **keywords).result(task.longest_seconds)
             except TimeoutError:
                 _discard(pool)
                 raise Problem(422, "undecodable", f"{task} takes too long; check the file.") from None

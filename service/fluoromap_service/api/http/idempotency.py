@@ -52,6 +52,7 @@ class Once:
     def __init__(self, request: Request, key: str | None, content: str | None = None) -> None:
         self._key = None if key is None else _hash(_caller(request), request.method, request.url.path, key)
         self._query = request.url.query
+        self._study: str | None = request.path_params.get("study_id")
         self.content = content
 
     def answer(self, act: Callable[[Session], Response]) -> Response:
@@ -87,7 +88,14 @@ class Once:
             row.status = response.status_code
             row.headers = {name: response.headers[name] for name in _STORED_HEADERS if name in response.headers}
             row.body = bytes(response.body).decode()
+            # The answer can contain the study's label and notes: it is deleted together with the study.
+            row.study_id = self._study or _created_study(response)
             return response
+
+
+def _created_study(response: Response) -> str | None:
+    collection, _, name = response.headers.get("location", "").rpartition("/")
+    return name if collection == "/v1/studies" else None
 
 
 def _reserve(session: Session, key: str, content: str) -> bool:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Generic, TypeVar
 from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import ColumnElement, select, tuple_
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Job, Study
@@ -58,6 +58,9 @@ class Paging:
             400 when the cursor belongs to another list.
         """
         query = select(kind).where(*conditions).order_by(kind.created.desc(), kind.id.desc()).limit(self.limit + 1)
+        if kind is Job:
+            # A snapshot has hundreds of kilobytes, and no list shows it.
+            query = query.options(defer(Job.snapshot))
         after = self._key(float, str)
         if after is not None:
             query = query.where(tuple_(kind.created, kind.id) < after)

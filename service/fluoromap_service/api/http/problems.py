@@ -10,11 +10,16 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
+from sqlalchemy import select
 from sqlalchemy.exc import DataError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from fluoromap_service.problem import Problem
+from fluoromap_service.store.disk import FULL
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.files import BrokenFile
+from fluoromap_service.store.models import Instance
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -67,10 +72,17 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+def no_space() -> Problem:
+    """Return the 507 for a disk that has no room left."""
+    detail = "The disk of the service is nearly full; delete studies that nobody needs, or give it more space."
+    return Problem(507, "no_space", detail)
+
+
 _CODES = {
     400: "malformed",
     404: "not_found",
     405: "method_not_allowed",
+    408: "request_timeout",
     413: "too_large",
     415: "unsupported_media_type",
 }
@@ -128,6 +140,17 @@ def install(app: FastAPI) -> None:
             Problem(422, "invalid", "Some fields of the request are wrong; see 'errors' for each of them.", places)
         )
 
+    @app.exception_handler(BrokenFile)
+    def broken_file(request: Request, error: BrokenFile) -> JSONResponse:
+        log.error("broken_file", sha256=error.sha256)
+        with reading() as session:
+            uid = session.scalar(select(Instance.sop_instance_uid).where(Instance.sha256 == error.sha256).limit(1))
+        if uid is None:
+            detail = "The stored file of this result is damaged. Start a new job; it computes the result again."
+            return answer(Problem(409, "result_broken", detail))
+        detail = "The stored file of this run is damaged. Upload the same file again; it replaces the damaged one."
+        return answer(Problem(409, "run_broken", detail, [("sop_instance_uid", uid)]))
+
     @app.exception_handler(DataError)
     async def value_out_of_range(request: Request, error: DataError) -> JSONResponse:
         detail = "The request contains a NUL character or a number out of range; remove it."
@@ -139,9 +162,9 @@ def install(app: FastAPI) -> None:
     for kind in DATABASE_AWAY:
         app.add_exception_handler(kind, unavailable)
 
-    @app.exception_handler(Exception)
-    async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        log.error(
-            "unexpected_error", error=type(error).__name__, path=request.scope.get("route_path", ""), exc_info=error
-        )
-        return answer(Problem(500, "internal", "The service failed and changed nothing; see its log."))
+    @app.exception_handler(OSError)
+    async def disk_is_full(request: Request, error: OSError) -> JSONResponse:
+        if error.errno not in FULL:
+            raise error
+        log.error("disk_full", path=getattr(request.scope.get("route"), "path", ""))
+        return answer(no_space())

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from typing import Annotated
 from urllib.parse import urlsplit
 
+import structlog
+from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Receive, Send
@@ -16,6 +19,7 @@ from starlette.types import Scope as AsgiScope
 from fluoromap_service import auth
 from fluoromap_service.api.http.problems import DATABASE_AWAY, answer, database_away
 from fluoromap_service.api.http.session import session_token
+from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
@@ -27,6 +31,8 @@ OPEN_PATHS = frozenset(
 )
 """The paths that answer without a token."""
 
+log = structlog.get_logger(__name__)
+
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
@@ -36,8 +42,9 @@ class Doorkeeper:
     Reading needs the scope ``read``, everything else ``write``.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, sign_ins: SignInLimit) -> None:
         self._app = app
+        self._sign_ins = sign_ins
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket") or scope["path"] in OPEN_PATHS:
@@ -45,7 +52,7 @@ class Doorkeeper:
             return
         connection = HTTPConnection(scope)
         try:
-            caller = await run_in_threadpool(_identify, connection)
+            caller = await to_thread.run_sync(_identify, connection, self._sign_ins, limiter=_threads())
             _demand(caller, Scope.READ if _only_reads(scope) else Scope.WRITE)
         except Problem as problem:
             if problem.status == 401 and _opens_page(connection):
@@ -77,13 +84,19 @@ def bearer_token(connection: HTTPConnection) -> str | None:
     return (credentials.strip() or None) if scheme.lower() == "bearer" else None
 
 
-def _identify(connection: HTTPConnection) -> Caller:
-    token = bearer_token(connection) or session_token(connection)
-    if token is not None:
-        caller = auth.verify(token)
+def _identify(connection: HTTPConnection, sign_ins: SignInLimit) -> Caller:
+    credentials = bearer_token(connection) or session_token(connection)
+    if credentials is not None:
+        token = hashlib.sha256(credentials.encode()).hexdigest()
+        address = connection.client.host if connection.client else ""
+        sign_ins.check(address, token)
+        caller = auth.verify(credentials)
         if caller is not None:
+            sign_ins.succeeded(address, token)
             return caller
         if auth.any_token():
+            sign_ins.failed(address)
+            log.warning("sign_in_failed", address=address)
             raise _unauthorised(
                 "This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"'
             )
@@ -111,9 +124,32 @@ def _check_local(connection: HTTPConnection) -> None:
     if name is None or not auth.is_loopback(name):
         raise Problem(403, "foreign_host", "Without tokens this service answers only under localhost or 127.0.0.1.")
     origin = connection.headers.get("origin")
-    own = f"{connection.scope['scheme']}://{host}".lower()
-    if origin is not None and origin.lower() not in (own, *settings().allowed_origins):
+    allowed = origin is not None and origin.lower() in settings().allowed_origins
+    site = connection.headers.get("sec-fetch-site", "none")
+    if site not in ("same-origin", "none") and not allowed and not _is_navigation(connection):
         raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
+    own = f"{connection.scope['scheme']}://{host}".lower()
+    if origin is not None and not allowed and origin.lower() != own:
+        raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
+
+
+def _is_navigation(connection: HTTPConnection) -> bool:
+    """Return whether a person follows a link to this service.
+
+    The page with the link cannot read the answer.
+    """
+    headers = connection.headers
+    return (
+        connection.scope.get("method") == "GET"
+        and headers.get("sec-fetch-mode") == "navigate"
+        and headers.get("sec-fetch-dest") == "document"
+    )
+
+
+@functools.cache
+def _threads() -> CapacityLimiter:
+    # Of its own, so that a request need not wait for the threads of other requests before it is even let in.
+    return CapacityLimiter(8)
 
 
 def _host_name(host: str) -> str | None:

@@ -7,7 +7,7 @@ from http import HTTPStatus
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import func, select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from fluoromap.reasons import Reason
@@ -44,6 +44,20 @@ class Links(BaseModel):
     map: str
     overlays: str
     report: str
+
+
+class JobSummary(BaseModel):
+    """One job in a list; the job itself has its stages and warnings too."""
+
+    id: str
+    study: str
+    state: JobState
+    progress: float = Field(ge=0, le=1, description="Mean over the stages; 1 when the job has ended.")
+    error: ProblemDocument | None
+    created: str
+    started: str | None
+    finished: str | None
+    links: Links
 
 
 class JobAnswer(BaseModel):
@@ -90,7 +104,6 @@ class JobAnswer(BaseModel):
 
 def job_answer(job: Job, stages: Sequence[StageRow], warnings: Sequence[Reason] = ()) -> JobAnswer:
     """Return a job with its stages in the shape of the answer."""
-    root = f"/v1/jobs/{job.id}"
     return JobAnswer(
         id=job.id,
         study=job.study_id,
@@ -102,13 +115,7 @@ def job_answer(job: Job, stages: Sequence[StageRow], warnings: Sequence[Reason] 
         created=rfc3339(job.created),
         started=rfc3339_or_none(job.started),
         finished=rfc3339_or_none(job.finished),
-        links=Links(
-            points=f"{root}/points",
-            tracks=f"{root}/tracks",
-            map=f"{root}/map",
-            overlays=f"{root}/overlays",
-            report=f"{root}/report.html",
-        ),
+        links=_links(job),
     )
 
 
@@ -117,16 +124,42 @@ def read_job(session: Session, job: Job) -> JobAnswer:
     return job_answer(job, stages_of(session, job.id), warnings_of(session, job))
 
 
-def read_jobs(session: Session, jobs: Sequence[Job]) -> dict[str, JobAnswer]:
-    """Return the answers of several jobs by their ids.
+def job_summaries(session: Session, jobs: Sequence[Job]) -> dict[str, JobSummary]:
+    """Return the entries of several jobs in a list, by their ids.
 
-    One query reads all stages.
+    The database computes the progress of the running jobs; no stage of a queued job has begun. No stage and no snapshot is read.
     """
-    ids = [job.id for job in jobs]
-    stages: dict[str, list[StageRow]] = {job_id: [] for job_id in ids}
-    for row in session.scalars(select(StageRow).where(StageRow.job_id.in_(ids)).order_by(StageRow.id)):
-        stages[row.job_id].append(row)
-    return {job.id: job_answer(job, stages[job.id], warnings_of(session, job)) for job in jobs}
+    progress = {job.id: 0.0 for job in jobs if job.state == JobState.QUEUED}
+    active = [job.id for job in jobs if job.state == JobState.RUNNING]
+    part = case((StageRow.state.in_(list(ENDED_STAGE)), 1.0), else_=StageRow.progress)
+    means = select(StageRow.job_id, func.avg(part)).where(StageRow.job_id.in_(active)).group_by(StageRow.job_id)
+    if active:
+        progress |= {job_id: round(mean, 4) for job_id, mean in session.execute(means)}
+    return {
+        job.id: JobSummary(
+            id=job.id,
+            study=job.study_id,
+            state=JobState(job.state),
+            progress=progress.get(job.id, 1.0),
+            error=_problem(job.error),
+            created=rfc3339(job.created),
+            started=rfc3339_or_none(job.started),
+            finished=rfc3339_or_none(job.finished),
+            links=_links(job),
+        )
+        for job in jobs
+    }
+
+
+def _links(job: Job) -> Links:
+    root = f"/v1/jobs/{job.id}"
+    return Links(
+        points=f"{root}/points",
+        tracks=f"{root}/tracks",
+        map=f"{root}/map",
+        overlays=f"{root}/overlays",
+        report=f"{root}/report.html",
+    )
 
 
 def etag_of(session: Session, job: Job) -> str:

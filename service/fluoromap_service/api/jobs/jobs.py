@@ -19,7 +19,7 @@ from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import JobId, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
-from fluoromap_service.api.jobs.job_answers import JobAnswer, etag_of, read_job, read_jobs
+from fluoromap_service.api.jobs.job_answers import JobAnswer, JobSummary, etag_of, job_summaries, read_job
 from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.results.finished import job_of
@@ -100,15 +100,15 @@ def create_job(
 
 
 @router.get(
-    "/v1/jobs", summary="List jobs", response_model=Page[JobAnswer], responses=responses(400, 401, 403, 422)
+    "/v1/jobs", summary="List jobs", response_model=Page[JobSummary], responses=responses(400, 401, 403, 422)
 )  # fmt: skip
 def list_jobs(
     caller: Reader, pages: Pages, study: Annotated[str | None, Query(description="Only the jobs of this study.")] = None
-) -> Page[JobAnswer]:
-    """List all jobs, the newest first."""
+) -> Page[JobSummary]:
+    """List all jobs, the newest first, without their stages and warnings."""
     with reading() as session:
         found = pages.newest_first(session, Job, *([] if study is None else [Job.study_id == study]))
-        answers = read_jobs(session, found)
+        answers = job_summaries(session, found)
     return pages.page_of_newest(found, lambda job: answers[job.id])
 
 

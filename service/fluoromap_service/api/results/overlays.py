@@ -70,6 +70,7 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
         if not path.exists():
             detail = "Somebody deleted this run; upload it again and start a new job to get its overlay."
             raise Problem(409, "run_deleted", detail)
+        files.checked_path(fusion.sha256)
         return run_in_pool(Task.DRAW_PICTURE, draw_fusion, path, fusion, look, moving)
 
     return kept_rendering(job_id, overlay_dependencies(fusion, look, moving=moving), make)

@@ -13,7 +13,7 @@ from sqlalchemy import select
 from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.jobs.stall import StallWatch, stall_seconds
 from fluoromap_service.settings import settings
-from fluoromap_service.store import files
+from fluoromap_service.store import disk, files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 
@@ -68,6 +68,8 @@ def _broker() -> str:
 def _files() -> str:
     with files.incoming() as path:
         path.write_bytes(b"")
+    if disk.free_bytes() < disk.reserve_bytes():
+        return "The disk is nearly full, so uploads are refused; delete studies or give the service more space."
     return ""
 
 

@@ -1,12 +1,15 @@
-"""The route of single frames for display, in stored pixels."""
+"""The routes of single frames for display, in stored pixels, and of the electrodes that they show."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, Field
 
+from fluoromap.catheters import Catalogue
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
@@ -16,9 +19,34 @@ from fluoromap_service.dicom import frame_png
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.study import instances
+from fluoromap_service.study import instances, preview, studies
+from fluoromap_service.study.catheters import catalogue_of
+from fluoromap_service.study.instances import StudyRun
+from fluoromap_service.study.preview import ScaleSource
 
 router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+
+
+class PreviewElectrodeOut(BaseModel):
+    """One electrode of a preview."""
+
+    catheter: str | None = Field(description="Null where no catheter of the study fits.", examples=["mapping"])
+    electrode: int = Field(description="1 is the tip.", examples=[1])
+    u_px: float = Field(examples=[251.5])
+    v_px: float = Field(examples=[233.0])
+    sd_px: float = Field(examples=[0.6])
+
+
+class PreviewOut(BaseModel):
+    """Electrodes of one frame, for showing only: a job does not use them."""
+
+    px_per_mm: float | None = Field(description="At the isocentre; null where `scale` is unknown.", examples=[3.6])
+    scale: ScaleSource = Field(
+        description="`measured`: from the run's geometry. `found`: the scale at which the study's catheters explain the pictures "
+        "best, right to about 20 %. `unknown`: no scale explains them."
+    )
+    inverted: bool = Field(description="Whether high values are dark although the header does not say so.")
+    electrodes: list[PreviewElectrodeOut]
 
 
 @router.get(
@@ -29,7 +57,7 @@ router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"]
             "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
             "description": "The frame.",
         },
-        **responses(401, 403, 404, 422, 429),
+        **responses(401, 403, 404, 409, 422, 429),
     },
 )
 def get_frame(
@@ -41,25 +69,66 @@ def get_frame(
     window: Annotated[
         str | None, Query(description="Centre and width in stored values.", examples=["512,1024"], max_length=60)
     ] = None,
+    electrodes: Annotated[bool, Query(description="Whether to draw the electrodes of the preview.")] = False,
 ) -> Response:
     """Return one frame as an 8-bit picture in stored pixels.
 
-    Without `window` the picture has the file's own window, otherwise the frame's own range.
+    Without `window` the picture has the file's own window, otherwise the frame's own range. With `electrodes` it has a ring round
+    each electrode of the preview.
     """
     chosen = None if window is None else _window(window)
-    with reading() as session:
-        run = instances.run_of(session, study_id, uid)
-    if n > run.facts.frames:
-        raise not_found("frame")
+    run, catalogue = _run_with_frame(study_id, uid, n)
+    if electrodes:
+        path, px_per_mm = files.checked_path(run.instance.sha256), _px_per_mm(run)
+        marked = run_in_pool(
+            Task.FIND_ELECTRODES, preview.preview_png, path, run.facts, catalogue, n - 1, px_per_mm, chosen
+        )
+        return Response(marked, media_type="image/png", headers={"Cache-Control": "no-store"})
     shown = "" if chosen is None else f"-{chosen[0]:g}-{chosen[1]:g}"
     etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
     if is_known(request, etag):
         return not_modified(etag)
-    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, files.path_of(run.instance.sha256), run.facts, n - 1, chosen)
+    path = files.checked_path(run.instance.sha256)
+    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
     # A stored file never changes, so a browser may keep the picture.
     return Response(
         picture, media_type="image/png", headers={"ETag": etag, "Cache-Control": "private, max-age=3600, immutable"}
     )
+
+
+@router.get("/{uid}/frames/{n}/preview", responses=responses(401, 403, 404, 409, 422, 429))
+def get_preview(study_id: StudyId, uid: InstanceUid, n: FrameNumber, caller: Reader) -> PreviewOut:
+    """Find the electrodes of one frame without a job, for showing only.
+
+    The run's geometry may be incomplete: then the scale is found from the study's catheters, and `scale` says so.
+    """
+    run, catalogue = _run_with_frame(study_id, uid, n)
+    path = files.checked_path(run.instance.sha256)
+    found = run_in_pool(
+        Task.FIND_ELECTRODES, preview.preview_electrodes, path, run.facts, catalogue, n - 1, _px_per_mm(run)
+    )
+    return PreviewOut.model_validate(asdict(found))
+
+
+def _run_with_frame(study_id: str, uid: str, n: int) -> tuple[StudyRun, Catalogue]:
+    with reading() as session:
+        run = instances.run_of(session, study_id, uid)
+        catalogue = catalogue_of(studies.get(session, study_id))
+    if n > run.facts.frames:
+        raise not_found("frame")
+    return run, catalogue
+
+
+def _px_per_mm(run: StudyRun) -> float | None:
+    """Return the measured scale at the isocentre.
+
+    It needs no angles. None while a length is missing.
+    """
+    gantry = run.gantry
+    lengths = gantry["source_detector_mm"], gantry["source_isocentre_mm"], gantry["pixel_spacing_mm"]
+    if any(length is None for length in lengths):
+        return None
+    return float(lengths[0] / lengths[1] / math.sqrt(lengths[2][0] * lengths[2][1]))
 
 
 def _window(text: str) -> tuple[float, float]:

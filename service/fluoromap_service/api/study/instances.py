@@ -9,7 +9,6 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
-from starlette.concurrency import run_in_threadpool
 
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.idempotency import Once, OnceUpload
@@ -19,7 +18,7 @@ from fluoromap_service.api.http.problems import ProblemDocument, document, respo
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
 from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
-from fluoromap_service.api.study.uploads import Part, receive
+from fluoromap_service.api.study.uploads import Part, in_upload_thread, receive
 from fluoromap_service.dicom import InstanceFacts, read_instance
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
@@ -137,7 +136,7 @@ async def upload_instances(
 
     A problem of one file does not affect the others.
     """
-    await run_in_threadpool(_check_study, study_id)
+    await in_upload_thread(_check_study, study_id)
     with ExitStack() as stack:
         parts, site_field = await receive(request, stack)
         site = site if site_field is None else site_field
@@ -151,7 +150,7 @@ async def upload_instances(
                 "The request has no part named 'file'; send each run as such a part.",
                 [("file", "missing")],
             )
-        return await run_in_threadpool(_store, study_id, parts, site, once)
+        return await in_upload_thread(_store, study_id, parts, site, once)
 
 
 def _check_study(study_id: str) -> None:

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from fluoromap_service.problem import Problem
-from fluoromap_service.store import files
+from fluoromap_service.store import disk, files
 
 MOST_PARTS = 2000
+PART_BYTES = 1 << 20
+"""Bytes of a body that are written at once."""
+
+UPLOAD_THREADS = 32
 _LONGEST_FIELD = 1024
+
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +182,7 @@ async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str |
             if not boundary:
                 raise _malformed()
             form = _Form(boundary, stack)
-            async for chunk in request.stream():
-                await run_in_threadpool(form.write, chunk)
+            await _write_all(request, form.write)
             if not form.ended:
                 raise _malformed()
             return form.files, form.site
@@ -186,6 +193,35 @@ async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str |
 
 async def _receive_raw(request: Request, stack: ExitStack) -> Part:
     arriving = _arriving(stack, None)
+    await _write_all(request, arriving.write)
+    return await in_upload_thread(arriving.finish)
+
+
+async def _write_all(request: Request, write: Callable[[bytes], None]) -> None:
+    """Write a body in large parts, because each part waits once for a thread."""
+    waiting = bytearray()
     async for chunk in request.stream():
-        await run_in_threadpool(arriving.write, chunk)
-    return await run_in_threadpool(arriving.finish)
+        waiting += chunk
+        if len(waiting) >= PART_BYTES:
+            await in_upload_thread(_write_part, write, bytes(waiting))
+            waiting.clear()
+    if waiting:
+        await in_upload_thread(_write_part, write, bytes(waiting))
+
+
+def _write_part(write: Callable[[bytes], None], part: bytes) -> None:
+    disk.check_room(len(part))
+    write(part)
+
+
+async def in_upload_thread(function: Callable[..., Answer], *arguments: Any) -> Answer:
+    """Call a function in a thread of the uploads.
+
+    They need not wait for the threads of readers.
+    """
+    return await to_thread.run_sync(function, *arguments, limiter=_threads())
+
+
+@functools.cache
+def _threads() -> CapacityLimiter:
+    return CapacityLimiter(UPLOAD_THREADS)

@@ -11,6 +11,7 @@ import uvicorn
 from fluoromap_service import auth, logs
 from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http import stopping
+from fluoromap_service.api.http.connections import TimedConnection
 from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options, end_with_supervisor, keep_compiled_kernels
 from fluoromap_service.cli.failures import CommandFailed
@@ -37,6 +38,8 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     service = create_app()
     config = uvicorn.Config(
         service,
+        http=TimedConnection,
+        log_config=None,
         host=settings().host,
         port=settings().port,
         log_level="warning",

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, catheter_type
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
-from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, StudySpec, simulate_study
+from fluoromap.phantom.fluoroscopy import detect, expected_photons
+from fluoromap.phantom.torso import torso
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
 
@@ -128,13 +130,64 @@ def test_pictures_without_catheters_get_none(frames, bits, monochrome1):
         assert entry.manual_needed == Reason.MANUAL_NEEDED
 
 
-def test_many_wires_without_electrodes_get_none():
-    random = np.random.default_rng(4)
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("seed", [4, 6, 7])
+def test_many_wires_without_electrodes_get_none(seed, count):
+    random = np.random.default_rng(seed)
     v, u = np.mgrid[0:384, 0:384].astype(np.float64)
     level = np.full((384, 384), 700.0)
     for _ in range(9):
         angle, offset, wide = random.uniform(0, np.pi), random.uniform(-150, 150), random.uniform(1, 9)
         across = (v - 192) * np.cos(angle) - (u - 192) * np.sin(angle) - offset
         level *= np.where(np.abs(across) < wide, random.uniform(0.5, 0.9), 1.0)
-    found = segmented([random.poisson(level).astype(np.uint16) for _ in range(3)], px_per_mm=3.5)
+    found = segmented([random.poisson(level).astype(np.uint16) for _ in range(count)], px_per_mm=3.5)
     assert all(entry.chains == () for entry in (*found.frames, found.diastole))
+
+
+def test_a_wrong_catalogue_gets_no_electrodes(simulated):
+    other = Catalogue(
+        (
+            Catheter("reference", 10, (8.0,) * 9, 2.0, 1.0),
+            Catheter("odd", 8, (13.0, 2.0, 13.0, 2.0, 13.0, 2.0, 13.0), 2.0, 1.0),
+        ),
+        "reference",
+        "odd",
+    )
+    found = segmented([simulated.frames[k] for k in range(6)], catalogue=other)
+    assert all(entry.chains == () for entry in found.frames)
+
+
+def test_a_catalogue_that_lacks_a_catheter_gets_no_more_than_it_lists(simulated):
+    two = Catalogue(DEFAULT_CATALOGUE.catheters[1:], "pacing", "mapping")
+    found = segmented([simulated.frames[k] for k in range(8)], catalogue=two)
+    assert all(len(entry.chains) <= 2 for entry in found.frames)
+    assert electrodes_right(found, simulated.truth)[1] == 0
+    assert found.diastole.manual_needed == Reason.EXTRA_CATHETER
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_single_frame_shows_its_catheters_or_none(simulated, inverted):
+    frame = simulated.frames[0]
+    found = segmented([np.uint16(4095) - frame if inverted else frame])
+    recall, false = electrodes_right(found, simulated.truth)
+    assert recall >= 0.6
+    assert false == 0
+
+
+@pytest.mark.parametrize(("contrast", "gantry"), [("LAT", LATERAL), ("PA", FRONTAL)])
+@pytest.mark.parametrize("count", [1, 5])
+def test_a_torso_without_catheters_gets_none(contrast, gantry, count):
+    appearance = APPEARANCES[contrast]
+    for seed in range(2):
+        behind = torso(gantry, appearance, np.random.default_rng(seed), np.random.default_rng(seed + 50), 0.0)
+        photons = expected_photons(behind, np.ones((512, 512), np.float32), appearance, 1.0)
+        found = segmented([detect(photons, appearance.photons, 100 * seed + key) for key in range(count)])
+        assert all(entry.chains == () and entry.manual_needed for entry in (*found.frames, found.diastole))
+
+
+def test_frames_in_which_the_catheters_are_gone_stay_empty(simulated):
+    frames = [simulated.frames[k] for k in range(11)]
+    gone = np.random.default_rng(2).poisson(np.median(frames[0], axis=0)[None].repeat(512, axis=0)).astype(np.uint16)
+    found = segmented([*frames, gone, gone])
+    assert [len(entry.chains) for entry in found.frames[11:]] == [0, 0]
+    assert sum(len(entry.chains) for entry in found.frames[:11]) >= 28

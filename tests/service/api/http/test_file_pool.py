@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
+import psutil
 import pytest
 
 from fluoromap_service.api.http import file_pool
@@ -63,3 +67,26 @@ def test_a_function_that_hangs_is_stopped(monkeypatch: pytest.MonkeyPatch, task:
     assert problem.value.detail.startswith(begin)
     monkeypatch.undo()
     assert run_in_pool(task, _double, 1) == 2
+
+
+def test_the_processes_end_with_a_killed_service(tmp_path: Path) -> None:
+    """Nothing closes the pool of a service that is killed."""
+    program = (
+        "import os\n"
+        "from fluoromap_service.api.http import file_pool\n"
+        "if __name__ == '__main__':\n"
+        "    file_pool.run_in_pool(file_pool.Task.DRAW_PICTURE, os.getpid)\n"
+        "    print(flush=True)\n"
+        "    input()\n"
+    )
+    script = tmp_path / "service.py"
+    script.write_text(program)
+    service = subprocess.Popen([sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert service.stdout is not None
+    service.stdout.readline()
+    processes = psutil.Process(service.pid).children(recursive=True)
+    assert len(processes) >= file_pool.PROCESSES
+    service.kill()
+    service.wait()
+    _, alive = psutil.wait_procs(processes, timeout=60)
+    assert alive == []

@@ -197,3 +197,15 @@ def test_a_wrong_request_starts_nothing(
     assert client.post(f"/v1/studies/{study.study_id}/jobs", json=body).status_code == status
     assert client.post("/v1/studies/none/jobs").status_code == 404
     assert published == []
+
+
+def test_a_list_holds_summaries(client: TestClient, study: FinishedStudy) -> None:
+    def listed() -> dict[str, Any]:
+        (item,) = client.get("/v1/jobs").json()["items"]
+        return dict(item)
+
+    whole = client.get(f"/v1/jobs/{study.job_id}").json()
+    assert listed() == {name: value for name, value in whole.items() if name not in ("stages", "warnings")}
+    study.segmented()
+    assert listed()["progress"] == pytest.approx(client.get(f"/v1/jobs/{study.job_id}").json()["progress"])
+    assert 0 < listed()["progress"] < 1

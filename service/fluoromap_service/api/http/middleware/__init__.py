@@ -1,0 +1,1 @@
+"""Layers around every route: headers, log, audit trail, free space, request bodies."""

@@ -1,0 +1,59 @@
+"""The command ``fluoromap audit``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fluoromap_service.cli.database_failures import explain_database_failures
+from fluoromap_service.cli.environment import apply_options
+from fluoromap_service.cli.failures import CommandFailed
+from fluoromap_service.cli.options import DataDir
+from fluoromap_service.store import audit as trail
+from fluoromap_service.store import schema
+from fluoromap_service.store.engine import reading
+
+app = typer.Typer(add_completion=False, no_args_is_help=True)
+
+
+@app.callback()
+def audit() -> None:
+    """Read the audit trail: who did what to which study."""
+
+
+@app.command()
+def export(
+    file: Annotated[Path | None, typer.Argument(help="File to write; standard output by default.")] = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Write all entries as JSON lines, oldest first."""
+    apply_options(data_dir=data_dir)
+    with explain_database_failures():
+        schema.upgrade()
+        with reading() as session, nullcontext(sys.stdout) if file is None else file.open("x") as stream:
+            for entry in trail.entries(session):
+                stream.write(json.dumps(trail.as_json(entry)) + "\n")
+
+
+@app.command()
+def verify(
+    head: Annotated[
+        str | None, typer.Option(help="Hash that an earlier check printed; it must still be in the trail.")
+    ] = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Check that nobody changed, removed or inserted an entry."""
+    apply_options(data_dir=data_dir)
+    with explain_database_failures():
+        schema.upgrade()
+        try:
+            with reading() as session:
+                count, last = trail.verify(session, head)
+        except trail.BrokenChain as broken:
+            raise CommandFailed(f"{broken} Compare with an earlier export.") from broken
+    typer.echo(f"{count} entries, unbroken; the last hash is {last}")

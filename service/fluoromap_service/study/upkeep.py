@@ -1,0 +1,88 @@
+"""Regular clean-up: what nobody needs any more leaves the database and the disk."""
+
+from __future__ import annotations
+
+import structlog
+from sqlalchemy import delete, func, select
+
+from fluoromap_service.problem import Problem
+from fluoromap_service.settings import settings
+from fluoromap_service.store import audit, disk, files
+from fluoromap_service.store.audit import Act
+from fluoromap_service.store.clock import db_now
+from fluoromap_service.store.engine import empty_write_ahead_log, reading, writing
+from fluoromap_service.store.models import Idempotency, Job, Rendering, Study
+from fluoromap_service.study import studies
+from fluoromap_service.study.instances import unlink_unreferenced
+
+ANSWER_SECONDS = 24 * 3600.0
+"""Time for which the answer to a request with an Idempotency-Key is kept."""
+
+LOW_DISK_FACTOR = 2
+"""Kept pictures and reports are deleted when less than this many reserves are free."""
+
+_BATCH = 100
+
+log = structlog.get_logger(__name__)
+
+
+def clean_up() -> None:
+    """Remove everything that is out of date.
+
+    Any process may call it at any time.
+    """
+    removed = files.remove_abandoned()
+    if removed:
+        log.info("incoming_files_removed", files=removed)
+    with writing() as session:
+        session.execute(delete(Idempotency).where(Idempotency.created < db_now() - ANSWER_SECONDS))
+    if settings().retention_days > 0:
+        delete_old_studies(settings().retention_days)
+    if disk.free_bytes() < LOW_DISK_FACTOR * disk.reserve_bytes():
+        delete_renderings()
+    empty_write_ahead_log()
+
+
+def delete_old_studies(days: float) -> int:
+    """Delete the studies without a change or job for so many days.
+
+    Return how many.
+    """
+    last_job = select(func.max(Job.created)).where(Job.study_id == Study.id).scalar_subquery()
+    limit = db_now() - days * 86400.0
+    old = select(Study.id).where(Study.updated < limit, func.coalesce(last_job, 0.0) < limit)
+    with reading() as session:
+        found = list(session.scalars(old))
+    deleted = 0
+    for study_id in found:
+        try:
+            with writing() as session:
+                unreferenced = studies.remove(session, study_id)
+                audit.append(session, [Act("retention", "delete study", study=study_id)])
+        except Problem:
+            # Somebody deleted it meanwhile, or its job still runs.
+            continue
+        unlink_unreferenced(unreferenced)
+        log.info("study_deleted_by_age", study=study_id)
+        deleted += 1
+    return deleted
+
+
+def delete_renderings() -> int:
+    """Delete kept pictures, meshes and pages, and return how many.
+
+    The service makes them again on request.
+    """
+    deleted = 0
+    while True:
+        with writing() as session:
+            files.lock(session)
+            rows = session.scalars(select(Rendering).order_by(Rendering.id).limit(_BATCH)).all()
+            if not rows:
+                return deleted
+            for row in rows:
+                session.delete(row)
+            session.flush()
+            unreferenced = [path.name for path in files.remove_unreferenced(session, [row.sha256 for row in rows])]
+        unlink_unreferenced(unreferenced)
+        deleted += len(rows)
