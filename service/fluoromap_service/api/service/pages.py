@@ -13,7 +13,7 @@ from pathlib import Path
 from fastapi import APIRouter, Request, Response
 
 import fluoromap_service
-from fluoromap_service.api.http.etags import is_known, not_modified
+from fluoromap_service.api.http.etags import is_known
 from fluoromap_service.api.http.security import SESSION, SIGN_IN, Reader, bearer_token
 from fluoromap_service.api.http.session import begin_session, end_session
 from fluoromap_service.problem import not_found
@@ -62,11 +62,12 @@ def _send(request: Request, name: str) -> Response:
     found = asset(name)
     if found is None:
         raise not_found("file")
-    if is_known(request, found.etag):
-        return not_modified(found.etag)
-    headers = {"ETag": found.etag, "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
+    headers = {"ETag": found.etag, "Cache-Control": "no-cache"}
     if name.endswith(".html"):
         headers["Content-Security-Policy"] = PAGE_POLICY
+    if is_known(request, found.etag):
+        # A browser replaces the headers of its copy by those of this answer (RFC 9111 section 3.2).
+        return Response(status_code=304, headers=headers)
     return Response(found.content, media_type=found.media_type, headers=headers)
 
 

@@ -36,6 +36,9 @@ def test_pages_may_run_their_own_scripts_only(service: TestClient) -> None:
     policy = service.get("/").headers["content-security-policy"]
     assert "script-src 'self'" in policy
     assert "unsafe" not in policy
+    # A browser that has the page takes over the headers of the answer "unchanged".
+    again = service.get("/", headers={"If-None-Match": service.get("/").headers["etag"]})
+    assert (again.status_code, again.headers["content-security-policy"]) == (304, policy)
 
 
 def test_page_without_session_leads_to_sign_in(service: TestClient, token: str) -> None:
