@@ -66,6 +66,13 @@ export class MapScene extends EventTarget {
     return name;
   }
 
+  /** Give the memory of the graphics card back; a browser has few such contexts. */
+  close() {
+    this.surface.mesh.geometry.dispose();
+    this.renderer.dispose();
+    this.renderer.forceContextLoss();
+  }
+
   /** Choose the colours again. */
   recolour() {
     const scale = this.uncertainty ? deviationsOf(this.map) : timesOf(this.map, this.palette);

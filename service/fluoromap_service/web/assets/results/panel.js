@@ -15,6 +15,7 @@ export function resultsPanel(state, correct) {
   const place = element("div", {});
   const choice = select([], "", {});
   let shown = "";
+  let forget = () => {};
 
   /** @param {Job} job */
   const show = async (job) => {
@@ -37,7 +38,12 @@ export function resultsPanel(state, correct) {
       const own = overlays.overlays.filter((/** @type {any} */ each) => each.site === state.chosen);
       fused.replaceChildren(own.length ? fusedViews(job.id, own, frames) : element("p", { class: "soft" }, "Choose a located site in the table to see the map over its fluoroscopy."));
     };
+    forget();
     state.addEventListener("chosen", choose);
+    forget = () => {
+      state.removeEventListener("chosen", choose);
+      chamber.scene?.close();
+    };
     chamber.addEventListener("made", () => {
       chamber.scene.addEventListener("chosen", (/** @type {CustomEvent} */ event) => state.choose(event.detail));
       choose();

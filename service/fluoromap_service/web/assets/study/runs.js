@@ -24,6 +24,17 @@ function sentences(state) {
   return lines;
 }
 
+/** Make a part anew, but not under the fingers of a person who types; the focus stays on the same control. @param {HTMLElement} place @param {() => Node} make */
+function refill(place, make) {
+  const focused = place.contains(document.activeElement) ? document.activeElement : null;
+  if (focused instanceof HTMLInputElement && place.children.length) return;
+  const name = focused?.getAttribute("aria-label") ?? focused?.textContent;
+  place.replaceChildren(make());
+  if (!name) return;
+  const again = [...place.querySelectorAll("button, select")].find((each) => (each.getAttribute("aria-label") ?? each.textContent) === name);
+  if (again instanceof HTMLElement) again.focus();
+}
+
 /** @param {StudyState} state @param {() => void} look @param {() => void} compute */
 export function runsPanel(state, look, compute) {
   const summary = element("ul", { "aria-live": "polite" });
@@ -42,8 +53,8 @@ export function runsPanel(state, look, compute) {
   };
   const show = () => {
     summary.replaceChildren(...sentences(state).map((line) => element("li", {}, line)));
-    table.replaceChildren(sitesTable(state));
-    geometry.replaceChildren(geometryForm(state));
+    refill(table, () => sitesTable(state));
+    refill(geometry, () => geometryForm(state));
   };
   state.addEventListener("changed", show);
   show();

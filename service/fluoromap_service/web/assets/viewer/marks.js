@@ -84,8 +84,14 @@ export class Marks extends EventTarget {
     const address = `${this.path}/frames/${frame}/electrodes`;
     // One request after the other: the last change has to be the last that the service stores.
     this.stored = this.stored.catch(() => undefined).then(async () => {
-      if (manual.length) await send("PUT", address, manual);
-      else this.frames.set(frame, await send("DELETE", address));
+      try {
+        if (manual.length) await send("PUT", address, manual);
+        else this.frames.set(frame, await send("DELETE", address));
+      } catch (error) {
+        // The view must not show a change that the service refused.
+        await this.load();
+        throw error;
+      }
       this.dispatchEvent(new Event("changed"));
       this.dispatchEvent(new Event("stored"));
     });
