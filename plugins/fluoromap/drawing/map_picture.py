@@ -15,7 +15,7 @@ from fluoromap.drawing.colours import Scale, scale_of
 from fluoromap.drawing.isochrones import Isochrone, isochrones
 from fluoromap.drawing.lettering import Labels, Point, font, line_with_squares
 from fluoromap.drawing.raster import rasterise
-from fluoromap.drawing.symbols import draw_dot, draw_time, is_outlier
+from fluoromap.drawing.symbols import draw_dot, draw_time, is_doubtful
 from fluoromap.drawing.wall import colour_table, line_parts, outline_edges, pixel_bands
 from fluoromap.fuser.surface import face_normals
 from fluoromap.geometry import view_axes
@@ -181,7 +181,7 @@ def _figures(chamber: ChamberMap) -> str:
     ]
     if chamber.leave_one_out_rms_ms is not None:
         parts.insert(3, f"leave-one-site-out error {chamber.leave_one_out_rms_ms:.1f} ms")
-    outliers = sum(is_outlier(site) for site in chamber.sites)
-    if outliers:
-        parts.append(f"{outliers} doubtful (?)")
+    doubtful = sum(is_doubtful(site) for site in chamber.sites)
+    if doubtful:
+        parts.append(f"{doubtful} doubtful (?)")
     return "   ·   ".join(parts)

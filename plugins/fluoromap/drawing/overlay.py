@@ -76,8 +76,8 @@ def draw_overlay(
     - the bands and lines of equal time on the wall that faces the viewer,
     - a hatch where no site is near,
     - the outline of the surface,
-    - every site with its time in ms: a dot on the wall that faces the viewer, a ring on the far wall, in amber with a
-      question mark where its neighbours contradict it,
+    - every site with its time in ms: a dot on the wall that faces the viewer, a ring on the far wall; the time is amber with a
+      question mark where the site is in doubt,
     - a star at the highlighted site's tip,
     - a colour bar,
     - site, direction of the view and purpose, the orientation of the patient, and the meaning of the symbols.
