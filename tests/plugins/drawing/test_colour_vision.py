@@ -11,8 +11,9 @@ import pytest
 from skimage.color import rgb2lab
 
 from fluoromap.drawing.colours import _ANCHORS_RGB, Palette, colour_map
+from fluoromap.reasons import AT_BEST_C, Reason
 
-SCRIPT = Path(__file__).parents[3] / "service/fluoromap_service/web/assets/map/colour-scale.js"
+PAGES = Path(__file__).parents[3] / "service/fluoromap_service/web/assets/map"
 
 # G. M. Machado et al., "A physiologically-based model for simulation of color vision deficiency" (2009), severity 1.
 VISIONS = {
@@ -36,8 +37,14 @@ def test_bands_two_steps_apart_never_look_alike(palette: Palette, vision: str) -
 
 
 def test_pages_have_the_same_palettes() -> None:
-    text = SCRIPT.read_text()
+    text = (PAGES / "colour-scale.js").read_text()
     for palette, anchors in _ANCHORS_RGB.items():
         found = re.search(rf'^  "?{palette}"?: (\[\[.*\]\]),$', text, re.M)
         assert found is not None
         assert json.loads(found[1]) == anchors.astype(int).tolist()
+
+
+def test_pages_doubt_the_same_sites() -> None:
+    found = re.search(r"^const DOUBTS = (\[.*\]);$", (PAGES / "scene.js").read_text(), re.M)
+    assert found is not None
+    assert set(json.loads(found[1])) == {*map(str, AT_BEST_C), str(Reason.LAT_OUTLIER)}

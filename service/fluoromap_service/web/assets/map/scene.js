@@ -8,6 +8,9 @@ import { surfaceOf } from "./surface.js";
 
 /** @typedef {import("../shared/types.js").ChamberMap} ChamberMap */
 
+/** Reasons that put a site's time, position or catheter in doubt: its name gets a question mark, as in the pictures. */
+const DOUBTS = ["extra_catheter", "geometry_doubtful", "identity_uncertain", "pairing_failed", "spacing_mismatch", "table_moved", "view_mirrored", "lat_outlier"];
+
 export class MapScene extends EventTarget {
   /** @param {HTMLElement} place An element of class `scene`. @param {ChamberMap} map */
   constructor(place, map) {
@@ -61,7 +64,7 @@ export class MapScene extends EventTarget {
   /** @param {import("../shared/types.js").MapSite} site */
   #name(site) {
     const name = document.createElement("span");
-    name.textContent = `${site.site} ${Math.round(site.lat_ms)} ms${site.reasons.includes("lat_outlier") ? " ?" : ""}`.replace("-", "−");
+    name.textContent = `${site.site} ${Math.round(site.lat_ms)} ms${site.reasons.some((code) => DOUBTS.includes(code)) ? " ?" : ""}`.replace("-", "−");
     this.labels.append(name);
     return name;
   }

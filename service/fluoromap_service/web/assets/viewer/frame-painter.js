@@ -8,7 +8,7 @@ export class FramePainter {
   constructor(run) {
     this.run = run;
     this.picture = new OffscreenCanvas(run.columns, run.rows);
-    this.context = /** @type {OffscreenCanvasRenderingContext2D} */ (this.picture.getContext("2d"));
+    this.context = /** @type {OffscreenCanvasRenderingContext2D} */ (this.picture.getContext("2d", { willReadFrequently: true }));
     this.image = this.context.createImageData(run.columns, run.rows);
     this.words = new Uint32Array(this.image.data.buffer);
     this.greys = new Uint32Array(256);
@@ -39,7 +39,7 @@ export class FramePainter {
    * @param {{chosen: string|null, line: {start: number[], end: number[], colour: string}|null}} marks `chosen`: key of an electrode.
    */
   paint(canvas, placement, study, electrodes, marks) {
-    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
     context.fillStyle = "#000";
     context.fillRect(0, 0, canvas.width, canvas.height);
     const scale = placement.scale(canvas, this.run);
