@@ -17,9 +17,9 @@ from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.dicom import DicomCode, dicom_problem, read_instance
 from fluoromap_service.dicom.pixel_layout import DECODABLE
 from fluoromap_service.dicom.reading import CAPTURES, PROJECTIONS
+from fluoromap_service.dicom.store_statuses import StoreStatus, status_of
 from fluoromap_service.listener.allow_list import AllowList
 from fluoromap_service.listener.arriving import ArrivingFile
-from fluoromap_service.listener.statuses import StoreStatus, status_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store.audit import Act

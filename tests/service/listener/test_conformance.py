@@ -6,10 +6,12 @@ import inspect
 import re
 from pathlib import Path
 
+from fastapi.routing import APIRoute
 from pydicom.uid import UID
 
+from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
-from fluoromap_service.listener.statuses import StoreStatus
 from fluoromap_service.settings import Settings
 
 PAGE = (Path(__file__).parents[3] / "docs" / "dicom-conformance.md").read_text()
@@ -39,6 +41,23 @@ def test_transfer_syntaxes() -> None:
 def test_statuses() -> None:
     rows = re.findall(r"^\| `([0-9A-F]{4})` \| (.+) \|$", section("Statuses of C-STORE"), re.M)
     assert rows == [(f"{status:04X}", status_meanings()[status]) for status in StoreStatus]
+
+
+def transactions() -> list[tuple[str, str, str]]:
+    """Return name, method and path of each DICOMweb route."""
+    modules = {"store": store, "search": search, "retrieve": retrieve}
+    return [
+        (name, method, route.path)
+        for name, module in modules.items()
+        for route in module.router.routes
+        if isinstance(route, APIRoute)
+        for method in sorted(route.methods)
+    ]
+
+
+def test_transactions() -> None:
+    rows = re.findall(r"^\| (store|search|retrieve) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
+    assert rows == transactions()
 
 
 def test_items() -> None:

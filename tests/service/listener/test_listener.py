@@ -34,9 +34,9 @@ from pynetdicom.transport import ThreadedAssociationServer
 from small_runs import STUDY_UID, edited, run_uid, small_run
 from sqlalchemy import func, select
 
+from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
 from fluoromap_service.listener.allow_list import AllowList
-from fluoromap_service.listener.statuses import StoreStatus
 from fluoromap_service.settings import settings
 from fluoromap_service.store import audit, files
 from fluoromap_service.store.engine import reading

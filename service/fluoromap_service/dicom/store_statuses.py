@@ -1,4 +1,4 @@
-"""The DICOM statuses with which the listener answers C-STORE (PS3.4 table B.2-1, PS3.7 annex C)."""
+"""The DICOM statuses of C-STORE, which are the failure reasons of STOW-RS too (PS3.4 table B.2-1, PS3.7 annex C)."""
 
 from __future__ import annotations
 
