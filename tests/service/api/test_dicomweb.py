@@ -194,3 +194,11 @@ def test_what_is_not_there_or_not_offered(service: TestClient, two_runs: list[by
     for accept in ("image/jpeg", 'multipart/related; type="application/dicom"; transfer-syntax=1.2.840.10008.1.2.4.50'):
         assert service.get(run, headers={"accept": accept}).status_code == 406
     assert service.get(f"{run}/frames/1", headers={"accept": "multipart/related; type=image/jpeg"}).status_code == 406
+
+
+def test_one_of_several_accepted_types_is_enough(service: TestClient, two_runs: list[bytes]) -> None:
+    accept = (
+        'multipart/related; type="image/jpeg"; transfer-syntax=1.2.840.10008.1.2.4.50, '
+        'multipart/related; type="application/octet-stream"'
+    )
+    assert len(parts_of(service.get(f"{address(two_runs[0])}/frames/1", headers={"accept": accept}))) == 1

@@ -112,8 +112,8 @@ def retrieve_frames(
     return _related("application/octet-stream", parts())
 
 
-def _check(request: Request, *kinds: str) -> str:
-    """Check the parameters and the Accept header, and return that header.
+def _check(request: Request, *kinds: str) -> list[str]:
+    """Check the parameters and the Accept header, and return its fitting items.
 
     A request has no parameters and accepts one of the media types.
 
@@ -122,21 +122,28 @@ def _check(request: Request, *kinds: str) -> str:
     Problem
         406 ``not_acceptable`` or 422 ``unknown_parameter``.
     """
-    accept = request.headers.get("accept", "*/*").lower()
-    types = {part.split(";")[0].strip() for part in accept.split(",")}
-    if not types & {"*/*", *kinds, *(f"{kind.split('/')[0]}/*" for kind in kinds)}:
-        raise _not_acceptable(f"This address answers with {kinds[0]}; change the Accept header.")
-    wanted = re.search(r'multipart/related[^,]*type="?([^";,]+)', accept)
-    if wanted and wanted[1] not in kinds:
-        raise _not_acceptable(f"This address answers with parts of {kinds[-1]}; change the Accept header.")
+    accepted = [item for item in request.headers.get("accept", "*/*").lower().split(",") if _fits(item, kinds)]
+    if not accepted:
+        raise _not_acceptable(f"This address answers with {kinds[-1]}; change the Accept header.")
     if request.query_params:
         detail = "This address has no query parameters; leave them out."
         raise Problem(422, "unknown_parameter", detail, [(f"query.{name}", "unknown") for name in request.query_params])
-    return accept
+    return accepted
 
 
-def _asked_syntaxes(accept: str) -> set[str]:
-    return set(re.findall(r'transfer-syntax="?([0-9.*]+)', accept))
+def _fits(item: str, kinds: tuple[str, ...]) -> bool:
+    """Return whether an item of an Accept header allows one of the media types."""
+    kind = item.split(";")[0].strip()
+    if kind not in ("*/*", *kinds, *(f"{each.split('/')[0]}/*" for each in kinds)):
+        return False
+    parts = re.search(r'[; ]type="?([^";]+)', item)
+    return parts is None or parts[1].strip() in ("*/*", *kinds)
+
+
+def _asked_syntaxes(accepted: list[str]) -> set[str]:
+    """Return the transfer syntaxes of an Accept header, ``*`` for any; empty when an item names none."""
+    asked = [re.findall(r'transfer-syntax="?([0-9.*]+)', item) for item in accepted]
+    return set() if [] in asked else {syntax for found in asked for syntax in found}
 
 
 def _not_acceptable(detail: str) -> Problem:
