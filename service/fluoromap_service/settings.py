@@ -28,7 +28,21 @@ class Settings(BaseSettings):
     cors_origins: str = Field(
         "", description="Web pages that browsers let use the API, as origins with spaces between; empty: none."
     )
-    max_upload_bytes: int = Field(4 * 2**30, gt=0, description="Largest request body accepted, in bytes.")
+    dicom_host: str = Field("127.0.0.1", description="Address the DICOM listener listens on.")
+    dicom_port: int = Field(11112, ge=0, le=65535, description="Port the DICOM listener listens on.")
+    dicom_aet: str = Field(
+        "FLUOROMAP", pattern=r"^[!-\[\]-~]{1,16}$", description="Application entity title of the DICOM listener."
+    )
+    dicom_allow: str = Field(
+        "",
+        description="Senders of the DICOM listener: AET or AET@address, with commas between; empty: 'up' starts no listener.",
+    )
+    dicom_associations: int = Field(
+        16, ge=1, description="Associations that the DICOM listener serves at the same time."
+    )
+    max_upload_bytes: int = Field(
+        4 * 2**30, gt=0, description="Largest request body or DICOM object accepted, in bytes."
+    )
     min_free_mib: int = Field(
         512, ge=0, description="Free space that requests may not fill, so that running jobs can end, in MiB."
     )

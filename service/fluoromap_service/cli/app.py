@@ -25,6 +25,7 @@ COMMANDS = {
     "figures": "Make the paper's Figures 3, 4 and 5 on a simulated study.",
     "api": "Run the API alone.",
     "worker": "Run a worker, which computes the stages of jobs.",
+    "dicom-listener": "Receive X-ray runs by DICOM C-STORE.",
     "db": "Manage the database.",
     "token": "Manage access tokens.",
     "backup": "Write database and files into one archive, while the service runs.",

@@ -40,9 +40,14 @@ def apply_options(host: str | None = None, port: int | None = None, data_dir: Pa
 
     The settings of this process and of its children come from there. None leaves a setting unchanged.
     """
-    for name, value in (("HOST", host), ("PORT", port), ("DATA_DIR", data_dir)):
+    apply_settings(host=host, port=port, data_dir=data_dir)
+
+
+def apply_settings(**values: object) -> None:
+    """Store settings by their names as environment variables; None leaves a setting unchanged."""
+    for name, value in values.items():
         if value is not None:
-            os.environ[f"FLUOROMAP_{name}"] = str(value)
+            os.environ[f"FLUOROMAP_{name.upper()}"] = str(value)
     settings.cache_clear()
 
 

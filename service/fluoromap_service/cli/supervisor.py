@@ -1,4 +1,4 @@
-"""The API and a worker as child processes of one command."""
+"""The API, a worker and the DICOM listener as child processes of one command."""
 
 from __future__ import annotations
 
@@ -139,7 +139,9 @@ class _Child:
 
 
 class Supervisor:
-    """The parent of the API and the worker: it starts both, restarts each when it dies or hangs, and stops both.
+    """The parent of the service's processes: it starts them, restarts each when it dies or hangs, and stops them.
+
+    They are the API, the worker, and the DICOM listener where it is wanted.
 
     Parameters
     ----------
@@ -149,12 +151,26 @@ class Supervisor:
         Environment of the children, with the FLUOROMAP_* settings.
     log_folder : Path, optional
         Folder of ``worker.log`` and ``api.log``, the output of the children. By default they use this process's output.
+    dicom : bool, optional
+        Whether to run the DICOM listener too. The supervisor restarts it when it dies; it does not look whether it hangs.
     """
 
-    def __init__(self, host: str, port: int, environment: Mapping[str, str], log_folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        environment: Mapping[str, str],
+        log_folder: Path | None = None,
+        *,
+        dicom: bool = False,
+    ) -> None:
         settings = dict(environment) | {"FLUOROMAP_HOST": host, "FLUOROMAP_PORT": str(port)}
         self._worker = _Child(["worker"], log_folder and log_folder / "worker.log", settings)
         self._api = _Child(["api"], log_folder and log_folder / "api.log", settings)
+        self._children = [self._api, self._worker]
+        if dicom:
+            log = log_folder and log_folder / "dicom-listener.log"
+            self._children.append(_Child(["dicom-listener"], log, settings))
         self._log_folder = log_folder
         self._was_ready = False
         self._next_look = self._last_answer = 0.0
@@ -163,9 +179,9 @@ class Supervisor:
         self.url = f"http://{address}:{port}"
 
     def start(self) -> None:
-        """Start the worker and the API."""
-        self._worker.start()
-        self._api.start()
+        """Start all children."""
+        for child in reversed(self._children):
+            child.start()
 
     def wait_until_ready(self, stop: threading.Event | None = None) -> None:
         """Wait until the API reports that it and a worker are ready.
@@ -202,7 +218,7 @@ class Supervisor:
         """
         if not self._was_ready and not self._api.alive:
             raise CommandFailed(f"The API ended unexpectedly; {self._where_to_look()}.")
-        for child in (self._api, self._worker):
+        for child in self._children:
             child.restart_when_dead()
 
     def check_service(self) -> None:
@@ -230,8 +246,8 @@ class Supervisor:
             child.kill_group()
 
     def stop(self) -> None:
-        """Ask both children to stop, wait up to STOP_SECONDS, then kill them."""
-        children = [child for child in (self._api, self._worker) if hasattr(child, "process")]
+        """Ask all children to stop, wait up to STOP_SECONDS, then kill them."""
+        children = [child for child in self._children if hasattr(child, "process")]
         for child in children:
             if child.alive:
                 child.process.terminate()

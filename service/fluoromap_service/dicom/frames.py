@@ -157,3 +157,11 @@ def cine_8bit(path: Path, facts: InstanceFacts, first: int, count: int) -> bytes
 def frame_png(path: Path, facts: InstanceFacts, frame: int, window: Pair | None) -> bytes:
     """Return frame ``frame`` (from 0) of a file as a greyscale PNG; ``window`` as in :func:`frame_to_8bit`."""
     return encode_png(frame_to_8bit(open_frames(path, facts)[frame], facts, window))
+
+
+def frame_bytes(path: Path, facts: InstanceFacts, frame: int) -> bytes:
+    """Return the stored pixels of one frame as bytes.
+
+    ``frame`` counts from 0. The bytes are row by row, little endian.
+    """
+    return open_frames(path, facts)[frame].tobytes()

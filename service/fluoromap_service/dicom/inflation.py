@@ -50,6 +50,30 @@ def open_dicom(path: Path) -> Iterator[BufferedReader]:
             yield cast(BufferedReader, inflated)
 
 
+def have_same_data_set(path: Path, other: Path) -> bool:
+    """Return whether two DICOM files have the same data set.
+
+    The bytes after the file meta information and the transfer syntax must be equal.
+
+    Raises
+    ------
+    Problem
+        As :func:`open_dicom`.
+    OSError
+        When a file cannot be opened.
+    """
+    with path.open("rb") as file, other.open("rb") as other_file:
+        (syntax, start), (other_syntax, other_start) = data_set_start(file), data_set_start(other_file)
+        if syntax != other_syntax or path.stat().st_size - start != other.stat().st_size - other_start:
+            return False
+        file.seek(start)
+        other_file.seek(other_start)
+        while piece := file.read(_CHUNK_BYTES):
+            if piece != other_file.read(_CHUNK_BYTES):
+                return False
+    return True
+
+
 def _inflate(source: IO[bytes], target: IO[bytes], most_bytes: int) -> None:
     """Write the inflated rest of a file (RFC 1951) into another file."""
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)

@@ -32,7 +32,7 @@ from fluoromap_service.dicom.positioner import (
 from fluoromap_service.dicom.timing import acquisition_time, frame_times_ms
 from fluoromap_service.problem import Problem
 
-_PROJECTIONS = frozenset(
+PROJECTIONS = frozenset(
     {
         XRayAngiographicImageStorage,
         XRayRadiofluoroscopicImageStorage,
@@ -40,14 +40,15 @@ _PROJECTIONS = frozenset(
         EnhancedXRFImageStorage,
     }
 )
-# Archives and workstations save XA runs as secondary captures; the modality is still XA or RF.
-_CAPTURES = frozenset(
+"""SOP classes of X-ray runs."""
+CAPTURES = frozenset(
     {
         SecondaryCaptureImageStorage,
         MultiFrameGrayscaleByteSecondaryCaptureImageStorage,
         MultiFrameGrayscaleWordSecondaryCaptureImageStorage,
     }
 )
+"""SOP classes of copies of runs, as archives and workstations save them; the modality is still XA or RF."""
 
 
 def read_instance(path: Path) -> InstanceFacts:
@@ -76,7 +77,7 @@ def read_instance(path: Path) -> InstanceFacts:
 
 def _check_kind(header: Header) -> None:
     kind, modality = header.text("SOPClassUID"), header.text("Modality")
-    if kind in _PROJECTIONS or (kind in _CAPTURES and modality in ("XA", "RF")):
+    if kind in PROJECTIONS or (kind in CAPTURES and modality in ("XA", "RF")):
         return
     if not kind:
         raise _lacks("SOPClassUID")

@@ -98,6 +98,8 @@ class Study(Base):
     reference: Mapped[str] = mapped_column(String(64))
     mapping: Mapped[str] = mapped_column(String(64))
     gantry: Mapped[Json] = mapped_column(default=dict)  # completes the headers of all runs
+    # The DICOM study whose runs join this study; only for a study that a DICOM door made.
+    study_instance_uid: Mapped[str | None] = mapped_column(String(64), index=True)
     created: Mapped[float] = mapped_column(default=db_now())
     updated: Mapped[float] = mapped_column(default=db_now(), onupdate=db_now())
 

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom.facts import InstanceFacts
+from fluoromap_service.dicom.inflation import have_same_data_set
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
@@ -153,22 +154,26 @@ def add(
     """Store an incoming file and refer to it from the study.
 
     Return False when both exist already. The file is stored again in that case too, because the stored one may be damaged.
+    A file with the stored data set and other file meta information counts as the stored file: each sender writes its own
+    (PS3.10 section 7.1).
 
     Raises
     ------
     Problem
-        409 when the store has other bytes under the same SOP Instance UID.
+        409 when the store has another data set under the same SOP Instance UID.
     """
     files.lock(session)
     known = session.get(Instance, facts.sop_instance_uid)
-    if known is not None and known.sha256 != sha256:
+    copy = known is not None and known.sha256 != sha256
+    if known is not None and copy and not _has_stored_data_set(path, known):
         raise Problem(
             409,
             "sop_instance_uid_taken",
             "The store has another file with the same SOP Instance UID; the sender must make a new UID for a changed file.",
             [("SOPInstanceUID", "already stored with other content")],
         )
-    files.keep(session, path, sha256=sha256)
+    if not copy:
+        files.keep(session, path, sha256=sha256)
     if known is None:
         session.add(
             Instance(
@@ -201,6 +206,13 @@ def add(
     )
     session.flush()
     return True
+
+
+def _has_stored_data_set(path: Path, known: Instance) -> bool:
+    try:
+        return have_same_data_set(path, files.checked_path(known.sha256))
+    except files.BrokenFile:
+        return False
 
 
 def remove(session: Session, study_id: str, uid: str) -> list[str]:

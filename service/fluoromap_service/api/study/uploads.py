@@ -40,7 +40,9 @@ class Part:
 
 
 @dataclass(slots=True)
-class _Arriving:
+class ArrivingPart:
+    """A file of a request that is being written."""
+
     path: Path
     file_name: str | None
     stream: BinaryIO
@@ -65,7 +67,7 @@ class _Form:
         self._stack = stack
         self._header = (b"", b"")
         self._disposition = b""
-        self._arriving: _Arriving | None = None
+        self._arriving: ArrivingPart | None = None
         self._text: bytearray | None = None
         self._parts = 0
         self.files: list[Part] = []
@@ -89,7 +91,7 @@ class _Form:
         try:
             self._parser.write(data)
         except FormParserError:
-            raise _malformed() from None
+            raise malformed() from None
 
     def _on_part_begin(self) -> None:
         self._parts += 1
@@ -116,7 +118,7 @@ class _Form:
         if name == "file":
             sent_name = options.get(b"filename")
             file_name = None if sent_name is None else sent_name.decode("utf-8", "replace")
-            self._arriving = _arriving(self._stack, file_name)
+            self._arriving = arriving_file(self._stack, file_name)
         elif name == "site":
             self._text = bytearray()
         else:
@@ -154,12 +156,17 @@ class _Form:
         self.ended = True
 
 
-def _arriving(stack: ExitStack, file_name: str | None) -> _Arriving:
+def arriving_file(stack: ExitStack, file_name: str | None) -> ArrivingPart:
+    """Return a new file of the store.
+
+    At its end ``stack`` removes the file unless the store kept it.
+    """
     path = stack.enter_context(files.incoming())
-    return _Arriving(path, file_name and file_name[:1000], stack.enter_context(path.open("wb")))
+    return ArrivingPart(path, file_name and file_name[:1000], stack.enter_context(path.open("wb")))
 
 
-def _malformed() -> Problem:
+def malformed() -> Problem:
+    """Return the problem of a broken multipart body."""
     return Problem(400, "malformed", "The multipart body is malformed or ends too early; send the request again.")
 
 
@@ -180,11 +187,11 @@ async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str |
         if kind == b"multipart/form-data":
             boundary = options.get(b"boundary")
             if not boundary:
-                raise _malformed()
+                raise malformed()
             form = _Form(boundary, stack)
-            await _write_all(request, form.write)
+            await write_all(request, form.write)
             if not form.ended:
-                raise _malformed()
+                raise malformed()
             return form.files, form.site
     except ClientDisconnect:
         raise Problem(400, "truncated", "The connection ended before the body; send the request again.") from None
@@ -192,12 +199,12 @@ async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str |
 
 
 async def _receive_raw(request: Request, stack: ExitStack) -> Part:
-    arriving = _arriving(stack, None)
-    await _write_all(request, arriving.write)
+    arriving = arriving_file(stack, None)
+    await write_all(request, arriving.write)
     return await in_upload_thread(arriving.finish)
 
 
-async def _write_all(request: Request, write: Callable[[bytes], None]) -> None:
+async def write_all(request: Request, write: Callable[[bytes], None]) -> None:
     """Write a body in large parts, because each part waits once for a thread."""
     waiting = bytearray()
     async for chunk in request.stream():

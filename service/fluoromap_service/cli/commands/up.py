@@ -22,7 +22,8 @@ app = typer.Typer(add_completion=False)
 def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     """Run the API and a worker.
 
-    By default they use SQLite and files, no server. A part that dies or hangs is started again.
+    By default they use SQLite and files, no server. A part that dies or hangs is started again. The DICOM listener runs too
+    when FLUOROMAP_DICOM_ALLOW names its senders.
     """
     apply_options(host, port, data_dir)
     host, port = settings().host, settings().port
@@ -32,7 +33,10 @@ def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
             auth.check_may_start(host)
             has_token = auth.any_token()
         check_port(host, port)
-        supervisor = Supervisor(host, port, os.environ)
+        dicom = bool(settings().dicom_allow.strip())
+        if dicom:
+            check_port(settings().dicom_host, settings().dicom_port)
+        supervisor = Supervisor(host, port, os.environ, dicom=dicom)
         typer.echo(f"fluoromap: starting with the data in {settings().data_dir}")
         if not has_token:
             typer.echo("fluoromap: open to every user of this machine, because no access token exists yet")

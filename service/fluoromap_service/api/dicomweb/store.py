@@ -1,0 +1,187 @@
+"""STOW-RS: runs of a multipart/related request, written to disk while they arrive (PS3.18 section 10.5)."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import ClientDisconnect
+
+from fluoromap_service.api.dicomweb.addresses import instance_url, study_url
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.security import Writer
+from fluoromap_service.api.study.uploads import (
+    MOST_PARTS,
+    ArrivingPart,
+    Part,
+    arriving_file,
+    in_upload_thread,
+    malformed,
+    write_all,
+)
+from fluoromap_service.dicom import InstanceFacts, read_instance
+from fluoromap_service.dicom.store_statuses import status_of
+from fluoromap_service.problem import Problem
+from fluoromap_service.store.audit import Act
+from fluoromap_service.store.engine import writing
+from fluoromap_service.study.arrivals import add_arrival
+
+router = APIRouter(prefix="/dicom-web", include_in_schema=False)
+
+DICOM_JSON = "application/dicom+json"
+
+Json = dict[str, Any]
+
+
+class _RelatedParts:
+    """The callbacks of a multipart parser: each part is one DICOM file."""
+
+    def __init__(self, boundary: bytes, stack: ExitStack) -> None:
+        self._stack = stack
+        self._header = (b"", b"")
+        self._content_type = b""
+        self._arriving: ArrivingPart | None = None
+        self.parts: list[Part] = []
+        self.ended = False
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._on_part_begin,
+                "on_header_field": self._on_header_field,
+                "on_header_value": self._on_header_value,
+                "on_header_end": self._on_header_end,
+                "on_headers_finished": self._on_headers_finished,
+                "on_part_data": self._on_part_data,
+                "on_part_end": self._on_part_end,
+                "on_end": self._on_end,
+            },
+        )
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._parser.write(data)
+        except FormParserError:
+            raise malformed() from None
+
+    def _on_part_begin(self) -> None:
+        if len(self.parts) >= MOST_PARTS:
+            raise Problem(
+                413, "too_many_parts", f"A request may have {MOST_PARTS} parts; send the rest in another request."
+            )
+        self._header, self._content_type = (b"", b""), b""
+
+    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
+        self._header = (self._header[0] + data[start:end], self._header[1])
+
+    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header = (self._header[0], self._header[1] + data[start:end])
+
+    def _on_header_end(self) -> None:
+        if self._header[0].lower() == b"content-type":
+            self._content_type = parse_options_header(self._header[1])[0]
+        self._header = (b"", b"")
+
+    def _on_headers_finished(self) -> None:
+        if self._content_type != b"application/dicom":
+            raise Problem(
+                415,
+                "unsupported_media_type",
+                "A part has another content type, or none; send parts of application/dicom.",
+            )
+        self._arriving = arriving_file(self._stack, None)
+
+    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._arriving is not None:
+            self._arriving.write(data[start:end])
+
+    def _on_part_end(self) -> None:
+        if self._arriving is not None:
+            self.parts.append(self._arriving.finish())
+        self._arriving = None
+
+    def _on_end(self) -> None:
+        self.ended = True
+
+
+@router.post("/studies")
+async def store_instances(request: Request, caller: Writer) -> JSONResponse:
+    """Store runs; each joins the mapping study of its DICOM study."""
+    return await _store_all(request, caller, None)
+
+
+@router.post("/studies/{study_uid}")
+async def store_instances_of_study(study_uid: str, request: Request, caller: Writer) -> JSONResponse:
+    """Store runs of one DICOM study."""
+    return await _store_all(request, caller, study_uid)
+
+
+async def _store_all(request: Request, caller: str, study_uid: str | None) -> JSONResponse:
+    _refuse_parameters(request)
+    kind, options = parse_options_header(request.headers.get("content-type"))
+    if kind != b"multipart/related" or options.get(b"type", b"application/dicom").lower() != b"application/dicom":
+        detail = 'Send the runs as multipart/related with type="application/dicom".'
+        raise Problem(415, "unsupported_media_type", detail)
+    boundary = options.get(b"boundary")
+    if not boundary:
+        raise malformed()
+    with ExitStack() as stack:
+        body = _RelatedParts(boundary, stack)
+        try:
+            await write_all(request, body.write)
+        except ClientDisconnect:
+            raise Problem(400, "truncated", "The connection ended before the body; send the request again.") from None
+        if not body.ended or not body.parts:
+            raise malformed()
+        return await in_upload_thread(_answer, body.parts, caller, study_uid, str(request.base_url))
+
+
+def _refuse_parameters(request: Request) -> None:
+    if request.query_params:
+        detail = "This address has no query parameters; leave them out."
+        raise Problem(422, "unknown_parameter", detail, [(f"query.{name}", "unknown") for name in request.query_params])
+
+
+def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) -> JSONResponse:
+    """Store the parts and return the Store Instances Response Module (PS3.18 annex I)."""
+    stored: list[Json] = []
+    failed: list[Json] = []
+    studies = set()
+    for part in parts:
+        facts: InstanceFacts | None = None
+        try:
+            # A hostile file can crash a decoder, so another process reads it.
+            facts = run_in_pool(Task.READ_FILE, read_instance, part.path)
+            if study_uid not in (None, facts.study_instance_uid):
+                raise Problem(422, "not_xa", "The run is of another DICOM study than the address; send it to its own.")
+            with writing() as session:
+                add_arrival(session, part.path, facts, part.sha256, Act(caller, "STOW-RS"))
+        except Problem as problem:
+            if problem.status in (429, 503):
+                raise
+            failed.append(_reference(facts) | {"00081197": {"vr": "US", "Value": [int(status_of(problem))]}})
+        else:
+            url = instance_url(base, facts.study_instance_uid, facts.series_instance_uid, facts.sop_instance_uid)
+            stored.append(_reference(facts) | {"00081190": {"vr": "UR", "Value": [url]}})
+            studies.add(facts.study_instance_uid)
+    answer: Json = {}
+    if len(studies) == 1:
+        answer["00081190"] = {"vr": "UR", "Value": [study_url(base, studies.pop())]}
+    if failed:
+        answer["00081198"] = {"vr": "SQ", "Value": failed}
+    if stored:
+        answer["00081199"] = {"vr": "SQ", "Value": stored}
+    status = 200 if not failed else 202 if stored else 409
+    return JSONResponse(answer, status, media_type=DICOM_JSON)
+
+
+def _reference(facts: InstanceFacts | None) -> Json:
+    if facts is None:
+        return {}
+    return {
+        "00081150": {"vr": "UI", "Value": [facts.sop_class_uid]},
+        "00081155": {"vr": "UI", "Value": [facts.sop_instance_uid]},
+    }

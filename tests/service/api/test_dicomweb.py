@@ -1,0 +1,204 @@
+"""DICOMweb: runs in by STOW-RS, found by QIDO-RS, out by WADO-RS."""
+
+from __future__ import annotations
+
+import io
+from email.parser import BytesParser
+from email.policy import HTTP
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydicom
+import pytest
+from fastapi.testclient import TestClient
+from pydicom.dataset import Dataset
+from small_runs import COLUMNS, FRAMES, ROWS, STUDY_UID, edited, run_uid, small_run
+from sqlalchemy import func, select
+
+from fluoromap_service.settings import settings
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.models import Instance
+
+STUDIES = "/dicom-web/studies"
+RELATED = 'multipart/related; type="application/dicom"; boundary=edge'
+
+
+def body(
+    *files: bytes, content_type: str = "Content-Type: application/dicom\r\n", end: bytes = b"--edge--\r\n"
+) -> bytes:
+    parts = [f"--edge\r\n{content_type}\r\n".encode() + file + b"\r\n" for file in files]
+    return b"".join(parts) + end
+
+
+def store(service: TestClient, *files: bytes, path: str = STUDIES) -> Any:
+    return service.post(path, content=body(*files), headers={"content-type": RELATED})
+
+
+def parts_of(answer: Any) -> list[bytes]:
+    assert answer.status_code == 200, answer.text
+    head = b"Content-Type: " + answer.headers["content-type"].encode() + b"\r\n\r\n"
+    message = BytesParser(policy=HTTP).parsebytes(head + answer.content)
+    return [part.get_payload(decode=True) for part in message.iter_parts()]  # type: ignore[misc]
+
+
+def found(service: TestClient, path: str) -> list[Dataset]:
+    answer = service.get(path)
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/dicom+json"
+    return [Dataset.from_json(entry) for entry in answer.json()]
+
+
+def stored_count() -> int:
+    with reading() as session:
+        return session.scalar(select(func.count()).select_from(Instance)) or 0
+
+
+def left_files() -> list[Path]:
+    return [path for path in settings().files_dir.rglob("*") if path.is_file()]
+
+
+@pytest.fixture
+def two_runs(service: TestClient, tmp_path: Path) -> list[bytes]:
+    """Two stored runs of one patient."""
+    files = [
+        edited(small_run(tmp_path, number, 90.0 * number), PatientName="Doe^Jane", PatientID="P7", StudyDate="20260301")
+        for number in (1, 2)
+    ]
+    assert store(service, *files).status_code == 200
+    return files
+
+
+def address(file: bytes) -> str:
+    run = pydicom.dcmread(io.BytesIO(file))
+    return f"{STUDIES}/{run.StudyInstanceUID}/series/{run.SeriesInstanceUID}/instances/{run.SOPInstanceUID}"
+
+
+def test_runs_join_one_mapping_study(service: TestClient, two_runs: list[bytes]) -> None:
+    (study,) = service.get("/v1/studies").json()["items"]
+    runs = service.get(f"/v1/studies/{study['id']}/instances").json()["items"]
+    assert [run["sop_instance_uid"] for run in runs] == [run_uid(1), run_uid(2)]
+
+
+def test_answer_refers_to_what_was_stored(service: TestClient, tmp_path: Path) -> None:
+    file = small_run(tmp_path, 1, 0.0)
+    answer = store(service, file, path=f"{STUDIES}/{STUDY_UID}")
+    assert answer.status_code == 200
+    result = Dataset.from_json(answer.json())
+    (reference,) = result.ReferencedSOPSequence
+    assert reference.ReferencedSOPInstanceUID == run_uid(1)
+    assert reference.RetrieveURL == f"http://127.0.0.1{address(file)}"
+    assert "FailedSOPSequence" not in result
+
+
+def test_failures_have_reasons(service: TestClient, tmp_path: Path) -> None:
+    good = small_run(tmp_path, 1, 0.0)
+    other_pixels = edited(good, PixelData=bytes(2 * FRAMES * ROWS * COLUMNS))
+    assert store(service, good).status_code == 200
+    computed_tomography = edited(good, Modality="CT", SOPClassUID="1.2.840.10008.5.1.4.1.1.2")
+    partly = store(service, small_run(tmp_path, 2, 0.0), other_pixels, b"no DICOM", computed_tomography)
+    assert partly.status_code == 202
+    result = Dataset.from_json(partly.json())
+    assert [item.FailureReason for item in result.FailedSOPSequence] == [0xC001, 0xC000, 0xA900]
+    assert [item.ReferencedSOPInstanceUID for item in result.ReferencedSOPSequence] == [run_uid(2)]
+    assert store(service, other_pixels).status_code == 409
+    assert store(service, small_run(tmp_path, 3, 0.0), path=f"{STUDIES}/1.2.3").status_code == 409
+    assert stored_count() == len(left_files()) == 2
+
+
+@pytest.mark.parametrize(
+    ("content_type", "content", "status"),
+    [
+        ("application/json", b"{}", 415),
+        ('multipart/related; type="application/dicom+json"; boundary=edge', body(b"{}"), 415),
+        (RELATED, body(b"x", content_type=""), 415),
+        (RELATED, body(b"x", content_type="Content-Type: text/plain\r\n"), 415),
+        ('multipart/related; type="application/dicom"', body(b"x"), 400),
+        (RELATED.replace("edge", "other"), body(b"x"), 400),
+        (RELATED, body(b"x", end=b""), 400),
+        (RELATED, b"", 400),
+        (RELATED, b"--edge--\r\n", 400),
+    ],
+)
+def test_bad_requests_store_nothing(service: TestClient, content_type: str, content: bytes, status: int) -> None:
+    answer = service.post(STUDIES, content=content, headers={"content-type": content_type})
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert (stored_count(), left_files()) == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("query", "count"),
+    [
+        ("", 1), ("?PatientID=P7", 1), ("?PatientID=P8", 0), ("?PatientName=doe*", 1), ("?PatientName=D?e^Jane", 1),
+        ("?00100010=Smith*", 0), (f"?StudyInstanceUID=1.2,{STUDY_UID}", 1), ("?StudyDate=20260228-20260302", 1),
+        ("?StudyDate=-20260228", 0), ("?StudyDate=20260301", 1), ("?ModalitiesInStudy=XA&limit=5&fuzzymatching=false", 1),
+        ("?offset=1", 0), ("?limit=0", 0), ("?AccessionNumber=", 1),
+    ],
+)  # fmt: skip
+def test_searches_for_studies(service: TestClient, two_runs: list[bytes], query: str, count: int) -> None:
+    assert len(found(service, STUDIES + query)) == count
+
+
+def test_study_series_and_instance_levels(service: TestClient, two_runs: list[bytes]) -> None:
+    (study,) = found(service, f"{STUDIES}?includefield=Manufacturer")
+    assert (study.PatientName, study.ModalitiesInStudy) == ("Doe^Jane", "XA")
+    assert (study.NumberOfStudyRelatedSeries, study.NumberOfStudyRelatedInstances) == (2, 2)
+    assert study.Manufacturer == pydicom.dcmread(io.BytesIO(two_runs[0])).Manufacturer
+    series = found(service, f"{STUDIES}/{STUDY_UID}/series")
+    assert {item.SeriesNumber for item in series} == {1, 2}
+    (instance,) = found(service, f"{STUDIES}/{STUDY_UID}/series/{series[0].SeriesInstanceUID}/instances")
+    assert (instance.Rows, instance.Columns, instance.NumberOfFrames) == (ROWS, COLUMNS, FRAMES)
+    assert len(found(service, f"{STUDIES}/{STUDY_UID}/instances")) == len(found(service, "/dicom-web/instances")) == 2
+    assert len(found(service, "/dicom-web/series?SeriesNumber=2")) == 1
+    assert len(found(service, "/dicom-web/instances?limit=1")) == 1
+
+
+def test_unknown_parameters_are_refused(service: TestClient, two_runs: list[bytes]) -> None:
+    for path in (STUDIES, f"{STUDIES}/{STUDY_UID}/metadata", f"{STUDIES}/{STUDY_UID}"):
+        answer = service.get(f"{path}?PatientNaem=Doe")
+        assert (answer.status_code, answer.json()["code"]) == (422, "unknown_parameter")
+    assert service.get(f"{STUDIES}?limit=many").status_code == 422
+
+
+def test_files_come_back_as_they_were_sent(service: TestClient, two_runs: list[bytes]) -> None:
+    accept = {"accept": 'multipart/related; type="application/dicom"; transfer-syntax=*'}
+    assert sorted(parts_of(service.get(f"{STUDIES}/{STUDY_UID}", headers=accept))) == sorted(two_runs)
+    assert parts_of(service.get(address(two_runs[0]), headers=accept)) == [two_runs[0]]
+    series = address(two_runs[1]).partition("/instances")[0]
+    assert parts_of(service.get(series)) == [two_runs[1]]
+
+
+def test_headers_come_without_pixels(service: TestClient, two_runs: list[bytes]) -> None:
+    (header,) = found(service, f"{address(two_runs[0])}/metadata")
+    sent = pydicom.dcmread(io.BytesIO(two_runs[0]))
+    del sent.PixelData
+    assert header == sent
+    assert len(found(service, f"{STUDIES}/{STUDY_UID}/metadata")) == 2
+
+
+def test_frames_are_the_stored_pixels(service: TestClient, two_runs: list[bytes]) -> None:
+    sent = pydicom.dcmread(io.BytesIO(two_runs[0])).pixel_array
+    frames = parts_of(service.get(f"{address(two_runs[0])}/frames/3,1"))
+    assert [np.frombuffer(frame, "<u2").reshape(ROWS, COLUMNS).tolist() for frame in frames] == [
+        sent[2].tolist(),
+        sent[0].tolist(),
+    ]
+
+
+def test_what_is_not_there_or_not_offered(service: TestClient, two_runs: list[bytes]) -> None:
+    run = address(two_runs[0])
+    assert service.get(f"{STUDIES}/1.2.3").status_code == 404
+    assert service.get(f"{run}/frames/4").status_code == 404
+    assert service.get(f"{run}/frames/x").status_code == 400
+    for accept in ("image/jpeg", 'multipart/related; type="application/dicom"; transfer-syntax=1.2.840.10008.1.2.4.50'):
+        assert service.get(run, headers={"accept": accept}).status_code == 406
+    assert service.get(f"{run}/frames/1", headers={"accept": "multipart/related; type=image/jpeg"}).status_code == 406
+
+
+def test_one_of_several_accepted_types_is_enough(service: TestClient, two_runs: list[bytes]) -> None:
+    accept = (
+        'multipart/related; type="image/jpeg"; transfer-syntax=1.2.840.10008.1.2.4.50, '
+        'multipart/related; type="application/octet-stream"'
+    )
+    assert len(parts_of(service.get(f"{address(two_runs[0])}/frames/1", headers={"accept": accept}))) == 1
