@@ -77,7 +77,7 @@ class FrameSearch:
         return entry
 
     def _search(self, x: Image, beside: Sequence[Image], frame: int, reach_cells: int) -> FrameChains:
-        """Search the image; with images beside it, search their mean and find its chains again in the image."""
+        """Search an image, or first its mean with the images beside it."""
         self.detector.forget_image()
         self.network.reach_cells = reach_cells
         mean: Image = np.mean([x, *beside], axis=0, dtype=np.float32) if beside else x
