@@ -44,7 +44,7 @@ def test_from_upload_over_a_correction_to_the_mesh(
     assert page.locator("#panel-map tr[data-site]").count() == 5
 
     # Somebody drags the tip of the mapping catheter in view a of a located site.
-    located = page.locator("#panel-map tr[data-grade=A], #panel-map tr[data-grade=B]").first
+    located = page.locator("#panel-map tr[data-grade]:not([data-grade=rejected])").first
     site = located.get_attribute("data-site")
     located.get_by_role("button", name="Find site").click()
     page.get_by_role("tab", name="2 Look and correct").click()
