@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from finished_study import FinishedStudy
+from finished_study import FinishedStudy, matching
 
 from fluoromap_service.api.jobs import jobs as job_routes
 from fluoromap_service.jobs import job_life
@@ -36,7 +36,7 @@ def test_a_job_has_exactly_the_promised_members(client: TestClient, study: Finis
 
 def test_progress_grows_to_one(client: TestClient, study: FinishedStudy) -> None:
     seen = [client.get(_path(study)).json()["progress"]]
-    for step in (study.segmented, lambda: study.end("match", None, ("any", 1))):
+    for step in (study.segmented, lambda: study.end("match", None, matching())):
         step()
         seen.append(client.get(_path(study)).json()["progress"])
     assert seen == sorted(set(seen))
