@@ -141,7 +141,10 @@ def _fits(item: str, kinds: tuple[str, ...]) -> bool:
 
 
 def _asked_syntaxes(accepted: list[str]) -> set[str]:
-    """Return the transfer syntaxes of an Accept header, ``*`` for any; empty when an item names none."""
+    """Return the transfer syntaxes of an Accept header, ``*`` for any.
+
+    The set is empty when an item names none.
+    """
     asked = [re.findall(r'transfer-syntax="?([0-9.*]+)', item) for item in accepted]
     return set() if [] in asked else {syntax for found in asked for syntax in found}
 
