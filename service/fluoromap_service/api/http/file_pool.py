@@ -35,6 +35,7 @@ class Task(StrEnum):
 
     READ_FILE = "Reading this file"
     DRAW_PICTURE = "Drawing this picture"
+    WRITE_DICOM = "Writing the results as DICOM"
     FIND_ELECTRODES = "Finding the electrodes of this frame"
 
     @property
