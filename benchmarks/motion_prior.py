@@ -31,6 +31,7 @@ from fluoromap.contracts import (
 )
 from fluoromap.monoplane.a_priori_lm import APrioriLM
 from fluoromap.monoplane.motion_prior import MotionPrior
+from fluoromap.monoplane.track_samples import in_study
 from fluoromap.phantom import HeartKind, SimulatedRun, StudySpec, simulate_study
 from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.reasons import Reason
@@ -143,7 +144,7 @@ def monoplane_view(matched: MatchedSite, located: LocatedSite, a: bool, others: 
         catalogue=CATALOGUE,
         frame_times_ms=matched.frame_times_a_ms if a else matched.frame_times_b_ms,
         observations=matched.track_a if a else matched.track_b,
-        a_priori=located.points,
+        a_priori=located.a_priori,
         a_priori_frame=located.frame_a if a else located.frame_b,
         cycle=None if others else located.cycle,
         others=tuple(site.cycle for site in others if site.cycle),
@@ -190,7 +191,7 @@ def run_scene(scene: Scene, seeds: Sequence[int], paper: bool = False) -> Scores
             others = () if scene.own_cycle else located.sites[1:]
             view = monoplane_view(matched[0], located.sites[0], number == 0, others)
             start = time.process_time()
-            track = solver.track(view, Silent())
+            track = in_study(solver.track(view, Silent()), view.camera, CATALOGUE.reference, located.sites[0].variation)
             scores.milliseconds.append(1000 * (time.process_time() - start) / len(view.observations))
             before = [step.track(view, Silent()) for step in steps]
             scores.by_view[number].append(score(track, run, before))

@@ -108,7 +108,7 @@ def tracked(*patterns: str) -> list[str]:
         names = subprocess.run(list_files, cwd=TOP, capture_output=True, text=True, check=True).stdout.splitlines()
     else:
         names = [str(path.relative_to(TOP)) for path in TOP.rglob("*") if path.is_file() and ".venv" not in path.parts]
-    own = [name for name in names if "/web/three/" not in name and (TOP / name).exists()]
+    own = [name for name in names if "/web/assets/three/" not in name and (TOP / name).exists()]
     return sorted(name for name in own if any(Path(name).match(pattern) for pattern in patterns))
 
 

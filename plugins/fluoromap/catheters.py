@@ -80,12 +80,15 @@ class Catheter:
         return self.electrodes >= _LEAST_ON_LOOP and equal
 
     def looks_like(self, other: Catheter) -> bool:
-        """Return whether the two look alike in fluoroscopy (all lengths within 0.5 mm)."""
+        """Return whether the two look alike in fluoroscopy (all lengths within 1 mm).
+
+        Descriptions are wrong by up to 0.5 mm each.
+        """
         if self.electrodes != other.electrodes:
             return False
         mine = (*self.spacing_mm, self.tip_mm, self.ring_mm)
         theirs = (*other.spacing_mm, other.tip_mm, other.ring_mm)
-        return all(abs(a - b) <= 0.5 for a, b in zip(mine, theirs, strict=True))
+        return all(abs(a - b) <= 1.0 for a, b in zip(mine, theirs, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

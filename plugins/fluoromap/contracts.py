@@ -8,7 +8,7 @@ of the top-left pixel. World points are millimetres along DICOM patient axes (LP
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from fluoromap.catheters import Catalogue
 from fluoromap.geometry import Camera
-from fluoromap.reasons import Reason
+from fluoromap.reasons import AT_BEST_B, AT_BEST_C, Reason
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -72,7 +72,7 @@ class Silent:
 
 
 class Grade(StrEnum):
-    """Trust in a position by the largest semi-axis of its 95 % ellipsoid."""
+    """Trust in a position: by the largest semi-axis of its 95 % ellipsoid, and by the doubts about it."""
 
     A = "A"
     B = "B"
@@ -80,14 +80,19 @@ class Grade(StrEnum):
     REJECTED = "rejected"
 
 
-def grade_of(covariance_mm2: ArrayLike) -> Grade:
-    """Return the grade of a 3x3 position covariance.
+def grade_of(covariance_mm2: ArrayLike, reasons: Iterable[Reason] = ()) -> Grade:
+    """Return the grade of a 3x3 position covariance with the reasons of the position.
 
-    A up to 2 mm, B up to 4 mm, C beyond (largest semi-axis of the 95 % ellipsoid).
+    A up to 2 mm, B up to 4 mm, C beyond (largest semi-axis of the 95 % ellipsoid). Reasons that no covariance contains limit
+    the grade: see ``AT_BEST_C`` and ``AT_BEST_B``.
     """
+    doubts = set(reasons)
+    if doubts & AT_BEST_C:
+        return Grade.C
     largest = float(np.linalg.eigvalsh(np.asarray(covariance_mm2, dtype=np.float64))[-1])
     semi_axis_mm = float(np.sqrt(CHI2_95_3D * max(largest, 0.0)))
-    return Grade.A if semi_axis_mm <= 2.0 else Grade.B if semi_axis_mm <= 4.0 else Grade.C
+    grade = Grade.A if semi_axis_mm <= 2.0 else Grade.B if semi_axis_mm <= 4.0 else Grade.C
+    return Grade.B if grade is Grade.A and doubts & AT_BEST_B else grade
 
 
 def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: type = np.float64) -> NDArray[Any]:
@@ -440,11 +445,27 @@ class SiteCycle:
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (p, m, 3, 3), "covariance_mm2"))
 
 
+@dataclass(frozen=True, slots=True)
+class StudyVariation:
+    """Variation that a study shows, as multiples of the assumed standard deviations.
+
+    breathing : between runs. beats : of a catheter's place from beat to beat. gantry_angle, gantry_offset : remaining error of
+    the gantry. The defaults hold where no study shows anything: any heart, and the root mean square over all kinds of gantry.
+    """
+
+    breathing: float = 1.0
+    beats: float = 1.0
+    gantry_angle: float = 1.458
+    gantry_offset: float = 2.269
+
+
 @dataclass(frozen=True, eq=False)
 class LocatedSite:
     """A site in 3D: points at diastole, cycle and final cameras (self-calibrated or not).
 
     frame_a, frame_b : the diastolic frames. reference_mm : (3,) the reference catheter's mean, None where not located.
+    variation : of the study that contains the site. a_priori : the points with the covariances of any gantry and any heart;
+    cycle has these too. A correction at another site changes neither, so that no track has to be computed again.
     """
 
     site: str
@@ -456,6 +477,8 @@ class LocatedSite:
     reference_mm: Array | None
     cycle: SiteCycle | None
     reasons: tuple[Reason, ...] = ()
+    variation: StudyVariation = StudyVariation()
+    a_priori: tuple[ElectrodePoint, ...] = ()
 
     def __post_init__(self) -> None:
         if self.reference_mm is not None:
@@ -467,6 +490,23 @@ class LocatedSite:
             if point.catheter == catheter and point.electrode == electrode:
                 return point
         return None
+
+    def reasons_of(self, catheter: str, electrode: int, reference: str | None = None) -> tuple[Reason, ...]:
+        """Return the reasons of an electrode's position: its own and the site's.
+
+        With the name of the reference catheter, for a position relative to it, the doubts about that catheter belong to
+        them.
+        """
+        point = self.point(catheter, electrode)
+        own = point.reasons if point is not None else ()
+        origin = self.doubts_about(reference) if reference is not None else ()
+        return tuple(dict.fromkeys((*own, *self.reasons, *origin)))
+
+    def doubts_about(self, catheter: str) -> tuple[Reason, ...]:
+        """Return the reasons of a catheter's points, and of the whole site, that limit the grade."""
+        own = [reason for point in self.points if point.catheter == catheter for reason in point.reasons]
+        reasons = (*own, *self.reasons)
+        return tuple(dict.fromkeys(reason for reason in reasons if reason in AT_BEST_C))
 
     def camera(self, view: View) -> Camera:
         """Return the camera of a view."""
@@ -556,6 +596,26 @@ class MonoplaneView:
 
 
 @dataclass(frozen=True, eq=False)
+class StudyShares:
+    """Shares of a track's covariances that grow and shrink with the variation of its study.
+
+    depth_mm2, relative_depth_mm2 : (4, n, m) variance along the ray from breathing, beats, gantry angle and gantry offset, in
+    the order of :class:`StudyVariation`. The second is that of positions less the reference's mean. angle_sd_rad, offset_sd_mm :
+    error of this view's gantry, which displaces the electrodes across its rays. All have the default variation.
+    """
+
+    depth_mm2: Array
+    relative_depth_mm2: Array
+    angle_sd_rad: float
+    offset_sd_mm: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "depth_mm2", frozen(self.depth_mm2, (4, None, None), "depth_mm2"))
+        relative = frozen(self.relative_depth_mm2, self.depth_mm2.shape, "relative_depth_mm2")
+        object.__setattr__(self, "relative_depth_mm2", relative)
+
+
+@dataclass(frozen=True, eq=False)
 class Track:
     """Electrodes in 3D in every frame of one view.
 
@@ -563,7 +623,8 @@ class Track:
     arrays contain 0 there. positions_mm, baseline_mm : (n, m, 3), the baseline being the plain back-projection at the
     prior's depth. covariance_mm2 : (n, m, 3, 3), from the isocentre. relative_covariance_mm2 : (n, m, 3, 3) of the position
     less the mean of the reference catheter's electrodes in the same frame; None where the solver does not compute it.
-    pixels_uv : (n, m, 2) observed. reasons : one tuple for each electrode.
+    pixels_uv : (n, m, 2) observed. reasons : one tuple for each electrode. shares : None where the solver does not state them.
+    The covariances have the default variation; :func:`fluoromap.monoplane.track_samples.in_study` brings them to the study's.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -574,6 +635,7 @@ class Track:
     pixels_uv: Array
     reasons: tuple[tuple[Reason, ...], ...]
     relative_covariance_mm2: Array | None = None
+    shares: StudyShares | None = None
 
     def __post_init__(self) -> None:
         m = len(self.labels)

@@ -22,6 +22,7 @@ class Reason(StrEnum):
     NO_A_PRIORI = "no_a_priori"
     PAIRING_FAILED = "pairing_failed"
     SPACING_MISMATCH = "spacing_mismatch"
+    CATALOGUE_CONTRADICTED = "catalogue_contradicted"
     TABLE_MOVED = "table_moved"
     DEPTH_UNOBSERVABLE = "depth_unobservable"
     DEPTH_ASSUMED = "depth_assumed"
@@ -64,6 +65,7 @@ _SENTENCES: dict[Reason, str] = {
     Reason.NO_A_PRIORI: "No biplane position is known here; a single view gives no depth.",
     Reason.PAIRING_FAILED: "The catheters of the two views do not belong together; check which runs are paired at this site.",
     Reason.SPACING_MISMATCH: "The electrode spacing found differs from the catalogue's; check the catheter's description.",
+    Reason.CATALOGUE_CONTRADICTED: "The image contradicts this catheter's description; check its electrode spacings and its tip.",
     Reason.TABLE_MOVED: "The table moved, or may have moved, between the two views; repeat one of them.",
     Reason.DEPTH_UNOBSERVABLE: "One view does not give the depth of this catheter to a useful accuracy.",
     Reason.DEPTH_ASSUMED: "The depth along the ray comes from the solver's start value, not from the image.",
@@ -86,3 +88,11 @@ _SENTENCES: dict[Reason, str] = {
     Reason.OUTSIDE_WINDOW: "This activation time lies outside the window of interest and was brought into it by whole cycles.",
     Reason.PLUGIN_FAILED: "The plugin for this stage failed; the job's stage shows its message.",
 }
+
+AT_BEST_C = frozenset({
+    Reason.IDENTITY_UNCERTAIN, Reason.EXTRA_CATHETER, Reason.TABLE_MOVED, Reason.GEOMETRY_DOUBTFUL, Reason.SPACING_MISMATCH,
+    Reason.VIEW_MIRRORED, Reason.PAIRING_FAILED,
+})  # fmt: skip
+"""Doubts about which electrode this is or where its views are: no covariance contains them, so the grade is at best C."""
+AT_BEST_B = frozenset({Reason.CATALOGUE_CONTRADICTED, Reason.MARK_NOT_USED})
+"""Doubts that may displace an electrode by a part of its size: the grade is at best B."""

@@ -31,7 +31,7 @@ _METHODS: dict[Kind, str] = {
     "fuser": "fuse",
 }
 DEFAULTS: dict[Kind, str] = {
-    "segmenter": "catheter-chain",
+    "segmenter": "learned-chain",
     "triangulator": "maximum-likelihood",
     "monoplane": "motion-prior",
     "fuser": "smooth-surface",

@@ -93,3 +93,13 @@ def test_cycles_and_tracks_agree_with_their_labels() -> None:
 def test_a_refusal_says_its_reason_s_sentence_unless_given_a_better_one() -> None:
     assert str(Refusal(Reason.NO_A_PRIORI)) == Reason.NO_A_PRIORI.sentence
     assert str(Refusal(Reason.DEPTH_UNOBSERVABLE, "17 mm")) == "17 mm"
+
+
+def test_a_grade_is_the_worse_of_covariance_and_doubt() -> None:
+    small, large = 0.01 * np.eye(3), 10.0 * np.eye(3)
+    assert grade_of(small) is Grade.A
+    assert grade_of(small, [Reason.IDENTITY_BY_MOTION]) is Grade.A
+    assert grade_of(small, [Reason.CATALOGUE_CONTRADICTED]) is Grade.B
+    assert grade_of(large, [Reason.CATALOGUE_CONTRADICTED]) is Grade.C
+    for reason in (Reason.IDENTITY_UNCERTAIN, Reason.TABLE_MOVED, Reason.GEOMETRY_DOUBTFUL, Reason.EXTRA_CATHETER):
+        assert grade_of(small, [reason]) is Grade.C

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 import shutil
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,24 @@ import pydicom
 import pytest
 from fastapi.testclient import TestClient
 
-from fluoromap.contracts import Context, Marks, Refusal, Run, Segmentation
+from fluoromap.contracts import Context, Marks, Matching, Refusal, Run, Segmentation
+from fluoromap.drawing.symbols import time_text
 from fluoromap.fuser.smooth_surface import SmoothSurface
+from fluoromap.matching import match_study
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.reasons import Reason
 from fluoromap.registry import Kind, Plugin
-from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
+from fluoromap.triangulator import study_triangulation
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
+from fluoromap.triangulator.site_locator import SiteLocator
+from fluoromap.triangulator.table_motion import Jump, table_jumps
 from fluoromap_service.jobs import pipeline
 from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
+from fluoromap_workers import stage_inputs
 
 
 def _send(service: TestClient, study_path: str, folder: Path) -> None:
@@ -178,19 +184,86 @@ def test_the_doubt_of_a_half_known_table_reaches_the_points(
         assert ("table_moved" in point["reasons"]) == (point["site"] in doubtful)
 
 
+def test_doubts_reach_points_tracks_map_overlays_and_report(
+    service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Matching doubts a catheter at one site, the headers' table another site, triangulation a third and a fourth."""
+    found = match_study
+
+    def doubting(*of: Any) -> Matching:
+        matching = found(*of)
+        sites = [
+            replace(site, notes=(*site.notes, ("mapping", Reason.EXTRA_CATHETER))) if site.site == "S01" else site
+            for site in matching.sites
+        ]
+        return replace(matching, sites=tuple(sites))
+
+    jumps = table_jumps
+
+    def jumping(sites: Any, *of: Any) -> list[Jump | None]:
+        return [
+            Jump("a", np.array([0.0, 0.0, 9.0])) if index == 1 else jump for index, jump in enumerate(jumps(sites, *of))
+        ]
+
+    locate = SiteLocator.locate
+
+    def doubted_geometry(self: SiteLocator, site: Any, jump: Any) -> Any:
+        belief = replace(self.belief, doubt=Reason.GEOMETRY_DOUBTFUL if site.site == "S04" else self.belief.doubt)
+        return locate(replace(self, belief=belief), site, jump)
+
+    monkeypatch.setattr(stage_inputs, "match_study", doubting)
+    monkeypatch.setattr(study_triangulation, "table_jumps", jumping)
+    monkeypatch.setattr(SiteLocator, "locate", doubted_geometry)
+    expected = {"S01": "extra_catheter", "S02": "table_moved", "S04": "geometry_doubtful"}
+    job = _job(service, sent)
+    base = f"/v1/jobs/{job['id']}"
+    tips = [
+        p for p in service.get(f"{base}/points").json()["points"]
+        if (p["catheter"], p["electrode"]) == ("mapping", 1) and p["grade"] != "rejected"
+    ]  # fmt: skip
+    tracks = service.get(f"{base}/tracks").json()["tracks"]
+    on_map = {site["site"]: site for site in service.get(f"{base}/map").json()["sites"]}
+    rows = service.get(f"{base}/report.html").text.split("<tr>")
+    uids = {(o["site"], o["view"]): o["sop_instance_uid"] for o in service.get(f"{base}/overlays").json()["overlays"]}
+    assert expected.keys() <= {tip["site"] for tip in tips}
+    for tip in tips:
+        site, doubt = tip["site"], expected.get(tip["site"])
+        samples = [
+            sample
+            for track in tracks
+            if (track["site"], track["catheter"]) == (site, "mapping")
+            for sample in track["samples"]
+        ]
+        assert samples
+        of_site = [row for row in rows if f">{site}</td>" in row]
+        with reading() as session:
+            fusion = fusion_of(session, session.get_one(Job, job["id"]), uids[site, "a"], None)
+        mark = next(each for each in fusion.chamber.sites if each.site == site)
+        for code in expected.values():
+            is_expected = code == doubt
+            assert (code in tip["reasons"]) == is_expected
+            assert (code in on_map[site]["reasons"]) == is_expected
+            assert all((code in sample["reasons"]) == is_expected for sample in samples)
+            assert any(code in row for row in of_site) == is_expected
+        if doubt:
+            assert tip["grade"] == "C"
+            assert {sample["grade"] for sample in samples} <= {"C", "rejected"}
+            assert time_text(mark).endswith("?")
+
+
 def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    segment = CatheterChain.segment
+    segment = LearnedChain.segment
     calls: list[int] = []
 
-    def fails_once(self: CatheterChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
+    def fails_once(self: LearnedChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
         calls.append(1)
         if len(calls) == 1:
             raise ArithmeticError("the plugin's own words")
         return segment(self, run, catalogue, corrections, context)
 
-    monkeypatch.setattr(CatheterChain, "segment", fails_once)
+    monkeypatch.setattr(LearnedChain, "segment", fails_once)
     job = _job(service, sent)
     assert job["state"] == "succeeded"
     failed = [row for row in job["stages"] if row["state"] == "failed"]
@@ -204,7 +277,7 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
 
 
 REFUSALS = {
-    "segmenter": (CatheterChain, "segment", Reason.MANUAL_NEEDED),
+    "segmenter": (LearnedChain, "segment", Reason.MANUAL_NEEDED),
     "triangulator": (MaximumLikelihood, "triangulate", Reason.TABLE_MOVED),
     "monoplane": (MotionPrior, "track", Reason.DEPTH_UNOBSERVABLE),
     "fuser": (SmoothSurface, "fuse", Reason.TOO_FEW_SITES),
@@ -241,7 +314,7 @@ def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
 
 
 RETURNED = {
-    "segmenter": (CatheterChain, "segment", "catheter-chain returned NoneType, expected Segmentation"),
+    "segmenter": (LearnedChain, "segment", "learned-chain returned NoneType, expected Segmentation"),
     "triangulator": (MaximumLikelihood, "triangulate", "maximum-likelihood returned NoneType, expected Triangulation"),
     "monoplane": (MotionPrior, "track", "motion-prior returned NoneType, expected Track"),
     "fuser": (SmoothSurface, "fuse", "smooth-surface returned NoneType, expected ChamberMap"),
@@ -268,7 +341,7 @@ def test_a_job_of_another_version_of_a_plugin_is_not_computed(
     installed = pipeline.plugin
 
     def older(kind: Kind, name: str) -> Plugin:
-        return dataclasses.replace(installed(kind, name), version="0")
+        return replace(installed(kind, name), version="0")
 
     monkeypatch.setattr(pipeline, "plugin", older)
     job = _job(service, sent)

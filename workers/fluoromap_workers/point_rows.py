@@ -25,6 +25,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
     refused = {site.site: site.reasons for site in triangulation.rejected}
     for planned in snapshot.sites:
         site = located.get(planned.site)
+        reference_doubts = site.doubts_about(snapshot.reference) if site else ()
         for catheter in snapshot.catalogue().catheters:
             doubts = tuple(reason for name, reason in notes.get(planned.site, ()) if name == catheter.name)
             for electrode in range(1, catheter.electrodes + 1):
@@ -33,7 +34,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
                     reasons = refused.get(planned.site) or doubts or (Reason.CATHETER_NOT_FOUND,)
                     rows.append(_rejected(job_id, planned, catheter.name, electrode, reasons))
                 else:
-                    rows.append(_located(job_id, planned, site, point, doubts))
+                    rows.append(_located(job_id, planned, site, point, doubts, reference_doubts))
     for not_ready in snapshot.rejected:
         for catheter in snapshot.catalogue().catheters:
             for electrode in range(1, catheter.electrodes + 1):
@@ -42,10 +43,13 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
 
 
 def _located(
-    job_id: str, planned: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...]
-) -> Point:
+    job_id: str, planned: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...],
+    reference_doubts: tuple[Reason, ...],
+) -> Point:  # fmt: skip
     relative = point.relative_mm is not None and point.relative_covariance_mm2 is not None
-    reasons = dict.fromkeys((*point.reasons, *site.reasons, *doubts))
+    own = (*point.reasons, *site.reasons, *doubts)
+    relative_own = (*own, *reference_doubts) if relative else own
+    reasons = dict.fromkeys(relative_own)
     if not relative:
         reasons[Reason.NO_REFERENCE] = None
     return Point(
@@ -65,8 +69,8 @@ def _located(
         residual_b_px=point.residual_px[1],
         ray_angle_deg=point.ray_angle_deg,
         lat_ms=planned.lat_ms,
-        grade=grade_of(point.covariance_mm2),
-        relative_grade=grade_of(point.relative_covariance_mm2) if relative else Grade.REJECTED,  # type: ignore[arg-type]
+        grade=grade_of(point.covariance_mm2, own),
+        relative_grade=grade_of(point.relative_covariance_mm2, relative_own) if relative else Grade.REJECTED,  # type: ignore[arg-type]
         reasons=[str(reason) for reason in reasons],
     )
 

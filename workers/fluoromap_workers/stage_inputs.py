@@ -298,7 +298,7 @@ def _monoplane_view(
         catalogue=catalogue,
         frame_times_ms=matched.frame_times_a_ms if first else matched.frame_times_b_ms,
         observations=matched.track_a if first else matched.track_b,
-        a_priori=tuple(_without_name_doubts(point) for point in located.points),
+        a_priori=tuple(_without_name_doubts(point) for point in located.a_priori or located.points),
         a_priori_frame=located.frame_a if first else located.frame_b,
         cycle=located.cycle,
         others=others,

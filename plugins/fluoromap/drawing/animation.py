@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from fluoromap.contracts import ChamberMap
-from fluoromap.drawing.colours import scale_of
+from fluoromap.drawing.colours import Colours, scale_of
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.geometry import Camera
 
@@ -43,8 +43,9 @@ def draw_propagation(
         )
         for until_ms in np.linspace(times.start_ms, times.stop_ms, PICTURES)
     ]
-    # All pictures share the palette of the last, which has every colour; unchanged pixels are then stored only once.
-    palette = pictures[-1].quantize(COLOURS, dither=Image.Dither.NONE)
+    # All pictures share the palette of the last, which has every colour; unchanged pixels are then stored only once. The
+    # colours of the colour bar are in it unchanged.
+    palette = _palette(pictures[-1], times.band_colours())
     reduced = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     stream = io.BytesIO()
     shown_ms = [PICTURE_MS] * (PICTURES - 1) + [LAST_PICTURE_MS]
@@ -52,3 +53,15 @@ def draw_propagation(
         stream, format="GIF", save_all=True, append_images=reduced[1:], duration=shown_ms, loop=0, disposal=1
     )
     return stream.getvalue()
+
+
+def _palette(picture: Image.Image, bands: Colours) -> Image.Image:
+    """Return an image with the palette of the pictures.
+
+    It has the bands' colours (k, 3) unchanged, and the most important other colours of the picture.
+    """
+    free = COLOURS - len(bands)
+    others = picture.quantize(free, dither=Image.Dither.NONE).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*bands.ravel().tolist(), *others[: 3 * free]])
+    return palette

@@ -34,8 +34,13 @@ _ANCHORS_RGB: dict[Palette, Array] = {
         ],
         dtype=np.float64,
     ),
+    # Lightest in the middle and dark at both ends, without a saturated green: so that colour-blind readers never see an early
+    # band as a late one.
     "red-early": np.array(
-        [(230, 20, 20), (255, 140, 0), (255, 235, 0), (60, 200, 40), (0, 200, 220), (30, 70, 230), (150, 30, 220)],
+        [
+            (150, 0, 10), (225, 60, 0), (255, 150, 0), (255, 240, 50), (200, 245, 210), (60, 210, 235), (20, 120, 235),
+            (40, 20, 170), (50, 0, 90),
+        ],
         dtype=np.float64,
     ),
 }  # fmt: skip

@@ -38,6 +38,24 @@ def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, in
     draw.text(middle, text, fill=ink, font=font(size), anchor="mm", stroke_width=stroke, stroke_fill=halo)
 
 
+def line_with_squares(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, ink: RGB) -> None:
+    """Draw a text with squares, centred on a point.
+
+    Each ``²`` is a small raised 2, because Pillow's typeface lacks the sign.
+    """
+    small = round(0.65 * size)
+    parts = text.split("²")
+    widths = [font(size).getlength(part) for part in parts]
+    raised = font(small).getlength("2")
+    u, v = middle[0] - (sum(widths) + raised * (len(parts) - 1)) / 2, middle[1]
+    for index, (part, width) in enumerate(zip(parts, widths, strict=True)):
+        if index:
+            draw.text((u, v - 0.35 * size), "2", fill=ink, font=font(small), anchor="lm")
+            u += raised
+        draw.text((u, v), part, fill=ink, font=font(size), anchor="lm")
+        u += width
+
+
 _NEAR = np.array([(1, 0), (-1, 0), (0, -1), (0, 1), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (-0.8, 0.8)])
 _DIRECTIONS = np.concatenate([_NEAR, 1.7 * _NEAR])
 

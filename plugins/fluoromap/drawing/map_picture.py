@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, ChamberMap
+from fluoromap.drawing.annotations import PURPOSE
 from fluoromap.drawing.colour_bar import draw_colour_bar
 from fluoromap.drawing.colours import Scale, scale_of
 from fluoromap.drawing.isochrones import Isochrone, isochrones
-from fluoromap.drawing.lettering import Labels, Point, font
+from fluoromap.drawing.lettering import Labels, Point, font, line_with_squares
 from fluoromap.drawing.raster import rasterise
-from fluoromap.drawing.symbols import draw_dot, draw_time, is_outlier
+from fluoromap.drawing.symbols import draw_dot, draw_time, is_doubtful
 from fluoromap.drawing.wall import colour_table, line_parts, outline_edges, pixel_bands
 from fluoromap.fuser.surface import face_normals
 from fluoromap.geometry import view_axes
@@ -23,16 +24,18 @@ Direction = tuple[str, float, float, tuple[str, str, str, str]]
 
 VIEWS: tuple[Direction, ...] = (
     ("AP", 0, 0, ("R", "L", "H", "F")),
-    ("LAO 45", 45, 0, ("RA", "LP", "H", "F")),
+    ("LAO 45", 45, 0, ("R-A", "L-P", "H", "F")),
     ("left lateral (LAO 90)", 90, 0, ("A", "P", "H", "F")),
     ("PA", 180, 0, ("L", "R", "H", "F")),
-    ("RAO 30", -30, 0, ("RP", "LA", "H", "F")),
+    ("RAO 30", -30, 0, ("R-P", "L-A", "H", "F")),
     ("from the feet", 0, -90, ("R", "L", "A", "P")),
 )
 """Name, primary and secondary C-arm angle in degrees, letters of the patient's directions left, right, top, bottom."""
 
 PANELS_A_ROW = 3
 PANEL_PX = 340
+GAP_PX = 28
+"""Space between panels, so that the letters of two neighbours do not look like one word."""
 MARGIN_PX = 40
 BAR_PX = 110
 FOOTER_PX = 40
@@ -75,16 +78,18 @@ def draw_map_views(
     middle = (extent.max(axis=0) + extent.min(axis=0)) / 2
     radius = float(np.linalg.norm(extent - middle, axis=1).max())
     px_per_mm = (PANEL_PX / 2 - MARGIN_PX) / radius
-    width, height = PANELS_A_ROW * PANEL_PX, -(-len(views) // PANELS_A_ROW) * PANEL_PX
+    pitch = PANEL_PX + GAP_PX
+    rows = -(-len(views) // PANELS_A_ROW)
+    width, height = PANELS_A_ROW * pitch - GAP_PX, rows * pitch - GAP_PX
     picture = Image.new("RGB", (width + BAR_PX, height + FOOTER_PX), BACKGROUND)
     for index, (name, primary, secondary, letters) in enumerate(views):
         panel = _Panel(primary, secondary, middle, px_per_mm).draw(chamber, lines, times)
         _caption(panel, name, letters)
-        picture.paste(panel, (PANEL_PX * (index % PANELS_A_ROW), PANEL_PX * (index // PANELS_A_ROW)))
+        picture.paste(panel, (pitch * (index % PANELS_A_ROW), pitch * (index // PANELS_A_ROW)))
     _scale_bar(ImageDraw.Draw(picture), px_per_mm, (width + 14.0, height + 0.55 * FOOTER_PX))
     draw_colour_bar(picture, times, 14, dark=False)
     place = (width / 2, height + 0.4 * FOOTER_PX)
-    ImageDraw.Draw(picture).text(place, _figures(chamber), fill=INK, font=font(14), anchor="mm")
+    line_with_squares(ImageDraw.Draw(picture), place, _figures(chamber), 14, INK)
     return np.asarray(picture)
 
 
@@ -167,15 +172,16 @@ def _scale_bar(draw: ImageDraw.ImageDraw, px_per_mm: float, start: Point) -> Non
 
 def _figures(chamber: ChamberMap) -> str:
     parts = [
+        PURPOSE,
         f"{len(chamber.sites)} sites",
         f"total activation time {chamber.total_activation_time_ms:.0f} ms",
         f"volume {chamber.volume_ml:.0f} ml",
-        f"area {chamber.area_cm2:.0f} cm2",
+        f"area {chamber.area_cm2:.0f} cm²",
         f"{100 * chamber.coverage:.0f} % covered",
     ]
     if chamber.leave_one_out_rms_ms is not None:
-        parts.insert(2, f"leave-one-site-out error {chamber.leave_one_out_rms_ms:.1f} ms")
-    outliers = sum(is_outlier(site) for site in chamber.sites)
-    if outliers:
-        parts.append(f"{outliers} doubtful (?)")
+        parts.insert(3, f"leave-one-site-out error {chamber.leave_one_out_rms_ms:.1f} ms")
+    doubtful = sum(is_doubtful(site) for site in chamber.sites)
+    if doubtful:
+        parts.append(f"{doubtful} doubtful (?)")
     return "   ·   ".join(parts)

@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, ChamberMap
+from fluoromap.drawing.annotations import PURPOSE, annotation_boxes, direction_text, draw_annotations
 from fluoromap.drawing.colour_bar import bar_box, draw_colour_bar
 from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, halo_text
+from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Box, Labels, Point, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
 from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, colour_table, line_parts, outline_edges, pixel_bands
@@ -75,10 +76,11 @@ def draw_overlay(
     - the bands and lines of equal time on the wall that faces the viewer,
     - a hatch where no site is near,
     - the outline of the surface,
-    - every site with its time in ms: a dot on the wall that faces the viewer, a ring on the far wall, in amber with a
-      question mark where its neighbours contradict it,
+    - every site with its time in ms: a dot on the wall that faces the viewer, a ring on the far wall; the time is amber with a
+      question mark where the site is in doubt,
     - a star at the highlighted site's tip,
-    - a colour bar.
+    - a colour bar,
+    - site, direction of the view and purpose, the orientation of the patient, and the meaning of the symbols.
 
     Parameters
     ----------
@@ -122,10 +124,13 @@ def draw_overlay(
     raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
     _tint(image, pixel_bands(raster, chamber, times, canvas.unit, look.until_ms), times)
     _draw_lines(image, canvas, chamber, facing, times, look)
-    _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms)
+    caption = f"{highlight_site}    {direction_text(camera)}    {PURPOSE}"
+    words = annotation_boxes(image.size, canvas.letters, caption)
+    _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms, words)
+    draw_annotations(image, camera, caption, canvas.letters)
     if look.until_ms is not None:
         text, size_px = f"{milliseconds(look.until_ms)} ms", round(1.6 * canvas.letters)
-        halo_text(ImageDraw.Draw(image), (3.2 * size_px, size_px), text, size_px, WHITE, BLACK)
+        halo_text(ImageDraw.Draw(image), (3.2 * size_px, 1.6 * size_px), text, size_px, WHITE, BLACK)
     return np.asarray(image)
 
 
@@ -233,7 +238,7 @@ def _draw_lines(
 
 def _draw_sites(
     image: Image.Image, canvas: _Canvas, chamber: ChamberMap, raster: Raster, highlight_site: str,
-    tip_uv: ArrayLike | None, times: Scale, until_ms: float | None,
+    tip_uv: ArrayLike | None, times: Scale, until_ms: float | None, words: Sequence[Box],
 ) -> None:  # fmt: skip
     size, unit = canvas.letters, canvas.unit
     uv, _ = canvas.project(np.array([site.position_mm for site in chamber.sites]))
@@ -250,7 +255,7 @@ def _draw_sites(
     marks = [places[i] for i in others] + ([] if star is None else [star])
     reach = 4 * unit
     taken = [(u - reach, v - reach, u + reach, v + reach) for u, v in marks]
-    labels = Labels(image.width, image.height, [*taken, bar_box(times, image.size, size)])
+    labels = Labels(image.width, image.height, [*taken, *words, bar_box(times, image.size, size)])
     draw = ImageDraw.Draw(image)
     if star is not None and highlighted is not None:
         text, larger = f"{time_text(highlighted)} ms", round(1.25 * size)

@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 from fluoromap.contracts import Array, SurfaceSite
 from fluoromap.drawing.colours import Scale, milliseconds
 from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Labels, Point, halo_text
-from fluoromap.reasons import Reason
+from fluoromap.reasons import AT_BEST_C, Reason
 
 OUTLIER_RGB: RGB = (255, 176, 64)
 FAR_RGB: RGB = (205, 205, 205)
@@ -24,18 +24,23 @@ def is_outlier(site: SurfaceSite) -> bool:
     return Reason.LAT_OUTLIER in site.reasons
 
 
+def is_doubtful(site: SurfaceSite) -> bool:
+    """Return True where a site's time, position or catheter is in doubt."""
+    return is_outlier(site) or not AT_BEST_C.isdisjoint(site.reasons)
+
+
 def time_text(site: SurfaceSite) -> str:
     """Return the site's time in ms.
 
-    A question mark follows where its neighbours contradict it.
+    A question mark follows where the site is in doubt.
     """
-    return milliseconds(site.lat_ms) + ("?" if is_outlier(site) else "")
+    return milliseconds(site.lat_ms) + ("?" if is_doubtful(site) else "")
 
 
 def draw_dot(image: Image.Image, place: Point, site: SurfaceSite, times: Scale, unit: float, *, near: bool) -> None:
     """Draw a site as a dot in the colour of its time.
 
-    It is filled on the near wall and a ring on the far wall; an outlier is amber.
+    It is filled on the near wall and a ring on the far wall; a time that the neighbours contradict is amber.
     """
     band = tuple(times.band_colours()[times.band(np.array(site.lat_ms))].tolist())
     colour = OUTLIER_RGB if is_outlier(site) else band
@@ -54,13 +59,13 @@ def draw_time(
 ) -> None:  # fmt: skip
     """Draw the site's time beside its dot.
 
-    The letters are dark where the picture's background is light.
+    The letters are amber where the site is in doubt. Else they are dark where the picture's background is light.
     """
     text = time_text(site)
     if on_light:
-        ink, halo = DARK_OUTLIER_RGB if is_outlier(site) else DARK_RGB, WHITE
+        ink, halo = DARK_OUTLIER_RGB if is_doubtful(site) else DARK_RGB, WHITE
     else:
-        ink, halo = OUTLIER_RGB if is_outlier(site) else WHITE if near else FAR_RGB, BLACK
+        ink, halo = OUTLIER_RGB if is_doubtful(site) else WHITE if near else FAR_RGB, BLACK
     halo_text(draw, labels.place(place, text, size, 4.5 * unit), text, size, ink, halo)
 
 

@@ -22,7 +22,7 @@ from fluoromap.fuser.surface import (
     volume_mm3,
 )
 from fluoromap.fuser.surface_field import SurfaceField
-from fluoromap.reasons import Reason
+from fluoromap.reasons import AT_BEST_C, Reason
 
 LEAST_EXTENT_MM = 2.0
 """Sites that all lie within this distance of their mean coincide: the position error of the tips is as large."""
@@ -158,6 +158,7 @@ def chamber_map(
     if not equal:
         velocity = conduction_velocity(used_points.positions_mm, normals, lat[used], times.sd_ms, difference)
     warnings = {Reason.LAT_OUTLIER: not used.all(), Reason.OUTSIDE_WINDOW: outside.any(), Reason.TIMES_EQUAL: equal}
+    doubts = dict.fromkeys(reason for site in sites for reason in site.reasons if reason in AT_BEST_C)
     context.progress(1.0)
 
     return ChamberMap(
@@ -190,7 +191,7 @@ def chamber_map(
         volume_ml=volume_mm3(vertices_mm, faces) / 1e3,
         area_cm2=float(areas.sum()) / 1e2,
         coverage=float((areas * covered[faces].mean(axis=1)).sum() / areas.sum()),
-        warnings=tuple(reason for reason, holds in warnings.items() if holds),
+        warnings=(*(reason for reason, holds in warnings.items() if holds), *doubts),
         conduction_velocity=velocity,
         cycle_length_ms=params.cycle_length_ms,
     )

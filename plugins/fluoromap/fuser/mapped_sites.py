@@ -57,10 +57,12 @@ def mapped_sites(
         if tip is None or site.site not in times_ms:
             continue
         if tip.relative_mm is not None and tip.relative_covariance_mm2 is not None:
-            position, covariance, reasons = tip.relative_mm, tip.relative_covariance_mm2, ()
+            position, covariance = tip.relative_mm, tip.relative_covariance_mm2
+            reasons = site.doubts_about(catalogue.reference)
         else:
             position, covariance = tip.position_mm - origin, tip.covariance_mm2 + spread
             reasons = (Reason.NO_REFERENCE,)
+        reasons = tuple(dict.fromkeys((*site.doubts_about(mapping.name), *reasons)))
         lat_ms, lat_sd_ms = times_ms[site.site]
         sites.append(
             MappedSite(

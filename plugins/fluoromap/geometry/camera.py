@@ -6,7 +6,7 @@ Pixel (u, v): column and row index; (0, 0) is the centre of the top-left pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +28,8 @@ class Camera:
         left-handed rotation block (determinant -1); either handedness is legal.
     rows, columns : int
         Size of the stored image, for drawing and for the limits of the field.
+    isocentre_world_mm : array_like, shape (3,)
+        Place of the isocentre: the gantry turns about it. It is the origin unless the world was displaced.
 
     Raises
     ------
@@ -38,8 +40,14 @@ class Camera:
     matrix: Array
     rows: int
     columns: int
+    isocentre_world_mm: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
+        isocentre = np.array(self.isocentre_world_mm, dtype=np.float64)
+        if isocentre.shape != (3,) or not np.isfinite(isocentre).all():
+            raise ValueError("the isocentre is not a finite point; give three numbers in mm")
+        isocentre.setflags(write=False)
+        object.__setattr__(self, "isocentre_world_mm", isocentre)
         matrix = np.array(self.matrix, dtype=np.float64)
         if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
             raise ValueError("a camera is a finite 3x4 matrix")
@@ -153,12 +161,21 @@ class Camera:
     def translated(self, shift_world_mm: ArrayLike) -> Camera:
         """Return the camera for coordinates with another origin.
 
-        The new origin lies at ``shift_world_mm`` in this camera's world.
+        The new origin lies at ``shift_world_mm`` in this camera's world. For a run on a moved table, the shift is the
+        table's displacement: the coordinates then belong to the patient, and all runs share them.
         """
         shift = np.asarray(shift_world_mm, dtype=np.float64)
         matrix = self.matrix.copy()
         matrix[:, 3] += matrix[:, :3] @ shift
-        return Camera(matrix, self.rows, self.columns)
+        return Camera(matrix, self.rows, self.columns, self.isocentre_world_mm - shift)
+
+    def displaced(self, displacement: ArrayLike) -> Camera:
+        """Return the camera of a view that sees the world displaced by ``displacement`` (4, 4) about the isocentre."""
+        about = np.eye(4)
+        about[:3, 3] = self.isocentre_world_mm
+        back = np.eye(4)
+        back[:3, 3] = -self.isocentre_world_mm
+        return replace(self, matrix=self.matrix @ about @ np.asarray(displacement, dtype=np.float64) @ back)
 
 
 def ray_angle_deg(first: Camera, second: Camera) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -36,7 +37,7 @@ def mirror(camera: Camera) -> Camera:
     """
     matrix = camera.matrix.copy()
     matrix[0] = (camera.columns - 1) * matrix[2] - matrix[0]
-    return Camera(matrix, camera.rows, camera.columns)
+    return replace(camera, matrix=matrix)
 
 
 def mirrored_gain(original: Hypotheses, mirrored: Sequence[Hypotheses]) -> float:

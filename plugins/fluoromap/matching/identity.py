@@ -13,10 +13,12 @@ from fluoromap.contracts import Array
 from fluoromap.matching.run_catheters import RunCatheter
 from fluoromap.reasons import Reason
 
-CLEARLY_STILLER = 0.6
-"""The reference is identified by motion when its variance between sites is below this share of any look-alike's."""
-POSITION_VARIANCE_MM2 = 0.3
-"""Variance of a catheter's diastolic place from other causes than motion between sites: detection, beat to beat."""
+CLEARLY_STILLER = 5.0
+"""The reference is identified by motion when the log likelihood ratio for it against any look-alike exceeds this."""
+_OWN_MM2 = np.geomspace(0.05, 25.0, 12)
+"""Variances tried for a catheter's own motion between sites, an axis; the least is from detection and beats alone."""
+_COMMON_MM2 = np.concatenate([[0.0], np.geomspace(0.1, 1000.0, 13)])
+"""Variances tried for the motion of all catheters between sites, an axis: breathing and a moved table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +149,43 @@ def _positions_at(sites: Sequence[Sequence[PairedCatheter]], places: list[list[i
     return {s: site[places[s].index(place)].position_mm for s, site in enumerate(sites) if place in places[s]}
 
 
+def stiller(first_mm: Array, second_mm: Array) -> float:
+    """Return the log likelihood ratio for the first catheter being stiller.
+
+    It compares the motion of each catheter by itself.
+
+    Breathing and the table displace both alike between the sites, by different amounts along each axis. A large common
+    displacement hides which of the two moves by itself.
+
+    Parameters
+    ----------
+    first_mm, second_mm : ndarray, shape (s, 3)
+        Diastolic places at the same sites.
+    """
+    both = np.stack([first_mm - first_mm.mean(axis=0), second_mm - second_mm.mean(axis=0)])
+    scatter = np.einsum("isx,jsx->xij", both, both)[:, :, :, None, None, None]
+    first, second, common = np.meshgrid(_OWN_MM2, _OWN_MM2, _COMMON_MM2, indexing="ij")
+    determinant = common * (first + second) + first * second
+    misfit = (
+        scatter[:, 0, 0] * (common + second) - 2 * scatter[:, 0, 1] * common + scatter[:, 1, 1] * (common + first)
+    ) / determinant
+    likelihood = -0.5 * ((len(first_mm) - 1) * np.log(determinant) + misfit)
+    best = likelihood.max(axis=-1).sum(axis=0)
+    less = np.triu_indices(len(_OWN_MM2), 1)
+    return float(best[less].max() - best.T[less].max())
+
+
+def _exchanged(first_mm: Array, second_mm: Array) -> bool:
+    """Return whether two catheters seem exchanged at some of the sites (s, 3) against the others.
+
+    Their places follow from site to site by nearness. A table that moved far breaks that, but keeps the catheters apart by the
+    same vector.
+    """
+    apart = first_mm - second_mm
+    usual = np.median(apart, axis=0)
+    return bool((np.linalg.norm(apart + usual, axis=1) < np.linalg.norm(apart - usual, axis=1)).any())
+
+
 def _stillest(
     sites: Sequence[Sequence[PairedCatheter]], places: list[list[int]], free: list[int]
 ) -> tuple[int, Reason]:
@@ -155,13 +194,12 @@ def _stillest(
     together = sorted(set.intersection(*shown))
     if len(free) > 1 and len(together) >= 3:
         positions = np.array([[_positions_at(sites, places, place)[s] for s in together] for place in free])
-        centred = positions - positions.mean(axis=1, keepdims=True)
-        covariance = np.einsum("isx,jsx->ij", centred, centred) / (len(together) - 1)
-        shared = (covariance.sum(axis=1) - np.diag(covariance)) / (len(free) - 1)
-        own = np.maximum(np.diag(covariance) - shared, 0.0) + POSITION_VARIANCE_MM2
-        first, second = np.argsort(own)[:2]
-        if own[first] < CLEARLY_STILLER * own[second]:
-            return free[int(first)], Reason.IDENTITY_BY_MOTION
+        for index, place in enumerate(free):
+            others = np.delete(positions, index, axis=0)
+            if any(_exchanged(positions[index], other) for other in others):
+                continue
+            if all(stiller(positions[index], other) > CLEARLY_STILLER for other in others):
+                return place, Reason.IDENTITY_BY_MOTION
     motion = [
         np.mean([site[places[s].index(place)].motion_px for s, site in enumerate(sites) if place in places[s]])
         for place in free

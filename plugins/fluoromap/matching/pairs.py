@@ -158,4 +158,4 @@ def _turned(camera: Camera, axis: int) -> Camera:
     turn = np.eye(4)
     turn[first, first] = turn[second, second] = c
     turn[first, second], turn[second, first] = -s, s
-    return Camera(camera.matrix @ turn, camera.rows, camera.columns)
+    return camera.displaced(turn)

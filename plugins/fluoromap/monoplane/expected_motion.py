@@ -89,8 +89,9 @@ def expected_motion(
     n, m = electrodes.visible.shape
     points = np.array([point.covariance_mm2 for point in electrodes.a_priori])
     others = _other_errors_mm2(
-        electrodes.a_priori_mm, electrodes.labels, view.catalogue, beat_sd_mm, gantry_angle_sd_deg
-    )
+        electrodes.a_priori_mm, electrodes.labels, view.catalogue, beat_sd_mm, gantry_angle_sd_deg,
+        view.camera.isocentre_world_mm,
+    )  # fmt: skip
     common = _common_covariance(points - others)
     sd = np.array([mapping_sd_mm if name == view.catalogue.mapping else other_sd_mm for name in electrodes.catheters])
     unknown_sd = np.sqrt(motion_variance_share(electrodes.phases, view.a_priori_frame))[:, None] * sd
@@ -143,7 +144,14 @@ def _from_own_cycle(
         known = curve.labels[row] == label
         mean[:, index] = places[:, row] if known else electrodes.a_priori_mm[index] + moved[:, index]
         offset[:, index] = unsure
-    others = _other_errors_mm2(cycle.positions_mm, cycle.labels, view.catalogue, beat_sd_mm, gantry_angle_sd_deg)
+    others = _other_errors_mm2(
+        cycle.positions_mm,
+        cycle.labels,
+        view.catalogue,
+        beat_sd_mm,
+        gantry_angle_sd_deg,
+        view.camera.isocentre_world_mm,
+    )
     common = _common_covariance((cycle.covariance_mm2 - others).reshape(-1, 3, 3))
     return ExpectedMotion(
         mean, moved, velocity, offset, common, pace.cycles, True, pace.frames_per_cycle, pace.spread, ()
@@ -165,11 +173,12 @@ def _other_errors_mm2(
     catalogue: Catalogue,
     beat_sd_mm: float,
     angle_sd_deg: float,
+    isocentre_mm: Array,
 ) -> Array:
     """Return the share of beats and gantry angles in the covariances (..., m, 3, 3) of positions (..., m, 3)."""
     follows = follows_tip(positions_mm, labels, catalogue)
     beats: Array = beat_sd_mm**2 * follows @ np.swapaxes(follows, -1, -2)
-    return beats + gantry_angle_covariance_mm2(positions_mm, angle_sd_deg)
+    return beats + gantry_angle_covariance_mm2(positions_mm - isocentre_mm, angle_sd_deg)
 
 
 def _common_covariance(covariances_mm2: Array) -> Array:

@@ -25,20 +25,23 @@ _SETTLED_MM = 0.005
 class PathPrior:
     """Prior of the paths, before the view's pixels are used.
 
-    mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. parts : (q,) the part of each
-    column; the columns of part p > 0 are multiplied by the square root of its gain. white_mm2 : (n, 3 m, 3 m) covariance of
-    each frame's own deviation.
+    mean_mm : (n, m, 3). columns_mm : (n, m, 3, q), one for each unit normal coefficient. unseen_mm : (n, m, 3, q) deviations
+    along the rays that no view shows: they belong to the covariance alone. parts : (q,) the part of each column; the columns
+    of part p > 0 are multiplied by the square root of its gain. causes : (q,) the cause of each column. white_mm2 :
+    (n, 3 m, 3 m) covariance of each frame's own deviation.
     """
 
     mean_mm: Array
     columns_mm: Array
+    unseen_mm: Array
     parts: IntArray
+    causes: IntArray
     white_mm2: Array
 
     def variance_mm2(self, gains: Array, parts: Sequence[int], directions: Array) -> Array:
         """Return the prior variance (n, m) along unit directions (n, m, 3), of some parts and the white share."""
         chosen = np.isin(self.parts, parts)
-        along = np.einsum("nmi,nmiq->nmq", directions, self.columns_mm[..., chosen])
+        along = np.einsum("nmi,nmiq->nmq", directions, (self.columns_mm + self.unseen_mm)[..., chosen])
         white = np.einsum("nmi,nmij,nmj->nm", directions, _own_blocks(self.white_mm2), directions)
         variance: Array = (along**2 * gains[self.parts[chosen]]).sum(axis=-1) + white
         return variance
@@ -48,13 +51,15 @@ class PathPrior:
 class Lengths:
     """Lengths between electrodes of a catheter.
 
-    first, second : (k,) electrodes. lengths_mm : (n, k). sd_mm : (k,) standard deviations.
+    first, second : (k,) electrodes. lengths_mm : (n, k). sd_mm : (k,) standard deviation of each frame's own error.
+    lasting_sd_mm : (k,) standard deviation of an error that is the same in all frames.
     """
 
     first: IntArray
     second: IntArray
     lengths_mm: Array
     sd_mm: Array
+    lasting_sd_mm: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +114,8 @@ def _linearise(evidence: Evidence, positions_mm: Array) -> _Linear:
 class _WhiteEvidence:
     """The evidence with unit noise; each frame's own deviation is integrated out.
 
-    gap : (n, r) difference from the prior mean's prediction. by_position : (n, r, 3 m), by_w : (n, r, q) its slopes.
+    gap : (n, r) difference from the prior mean's prediction. by_position : (n, r, 3 m), by_w : (n, r, q + k) its slopes.
+    The last k coefficients are the lasting errors of the lengths.
     """
 
     gap: Array
@@ -122,15 +128,25 @@ class _WhiteEvidence:
         return flat.T @ flat, flat.T @ self.gap.reshape(-1)
 
 
+def _with_lengths(columns: Array, lengths: Lengths) -> Array:
+    """Return columns (n, 3 m, q + k): the lengths' lasting errors displace no electrode by themselves."""
+    none = np.zeros((*columns.shape[:2], len(lengths.first)))
+    return np.concatenate([columns, none], axis=2)
+
+
 def _whiten(evidence: Evidence, prior: PathPrior, columns: Array, positions_mm: Array) -> _WhiteEvidence:
-    """Linearise the evidence at ``positions_mm`` and whiten it; ``columns`` (n, 3 m, q)."""
+    """Linearise the evidence at ``positions_mm`` and whiten it; ``columns`` (n, 3 m, q + k)."""
     linear = _linearise(evidence, positions_mm)
     from_mean = (positions_mm - prior.mean_mm).reshape(len(columns), -1, 1)
     gap = linear.residual[..., None] + linear.slope @ from_mean
     spread = linear.noise + linear.slope @ prior.white_mm2 @ np.swapaxes(linear.slope, 1, 2)
     whiten = np.linalg.inv(np.linalg.cholesky(spread))
     by_position = whiten @ linear.slope
-    return _WhiteEvidence((whiten @ gap)[..., 0], by_position, by_position @ columns)
+    by_w = by_position @ columns
+    lasting = evidence.lengths.lasting_sd_mm
+    if len(lasting):
+        by_w[:, :, -len(lasting) :] += whiten[:, :, -len(lasting) :] * lasting
+    return _WhiteEvidence((whiten @ gap)[..., 0], by_position, by_w)
 
 
 def estimate_gains(prior: PathPrior, evidence: Evidence, at_mm: Array, choices: Sequence[Sequence[float]]) -> Array:
@@ -139,12 +155,13 @@ def estimate_gains(prior: PathPrior, evidence: Evidence, at_mm: Array, choices: 
     Coordinate ascent chooses among ``choices`` for each part from 1 on. A log-normal prior around 1 with standard deviation
     1.5 keeps a gain near 1 where the view shows nothing about it. The first entry, of the fixed part, is 1.
     """
-    columns = prior.columns_mm.reshape(len(at_mm), -1, len(prior.parts))
+    columns = _with_lengths(prior.columns_mm.reshape(len(at_mm), -1, len(prior.parts)), evidence.lengths)
+    parts = np.concatenate([prior.parts, np.zeros(len(evidence.lengths.first), dtype=np.int64)])
     information, vector = _whiten(evidence, prior, columns, at_mm).information()
     gains = np.ones(1 + len(choices))
 
     def likelihood(trial: Array) -> float:
-        scale = np.sqrt(trial)[prior.parts]
+        scale = np.sqrt(trial)[parts]
         whole = scale[:, None] * information * scale + np.eye(len(scale))
         factor = cho_factor(whole, lower=True, overwrite_a=True, check_finite=False)
         explained = (scale * vector) @ cho_solve(factor, scale * vector, check_finite=False)
@@ -180,6 +197,7 @@ def most_probable(prior: PathPrior, evidence: Evidence, gains: Array, start_mm: 
     """
     n, m = start_mm.shape[:2]
     columns = (prior.columns_mm * np.sqrt(gains)[prior.parts]).reshape(n, 3 * m, -1)
+    columns = _with_lengths(columns, evidence.lengths)
     positions = start_mm
     for _ in range(steps):
         white = _whiten(evidence, prior, columns, positions)
@@ -196,6 +214,8 @@ def most_probable(prior: PathPrior, evidence: Evidence, gains: Array, start_mm: 
     left = (columns - share @ white.by_w).reshape(n * 3 * m, -1)
     half = solve_triangular(factor, left.T, lower=True, check_finite=False).T.reshape(n, 3 * m, -1)
     covariance = half @ np.swapaxes(half, 1, 2) + prior.white_mm2 - share @ np.swapaxes(share, 1, 2)
+    unseen = (prior.unseen_mm * np.sqrt(gains)[prior.parts]).reshape(n, 3 * m, -1)
+    covariance = covariance + unseen @ np.swapaxes(unseen, 1, 2)
     return Paths(positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2)
 
 

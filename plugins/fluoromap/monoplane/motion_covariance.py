@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Self
 
 import numpy as np
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue, follows_tip
-from fluoromap.contracts import Array, MonoplaneView
+from fluoromap.contracts import Array, MonoplaneView, StudyVariation
 from fluoromap.monoplane.expected_motion import ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
 from fluoromap.monoplane.view_electrodes import isocentre_covariance_mm2
 
 FIXED, OFFSET, TILT, BEND = range(4)
+BREATHING, BEATS, ANGLE, ISOCENTRE, OTHER = range(5)
+"""Causes of deviations: the first four in the order of :class:`~fluoromap.contracts.StudyVariation`."""
 _READING_SD_FRAMES = 0.29
 """An R wave is timed to the nearest frame: standard deviation of a uniform distribution one frame wide."""
 _SYSTOLE_PHASE = 0.3
+_FOLLOWS_INTERVAL = 0.5
+"""Change of a beat's amplitude with the interval before it, both as shares."""
 _ALIGNED_SD_CYCLE = 0.01
 _OFFSET_HARMONICS, _SHAPE_HARMONICS = 4, 3
 _LASTING_SHARE = 0.7
@@ -53,9 +58,20 @@ class MotionParams(BaseModel, extra="forbid"):
     )
     gantry_angle_sd_deg: float = Field(0.5, ge=0, le=10, description="Error of each gantry angle, degrees.")
     magnification_sd: float = Field(
-        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+        0.003, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
     )
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in this view, mm.")
+
+    def with_any_gantry(self) -> Self:
+        """Return the parameters with the root mean square errors over all kinds of gantry."""
+        any_study = StudyVariation()
+        return self.model_copy(
+            update={
+                "gantry_angle_sd_deg": any_study.gantry_angle * self.gantry_angle_sd_deg,
+                "isocentre_sd_mm": any_study.gantry_offset * self.isocentre_sd_mm,
+                "magnification_sd": any_study.gantry_angle * self.magnification_sd,
+            }
+        )
 
     def respiration_sd_mm(self) -> Array:
         """Return the breathing standard deviations (3,) along the patient's axes, mm."""
@@ -85,41 +101,80 @@ class MotionCovariance:
 
     def window(self, frames: slice) -> PathPrior:
         """Return the prior of consecutive frames, about one beat."""
-        columns, parts = [], []
-        for part, block in self._parts(frames):
-            columns.append(block)
+        columns, unseen, parts, causes = [], [], [], []
+        rays = self.rays[frames]
+        for part, cause, seen_along, block in self._parts(frames):
+            along = _along(rays, block)
+            columns.append(block if seen_along else block - along)
+            unseen.append(np.zeros_like(along) if seen_along else along)
             parts += [part] * block.shape[-1]
+            causes += [cause] * block.shape[-1]
         mean = self._expected.mean_mm[frames]
-        return PathPrior(mean, np.concatenate(columns, axis=-1), np.array(parts), self._white(frames))
+        return PathPrior(
+            mean,
+            np.concatenate(columns, axis=-1),
+            np.concatenate(unseen, axis=-1),
+            np.array(parts),
+            np.array(causes),
+            self._white(frames),
+        )
 
-    def _parts(self, frames: slice) -> Iterator[tuple[int, Array]]:
-        """Yield columns (n, m, 3, k) with their part."""
+    def _parts(self, frames: slice) -> Iterator[tuple[int, int, bool, Array]]:
+        """Yield part, cause, True where the view shows its depth, and columns.
+
+        The columns are (n, m, 3, k).
+
+        A view shows the depth of a beat by its motion across the rays, and the depth of a tilt by the catheter's lengths. It
+        does not show the depth of a catheter as a whole, nor that of breathing: 1 mm changes the size of the image by 0.2 %.
+        """
         p, expected = self._params, self._expected
         mean = expected.mean_mm[frames]
         n, m = mean.shape[:2]
         breath = p.respiration_sd_mm()
         everywhere = np.ones((n, m, 1, 1))
         isocentre = isocentre_covariance_mm2(self._camera, p.isocentre_sd_mm)
-        yield FIXED, everywhere * _root(expected.common_mm2 + np.diag(breath**2) + isocentre)
+        breathing, offset, rest = self._common_shares()
+        whole = _root(expected.common_mm2)
+        yield (
+            FIXED,
+            BREATHING,
+            False,
+            everywhere * np.concatenate([np.sqrt(breathing) * whole, np.diag(breath)], axis=1),
+        )
+        yield FIXED, ISOCENTRE, False, everywhere * np.concatenate([np.sqrt(offset) * whole, _root(isocentre)], axis=1)
+        yield FIXED, OTHER, False, everywhere * np.sqrt(rest) * whole
         # Biplane positions are those at the middle of the two runs' breathing positions. This run's breathing position is
         # as far from the middle as the other run's. The other run alone measured the depth, so that the error along the
         # ray is twice the distance to the middle.
         depth = min(self._axis @ expected.common_mm2 @ self._axis, self._axis @ np.diag(breath**2) @ self._axis / 2)
-        yield FIXED, everywhere * np.sqrt(depth) * self._axis[:, None]
+        yield FIXED, BREATHING, False, everywhere * np.sqrt(depth) * self._axis[:, None]
         if breath.max() > 0:
             drift = p.respiration_drift_sd_mm * breath / breath.max()
-            yield FIXED, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
+            yield FIXED, BREATHING, False, np.linspace(-0.5, 0.5, n)[:, None, None, None] * everywhere * np.diag(drift)
         # The other view measured the depth; its wrong gantry angle rotates that depth about the isocentre.
-        turned = np.cross(np.eye(3), mean[:, :, None]).swapaxes(-1, -2)
-        yield FIXED, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
+        from_isocentre = mean - self._camera.isocentre_world_mm
+        turned = np.cross(np.eye(3), from_isocentre[:, :, None]).swapaxes(-1, -2)
+        yield FIXED, ANGLE, False, _along(self.rays[frames], turned) * np.radians(p.gantry_angle_sd_deg)
         # This view's wrong angle is a source of its own, else its effect would be taken for another size, that is depth.
-        yield FIXED, turned * np.radians(p.gantry_angle_sd_deg)
-        yield FIXED, (mean * p.magnification_sd)[..., None]
+        # It displaces the image, not the electrode: only its part across the rays counts.
+        rays = self.rays[frames]
+        yield FIXED, ANGLE, False, _across(rays, turned) * np.radians(p.gantry_angle_sd_deg)
+        yield FIXED, ANGLE, False, _across(rays, from_isocentre[..., None]) * p.magnification_sd
         yield from self._beats(frames, self.rays[frames])
         if expected.beats:
             yield from self._free(frames)
 
-    def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, Array]]:
+    def _common_shares(self) -> tuple[float, float, float]:
+        """Return the shares of breathing, isocentre and others in the common depth."""
+        p, axis = self._params, self._axis
+        common = float(axis @ self._expected.common_mm2 @ axis)
+        if common <= 0:
+            return 0.0, 0.0, 1.0
+        breathing = min(common, float(axis @ np.diag(p.respiration_sd_mm() ** 2) @ axis) / 2)
+        offset = min(common - breathing, p.isocentre_sd_mm**2)
+        return breathing / common, offset / common, (common - breathing - offset) / common
+
+    def _beats(self, frames: slice, rays: Array) -> Iterator[tuple[int, int, bool, Array]]:
         """Yield the deviations of this beat from the mean beat.
 
         The mean beats of the two views differ too.
@@ -131,20 +186,24 @@ class MotionCovariance:
         reading = _READING_SD_FRAMES / expected.frames_per_cycle
         timing = np.hypot(p.beat_timing_sd, reading)
         uneven = _SYSTOLE_PHASE * expected.cycle_spread
-        yield FIXED, moved * p.beat_amplitude_sd
-        yield FIXED, velocity * np.hypot(timing, uneven)
+        # A long interval fills the heart: the beat after it is stronger.
+        amplitude = np.hypot(p.beat_amplitude_sd, _FOLLOWS_INTERVAL * expected.cycle_spread)
+        yield FIXED, OTHER, True, moved * amplitude
+        yield FIXED, OTHER, True, velocity * np.hypot(timing, uneven)
         averaged = 1 / np.sqrt(expected.beats)
         for name in self._catheters:
-            yield FIXED, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
+            yield FIXED, BEATS, False, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
         if expected.own_cycle:
             # Depth comes from the other view's run, and this view cannot show how that run's beats differ.
-            yield FIXED, _along(rays, moved * p.beat_amplitude_sd * averaged)
+            yield FIXED, OTHER, False, _along(rays, moved * amplitude * averaged)
             yield (
                 FIXED,
+                OTHER,
+                False,
                 _along(rays, velocity * np.hypot(p.beat_timing_sd * averaged, np.hypot(uneven, _ALIGNED_SD_CYCLE))),
             )
 
-    def _free(self, frames: slice) -> Iterator[tuple[int, Array]]:
+    def _free(self, frames: slice) -> Iterator[tuple[int, int, bool, Array]]:
         """Yield each catheter's offset, tilt and bend over the beat.
 
         The view itself determines their sizes.
@@ -154,9 +213,16 @@ class MotionCovariance:
         for name, (tilt, bend) in zip(self._catheters, self._shapes, strict=True):
             own = self._names == name
             tilt_sd, bend_sd = self._looseness(name)
-            yield OFFSET, _in_time(fast, np.where(own, offset_sd, 0.0)[..., None, None] * self._follows[frames])
-            yield TILT, _in_time(slow, (tilt_sd * tilt)[:, None, None] * np.eye(3))
-            yield BEND, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
+            # With a cycle of its own, a catheter's offset is that of beats. Else other sites' motion dominates it.
+            cause = BEATS if self._expected.own_cycle else OTHER
+            yield (
+                OFFSET,
+                cause,
+                False,
+                _in_time(fast, np.where(own, offset_sd, 0.0)[..., None, None] * self._follows[frames]),
+            )
+            yield TILT, OTHER, True, _in_time(slow, (tilt_sd * tilt)[:, None, None] * np.eye(3))
+            yield BEND, OTHER, True, _in_time(slow, (bend_sd * bend)[:, None, None] * np.eye(3))
 
     def _looseness(self, name: str) -> tuple[float, float]:
         """Return a catheter's deviation from its expected shape.
@@ -228,6 +294,12 @@ def _along(rays: Array, columns: Array) -> Array:
     """Return the part of columns (n, m, 3, k) along the rays (n, m, 3)."""
     share: Array = rays[..., None] * np.einsum("nmi,nmik->nmk", rays, columns)[..., None, :]
     return share
+
+
+def _across(rays: Array, columns: Array) -> Array:
+    """Return the part of columns (n, m, 3, k) across the rays (n, m, 3)."""
+    across: Array = columns - _along(rays, columns)
+    return across
 
 
 def _root(covariance: Array) -> Array:

@@ -10,12 +10,11 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, Track
-from fluoromap.geometry import Camera
+from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, StudyShares, Track
 from fluoromap.monoplane.catheter_lengths import catheter_lengths
 from fluoromap.monoplane.expected_motion import expected_motion
 from fluoromap.monoplane.gaussian_path import Evidence, PathPrior, estimate_gains, most_probable, surprise
-from fluoromap.monoplane.motion_covariance import BEND, FIXED, OFFSET, TILT, MotionCovariance, MotionParams
+from fluoromap.monoplane.motion_covariance import BEND, FIXED, OFFSET, OTHER, TILT, MotionCovariance, MotionParams
 from fluoromap.monoplane.view_electrodes import (
     ViewElectrodes,
     gantry_angle_covariance_mm2,
@@ -63,10 +62,10 @@ class MotionPrior:
         )
 
     name: ClassVar[str] = "motion-prior"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "6"
 
     def __init__(self, params: MotionPrior.Params) -> None:
-        self._params = params
+        self._params = params.with_any_gantry()
 
     def track(self, view: MonoplaneView, context: Context) -> Track:
         """Track every electrode that has an a-priori position.
@@ -85,20 +84,22 @@ class MotionPrior:
         baseline = view.camera.back_project(electrodes.pixels_uv, view.camera.depth_mm(expected.mean_mm))
         baseline = np.where(electrodes.visible[..., None], baseline, expected.mean_mm)
         windows = tuple(_windows(electrodes.phases))
-        run = _Run(view, electrodes, baseline, covariance.rays)
+        run = _Run(view, electrodes, baseline, covariance.rays, expected.mean_mm, expected.common_mm2)
         trusted = self._trusted_pixels(run, [(frames, covariance.window(frames)) for frames in windows])
         n, m = electrodes.visible.shape
         positions, joint = baseline.copy(), np.zeros((n, 3 * m, 3 * m))
+        depth = np.zeros((OTHER, n, m, m))
         gated = electrodes.visible & ~trusted
         for number, frames in enumerate(windows):
             context.check()
-            positions[frames], joint[frames], closed = self._window(run, frames, covariance.window(frames), trusted)
+            prior = covariance.window(frames)
+            positions[frames], joint[frames], depth[:, frames], closed = self._window(run, frames, prior, trusted)
             gated[frames] |= closed & electrodes.visible[frames]
             context.progress((number + 1) / len(windows))
         reasons = list(expected.reasons)
         if expected.cycle_spread > _IRREGULAR:
             reasons.append(Reason.IRREGULAR_RHYTHM)
-        return self._track(run, positions, joint, gated, reasons)
+        return self._track(run, positions, joint, depth, gated, reasons)
 
     def _trusted_pixels(self, run: _Run, windows: list[tuple[slice, PathPrior]]) -> BoolArray:
         """Return the pixels (n, m) that are near enough to the prior's expectation to be used.
@@ -122,8 +123,17 @@ class MotionPrior:
                 )
         return trusted
 
-    def _window(self, run: _Run, frames: slice, prior: PathPrior, trusted: BoolArray) -> tuple[Array, Array, BoolArray]:
-        """Return positions (n, m, 3), joint covariance (n, 3 m, 3 m) and gated catheters (n, m) of one window."""
+    def _window(
+        self, run: _Run, frames: slice, prior: PathPrior, trusted: BoolArray
+    ) -> tuple[Array, Array, Array, BoolArray]:
+        """Return the answer for one window.
+
+        Returns
+        -------
+        tuple
+            Positions (n, m, 3), joint covariance (n, 3 m, 3 m), joint covariance of the depths from each cause that the study
+            scales (4, n, m, m), and gated catheters (n, m).
+        """
         evidence = run.evidence(frames, trusted[frames])
         start, rays = run.baseline_mm[frames], run.rays[frames]
         free = bool((prior.parts != FIXED).any())
@@ -145,7 +155,9 @@ class MotionPrior:
             + apart[..., :, None] * apart[..., None, :]
         )
         positions = np.where(outside[..., None], start, paths.positions_mm)
-        return positions, _with_baseline(paths.covariance_mm2, outside, alone), np.broadcast_to(closed, outside.shape)
+        depth = _depth_by_cause(prior, gains, rays, outside)
+        joint = _with_baseline(paths.covariance_mm2, outside, alone)
+        return positions, joint, depth, np.broadcast_to(closed, outside.shape)
 
     def _gated_catheters(self, electrodes: ViewElectrodes, used: BoolArray, deeper: Array, usual: Array) -> BoolArray:
         """Return the electrodes (m,) of catheters whose depth moved too far.
@@ -160,21 +172,40 @@ class MotionPrior:
                 closed[names == name] = (deeper[own] ** 2).mean() > self._params.gate_sd**2 * usual[own].mean()
         return closed
 
-    def _track(self, run: _Run, positions: Array, joint: Array, gated: BoolArray, reasons: list[Reason]) -> Track:
+    def _track(
+        self, run: _Run, positions: Array, joint: Array, depth: Array, gated: BoolArray, reasons: list[Reason]
+    ) -> Track:
         electrodes = run.electrodes
         n, m = electrodes.visible.shape
         blocks = np.einsum("nmimj->nmij", joint.reshape(n, m, 3, m, 3))
         across = np.eye(3) - run.rays[..., :, None] * run.rays[..., None, :]
         # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
-        gantry = gantry_angle_covariance_mm2(positions, self._params.gantry_angle_sd_deg)
-        gantry = across @ (gantry + self._params.isocentre_sd_mm**2 * np.eye(3)) @ across
+        p, isocentre = self._params, run.view.camera.isocentre_world_mm
+        gantry = gantry_angle_covariance_mm2(positions - isocentre, p.gantry_angle_sd_deg)
+        gantry = gantry + p.isocentre_sd_mm**2 * np.eye(3)
+        if any(Reason.TABLE_MOVED in point.reasons for point in electrodes.a_priori):
+            # Nothing shows whether this view or the other one has the table's true place.
+            gantry = gantry + run.common_mm2
+        gantry = across @ gantry @ across
         absolute = blocks + gantry
-        relative = self._relative(run, positions, joint, absolute, across)
+        weights, has_reference = _from_reference(electrodes, run.view.catalogue.reference)
+        relative = self._relative(positions, joint, weights, across)
+        relative = np.where(has_reference[:, None, None, None], relative, absolute)
+        depths = np.einsum("cnaa->cna", depth)
+        relative_depths = np.einsum("nka,cnab,nkb->cnk", weights, depth, weights, optimize=True)
+        shares = StudyShares(
+            depths,
+            np.where(has_reference[:, None], relative_depths, depths),
+            float(np.radians(p.gantry_angle_sd_deg)),
+            p.isocentre_sd_mm,
+        )
         shown = electrodes.visible[..., None]
         by_electrode = []
         for index, interrupted in enumerate(electrodes.interrupted()):
             own = [Reason.PRIOR_GATE] if gated[:, index].any() else []
-            by_electrode.append((*reasons, *own, *([Reason.TRACK_INTERRUPTED] if interrupted else [])))
+            if interrupted:
+                own.append(Reason.TRACK_INTERRUPTED)
+            by_electrode.append(tuple(dict.fromkeys((*electrodes.a_priori[index].reasons, *reasons, *own))))
         return Track(
             labels=electrodes.labels,
             located=electrodes.visible,
@@ -184,40 +215,47 @@ class MotionPrior:
             pixels_uv=electrodes.pixels_uv,
             reasons=tuple(by_electrode),
             relative_covariance_mm2=np.where(shown[..., None], relative, 0.0),
+            shares=shares,
         )
 
-    def _relative(self, run: _Run, positions: Array, joint: Array, absolute: Array, across: Array) -> Array:
-        """Return the covariance (n, m, 3, 3) of positions relative to the reference's mean.
+    def _relative(self, positions: Array, joint: Array, weights: Array, across: Array) -> Array:
+        """Return the covariance (n, m, 3, 3) of positions less the reference's mean.
 
-        Frames without the reference get the absolute covariance.
+        ``weights`` (n, m, m) subtract that mean.
         """
-        electrodes = run.electrodes
-        n, m = electrodes.visible.shape
-        is_reference = np.array([name == run.view.catalogue.reference for name in electrodes.catheters])
-        visible = electrodes.visible & is_reference
-        count = visible.sum(axis=1)
-        mean = visible / np.maximum(count, 1)[:, None]
-        weights = np.eye(m) - mean[:, None, :]
+        n, m = positions.shape[:2]
         parts = joint.reshape(n, m, 3, m, 3)
         own = np.einsum("nka,naibj,nkb->nkij", weights, parts, weights, optimize=True)
-        apart = positions - np.einsum("na,nai->ni", mean, positions)[:, None]
+        apart = np.einsum("nka,nai->nki", weights, positions)
         turned = across @ gantry_angle_covariance_mm2(apart, self._params.gantry_angle_sd_deg) @ across
-        relative: Array = np.where((count > 0)[:, None, None, None], own + turned, absolute)
+        relative: Array = own + turned
         return relative
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One run with its baseline (n, m, 3) and the unit rays (n, m, 3) through the expected positions."""
+    """One run with its baseline (n, m, 3), expected positions (n, m, 3) and the unit rays (n, m, 3) through these.
+
+    common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times.
+    """
 
     view: MonoplaneView
     electrodes: ViewElectrodes
     baseline_mm: Array
     rays: Array
+    expected_mm: Array
+    common_mm2: Array
 
     def evidence(self, frames: slice, used: BoolArray) -> Evidence:
-        electrodes = self.electrodes
-        lengths = catheter_lengths(self.view.catalogue, electrodes.labels, self.baseline_mm[frames])
+        electrodes, view = self.electrodes, self.view
+        # Without a cycle, two views saw the distances at diastole only: other sites' motion stretches a catheter.
+        located = self.expected_mm[frames]
+        if view.cycle is None:
+            located = np.broadcast_to(electrodes.a_priori_mm, located.shape)
+        moments = len(view.cycle.phases) if view.cycle is not None else 1
+        variances = np.trace(electrodes.covariance_px2[electrodes.visible], axis1=1, axis2=2) / 2
+        pixel_sd_mm = float(np.sqrt(np.median(variances))) / view.camera.px_per_mm
+        lengths = catheter_lengths(view.catalogue, electrodes.a_priori, located, moments, pixel_sd_mm)
         return Evidence(
             self.view.camera, electrodes.pixels_uv[frames], electrodes.covariance_px2[frames], used, lengths
         )
@@ -234,7 +272,31 @@ class _Run:
         camera = self.view.camera
         flipped = camera.matrix.copy()
         flipped[0] = 2 * camera.principal_point_uv[0] * camera.matrix[2] - camera.matrix[0]
-        return replace(self, view=replace(self.view, camera=Camera(flipped, camera.rows, camera.columns)))
+        return replace(self, view=replace(self.view, camera=replace(camera, matrix=flipped)))
+
+
+def _from_reference(electrodes: ViewElectrodes, reference: str) -> tuple[Array, BoolArray]:
+    """Return weights (n, m, m) that subtract the reference's mean, and the frames (n,) that show the reference."""
+    is_reference = np.array([name == reference for name in electrodes.catheters])
+    visible = electrodes.visible & is_reference
+    count = visible.sum(axis=1)
+    mean = visible / np.maximum(count, 1)[:, None]
+    return np.eye(len(is_reference)) - mean[:, None, :], count > 0
+
+
+def _depth_by_cause(prior: PathPrior, gains: Array, rays: Array, outside: BoolArray) -> Array:
+    """Return the covariance (4, n, m, m) of unseen depths from each cause.
+
+    The study scales these causes. Electrodes ``outside`` (n, m) are independent of the others.
+    """
+    along = np.einsum("nmi,nmiq->nmq", rays, prior.unseen_mm) * np.sqrt(gains)[prior.parts]
+    joint = np.stack([
+        np.einsum("naq,nbq->nab", of_cause, of_cause)
+        for of_cause in (along[..., prior.causes == cause] for cause in range(OTHER))
+    ])  # fmt: skip
+    together = ~(outside[:, :, None] | outside[:, None, :]) | np.eye(outside.shape[1], dtype=np.bool_)
+    found: Array = joint * together
+    return found
 
 
 def _by_catheter(electrodes: ViewElectrodes, found: Array, frames: slice) -> Array:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from fluoromap.contracts import Array, BoolArray, Grade, LocatedSite, Track, grade_of
+from fluoromap.contracts import Array, BoolArray, Grade, LocatedSite, StudyVariation, Track, grade_of
 from fluoromap.geometry import Camera
 from fluoromap.reasons import Reason
 
@@ -90,7 +90,62 @@ def reference_origins(track: Track, site: LocatedSite, catheter: str, others_mm:
     return FrameOrigins(mean, np.ones_like(same_frame), borrowed, same_frame)
 
 
-def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigins) -> Iterator[Sample]:
+def in_study(track: Track, camera: Camera, reference: str, variation: StudyVariation) -> Track:
+    """Return the track with the covariances of a study with this variation.
+
+    A solver assumes any gantry and any heart, so that its result depends on one site alone. A study shows how far its heart
+    breathes and how wrong its gantry can be: its tracks are more certain, or less.
+
+    Parameters
+    ----------
+    track : Track
+    camera : Camera
+        Camera of the tracked view.
+    reference : str
+        Name of the reference catheter.
+    variation : StudyVariation
+        Of the study.
+    """
+    shares = track.shares
+    if shares is None:
+        return track
+    change = np.square(np.array(astuple(variation)) / np.array(astuple(StudyVariation()))) - 1
+    rays = track.positions_mm - camera.source_world_mm
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = rays[..., :, None] * rays[..., None, :]
+    across = np.eye(3) - along
+    angle, offset = change[2] * shares.angle_sd_rad**2, change[3] * shares.offset_sd_mm**2
+    turned = angle * _turned_mm2(track.positions_mm - camera.isocentre_world_mm) + offset * np.eye(3)
+    depth = np.einsum("c,cnm->nm", change, shares.depth_mm2)
+    absolute = track.covariance_mm2 + depth[..., None, None] * along + across @ turned @ across
+    relative = track.relative_covariance_mm2
+    if relative is not None:
+        is_reference = np.array([name == reference for name, _ in track.labels])
+        shown = track.located & is_reference
+        count = shown.sum(axis=1)
+        mean = np.einsum("nm,nmi->ni", shown, track.positions_mm) / np.maximum(count, 1)[:, None]
+        from_reference = angle * _turned_mm2(track.positions_mm - mean[:, None])
+        relative_turned = np.where((count > 0)[:, None, None, None], from_reference, turned)
+        depth = np.einsum("c,cnm->nm", change, shares.relative_depth_mm2)
+        relative = relative + depth[..., None, None] * along + across @ relative_turned @ across
+        relative = np.where(track.located[..., None, None], relative, 0.0)
+    absolute = np.where(track.located[..., None, None], absolute, 0.0)
+    return replace(track, covariance_mm2=absolute, relative_covariance_mm2=relative, shares=None)
+
+
+def _turned_mm2(points_mm: Array) -> Array:
+    """Return the covariance (..., 3, 3) of turned points (..., 3), mm^2.
+
+    The rotation has unit variance about every axis.
+    """
+    squares = (points_mm**2).sum(axis=-1)[..., None, None] * np.eye(3)
+    covariance: Array = squares - points_mm[..., :, None] * points_mm[..., None, :]
+    return covariance
+
+
+def track_samples(
+    track: Track, index: int, camera: Camera, origins: FrameOrigins, doubts: tuple[Reason, ...] = ()
+) -> Iterator[Sample]:
     """Return the samples of one electrode, one for each frame.
 
     Where the origin is the reference of the same frame, the covariance is that of the difference, if the solver gives it:
@@ -105,8 +160,10 @@ def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigin
         Camera of the tracked view.
     origins : FrameOrigins
         For all frames of the track.
+    doubts : tuple of Reason
+        Reasons of the electrode's point at its site: they apply to the track too.
     """
-    doubts = track.reasons[index]
+    doubts = (*track.reasons[index], *doubts)
     source = camera.source_world_mm
     for frame, located in enumerate(track.located[:, index]):
         if not located:
@@ -124,7 +181,7 @@ def track_samples(track: Track, index: int, camera: Camera, origins: FrameOrigin
         origin = origins.positions_mm[frame]
         yield Sample(
             frame + 1, position - origin, track.baseline_mm[frame, index] - origin, covariance, along, lateral, pixel,
-            grade_of(covariance), tuple(dict.fromkeys(reasons)),
+            grade_of(covariance, reasons), tuple(dict.fromkeys(reasons)),
         )  # fmt: skip
 
 

@@ -97,7 +97,7 @@ class ChainDetector:
     def _evidence(self, probability: Array) -> Array:
         return evidence(probability, self.acceptance.trust)
 
-    def find_chains(self, x: Image, frame: int) -> FrameChains:
+    def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image, or the reason why there are none.
 
         One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are

@@ -52,6 +52,13 @@ class Likeness:
     cell_px: float
     first_px: float
 
+    def at(self, points_uv: Array) -> Array:
+        """Return the values of the cells that points (n, 2) lie in, (n,)."""
+        last = np.array(self.values.shape[::-1]) - 1
+        cells = np.clip(np.rint((points_uv - self.first_px) / self.cell_px), 0, last).astype(np.int64)
+        values: Array = self.values[cells[:, 1], cells[:, 0]].astype(np.float64)
+        return values
+
 
 class ImageEvidence(Protocol):
     """What a proposer knows about one log image."""

@@ -26,6 +26,7 @@ _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
 _SPACING_SD = 0.10
+_LONG_CATHETER = 6
 _PROFILE_SAMPLES = 7.0
 _WINDOW_MM = 2.0
 _LEAST_MISFIT = 0.01
@@ -306,7 +307,7 @@ def _pull_to_spacing(
 ) -> None:
     """Combine measured arc lengths with the catalogue's spacing, in place.
 
-    One foreshortening and one offset are free.
+    One foreshortening and one offset are free. A long catheter's foreshortening changes along it: a trend is free too.
     """
     variance = weighed_sd * weighed_sd
     model_sd = 0.5 * _SPACING_SD * px_per_mm * arc_mm[-1] / (len(arc_mm) - 1)
@@ -314,10 +315,17 @@ def _pull_to_spacing(
     weights /= weights.sum(axis=1, keepdims=True)
     x = arc_mm - (weights @ arc_mm)[:, None]
     y = arc - (weights * arc).sum(axis=1, keepdims=True)
-    weights *= x
-    slope = (weights * y).sum(axis=1) / (weights * x).sum(axis=1)
+    weighed_x = weights * x
+    slope = (weighed_x * y).sum(axis=1) / (weighed_x * x).sum(axis=1)
+    rest = slope[:, None] * x - y
+    if len(arc_mm) >= _LONG_CATHETER:
+        bend = x * x
+        bend -= (weights * bend).sum(axis=1, keepdims=True)
+        bend -= ((weighed_x * bend).sum(axis=1) / (weighed_x * x).sum(axis=1))[:, None] * x
+        trend = -(weights * bend * rest).sum(axis=1) / (weights * bend * bend).sum(axis=1)
+        rest += trend[:, None] * bend
     share = variance / (variance + model_sd * model_sd)
-    points += (share * (slope[:, None] * x - y))[..., None] * axes
+    points += (share * rest)[..., None] * axes
     sd[..., 0] = weighed_sd * np.sqrt(1.0 - 0.5 * share)
 
 

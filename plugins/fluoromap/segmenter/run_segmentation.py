@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -14,20 +15,32 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
-from fluoromap.segmenter.tracking import ChainSearch, chain_distance, track_chains
+from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
 
 _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
+_SAME_MOMENT_MS = 40.0
+
+RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image]], bool]
+"""(frame -> chain of one track, frame -> log image) -> whether the run shows a catheter there."""
 
 
 class Detector(Protocol):
     """Search for chains in the log images of one run."""
 
-    def find_chains(self, x: Image, frame: int) -> FrameChains:
+    def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image.
 
         With ``manual_needed`` the chains are uncertain: they may continue a track but do not begin one.
+
+        Parameters
+        ----------
+        x : (rows, columns) float32
+            Log image.
+        frame : int
+        beside : sequence of (rows, columns) float32
+            The frames before and after, where they show nearly the same moment.
         """
 
     def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
@@ -63,8 +76,7 @@ def segment_run(
     context: Context,
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
-    least_detected: float | None = None,
-    confirms: Callable[[Chain], bool] | None = None,
+    shows_catheter: RunJudge | None = None,
 ) -> Segmentation:
     """Segment a run: tracked chains of all frames, and diastolic chains.
 
@@ -87,8 +99,8 @@ def segment_run(
         The field mask of the run -> the detector to use.
     search_again : bool
         Whether to search for missing catheters with :meth:`Detector.find_again`.
-    least_detected, confirms
-        See :func:`~fluoromap.segmenter.tracking.track_chains`.
+    shows_catheter : RunJudge, optional
+        Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     """
     context.check()
     field = find_field(run.frames, run.pixels)
@@ -103,11 +115,15 @@ def segment_run(
     motion = np.zeros(count)
     found: list[FrameChains] = []
     automatic: dict[int, tuple[Chain, ...]] = {}
+    images: deque[tuple[int, Image]] = deque(maxlen=3)
     for index in range(count):
         context.check()
-        x = log_image(index)
+        images += [
+            (after, log_image(after)) for after in range(images[-1][0] + 1 if images else 0, min(index + 2, count))
+        ]
+        (x,) = (image for number, image in images if number == index)
         motion[index] = meter(x)
-        entry = detector.find_chains(x, index)
+        entry = detector.find_chains(x, index, _beside(index, images, run.frame_times_ms))
         if index in marks:
             automatic[index] = entry.chains if entry.manual_needed is None else ()
             entry = FrameChains(index, tuple(replace(chain, manual=True) for chain in marks[index]))
@@ -127,7 +143,8 @@ def segment_run(
     catheters = len(catalogue.catheters)
     search = _chain_search(detector, log_image, context) if search_again else None
     seed = mean if len(averaged) > 1 else None
-    entries = track_chains(found, run.frame_times_ms, catheters, search, seed, least_detected, confirms)
+    accepts = None if shows_catheter is None else _judge(shows_catheter, log_image)
+    entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
@@ -135,6 +152,9 @@ def segment_run(
         chains = _add_missing_catheters(mean_image, chains, detector, averaged, entries, catheters)
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
+    if shows_catheter is not None and count > 1:
+        tracks = {chain.track for entry in entries for chain in entry.chains}
+        chains = tuple(chain for chain in chains if chain.manual or chain.track in tracks)
     reason = None if chains else Reason.MANUAL_NEEDED
     if chains and detector.shows_extra_catheter(mean_image, chains):
         reason = Reason.EXTRA_CATHETER
@@ -148,6 +168,22 @@ def segment_run(
         frame_times_ms=run.frame_times_ms,
         r_wave_frames=run.r_wave_frames,
     )
+
+
+def _beside(frame: int, images: Iterable[tuple[int, Image]], frame_times_ms: Array) -> list[Image]:
+    """Return the images of other frames that are near in time.
+
+    Catheters have hardly moved between them.
+    """
+    return [
+        image
+        for number, image in images
+        if number != frame and abs(frame_times_ms[number] - frame_times_ms[frame]) <= _SAME_MOMENT_MS
+    ]
+
+
+def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image]) -> TrackJudge:
+    return lambda chains: shows_catheter(chains, log_image)
 
 
 def _chain_search(detector: Detector, log_image: Callable[[int], Image], context: Context) -> ChainSearch:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,12 +29,18 @@ _SEEN_AT_LEAST = 0.2
 _RECOVERED_AT_LEAST = 0.5
 _LONG_RUN = 5
 _REVERSED_PX = 4.0
+_MOST_RETRIES, _JUDGED_FRAMES = 2, 4
+_ACCEPTED_AT_LEAST = 0.5
 
 ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
 
 
-@dataclass(slots=True)
+TrackJudge = Callable[[Mapping[int, Chain]], bool]
+"""frame -> chain of one track -> whether the run shows a catheter there."""
+
+
+@dataclass(slots=True, eq=False)
 class _Track:
     """A catheter along the run.
 
@@ -88,8 +95,7 @@ def track_chains(
     catheters: int,
     search: ChainSearch | None = None,
     seed: FrameChains | None = None,
-    least_detected: float | None = None,
-    confirms: Callable[[Chain], bool] | None = None,
+    accepts: TrackJudge | None = None,
 ) -> tuple[FrameChains, ...]:
     """Give the chains of a run track numbers.
 
@@ -114,11 +120,10 @@ def track_chains(
     search : ChainSearch, optional
     seed : FrameChains, optional
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
-    least_detected : float, optional
-        Share of the frames of a long run in which a catheter must be found without ``search``. By default 0.2, or none where the
-        seed has it and half of the frames show it.
-    confirms : callable, optional
-        Whether a chain that ``search`` found counts as if it had been found without.
+    accepts : TrackJudge, optional
+        Decides about each track of four or more frames, and of half of the frames in short runs. Where it rejects one, the run is
+        tracked again without the track's chains, twice at most. An accepted track has chains in half of the frames. All tracks are
+        accepted by default.
 
     Returns
     -------
@@ -128,36 +133,18 @@ def track_chains(
     """
     if not found:
         return ()
-    marked = [entry.frame for entry in found if any(chain.manual for chain in entry.chains)]
-    tracks: list[_Track] = []
-    if seed is not None and seed.chains and not marked:
-        start = seed.frame
-        at = float(frame_times_ms[start])
-        tracks = [_Track(chain, at, np.zeros(2), detections=0, from_seed=True) for chain in seed.chains]
-    else:
-        start = marked[0] if marked else _start(found, catheters)
-    for frames in (range(start, len(found)), range(start - 1, -1, -1)):
-        if frames.step < 0:
-            for track in tracks:
-                first = min(track.chains, default=None)
-                if first is None:
-                    continue
-                track.chain, track.time_ms = track.chains[first], float(frame_times_ms[first])
-                track.velocity = _first_velocity(track.chains, frame_times_ms)
-        for frame in frames:
-            _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search, confirms)
-    share = _SEEN_AT_LEAST if least_detected is None else least_detected
-    least = max(2.0, share * len(found)) if len(found) >= _LONG_RUN else 1.0
+    tracks = _follow(found, frame_times_ms, catheters, search, seed)
+    least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
+    if accepts is not None:
+        least = max(least, _ACCEPTED_AT_LEAST * len(found))
+        tracks = _accepted(tracks, found, frame_times_ms, catheters, search, accepts)
     tracks_kept = [
         track
         for track in tracks
         if track.manual
         or track.detections >= least
-        or (
-            least_detected is None
-            and track.from_seed
-            and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found))
-        )
+        or (track.from_seed and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found)))
+        or (accepts is not None and len(track.chains) >= least)
     ]
     tracks_kept.sort(key=lambda track: -track.detections)
     for track in tracks_kept:
@@ -176,6 +163,76 @@ def track_chains(
         reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
         entries.append(FrameChains(frame, tuple(chains), reason))
     return tuple(entries)
+
+
+def _follow(
+    found: Sequence[FrameChains],
+    frame_times_ms: Array,
+    catheters: int,
+    search: ChainSearch | None,
+    seed: FrameChains | None,
+) -> list[_Track]:
+    """Return all tracks, false ones too."""
+    marked = [entry.frame for entry in found if any(chain.manual for chain in entry.chains)]
+    tracks: list[_Track] = []
+    if seed is not None and seed.chains and not marked:
+        start = seed.frame
+        at = float(frame_times_ms[start])
+        tracks = [_Track(chain, at, np.zeros(2), detections=0, from_seed=True) for chain in seed.chains]
+    else:
+        start = marked[0] if marked else _start(found, catheters)
+    for frames in (range(start, len(found)), range(start - 1, -1, -1)):
+        if frames.step < 0:
+            for track in tracks:
+                first = min(track.chains, default=None)
+                if first is None:
+                    continue
+                track.chain, track.time_ms = track.chains[first], float(frame_times_ms[first])
+                track.velocity = _first_velocity(track.chains, frame_times_ms)
+        for frame in frames:
+            _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search)
+    return tracks
+
+
+def _accepted(
+    tracks: list[_Track],
+    found: Sequence[FrameChains],
+    frame_times_ms: Array,
+    catheters: int,
+    search: ChainSearch | None,
+    accepts: TrackJudge,
+) -> list[_Track]:
+    """Return the tracks without wrong ones.
+
+    A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
+    """
+    judged = min(_JUDGED_FRAMES, math.ceil(_ACCEPTED_AT_LEAST * len(found)))
+    for attempt in range(_MOST_RETRIES + 1):
+        wrong = [
+            track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
+        ]
+        tracks = [track for track in tracks if track not in wrong]
+        found = [_without(entry, wrong) for entry in found]
+        if not wrong or attempt == _MOST_RETRIES or not any(entry.chains for entry in found):
+            break
+        sure = [track for track in tracks if len(track.chains) >= judged]
+        start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in sure))
+        seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
+        tracks = _follow(found, frame_times_ms, catheters, search, seed)
+    return tracks
+
+
+def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
+    """Return a frame's chains without those of wrong tracks."""
+    places = [track.chains[entry.frame] for track in wrong if entry.frame in track.chains]
+    return replace(
+        entry,
+        chains=tuple(
+            chain
+            for chain in entry.chains
+            if chain.manual or all(sum(chain_distance(chain, place)) > _SAME_PLACE_PX for place in places)
+        ),
+    )
 
 
 def _start(found: Sequence[FrameChains], catheters: int) -> int:
@@ -237,8 +294,7 @@ def _overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
 
 
 def _advance(
-    tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None,
-    confirms: Callable[[Chain], bool] | None,
+    tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None
 ) -> None:  # fmt: skip
     numbers, turned = _assign(tracks, entry.chains, time_ms)
     by_hand = any(chain.manual for chain in entry.chains)
@@ -273,7 +329,6 @@ def _advance(
             shift, reach = _expected(track, time_ms)
             recovered = search(entry.frame, track.chain, shift, reach, present)
             if recovered is not None and not _overlaps(recovered, present):
-                track.detections += confirms is not None and confirms(recovered)
                 _extend(track, recovered, entry.frame, time_ms)
                 present.append(recovered)
     for chain in loose:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from fluoromap.reasons import Reason
 
 def add_alternative(
     points: tuple[ElectrodePoint, ...],
-    other: Mapping[tuple[str, int], ElectrodePoint],
+    others: tuple[ElectrodePoint, ...],
     reference_shift_mm: Array | None,
     probability: float,
 ) -> tuple[ElectrodePoint, ...]:
@@ -28,16 +27,18 @@ def add_alternative(
     ----------
     points : tuple of ElectrodePoint
         Electrodes under the most probable pairing.
-    other : mapping
-        (catheter, electrode) -> the same electrode under the alternative pairing.
+    others : tuple of ElectrodePoint
+        Electrodes under the alternative pairing.
     reference_shift_mm : ndarray (3,) or None
         Displacement of the reference's mean from this pairing to the alternative one, world; None where the reference is
         not located in both pairings.
     probability : float
         Probability of the alternative.
     """
+    by_label = {(point.catheter, point.electrode): point for point in others}
     return tuple(
-        _mix(point, other.get((point.catheter, point.electrode)), reference_shift_mm, probability) for point in points
+        _mix(point, by_label.get((point.catheter, point.electrode)), reference_shift_mm, probability)
+        for point in points
     )
 
 

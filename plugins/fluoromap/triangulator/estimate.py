@@ -89,6 +89,16 @@ class JointLeastSquares:
         return Estimate(points, gain)
 
 
+def triangulate_unweighted(cameras: Cameras, pixels: TwoViewPixels) -> Array:
+    """Return the points (N, 3) of least reprojection error where every pixel counts alike.
+
+    Breathing between the runs displaces such points alike. Weighted points follow the view that knows their pixel better:
+    then breathing tears neighbours apart, and their distances are wrong by millimetres.
+    """
+    alike = np.broadcast_to(np.eye(2), (len(pixels.labels), 2, 2))
+    return triangulate_maximum_likelihood(*cameras, *pixels.pixels, alike, alike)
+
+
 def separate_gain(cameras: Cameras, points_mm: Array) -> Array:
     """Return the gain (..., 3 N, 4 N) of unweighted least squares, each electrode separately."""
     *moments, n, _ = points_mm.shape

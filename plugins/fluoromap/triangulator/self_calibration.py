@@ -1,7 +1,7 @@
-"""Self-calibration: rotation and offset of view b's camera against the header, from a study's electrodes.
+"""Self-calibration: errors of the gantry and variation of the heart, from the electrodes of a whole study.
 
-Errors of the gantry are common to the study. Breathing is common to one run of one site. A beat is common to one catheter
-in one run. The electrodes' epipolar distances over all sites separate the three.
+Errors of the gantry are common to the study, and so are errors of the catalogue's gaps. Breathing is common to one run of one
+site. A beat is common to one catheter in one run. The electrodes' epipolar distances and gaps over all sites separate them.
 """
 
 from __future__ import annotations
@@ -11,44 +11,46 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
+from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Calibration
-from fluoromap.geometry import Camera
-from fluoromap.triangulator.estimate import separate_gain, triangulate_maximum_likelihood
-from fluoromap.triangulator.spacing import neighbours
-from fluoromap.triangulator.stray_electrodes import epipolar_rows
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import (
-    Share,
-    UncertaintyParams,
-    breathing_effect_px,
-    error_sources,
-    gantry_effect_px,
-    jacobians,
-    pixel_noise_px2,
+from fluoromap.contracts import Array, Calibration, StudyVariation
+from fluoromap.reasons import Reason
+from fluoromap.triangulator.study_equations import (
+    GANTRY_UNKNOWNS,
+    GAP_SD_MM,
+    HEART_SCALES,
+    HeartScale,
+    Information,
+    SiteEquations,
+    gap_labels,
+    information,
+    site_equations,
 )
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
+from fluoromap.triangulator.uncertainty import GANTRY_KINDS, LARGEST_MULTIPLE, UncertaintyParams
 
-ROTATION_SD_DEG = 1.0
-OFFSET_SD_MM = 2.0
-"""Prior standard deviations of view b's rotation and offset against view a and the header, an axis."""
-GANTRY_PRIOR = np.diag(np.tile(np.repeat(np.square([np.radians(ROTATION_SD_DEG), OFFSET_SD_MM]), 3), 2)) / 2
-"""Covariance (12, 12) of both views' errors; each view has half of the variance of b against a."""
-WORSE_SHARE = 0.03
-"""Share of gantries with errors as large as GANTRY_PRIOR; the others have the errors that the parameters state."""
 GATE_EPIPOLAR_RATIO = 1.3
 """Ratio of epipolar RMS to pixel noise below which the header is believed."""
 GATE_LOG_ODDS = 3.0
-"""Natural logarithm of the odds for a wrong gantry against a right one (20 to 1) above which calibration may apply."""
+"""Natural logarithm of the odds for a wrong header against a right one (20 to 1) above which calibration may apply."""
 FEWEST_SITES = 3
+FEWEST_ELECTRODES = 28
+"""Twice the gantry's unknowns: on a real C-arm, calibration from fewer landmarks made distances worse."""
 FARTHEST_CHI2 = 22.46
 """99.9th percentile of chi-squared with 6 degrees of freedom: a larger difference from the header is no gantry error."""
+FARTHEST_OFFSET_MM = 6.0
+"""Largest offset of one view against the other that a gantry can have; a larger one is a moved table."""
 STILL_MISFIT = 2.0
 """Misfit an equation (1 is expected) above which the calibrated gantry does not explain the electrodes either."""
-_SPACING_SD_MM = 0.1
+LEAST_AGREEING = 0.7
+"""Share of the sites that must agree with some gantry and some heart, for the others to be left out."""
+UNEXPLAINED_BELOW = 1e-6
+"""Probability of a site's misfit by chance below which its electrodes are wrong."""
 _STEPS = 4
-_SCALED: tuple[Share, ...] = ("breathing", "phase_mismatch")
-_SCALE_LOG_SD = 1.1
+_NEGLIGIBLE = 9.0
+"""Difference of log evidence beyond which a kind of heart counts as ruled out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class GantryBelief:
     """The gantry's estimated error and its remaining uncertainty.
 
     camera_b_displacement : (4, 4) displacement of the world as view b sees it; the identity where the header is believed.
-    covariance : (12, 12) of the remaining errors, see :func:`~fluoromap.triangulator.uncertainty.gantry_effect_px`.
+    covariance : (14, 14) of the remaining errors, see :func:`~fluoromap.triangulator.uncertainty.gantry_effect_px`.
     """
 
     camera_b_displacement: Array
@@ -64,61 +66,28 @@ class GantryBelief:
 
     def cameras(self, nominal: Cameras) -> Cameras:
         """Return the cameras corrected from the header's nominal ones."""
-        return nominal[0], displaced_camera(nominal[1], self.camera_b_displacement)
-
-
-def displaced_camera(camera: Camera, turn: Array) -> Camera:
-    """Return the camera of a view that sees the world displaced by ``turn`` (4, 4)."""
-    return Camera(camera.matrix @ turn, camera.rows, camera.columns)
+        if (self.camera_b_displacement == np.eye(4)).all():
+            return nominal
+        return nominal[0], nominal[1].displaced(self.camera_b_displacement)
 
 
 @dataclass(frozen=True, eq=False)
-class _SiteEquations:
-    """One site's k equations ``residual = slope g + error`` for the gantry's 12 unknowns g.
+class StudyBelief:
+    """All that a study shows about its gantry and its heart.
 
-    The first ``epipolar`` equations are epipolar distances in px, the others electrode spacings in mm.
-
-    residual : (k,). slope : (k, 12). fixed : (k, k) covariance of the error from pixels and from the catalogue's spacings.
-    breathing, beats : (k, k) covariances from breathing and from beats. breath : (k, 3) effect of breathing, an mm.
-    pixel_variance : (epipolar,) px^2.
+    params : the parameters with this heart's breathing and beat variation. doubt : TABLE_MOVED or GEOMETRY_DOUBTFUL where
+    the electrodes contradict the header in a way that no gantry explains.
     """
 
-    residual: Array
-    slope: Array
-    fixed: Array
-    breathing: Array
-    beats: Array
-    breath: Array
-    epipolar: int
-    pixel_variance: Array
-
-    def covariance(self, scale: _Scale) -> Array:
-        total: Array = self.fixed + scale.breathing**2 * self.breathing + scale.beats**2 * self.beats
-        return total
+    gantry: GantryBelief
+    params: UncertaintyParams
+    variation: StudyVariation
+    doubt: Reason | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """Breathing and beat variation of a study, as multiples of the parameters' values."""
-
-    breathing: float = 1.0
-    beats: float = 1.0
-
-    @property
-    def log_prior(self) -> float:
-        return -0.5 * float(np.sum(np.log([self.breathing, self.beats]) ** 2)) / _SCALE_LOG_SD**2
-
-
-_SCALES = tuple(_Scale(breathing, beats) for breathing in (1.0, 0.3, 0.1) for beats in (1.0, 0.3, 0.1))
-
-
-@dataclass(frozen=True, eq=False)
-class _GantryKind:
-    """One kind of gantry: its probability, its prior (12, 12), and the heart's scale under it."""
-
-    weight: float
-    prior: Array
-    scale: _Scale
+def header_belief(params: UncertaintyParams) -> StudyBelief:
+    """Return the belief where no electrode shows the gantry's error or the heart's variation."""
+    return _belief(GantryBelief(np.eye(4), params.header_covariance()), HeartScale(), params)
 
 
 def calibrate(
@@ -126,13 +95,16 @@ def calibrate(
     catalogue: Catalogue,
     trusted: frozenset[str],
     params: UncertaintyParams,
-) -> tuple[Calibration | None, GantryBelief]:
+) -> tuple[Calibration | None, StudyBelief]:
     """Estimate the gantry's error from all sites, and decide whether to apply it.
 
-    The six unknowns are a rotation of view b about the isocentre (prior 1 degree) and its offset (prior 2 mm). The data
-    are the signed epipolar distance of every electrode and the catalogue's spacings. The header is kept unless both hold:
-    the epipolar RMS exceeds 1.3 times the pixel noise, and the odds for a wrong gantry against breathing and beats
-    exceed 20 to 1.
+    The unknowns are rotation, offset and scale of each view, and one error of the catalogue for each gap. The data are the
+    signed epipolar distance of every electrode and the distances between neighbours. Gantries are a mixture: most have the
+    errors that the parameters state, some have 2 or 4 times as large ones. The evidence of the study weighs them, together
+    with the breathing and the beat variation of its heart.
+
+    The header is kept unless both hold: the epipolar RMS exceeds 1.3 times the pixel noise, and the odds for a wrong header
+    against breathing, beats and wrong gaps exceed 20 to 1. A header that is kept is as uncertain as the study leaves it.
 
     Parameters
     ----------
@@ -146,183 +118,157 @@ def calibrate(
     tuple
         The calibration for the report (None with fewer than three sites), and the belief that locates the sites.
     """
-    header = GantryBelief(np.eye(4), params.gantry_covariance())
+    usual = params.gantry_covariance()
     if len(sites) < FEWEST_SITES:
-        return None, header
-    rows = _study_equations(sites, np.eye(4), catalogue, trusted, params)
-    # Each hypothesis first chooses the breathing and beat variation that suits it, so that the comparison is fair.
-    right = max(_evidence(rows, None, scale) for scale in _SCALES)
-    wrong, scale = max(((_evidence(rows, GANTRY_PRIOR, scale), scale) for scale in _SCALES), key=lambda one: one[0])
-    before = _epipolar_rms_px(rows, _posterior(rows, GANTRY_PRIOR, np.zeros(12), scale)[1], params, scale)
+        return None, header_belief(params)
+    gaps = gap_labels(catalogue, trusted)
+
+    def equations(gantry: GantryBelief) -> list[SiteEquations]:
+        return [site_equations(gantry.cameras(nominal), pixels, catalogue, gaps, params) for nominal, pixels in sites]
+
+    unknowns = GANTRY_UNKNOWNS + len(gaps)
+    rows = equations(GantryBelief(np.eye(4), usual))
+    agree = [_is_explained(one, usual, len(gaps)) for one in rows]
+    if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
+        # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.
+        sites = [site for site, explained in zip(sites, agree, strict=True) if explained]
+        rows = [one for one, explained in zip(rows, agree, strict=True) if explained]
+    mixture = _weigh(information(rows, np.zeros(unknowns)), usual, len(gaps))
     noise = float(np.sqrt(np.mean(np.concatenate([one.pixel_variance for one in rows]))))
-    if before <= GATE_EPIPOLAR_RATIO * noise or wrong - right <= GATE_LOG_ODDS:
-        return Calibration(False, np.zeros(3), np.zeros(3), before, before), header
-    kinds = _gantry_kinds(rows, header.covariance)
-    covariance, mean = _posterior_over_kinds(rows, kinds, np.zeros(12))
+    before = _epipolar_rms_px(rows, mixture, np.zeros(unknowns), params)
+    as_header = GantryBelief(np.eye(4), mixture.gantry_covariance(np.zeros(GANTRY_UNKNOWNS)))
+    kept = Calibration(False, np.zeros(3), np.zeros(3), before, before)
+    electrodes = sum(one.epipolar for one in rows)
+    if electrodes < FEWEST_ELECTRODES or before <= GATE_EPIPOLAR_RATIO * noise or mixture.log_odds <= GATE_LOG_ODDS:
+        return kept, _belief(as_header, mixture.scale, params)
     found = np.zeros(6)
     for _ in range(_STEPS):
-        found = mean[6:] - mean[:6]
-        rows = _study_equations(sites, _turn(found), catalogue, trusted, params)
-        covariance, mean = _posterior_over_kinds(rows, kinds, np.concatenate([np.zeros(6), found]))
+        found = mixture.mean[6:12] - mixture.mean[:6]
+        at = np.concatenate([np.zeros(6), found, np.zeros(unknowns - 12)])
+        rows = equations(GantryBelief(_displacement(found), usual))
+        mixture = _weigh(information(rows, at), usual, len(gaps))
     # View b takes the whole difference. An error that both views share is a displacement of the world, which is free.
-    left = np.concatenate([mean[:6], mean[6:] - found])
-    belief = GantryBelief(_turn(found), covariance + np.outer(left, left))
-    after = _epipolar_rms_px(rows, left, params, scale)
-    if float((found**2 / (2 * np.diagonal(GANTRY_PRIOR)[6:])).sum()) > FARTHEST_CHI2 or _misfit(rows) > STILL_MISFIT:
-        # Something else is wrong, such as a mirrored image or runs of another study. The sites report doubtful geometry.
-        return Calibration(False, np.zeros(3), np.zeros(3), before, before), header
-    return Calibration(True, np.degrees(found[:3]), found[3:], before, after), belief
+    at = np.concatenate([np.zeros(6), found, np.zeros(2)])
+    corrected = GantryBelief(_displacement(found), mixture.gantry_covariance(at))
+    after = _epipolar_rms_px(rows, mixture, np.concatenate([at, np.zeros(len(gaps))]), params)
+    distance = found**2 / (2 * LARGEST_MULTIPLE**2 * np.diagonal(usual)[6:12])
+    offset_mm = float(np.linalg.norm(found[3:]))
+    shifted = offset_mm > FARTHEST_OFFSET_MM and float(distance[:3].sum()) < float(distance[3:].sum())
+    doubt = Reason.TABLE_MOVED if shifted else Reason.GEOMETRY_DOUBTFUL
+    if float(distance.sum()) > FARTHEST_CHI2 or _misfit(rows, mixture.scale) > STILL_MISFIT:
+        # Something else is wrong, such as a mirrored image, a moved table or runs of another study.
+        covariance = as_header.covariance + LARGEST_MULTIPLE**2 * usual
+        return kept, _belief(GantryBelief(np.eye(4), covariance), mixture.scale, params, doubt)
+    calibration = Calibration(True, np.degrees(found[:3]), found[3:], before, after)
+    return calibration, _belief(corrected, mixture.scale, params, doubt if shifted else None)
 
 
-def _turn(six: Array) -> Array:
+def _belief(
+    gantry: GantryBelief, scale: HeartScale, params: UncertaintyParams, doubt: Reason | None = None
+) -> StudyBelief:
+    usual = np.diagonal(params.gantry_covariance())[:12].reshape(2, 2, 3)
+    shares = np.diagonal(gantry.covariance)[:12].reshape(2, 2, 3) / np.maximum(usual, 1e-12)
+    angle, offset = np.sqrt(shares.mean(axis=(0, 2)))
+    variation = StudyVariation(scale.breathing, scale.beats, float(angle), float(offset))
+    return StudyBelief(gantry, params.scaled(scale.breathing, scale.beats), variation, doubt)
+
+
+def _displacement(six: Array) -> Array:
     """Return the displacement (4, 4) ``X' = R X + t`` of a rotation vector (radians) and an offset (mm)."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
-    turn[:3, 3] = six[3:]
-    return turn
+    displacement = np.eye(4)
+    displacement[:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
+    displacement[:3, 3] = six[3:]
+    return displacement
 
 
-def _study_equations(
-    sites: Sequence[tuple[Cameras, TwoViewPixels]],
-    turn: Array,
-    catalogue: Catalogue,
-    trusted: frozenset[str],
-    params: UncertaintyParams,
-) -> list[_SiteEquations]:
-    return [
-        _site_equations((nominal[0], displaced_camera(nominal[1], turn)), pixels, catalogue, trusted, params)
-        for nominal, pixels in sites
+@dataclass(frozen=True, eq=False)
+class _Mixture:
+    """The unknowns over all kinds of gantry and heart, weighed by their evidence.
+
+    mean : (u,), covariance : (u, u) of the unknowns against header and catalogue. scale : RMS of the heart's scales.
+    log_odds : for a gantry with errors against one without.
+    """
+
+    mean: Array
+    covariance: Array
+    scale: HeartScale
+    log_odds: float
+
+    def gantry_covariance(self, about: Array) -> Array:
+        """Return the second moment (14, 14) of the gantry's errors about the applied correction ``about`` (14,)."""
+        left = self.mean[:GANTRY_UNKNOWNS] - about
+        moment: Array = self.covariance[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] + np.outer(left, left)
+        return moment
+
+
+def _prior(multiples: Array, usual: Array, gaps: int) -> Array:
+    """Return the covariance (u, u) of the unknowns before the study, with these multiples (14,) of the usual gantry."""
+    whole = np.zeros((GANTRY_UNKNOWNS + gaps,) * 2)
+    whole[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] = multiples[:, None] * usual * multiples
+    whole[GANTRY_UNKNOWNS:, GANTRY_UNKNOWNS:] = GAP_SD_MM**2 * np.eye(gaps)
+    return whole
+
+
+def _is_explained(row: SiteEquations, usual: Array, gaps: int) -> bool:
+    """Return True where the worst gantry and the most irregular heart explain a site."""
+    prior = _prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE), usual, gaps)
+    worst = HeartScale(max(one.breathing for one in HEART_SCALES), max(one.beats for one in HEART_SCALES))
+    covariance = row.covariance(worst) + row.slope @ prior @ row.slope.T
+    misfit = float(row.residual @ np.linalg.solve(covariance, row.residual))
+    return bool(chi2.sf(misfit, len(row.residual)) >= UNEXPLAINED_BELOW)
+
+
+def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
+    """Weigh all kinds of gantry and heart by their evidence.
+
+    No electrode shows an error that both views share, so each kind of gantry keeps its own prior there.
+    """
+    widest = _prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE), usual, gaps)
+    best = max(heart.log_evidence(widest) for heart in hearts)
+    plausible = [heart for heart in hearts if heart.log_evidence(widest) > best - _NEGLIGIBLE]
+    kinds = [
+        (heart, of_gantry, float(np.log(kind.share)) + heart.log_evidence(of_gantry))
+        for kind in GANTRY_KINDS
+        for of_gantry in [_prior(kind.multiples, usual, gaps)]
+        for heart in plausible
     ]
+    evidence = np.array([one for *_, one in kinds])
+    weights = np.exp(evidence - logsumexp(evidence))
+    no_error = _prior(np.zeros(GANTRY_UNKNOWNS), usual, gaps)
+    exact = logsumexp([heart.log_evidence(no_error) for heart in hearts])
+    likely = [(kind, weight) for kind, weight in zip(kinds, weights, strict=True) if weight > 1e-4]
+    total = sum(weight for _, weight in likely)
+    answers = [(heart.posterior(of_gantry), weight / total) for (heart, of_gantry, _), weight in likely]
+    mean = np.sum([weight * own for (_, own), weight in answers], axis=0)
+    covariance = np.sum([weight * (own + np.outer(at - mean, at - mean)) for (own, at), weight in answers], axis=0)
+    breathing, beats = (
+        float(np.sqrt(sum(weight / total * getattr(heart.scale, of) ** 2 for (heart, *_), weight in likely)))
+        for of in ("breathing", "beats")
+    )
+    return _Mixture(mean, covariance, HeartScale(breathing, beats), float(logsumexp(evidence) - exact))
 
 
-def _site_equations(
-    cameras: Cameras, pixels: TwoViewPixels, catalogue: Catalogue, trusted: frozenset[str], params: UncertaintyParams
-) -> _SiteEquations:
-    """Return a site's equations: epipolar distances, then electrode spacings."""
-    points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
-    n = len(points)
-    combine = epipolar_rows(cameras, points)
-    residual = combine @ pixels.residuals_px(cameras, points)
-    known = [
-        (i, j, gap) for i, j, gap in neighbours(pixels.labels, catalogue) if pixels.labels[i][0] in trusted
-    ]  # fmt: skip
-    if known:
-        first, second = (np.array([row[k] for row in known], dtype=np.intp) for k in (0, 1))
-        apart = points[first] - points[second]
-        length = np.linalg.norm(apart, axis=1)
-        gain = separate_gain(cameras, points).reshape(n, 3, 4 * n)
-        lengths = np.einsum("ka,kap->kp", apart / length[:, None], gain[first] - gain[second])
-        combine = np.concatenate([combine, lengths])
-        residual = np.concatenate([residual, length - [gap for *_, gap in known]])
-    sources = error_sources(cameras, points, pixels.labels, catalogue, params, np.zeros((12, 12)), None)
-    noise = pixel_noise_px2(pixels.covariances)
-    fixed = combine @ noise @ combine.T
-    fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
-    # The gantry's own sources are the unknowns. A wrong source distance acts as an offset along the ray, one of them.
-    parts = {share: np.zeros_like(fixed) for share in _SCALED}
-    for source in sources:
-        for share in parts.keys() & source.shares:
-            effect = combine @ source.effect_px
-            parts[share] += effect @ source.covariance @ effect.T
-    jacobian = jacobians(cameras, points)
-    return _SiteEquations(
-        residual, combine @ gantry_effect_px(jacobian, points), fixed, parts["breathing"], parts["phase_mismatch"],
-        combine @ breathing_effect_px(jacobian), n, np.diagonal(fixed)[:n],
-    )  # fmt: skip
+def _misfit(rows: Sequence[SiteEquations], scale: HeartScale) -> float:
+    """Return the mean squared misfit an equation.
 
-
-def _normal(rows: Sequence[_SiteEquations], linearised_at: Array, scale: _Scale) -> tuple[Array, Array]:
-    """Return the information (12, 12) on the gantry and the weighted residual (12,) of all sites."""
-    information, weighted = np.zeros((12, 12)), np.zeros(12)
-    for one in rows:
-        gain = np.linalg.solve(one.covariance(scale), one.slope).T
-        information += gain @ one.slope
-        weighted += gain @ (one.residual + one.slope @ linearised_at)
-    return information, weighted
-
-
-def _evidence(rows: Sequence[_SiteEquations], prior: Array | None, scale: _Scale) -> float:
-    """Return the study's log likelihood, up to a constant.
-
-    The gantry's errors are drawn from ``prior``; with None the gantry has no error.
+    It is 1 where pixels, breathing and beats explain the residuals.
     """
-    evidence = scale.log_prior
-    for one in rows:
-        covariance = one.covariance(scale)
-        evidence -= 0.5 * float(one.residual @ np.linalg.solve(covariance, one.residual))
-        evidence -= 0.5 * float(np.linalg.slogdet(covariance)[1])
-    if prior is not None:
-        information, weighted = _normal(rows, np.zeros(12), scale)
-        volume = np.linalg.slogdet(np.eye(12) + prior @ information)[1]
-        mean = prior @ np.linalg.solve(np.eye(12) + information @ prior, weighted)
-        evidence += 0.5 * float(weighted @ mean) - 0.5 * float(volume)
-    return evidence
-
-
-def _posterior(
-    rows: Sequence[_SiteEquations], prior: Array, linearised_at: Array, scale: _Scale
-) -> tuple[Array, Array]:
-    """Return covariance (12, 12) and mean (12,) of the gantry's errors against the header.
-
-    The equations were linearised at the errors ``linearised_at`` (12,).
-    """
-    information, weighted = _normal(rows, linearised_at, scale)
-    # prior (1 + information prior)^-1 needs no inverse of a prior that may be 0.
-    covariance: Array = np.asarray(prior @ np.linalg.inv(np.eye(12) + information @ prior), dtype=np.float64)
-    return covariance, covariance @ weighted
-
-
-def _gantry_kinds(rows: Sequence[_SiteEquations], assumed: Array) -> tuple[_GantryKind, ...]:
-    """Return two kinds of gantry with their posterior probabilities.
-
-    One kind has the errors that the parameters assume, covariance ``assumed`` (12, 12); the other has larger ones. No
-    electrode shows an error that both views share, so each kind keeps its own prior there.
-    """
-    shares = ((1 - WORSE_SHARE, assumed), (WORSE_SHARE, GANTRY_PRIOR))
-    found = [
-        max(
-            ((_evidence(rows, prior, scale) + np.log(share), prior, scale) for scale in _SCALES), key=lambda one: one[0]
-        )
-        for share, prior in shares
-    ]
-    most = max(odds for odds, *_ in found)
-    weights = np.exp([odds - most for odds, *_ in found])
-    weights /= weights.sum()
-    return tuple(_GantryKind(float(w), prior, scale) for w, (_, prior, scale) in zip(weights, found, strict=True))
-
-
-def _posterior_over_kinds(
-    rows: Sequence[_SiteEquations], kinds: Sequence[_GantryKind], linearised_at: Array
-) -> tuple[Array, Array]:
-    """Return covariance and mean as :func:`_posterior`, over all kinds of gantry."""
-    answers = [_posterior(rows, kind.prior, linearised_at, kind.scale) for kind in kinds]
-    mean = np.sum([kind.weight * own for kind, (_, own) in zip(kinds, answers, strict=True)], axis=0)
-    parts = [
-        kind.weight * (covariance + np.outer(own - mean, own - mean))
-        for kind, (covariance, own) in zip(kinds, answers, strict=True)
-    ]
-    return np.sum(parts, axis=0), mean
-
-
-def _misfit(rows: Sequence[_SiteEquations]) -> float:
-    """Return the mean squared misfit per equation.
-
-    It is 1 where pixels, breathing and beats explain it.
-    """
-    total = sum(float(one.residual @ np.linalg.solve(one.covariance(_Scale()), one.residual)) for one in rows)
+    total = sum(float(one.residual @ np.linalg.solve(one.covariance(scale), one.residual)) for one in rows)
     return total / sum(len(one.residual) for one in rows)
 
 
-def _epipolar_rms_px(rows: Sequence[_SiteEquations], gantry: Array, params: UncertaintyParams, scale: _Scale) -> float:
+def _epipolar_rms_px(
+    rows: Sequence[SiteEquations], mixture: _Mixture, linearised_at: Array, params: UncertaintyParams
+) -> float:
     """Return the Sampson RMS over the study, without each site's breathing.
 
-    The breathing is estimated as if the gantry's errors were ``gantry`` (12,).
+    The equations were linearised at the unknowns ``linearised_at`` (u,).
     """
     left = []
-    prior = scale.breathing**2 * params.respiration_covariance_mm2() / 2
+    prior = mixture.scale.breathing**2 * params.respiration_covariance_mm2() / 2
     for one in rows:
         k = slice(one.epipolar)
-        unexplained = one.residual[k] - one.slope[k] @ gantry
-        breath = prior @ one.breath[k].T @ np.linalg.solve(one.covariance(scale)[k, k], unexplained)
+        unexplained = one.residual[k] - one.slope[k] @ (mixture.mean - linearised_at)
+        breath = prior @ one.breath[k].T @ np.linalg.solve(one.covariance(mixture.scale)[k, k], unexplained)
         left.append(one.residual[k] - one.breath[k] @ breath)
     return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, PhasePair, SiteCycle
 from fluoromap.triangulator.estimate import Method
+from fluoromap.triangulator.table_motion import Jump, jump_source
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     Motion,
@@ -98,14 +99,17 @@ def locate_cycle(
     params: UncertaintyParams,
     method: Method,
     gantry_covariance: Array,
+    jump: Jump | None = None,
 ) -> SiteCycle:
     """Locate the electrodes at every moment.
 
-    The covariance grows where the heart moves fast.
+    The covariance grows where the heart moves fast. A ``jump`` of the table between the two runs displaces all moments alike.
     """
     start, pixels = moments.positions_mm, moments.pixels
     motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
     sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
+    if jump is not None:
+        sources = (*sources, jump_source(cameras, start, jump))
     noise = pixel_noise_px2(pixels.covariances)
     errors = noise + sum(source.pixels_px2() for source in sources)
     seen = visible_breathing(cameras, start, params)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,18 +14,16 @@ from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.estimate import Estimate, Method
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
-from fluoromap.triangulator.self_calibration import GantryBelief
+from fluoromap.triangulator.self_calibration import StudyBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
 from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
-from fluoromap.triangulator.table_motion import Jump
+from fluoromap.triangulator.table_motion import Jump, jump_source
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
-    UncertaintyParams,
-    effect_px,
+    Motion,
     error_sources,
-    jacobians,
     pixel_noise_px2,
     relative_covariance_mm2,
     visible_breathing,
@@ -40,15 +39,19 @@ DOUBTFUL_BELOW = 1e-5
 class SiteLocator:
     """The method and assumptions that locate the sites of one study.
 
-    wrong_spacings : catheters whose catalogue entry contradicts the study. origin : of the study, where sites locate different
-    electrodes of the reference catheter; otherwise the mean of a site's own electrodes is its origin.
+    belief : of the study. any_study : the belief where no study shows anything. Positions, cycles and a-priori points depend
+    on that belief and on the cameras alone, so that a correction at one site changes no other. spacing_limit_mm : electrode
+    spacings farther than this from the catalogue's are reported. gap_doubts : catheters whose catalogue entry contradicts the
+    study, with the reason. origin : of the study, where sites locate different electrodes of the reference catheter; otherwise
+    the mean of a site's own electrodes is its origin.
     """
 
     method: Method
-    params: UncertaintyParams
     catalogue: Catalogue
-    gantry: GantryBelief
-    wrong_spacings: frozenset[str] = frozenset()
+    belief: StudyBelief
+    any_study: StudyBelief
+    spacing_limit_mm: float
+    gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
     origin: ReferenceOrigin | None = None
 
     def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
@@ -60,30 +63,39 @@ class SiteLocator:
             The site, its diastole for the error budget, and sentences for the report. None where no plausible position
             agrees with both views.
         """
-        cameras = self.gantry.cameras((site.camera_a, site.camera_b))
+        cameras = self.belief.gantry.cameras((site.camera_a, site.camera_b))
         rest = site.diastole.a.phase if site.diastole.a.phase is not None else site.diastole.b.phase
         moments = cycle_moments(site.cycle, cameras, self.method) if rest is not None else None
         moment = self._moment(site.diastole, cameras, moments, jump)
         if moment is None:
             return None
-        points, reference_mm = self._points(site, moment, cameras)
-        if site.alternative is not None:
-            other = self._moment(site.alternative.diastole, cameras, moments, jump)
-            if other is not None:
-                others, other_mm = self._points(site, other, cameras)
-                shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
-                by_label = {(point.catheter, point.electrode): point for point in others}
-                points = add_alternative(points, by_label, shift, site.alternative.probability)
+        doubts = tuple(dict.fromkeys(reason for reason, holds in (
+            (Reason.TABLE_MOVED, (jump is not None and jump.is_certain) or self.belief.doubt is Reason.TABLE_MOVED),
+            (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
+        ) if holds))  # fmt: skip
+        other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
+        points, reference_mm = self._points(site, moment, moment.joint_mm2, cameras, doubts)
+        # The study's origin depends on the other sites.
+        alone = replace(self, origin=None)
+        a_priori, _ = alone._points(site, moment, moment.any_joint_mm2, cameras, doubts)
+        if site.alternative is not None and other is not None:
+            others, other_mm = self._points(site, other, other.joint_mm2, cameras, doubts)
+            any_others, _ = alone._points(site, other, other.any_joint_mm2, cameras, doubts)
+            shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
+            p = site.alternative.probability
+            points, a_priori = (
+                add_alternative(points, others, shift, p),
+                add_alternative(a_priori, any_others, shift, p),
+            )
         cycle = None
         if moments is not None and rest is not None:
             cycle = locate_cycle(
-                moments, rest, cameras, self.catalogue, self.params, self.method, self.gantry.covariance
-            )
+                moments, rest, cameras, self.catalogue, self.any_study.params, self.method,
+                self.any_study.gantry.covariance, jump,
+            )  # fmt: skip
         reasons = [reason for reason, holds in (
             (Reason.NO_REFERENCE, reference_mm is None),
             (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
-            (Reason.TABLE_MOVED, jump is not None),
-            (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1),
         ) if holds]  # fmt: skip
         answer = LocatedSite(
             site=site.site,
@@ -94,9 +106,11 @@ class SiteLocator:
             points=points,
             reference_mm=reference_mm,
             cycle=cycle,
-            reasons=tuple(reasons),
+            reasons=(*reasons, *doubts),
+            variation=self.belief.variation,
+            a_priori=a_priori,
         )
-        return answer, moment, _breathing_note(site.site, moment) if jump is None else []
+        return answer, moment, [] if jump is not None and jump.is_certain else _breathing_note(site.site, moment)
 
     def _moment(
         self, pair: PhasePair, cameras: Cameras, cycle: CycleMoments | None, jump: Jump | None
@@ -109,39 +123,51 @@ class SiteLocator:
         motion = (
             cycle.motion(np.array(phase), phase, pixels.labels) if cycle is not None and phase is not None else None
         )
-        sources = error_sources(
-            cameras, start, pixels.labels, self.catalogue, self.params, self.gantry.covariance, motion
-        )  # fmt: skip
-        if jump is not None:
-            sources = (*sources, _jump_source(cameras, start, jump))
+        sources, any_sources = (
+            self._sources(belief, cameras, start, pixels.labels, motion, jump)
+            for belief in (self.belief, self.any_study)
+        )
         if self.method.estimates_breathing:
-            pixels = widen_strays(cameras, pixels, start, sources)
+            pixels = widen_strays(cameras, pixels, start, any_sources)
         noise = pixel_noise_px2(pixels.covariances)
-        errors = noise + sum(source.pixels_px2() for source in sources)
-        breathing = visible_breathing(cameras, start, self.params)
+        errors, any_errors = (
+            noise + sum(source.pixels_px2() for source in own) for own in (sources, any_sources)
+        )  # fmt: skip
+        breathing = visible_breathing(cameras, start, self.any_study.params)
         found = self.method.estimate(cameras, pixels, start, noise + breathing.pixels_px2())
         if not _plausible(found.points_mm):
             return None
         residuals = pixels.residuals_px(cameras, found.points_mm)
-        breathing_mm, inflation = 0.0, 1.0
+        breathing_mm, inflation, any_inflation = 0.0, 1.0, 1.0
         if self.method.estimates_breathing:
             # Epipolar residuals do not depend on the pixels' weights: no displacement of an electrode changes them.
             rows = epipolar_rows(cameras, found.points_mm)
-            apart, free = rows @ residuals, len(start)
-            misfit = float(apart @ np.linalg.solve(rows @ errors @ rows.T, apart))
+            inflation, any_inflation = (_inflation(rows, residuals, own) for own in (errors, any_errors))
             gain = breathing.covariance @ breathing.effect_px.T @ np.linalg.inv(noise + breathing.pixels_px2())
             breathing_mm = float((gain @ residuals)[0])
             residuals = residuals - breathing.effect_px[:, 0] * breathing_mm
-            if chi2.sf(misfit, free) < DOUBTFUL_BELOW:
-                inflation = misfit / free
-        return Moment(pixels, found, sources, noise, errors, residuals.reshape(-1, 2, 2), breathing_mm, inflation)
+        return Moment(
+            pixels, found, sources, noise, residuals.reshape(-1, 2, 2), breathing_mm, inflation,
+            inflation * found.covariance_mm2(errors), any_inflation * found.covariance_mm2(any_errors),
+        )  # fmt: skip
+
+    def _sources(
+        self, belief: StudyBelief, cameras: Cameras, points_mm: Array, labels: Sequence[tuple[str, int]],
+        motion: Motion | None, jump: Jump | None,
+    ) -> tuple[ErrorSource, ...]:  # fmt: skip
+        sources = error_sources(
+            cameras, points_mm, labels, self.catalogue, belief.params, belief.gantry.covariance, motion
+        )
+        return sources if jump is None else (*sources, jump_source(cameras, points_mm, jump))
 
     def _points(
-        self, site: MatchedSite, moment: Moment, cameras: Cameras
+        self, site: MatchedSite, moment: Moment, joint: Array, cameras: Cameras, site_doubts: tuple[Reason, ...]
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
-        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
+        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located.
+
+        ``joint`` (N, 3, N, 3) is the covariance of all electrodes.
+        """
         pixels, points = moment.pixels, moment.found.points_mm
-        joint = moment.inflation * moment.found.covariance_mm2(moment.errors_px2)
         reference = [
             i
             for i, (catheter, electrode) in enumerate(pixels.labels)
@@ -152,8 +178,8 @@ class SiteLocator:
             by_offsets = self.origin.from_electrodes([pixels.labels[i][1] for i in reference], points[reference])
             assert by_offsets is not None, "these electrodes have offsets"
             reference_mm, added_mm2 = by_offsets
-        mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.params.spacing_limit_mm)
-        doubts: dict[str, list[Reason]] = {name: [Reason.SPACING_MISMATCH] for name in self.wrong_spacings}
+        mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.spacing_limit_mm)
+        doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
             doubts.setdefault(catheter, []).append(reason)
         angles = _ray_angles_deg(cameras, pixels)
@@ -172,7 +198,7 @@ class SiteLocator:
                 ray_angle_deg=float(angles[i]),
                 reasons=tuple(
                     dict.fromkeys((
-                        *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []),
+                        *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
                     ))
                 ),
             )
@@ -185,34 +211,35 @@ class SiteLocator:
 class Moment:
     """A site at diastole: N electrodes in 3D with their sources of error.
 
-    noise_px2 : (4 N, 4 N) covariance from pixel noise. errors_px2 : (4 N, 4 N) covariance from all sources.
-    residuals_px : (N, 2 views, 2), without the displacement of the heart between the runs. breathing_mm : half of that
-    displacement, as far as the views show it. inflation : misfit over its expected value where chance does not explain
-    it, else 1.
+    noise_px2 : (4 N, 4 N) covariance from pixel noise. residuals_px : (N, 2 views, 2), without the displacement of the heart
+    between the runs. breathing_mm : half of that displacement, as far as the views show it. inflation : misfit over its
+    expected value where chance does not explain it, else 1. joint_mm2, any_joint_mm2 : (N, 3, N, 3) covariance of all
+    electrodes, in this study and in any study.
     """
 
     pixels: TwoViewPixels
     found: Estimate
     sources: tuple[ErrorSource, ...]
     noise_px2: Array
-    errors_px2: Array
     residuals_px: Array
     breathing_mm: float
     inflation: float
+    joint_mm2: Array
+    any_joint_mm2: Array
+
+
+def _inflation(rows: Array, residuals_px: Array, errors_px2: Array) -> float:
+    """Return the misfit of the epipolar distances over its expected value.
+
+    It is 1 where chance explains the misfit. ``rows`` (N, 4 N) combine the pixels to epipolar distances.
+    """
+    apart = rows @ residuals_px
+    misfit = float(apart @ np.linalg.solve(rows @ errors_px2 @ rows.T, apart))
+    return misfit / len(rows) if chi2.sf(misfit, len(rows)) < DOUBTFUL_BELOW else 1.0
 
 
 def _plausible(points_mm: Array) -> bool:
     return bool(np.isfinite(points_mm).all() and np.abs(points_mm).max() < FAR_MM)
-
-
-def _jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
-    """Return the error source of a jump, in either direction.
-
-    Either view may show the true place.
-    """
-    own, none = jump.displacement_mm[:, None], np.zeros((3, 1))
-    effect = effect_px(jacobians(cameras, points_mm), *((own, none) if jump.view == "a" else (none, own)))
-    return ErrorSource(effect, np.eye(1), ("breathing",))
 
 
 def _breathing_note(site: str, moment: Moment) -> list[str]:

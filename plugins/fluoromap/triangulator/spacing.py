@@ -14,6 +14,8 @@ from fluoromap.triangulator.two_view_pixels import TwoViewPixels
 
 STUDY_LIMIT_MM = 0.75
 """Difference between a spacing's median over the study and the catalogue's above which the catalogue is wrong."""
+DOUBT_LIMIT_MM = 0.4
+"""Difference above which the image contradicts the catalogue. A bent shaft or a tip's centre explains smaller ones."""
 _CHANCE_SD = 4.0
 
 
@@ -62,9 +64,9 @@ def spacing_mismatches(
 
 
 def wrong_spacings(
-    sites: Sequence[tuple[TwoViewPixels, Array, Array]], catalogue: Catalogue
+    sites: Sequence[tuple[TwoViewPixels, Array, Array]], catalogue: Catalogue, limit_mm: float
 ) -> dict[str, list[WrongGap]]:
-    """Return the catheters that the catalogue describes wrongly, with their wrong gaps.
+    """Return the catheters with gaps that differ from the catalogue's by more than ``limit_mm``.
 
     Parameters
     ----------
@@ -85,6 +87,6 @@ def wrong_spacings(
         values = np.array(lengths)
         median, gap = float(np.median(values[:, 0])), float(values[0, 2])
         chance_mm = _CHANCE_SD * float(np.sqrt(values[:, 1].mean() / len(values)))
-        if abs(median - gap) > max(STUDY_LIMIT_MM, chance_mm):
+        if abs(median - gap) > max(limit_mm, chance_mm):
             wrong.setdefault(name, []).append(WrongGap(first, second, median, gap))
     return wrong

@@ -22,15 +22,21 @@ from fluoromap.contracts import (
 from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
-from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_maximum_likelihood
+from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
 from fluoromap.triangulator.reference_origin import common_origin, deviates
-from fluoromap.triangulator.self_calibration import GANTRY_PRIOR, GantryBelief, calibrate
+from fluoromap.triangulator.self_calibration import calibrate, header_belief
 from fluoromap.triangulator.site_locator import Moment, SiteLocator
-from fluoromap.triangulator.spacing import WrongGap, wrong_spacings
+from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
-from fluoromap.triangulator.uncertainty import Share, UncertaintyParams, error_sources, pixel_noise_px2
+from fluoromap.triangulator.uncertainty import (
+    LARGEST_MULTIPLE,
+    Share,
+    UncertaintyParams,
+    error_sources,
+    pixel_noise_px2,
+)
 
 _SAME_GANTRY_DEG = 3.0
 
@@ -43,7 +49,8 @@ def locate_study(
     Sites whose views are too close together or whose mapping catheter is missing are rejected.
     """
     usable, rejected, notes = _usable_sites(sites, catalogue)
-    locator = SiteLocator(method, params, catalogue, GantryBelief(np.eye(4), params.gantry_covariance()))
+    header = header_belief(params)
+    locator = SiteLocator(method, catalogue, header, header, params.spacing_limit_mm)
     return _locate_sites([(site, None, locator) for site in usable], catalogue, context, rejected, notes, None)
 
 
@@ -59,23 +66,33 @@ def calibrate_and_locate(
     resting = frozenset(catalogue.names) - {catalogue.mapping}
     jumps = table_jumps([(cameras, pixels, points) for cameras, pixels, points, _ in first], resting, params)
     notes += table_notes([site.site for site in usable], jumps)
-    wrong = wrong_spacings([(pixels, points, joint) for _, pixels, points, joint in first], catalogue)
-    notes += _spacing_notes(wrong, catalogue)
+    spacings = [(pixels, points, joint) for _, pixels, points, joint in first]
+    wrong = wrong_spacings(spacings, catalogue, STUDY_LIMIT_MM)
+    contradicted = {
+        name: gaps for name, gaps in wrong_spacings(spacings, catalogue, DOUBT_LIMIT_MM).items() if name not in wrong
+    }
+    notes += _spacing_notes(wrong, catalogue) + _contradiction_notes(contradicted)
     if set(wrong) == set(catalogue.names):
         # Catheter names and scale both come from the spacings, so no located position can be trusted.
         reasons = (Reason.SPACING_MISMATCH, Reason.GEOMETRY_DOUBTFUL)
         rejected += [RejectedSite(site.site, reasons) for site in usable]
         return Triangulation((), tuple(rejected), tuple(notes))
     same_gantry = _same_gantry(usable)
-    unmoved = [first[i][:2] for i in same_gantry if jumps[i] is None]
-    calibration, gantry = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
+    is_certain = [jump is not None and jump.is_certain for jump in jumps]
+    unmoved = [first[i][:2] for i in same_gantry if not is_certain[i]]
+    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
     if calibration is not None and calibration.applied:
         notes.append(_calibration_note(calibration))
-    header = GantryBelief(np.eye(4), params.gantry_covariance())
-    work = [
-        (site, jump, SiteLocator(method, params, catalogue, gantry if i in same_gantry else header, frozenset(wrong)))
-        for i, (site, jump) in enumerate(zip(usable, jumps, strict=True))
-    ]
+    if belief.doubt is not None:
+        notes.append(_doubt_note(belief.doubt))
+    header = header_belief(params)
+    gap_doubts = dict.fromkeys(contradicted, Reason.CATALOGUE_CONTRADICTED) | dict.fromkeys(
+        wrong, Reason.SPACING_MISMATCH
+    )
+    work = []
+    for i, (site, jump) in enumerate(zip(usable, jumps, strict=True)):
+        own = belief if i in same_gantry else header
+        work.append((site, jump, SiteLocator(method, catalogue, own, header, params.spacing_limit_mm, gap_doubts)))
     return _locate_sites(work, catalogue, context, rejected, notes, calibration)
 
 
@@ -149,8 +166,9 @@ def _first_look(
     Points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise.
     """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    points = triangulate_maximum_likelihood(*cameras, *pixels.pixels, *pixels.covariances)
-    sources = error_sources(cameras, points, pixels.labels, catalogue, params, GANTRY_PRIOR, None)
+    points = triangulate_unweighted(cameras, pixels)
+    widest = LARGEST_MULTIPLE**2 * params.gantry_covariance()
+    sources = error_sources(cameras, points, pixels.labels, catalogue, params, widest, None)
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))
     return cameras, pixels, points, alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
@@ -182,16 +200,37 @@ def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue
             "The electrode spacings of every catheter differ from its description. Check the pixel spacing and the source "
             "distances of both runs, then the description of the catheters."
         ]
-    notes = []
-    for name, gaps in wrong.items():
-        differences = ", ".join(
-            f"{gap.first} to {gap.second}: {gap.located_mm:.1f} mm instead of {gap.catalogue_mm:.1f}" for gap in gaps
+    return [
+        f"The electrode spacings of the catheter {name!r} differ from its description ({_differences(gaps)}), which was "
+        "therefore not used to check the gantry. Correct the description."
+        for name, gaps in wrong.items()
+    ]
+
+
+def _contradiction_notes(contradicted: Mapping[str, Sequence[WrongGap]]) -> list[str]:
+    return [
+        f"The images contradict the description of the catheter {name!r} ({_differences(gaps)}). Check its electrode "
+        "spacings and its tip."
+        for name, gaps in contradicted.items()
+    ]
+
+
+def _differences(gaps: Sequence[WrongGap]) -> str:
+    return ", ".join(
+        f"{gap.first} to {gap.second}: {gap.located_mm:.1f} mm instead of {gap.catalogue_mm:.1f}" for gap in gaps
+    )
+
+
+def _doubt_note(doubt: Reason) -> str:
+    if doubt is Reason.TABLE_MOVED:
+        return (
+            "At all sites the heart is displaced by the same amount between the two views: the table moved between the runs "
+            "of view a and those of view b. Send its position with the files, or repeat one view."
         )
-        notes.append(
-            f"The electrode spacings of the catheter {name!r} differ from its description ({differences}), which was "
-            "therefore not used to check the gantry. Correct the description."
-        )
-    return notes
+    return (
+        "The two views of the study contradict each other in a way that no gantry error explains. Check the geometry of both "
+        "views."
+    )
 
 
 def _calibration_note(calibration: Calibration) -> str:

@@ -6,25 +6,43 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import norm
 
 from fluoromap.contracts import Array, View
 from fluoromap.geometry import Camera
+from fluoromap.triangulator.study_equations import HeartScale
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import ErrorSource, UncertaintyParams, effect_px, jacobians
 
 FEWEST_SITES = 3
 """Fewest sites from which the heart's usual place can be estimated."""
 _BEYOND_SD = 4.5
-_LEAST_MM = 4.0
+_LEAST_MM = 3.0
 _SLIP_MM = 4.0
+_JUMP_SHARE, _JUMP_SD_MM = 0.02, 15.0
+"""Share of the sites between whose runs the table moves, and how far along one axis."""
+CERTAIN, _POSSIBLE = 0.95, 0.05
+"""Probabilities of a jump above which it is reported, and above which it counts in the ellipsoids."""
+_BREATHING_SHARES = np.geomspace(0.05, 2.0, 20)
+"""Breathing of a heart as multiples of the assumed one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Jump:
-    """A displacement of the heart in one view of a site: ``displacement_mm`` (3,), world, across that view's rays."""
+    """A displacement of the heart in one view of a site.
+
+    displacement_mm : (3,) world, across that view's rays. probability : that it is no breath. A certain jump is reported; a
+    possible one widens the ellipsoids of its site.
+    """
 
     view: View
     displacement_mm: Array
+    probability: float = 1.0
+
+    @property
+    def is_certain(self) -> bool:
+        return self.probability >= CERTAIN
 
 
 def table_jumps(
@@ -46,15 +64,41 @@ def table_jumps(
     if len(sites) < FEWEST_SITES:
         return [None] * len(sites)
     usual = _usual_places(sites, resting)
-    return [_site_jump(cameras, pixels, usual, params) for cameras, pixels, _ in sites]
+    found = [_displacements(cameras, pixels, usual) for cameras, pixels, _ in sites]
+    scale, probabilities = _views_apart(sites, found, params)
+    # Only the head-feet direction shows how far this heart breathes.
+    own = params.model_copy(update={"respiration_head_feet_sd_mm": scale * params.respiration_head_feet_sd_mm})
+    return _with_boundary([
+        None if moved is None else _site_jump(cameras, moved, probability, own, params)
+        for (cameras, *_), moved, probability in zip(sites, found, probabilities, strict=True)
+    ])  # fmt: skip
+
+
+def _with_boundary(jumps: list[Jump | None]) -> list[Jump | None]:
+    """Return the jumps with the sites at which a lasting move may have happened.
+
+    The table may move between the two runs of a site and stay there. If view b differs at the first sites, the move may have
+    happened at the next site; if view a differs at the last sites, at the site before them.
+    """
+    found = list(jumps)
+    views = [jump.view if jump is not None and jump.is_certain else None for jump in jumps]
+    first = next((k for k, view in enumerate(views) if view != "b"), len(jumps))
+    if 0 < first < len(jumps) and views[first] is None:
+        found[first] = jumps[first - 1]
+    last = next((k for k, view in enumerate(reversed(views)) if view != "a"), len(jumps))
+    before = len(jumps) - last - 1
+    if 0 < last < len(jumps) and views[before] is None:
+        found[before] = jumps[before + 1]
+    return found
 
 
 def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]:
-    """Return a sentence for each view that jumped.
+    """Return a sentence for each view that certainly jumped.
 
     It says at which sites, and how far.
     """
     notes = []
+    jumps = [jump if jump is not None and jump.is_certain else None for jump in jumps]
     for view in ("a", "b"):
         at = [index for index, jump in enumerate(jumps) if jump is not None and jump.view == view]
         if not at:
@@ -69,6 +113,17 @@ def table_notes(names: Sequence[str], jumps: Sequence[Jump | None]) -> list[str]
     return notes
 
 
+def jump_source(cameras: Cameras, points_mm: Array, jump: Jump) -> ErrorSource:
+    """Return the error source of a jump.
+
+    Either view may show the true place, and a view does not show the jump along its rays. So each view may be displaced in
+    any direction by as much as the jump. The variance of a possible jump is its expected value.
+    """
+    in_a, in_b = np.eye(3, 6), np.eye(3, 6, 3)
+    variance = jump.probability * float(jump.displacement_mm @ jump.displacement_mm) / 2
+    return ErrorSource(effect_px(jacobians(cameras, points_mm), in_a, in_b), variance * np.eye(6), ("breathing",) * 6)
+
+
 def _usual_places(
     sites: Sequence[tuple[Cameras, TwoViewPixels, Array]], resting: frozenset[str]
 ) -> dict[tuple[str, int], Array]:
@@ -80,11 +135,14 @@ def _usual_places(
     return {label: np.median(places, axis=0) for label, places in by_label.items() if len(places) >= FEWEST_SITES}
 
 
-def _site_jump(
-    cameras: Cameras, pixels: TwoViewPixels, usual: dict[tuple[str, int], Array], params: UncertaintyParams
-) -> Jump | None:
+def _displacements(
+    cameras: Cameras, pixels: TwoViewPixels, usual: dict[tuple[str, int], Array]
+) -> tuple[Array, Array] | None:
+    """Return the displacements of the resting catheters in view a and b.
+
+    Each is (3,), from their usual places and across the view's rays. None where the site shows no resting catheter.
+    """
     found: list[Array] = []
-    strange: list[bool] = []
     for camera, uv in zip(cameras, pixels.pixels, strict=True):
         moved: dict[str, list[Array]] = {}
         for label, pixel in zip(pixels.labels, uv, strict=True):
@@ -93,19 +151,73 @@ def _site_jump(
                 moved.setdefault(label[0], []).append(inverse @ (pixel - camera.project(usual[label])))
         if not moved:
             return None
-        common = _common_displacement(np.array([np.mean(own, axis=0) for own in moved.values()]))
-        found.append(common)
-        strange.append(_exceeds_breathing(common, camera, params))
-    # Only a displacement along this direction is visible in both views.
+        found.append(_common_displacement(np.array([np.mean(own, axis=0) for own in moved.values()])))
+    return found[0], found[1]
+
+
+def _shared_axis(cameras: Cameras) -> Array:
+    """Return the unit direction (3,) along which both views show a displacement."""
     shared = np.cross(cameras[0].axis_world, cameras[1].axis_world)
-    shared /= np.linalg.norm(shared)
-    apart = shared * float(shared @ (found[0] - found[1]))
-    if all(strange) and not _exceeds_breathing(apart / np.sqrt(2), None, params):
-        return None
-    if not any(strange):
-        return None
-    view = int(np.linalg.norm(found[1]) > np.linalg.norm(found[0])) if all(strange) else strange.index(True)
-    return Jump("b" if view else "a", found[view])
+    unit: Array = shared / np.linalg.norm(shared)
+    return unit
+
+
+def _views_apart(
+    sites: Sequence[tuple[Cameras, TwoViewPixels, Array]],
+    found: Sequence[tuple[Array, Array] | None],
+    params: UncertaintyParams,
+) -> tuple[float, list[float]]:
+    """Return this heart's breathing, and each site's probability of a jump.
+
+    A jump displaces the two views of a site farther than a breath does. The breathing is a multiple of the assumed one. Breathing
+    displaces the views of every site against each other; a moved table displaces those of a few sites. A few sites show the
+    breathing inaccurately, so every breathing counts with its probability.
+    """
+    known = [index for index, moved in enumerate(found) if moved is not None]
+    probabilities = [0.0] * len(sites)
+    if not known:
+        return 1.0, probabilities
+    apart, variance = [], []
+    for index in known:
+        (cameras, *_), moved = sites[index], found[index]
+        assert moved is not None
+        shared = _shared_axis(cameras)
+        apart.append(float(shared @ (moved[0] - moved[1])))
+        variance.append(2 * float(shared @ params.respiration_covariance_mm2() @ shared))
+    from_usual = np.array(apart) - np.median(apart)
+    spread = np.square(_BREATHING_SHARES)[:, None] * np.array(variance) + 2 * params.beat_sd_mm**2
+    breath = np.log(1 - _JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread))
+    jump = np.log(_JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread + _JUMP_SD_MM**2))
+    either = np.logaddexp(breath, jump)
+    evidence = either.sum(axis=1) + [HeartScale(share, 1.0).log_prior for share in _BREATHING_SHARES]
+    weights = np.exp(evidence - logsumexp(evidence))
+    far = np.abs(from_usual) / np.sqrt(2) > _LEAST_MM
+    for index, probability in zip(known, far * (weights @ np.exp(jump - either)), strict=True):
+        probabilities[index] = float(probability)
+    return float(np.sqrt(weights @ np.square(_BREATHING_SHARES))), probabilities
+
+
+def _site_jump(
+    cameras: Cameras, moved: tuple[Array, Array], probability: float, own: UncertaintyParams, params: UncertaintyParams
+) -> Jump | None:
+    """Return the jump of a site, or None.
+
+    ``moved`` are its displacements in both views; they jumped against each other with this ``probability``. ``own`` has this
+    heart's breathing, ``params`` the assumed one.
+    """
+    shared = _shared_axis(cameras)
+    strange = [
+        _exceeds_breathing(one - shared * (shared @ one), camera, params)
+        for one, camera in zip(moved, cameras, strict=True)
+    ]
+    farther = int(np.linalg.norm(moved[1]) > np.linalg.norm(moved[0]))
+    if probability < CERTAIN:
+        # Displaced alike in both views: the table moved before both runs, or the heart lies elsewhere. That does no harm.
+        alike = all(_exceeds_breathing(shared * float(shared @ one), None, own) for one in moved)
+        if alike or all(strange) or not any(strange):
+            return Jump("b" if farther else "a", moved[farther], probability) if probability > _POSSIBLE else None
+    view = farther if strange[0] == strange[1] else strange.index(True)
+    return Jump("b" if view else "a", moved[view])
 
 
 def _common_displacement(displacements_mm: Array) -> Array:

@@ -18,8 +18,37 @@ from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.two_view_pixels import Cameras
 
-Share = Literal["angles", "source_distances", "phase_mismatch", "breathing"]
+Share = Literal["pixels", "angles", "source_distances", "phase_mismatch", "breathing"]
 """Entry of the :class:`~fluoromap.contracts.ErrorBudget` to which an error source belongs."""
+
+
+@dataclass(frozen=True, slots=True)
+class GantryKind:
+    """A kind of gantry: its errors as multiples of the stated standard deviations, and its share of all gantries."""
+
+    angle: float
+    offset: float
+    share: float
+
+    @property
+    def multiples(self) -> Array:
+        """Multiples (14,) of the unknowns' standard deviations; see :func:`gantry_effect_px`."""
+        return np.array([*([self.angle] * 3 + [self.offset] * 3) * 2, self.angle, self.angle])
+
+
+GANTRY_KINDS = tuple(
+    GantryKind(angle, offset, share * given)
+    for angle, share, by_offset in (
+        (0.5, 0.30, (0.50, 0.36, 0.14)),
+        (1.0, 0.45, (0.50, 0.36, 0.14)),
+        (2.0, 0.20, (0.20, 0.50, 0.30)),
+        (4.0, 0.05, (0.05, 0.25, 0.70)),
+    )
+    for offset, given in zip((1.0, 2.0, 4.0), by_offset, strict=True)
+)
+"""Kinds of gantry. A real C-arm had 0.2 to 0.33 degree and 0.5 to 0.8 mm, with tails to 0.8 degree and 2.2 mm. Offsets exceed
+their stated value more often than angles do; a C-arm with wrong angles tends to have wrong offsets too."""
+LARGEST_MULTIPLE = 4.0
 
 
 class UncertaintyParams(BaseModel, extra="forbid"):
@@ -30,7 +59,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
     )
     isocentre_sd_mm: float = Field(0.5, ge=0, le=20, description="Error of the isocentre's place in each view, mm.")
     magnification_sd: float = Field(
-        0.002, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
+        0.003, ge=0, le=0.2, description="Relative error of the source-to-detector distance in each view."
     )
     respiration_head_feet_sd_mm: float = Field(
         4.0, ge=0, le=30, description="Breathing position of the heart in each run along the patient's long axis, mm."
@@ -49,6 +78,12 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         ge=0,
         le=10,
         description="Displacement of an electrode beyond the share that follows its catheter's tip, mm an axis.",
+    )
+    tip_centre_sd_mm: float = Field(
+        0.2,
+        ge=0,
+        le=5,
+        description="Distance along the shaft from the tip electrode's middle to its centre in the image, mm.",
     )
     beat_amplitude_sd: float = Field(
         0.04, ge=0, le=1, description="Variation of the motion's amplitude from beat to beat, as a share of it."
@@ -69,9 +104,33 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         return np.diag([other, other, head])
 
     def gantry_covariance(self) -> Array:
-        """Return the covariance (12, 12) of the gantry's errors, independent in each view; see :func:`gantry_effect_px`."""
+        """Return the covariance (14, 14) of the gantry's errors, independent in each view; see :func:`gantry_effect_px`.
+
+        It describes the usual gantry. Other gantries are better or worse, see ``GANTRY_KINDS``.
+        """
         angle, offset = np.radians(self.gantry_angle_sd_deg) ** 2, self.isocentre_sd_mm**2
-        return np.diag(np.tile(np.repeat([angle, offset], 3), 2))
+        views = np.tile(np.repeat([angle, offset], 3), 2)
+        return np.diag([*views, *np.full(2, self.magnification_sd**2)])
+
+    def header_covariance(self) -> Array:
+        """Return the covariance (14, 14) of errors that no data show.
+
+        It is the second moment over all kinds of gantry.
+        """
+        shares = sum((kind.share * kind.multiples**2 for kind in GANTRY_KINDS), np.zeros(14))
+        covariance: Array = self.gantry_covariance() * shares
+        return covariance
+
+    def scaled(self, breathing: float, beats: float) -> UncertaintyParams:
+        """Return the parameters with these multiples of breathing and beats."""
+        return self.model_copy(
+            update={
+                "respiration_head_feet_sd_mm": breathing * self.respiration_head_feet_sd_mm,
+                "respiration_other_sd_mm": breathing * self.respiration_other_sd_mm,
+                "respiration_drift_sd_mm": breathing * self.respiration_drift_sd_mm,
+                "beat_sd_mm": beats * self.beat_sd_mm,
+            }
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,18 +183,31 @@ def effect_px(jacobian: Array, displacement_a: Array, displacement_b: Array) -> 
     return effect
 
 
-def gantry_effect_px(jacobian: Array, points_world_mm: Array) -> Array:
-    """Return the effect (4 N, 12) of the gantry's errors on the pixels.
+def gantry_effect_px(cameras: Cameras, jacobian: Array, points_world_mm: Array) -> Array:
+    """Return the effect (4 N, 14) of the gantry's errors on the pixels.
 
-    The parameters are the rotation vector about the isocentre (radians) and the offset (mm) of view a, then of view b.
-    They displace the electrodes as that view sees them: ``X' = R X + t``.
+    The first 12 parameters are the rotation vector about the isocentre (radians) and the offset (mm) of view a, then of
+    view b. They displace the electrodes as that view sees them: ``X' = R X + t``. The last two are the relative errors of
+    the source-to-detector distance in view a and b.
     """
-    x, y, z = np.moveaxis(points_world_mm, -1, 0)
+    own = [_turned_and_shifted(points_world_mm - camera.isocentre_world_mm) for camera in cameras]
+    none = np.zeros_like(own[0])
+    across = [_across(camera, points_world_mm) for camera in cameras]
+    no_scale = np.zeros_like(across[0])
+    in_a = np.concatenate([own[0], none, across[0], no_scale], axis=-1)
+    in_b = np.concatenate([none, own[1], no_scale, across[1]], axis=-1)
+    return effect_px(jacobian, in_a, in_b)
+
+
+def _turned_and_shifted(points_mm: Array) -> Array:
+    """Return the displacement (..., N, 3, 6) by a rotation and an offset.
+
+    The first three columns are a small rotation vector about the origin.
+    """
+    x, y, z = np.moveaxis(points_mm, -1, 0)
     zero = np.zeros_like(x)
     cross_product = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), (0, 1), (-2, -1))
-    own = np.concatenate([cross_product, np.broadcast_to(np.eye(3), cross_product.shape)], axis=-1)
-    none = np.zeros_like(own)
-    return effect_px(jacobian, np.concatenate([own, none], axis=-1), np.concatenate([none, own], axis=-1))
+    return np.concatenate([cross_product, np.broadcast_to(np.eye(3), cross_product.shape)], axis=-1)
 
 
 def breathing_effect_px(jacobian: Array) -> Array:
@@ -180,19 +252,17 @@ def error_sources(
     points_world_mm : ndarray, shape (..., N, 3)
     labels : sequence of (catheter, electrode)
         Labels of the N points.
-    gantry_covariance : ndarray, shape (12, 12)
+    gantry_covariance : ndarray, shape (14, 14)
         From :meth:`UncertaintyParams.gantry_covariance` or from self-calibration.
     motion : Motion or None
         None where the heart rests.
     """
     n = len(labels)
     jacobian = jacobians(cameras, points_world_mm)
-    gantry: tuple[Share, ...] = (*("angles",) * 3, *("source_distances",) * 3) * 2
+    gantry: tuple[Share, ...] = (*(*("angles",) * 3, *("source_distances",) * 3) * 2, *("source_distances",) * 2)
     head_feet = np.array([[0.0], [0.0], [1.0]])
-    across = [_across(camera, points_world_mm) for camera in cameras]
     sources = [
-        ErrorSource(gantry_effect_px(jacobian, points_world_mm), gantry_covariance, gantry),
-        _both_views(jacobian, across[0], across[1], params.magnification_sd, "source_distances"),
+        ErrorSource(gantry_effect_px(cameras, jacobian, points_world_mm), gantry_covariance, gantry),
         ErrorSource(breathing_effect_px(jacobian), params.respiration_covariance_mm2() / 2, ("breathing",) * 3),
         _both_views(jacobian, head_feet, head_feet, params.respiration_drift_sd_mm, "breathing"),
     ]
@@ -200,6 +270,11 @@ def error_sources(
     for name in sorted({catheter for catheter, _ in labels}):
         own = follows * np.array([catheter == name for catheter, _ in labels])[:, None, None]
         sources.append(_both_views(jacobian, own, own, params.beat_sd_mm, "phase_mismatch"))
+        tip = _tip_along_shaft(points_world_mm, labels, name)
+        if tip is not None:
+            # Both views show the same centre, so that no epipolar distance reveals it.
+            effect = effect_px(jacobian, tip, tip)
+            sources.append(ErrorSource(effect, np.array([[params.tip_centre_sd_mm**2]]), ("pixels",)))
     each = np.eye(3 * n).reshape(n, 3, 3 * n)
     sources.append(_both_views(jacobian, each, each, params.bend_sd_mm, "phase_mismatch"))
     if motion is not None:
@@ -215,6 +290,20 @@ def error_sources(
     return tuple(sources)
 
 
+def _tip_along_shaft(points_world_mm: Array, labels: Sequence[tuple[str, int]], catheter: str) -> Array | None:
+    """Return the displacement (..., N, 3, 1) of a tip along its shaft.
+
+    None where electrode 1 or 2 is missing.
+    """
+    if (catheter, 1) not in labels or (catheter, 2) not in labels:
+        return None
+    tip, second = labels.index((catheter, 1)), labels.index((catheter, 2))
+    along = points_world_mm[..., tip, :] - points_world_mm[..., second, :]
+    displaced = np.zeros((*points_world_mm.shape, 1))
+    displaced[..., tip, :, 0] = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    return displaced
+
+
 def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Share) -> ErrorSource:
     """Return a source whose parameters vary independently in each view."""
     k = in_a.shape[-1]
@@ -228,8 +317,8 @@ def _both_views(jacobian: Array, in_a: Array, in_b: Array, sd: float, share: Sha
 
 def _across(camera: Camera, points_world_mm: Array) -> Array:
     """Return the part of points across the central ray, (..., N, 3, 1): a wrong magnification stretches it."""
-    along = camera.axis_world
-    across: Array = (points_world_mm - (points_world_mm @ along)[..., None] * along)[..., None]
+    along, points = camera.axis_world, points_world_mm - camera.isocentre_world_mm
+    across: Array = (points - (points @ along)[..., None] * along)[..., None]
     return across
 
 

@@ -28,15 +28,18 @@ from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, dicom_files, maps, overlays, points, report, tracks
-from fluoromap_service.api.service import health, metrics, plugins
+from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
     activation_times,
     catheter_types,
+    cine,
     electrodes,
     electrograms,
+    epipolar,
     frames,
     instances,
+    run_electrodes,
     sites,
     studies,
 )
@@ -52,7 +55,10 @@ ROUTERS = (
     catheter_types.router,
     instances.router,
     frames.router,
+    cine.router,
+    epipolar.router,
     electrodes.router,
+    run_electrodes.router,
     activation_times.router,
     electrograms.router,
     sites.router,
@@ -66,11 +72,13 @@ ROUTERS = (
     archive.router,
     dicom_files.router,
     plugins.router,
+    reasons.router,
     health.router,
     metrics.router,
     store.router,
     search.router,
     retrieve.router,
+    pages.router,
 )
 
 log = structlog.get_logger(__name__)

@@ -4,7 +4,7 @@ import warnings
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.facts import HeaderWarning, InstanceFacts
-from fluoromap_service.dicom.frames import DicomFrames, frame_png, frame_to_8bit, open_frames
+from fluoromap_service.dicom.frames import DicomFrames, cine_8bit, frame_png, frame_to_8bit, open_frames
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.dicom.reading import read_instance
 from fluoromap_service.dicom.writing import deterministic_uid, write_cine
@@ -17,6 +17,7 @@ __all__ = [
     "DicomFrames",
     "HeaderWarning",
     "InstanceFacts",
+    "cine_8bit",
     "deterministic_uid",
     "dicom_problem",
     "frame_png",

@@ -141,6 +141,19 @@ def frame_to_8bit(pixels: Pixels, facts: InstanceFacts, window: Pair | None = No
     return display
 
 
+def cine_8bit(path: Path, facts: InstanceFacts, first: int, count: int) -> bytes:
+    """Return ``count`` frames from frame ``first`` (from 0) on for display, one byte a pixel.
+
+    All frames have one window, so that the picture does not flicker: the file's own, else the range of the run's first frame.
+    """
+    frames = open_frames(path, facts)
+    chosen = facts.window
+    if chosen is None:
+        low, high = (float(value) for value in np.percentile(frames[0].astype(np.float32), (0.5, 99.5)))
+        chosen = ((low + high + 1) / 2, max(high - low, 1.0) + 1)
+    return b"".join(frame_to_8bit(frames[first + k], facts, chosen).tobytes() for k in range(count))
+
+
 def frame_png(path: Path, facts: InstanceFacts, frame: int, window: Pair | None) -> bytes:
     """Return frame ``frame`` (from 0) of a file as a greyscale PNG; ``window`` as in :func:`frame_to_8bit`."""
     return encode_png(frame_to_8bit(open_frames(path, facts)[frame], facts, window))

@@ -1,4 +1,4 @@
-"""The electrodes that the newest job detected in one frame."""
+"""The electrodes that the newest job detected in the frames of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,28 @@ class DetectedElectrode:
 
 def detected_electrodes(session: Session, study_id: str, uid: str, frame: int) -> list[DetectedElectrode]:
     """Return the electrodes that the newest job with this run detected in a frame (counted from 0)."""
-    stage = session.scalar(
+    stage = _newest_segmentation(session, study_id, uid)
+    if stage is None:
+        return []
+    found = load(Segmentation, stage).frames[frame]
+    return _electrodes(found.chains, _named_chains(session, stage.job_id, uid).get(frame, ()))
+
+
+def detections_of_run(session: Session, study_id: str, uid: str) -> list[list[DetectedElectrode]]:
+    """Return the electrodes of every frame as the newest job detected them.
+
+    Without such a job the list is empty.
+    """
+    stage = _newest_segmentation(session, study_id, uid)
+    if stage is None:
+        return []
+    named = _named_chains(session, stage.job_id, uid)
+    frames = load(Segmentation, stage).frames
+    return [_electrodes(found.chains, named.get(frame, ())) for frame, found in enumerate(frames)]
+
+
+def _newest_segmentation(session: Session, study_id: str, uid: str) -> StageRow | None:
+    return session.scalar(
         select(StageRow)
         .join(Job, Job.id == StageRow.job_id)
         .where(
@@ -39,24 +60,25 @@ def detected_electrodes(session: Session, study_id: str, uid: str, frame: int) -
         .order_by(Job.created.desc(), Job.id)
         .limit(1)
     )
-    if stage is None:
-        return []
+
+
+def _electrodes(all_chains: tuple[Chain, ...], named: tuple[NamedChain, ...]) -> list[DetectedElectrode]:
     # A person may have deleted the correction after the job: a chain set by hand is no detection.
-    chains = tuple(chain for chain in load(Segmentation, stage).frames[frame].chains if not chain.manual)
+    chains = tuple(chain for chain in all_chains if not chain.manual)
     found: list[DetectedElectrode] = []
-    for chain, name in zip(chains, _names(session, stage.job_id, uid, frame, chains), strict=True):
+    for chain, name in zip(chains, _names(chains, named), strict=True):
         for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
             sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
             found.append(DetectedElectrode(name, electrode, float(u), float(v), sd))
     return found
 
 
-def _names(session: Session, job_id: str, uid: str, frame: int, chains: tuple[Chain, ...]) -> list[str | None]:
+def _names(chains: tuple[Chain, ...], named: tuple[NamedChain, ...]) -> list[str | None]:
     """Return a catheter for each chain, none twice.
 
     It is the catheter that the job's matching chose, else the most probable kind.
     """
-    of_track = {chain.track: chain.catheter for chain in _named_chains(session, job_id, uid, frame)}
+    of_track = {chain.track: chain.catheter for chain in named}
     names = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
     likely = sorted(
         ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
@@ -68,15 +90,17 @@ def _names(session: Session, job_id: str, uid: str, frame: int, chains: tuple[Ch
     return names
 
 
-def _named_chains(session: Session, job_id: str, uid: str, frame: int) -> tuple[NamedChain, ...]:
+def _named_chains(session: Session, job_id: str, uid: str) -> dict[int, tuple[NamedChain, ...]]:
+    """Return the named catheters of each frame (counted from 0) of a run."""
     stage = stage_of(session, job_id, "match")
     if stage is None or stage.state != StageState.DONE:
-        return ()
+        return {}
     snapshot = Snapshot.model_validate(session.get_one(Job, job_id).snapshot)
     views = {
         site.site: "a" if site.view_a == uid else "b" for site in snapshot.sites if uid in (site.view_a, site.view_b)
     }
     for site in load(Matching, stage).sites:
         if site.site in views:
-            return (site.track_a if views[site.site] == "a" else site.track_b)[frame].chains
-    return ()
+            track = site.track_a if views[site.site] == "a" else site.track_b
+            return {frame: observation.chains for frame, observation in enumerate(track)}
+    return {}

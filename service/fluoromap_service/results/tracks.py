@@ -10,7 +10,14 @@ from sqlalchemy.orm import Session
 
 from fluoromap.contracts import LocatedSite, Track, Triangulation, View
 from fluoromap.fuser.mapped_sites import map_origin
-from fluoromap.monoplane.track_samples import FrameOrigins, Sample, isocentre_origins, reference_origins, track_samples
+from fluoromap.monoplane.track_samples import (
+    FrameOrigins,
+    Sample,
+    in_study,
+    isocentre_origins,
+    reference_origins,
+    track_samples,
+)
 from fluoromap.reasons import Reason
 from fluoromap_service.jobs.stage_results import SiteTracks, load, stages_of
 from fluoromap_service.problem import not_found
@@ -104,7 +111,10 @@ def _site(
             reasons = (result.refused, *site_reasons) if result.refused else site_reasons
             yield RejectedView(stage.subject, result.view, tuple(dict.fromkeys(reasons)), result.message)
             continue
-        track, camera, frames = result.track, site.camera(result.view), origin.frames(result.track, site)
+        camera = site.camera(result.view)
+        track = in_study(result.track, camera, origin.catheter, site.variation)
+        frames = origin.frames(track, site)
         for index, (catheter, electrode) in enumerate(track.labels):
-            samples = track_samples(track, index, camera, frames)
+            reference = None if origin.origin is Origin.ISOCENTRE else origin.catheter
+            samples = track_samples(track, index, camera, frames, site.reasons_of(catheter, electrode, reference))
             yield ElectrodeSamples(stage.subject, result.view, catheter, electrode, stage.plugin, samples)

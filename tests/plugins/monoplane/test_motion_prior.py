@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -17,16 +17,19 @@ from fluoromap.contracts import (
     Refusal,
     Silent,
     SiteCycle,
+    StudyVariation,
     Track,
 )
 from fluoromap.monoplane.expected_motion import expected_motion
 from fluoromap.monoplane.motion_covariance import FIXED, MotionCovariance, MotionParams
 from fluoromap.monoplane.motion_prior import MotionPrior
+from fluoromap.monoplane.track_samples import in_study
 from fluoromap.monoplane.view_electrodes import gather_electrodes
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
+from fluoromap.triangulator.self_calibration import header_belief
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 EXACT = {
@@ -344,3 +347,36 @@ def test_cost_is_linear_in_frames_because_beats_are_solved_one_by_one() -> None:
     part = _track(replace(view, observations=view.observations[:cut], frame_times_ms=view.frame_times_ms[:cut]))
     # The pixels of later beats do not enter; only the number of beats that were averaged differs.
     assert np.abs(part.positions_mm - whole.positions_mm[:cut]).max() < 0.3
+
+
+def test_a_track_belongs_to_its_study_only_when_it_is_read() -> None:
+    """The study's variation changes the covariances, not the positions, and each cause changes its own share."""
+    views, _, _ = _study(3)
+    track, camera = _track(views[0], isocentre_sd_mm=0.5, respiration_other_sd_mm=1.0), views[0].camera
+    same = in_study(track, camera, "reference", StudyVariation())
+    np.testing.assert_allclose(same.covariance_mm2, track.covariance_mm2, atol=1e-12)
+    calm = in_study(track, camera, "reference", StudyVariation(0.1, 0.3, 0.5, 1.0))
+    wild = in_study(track, camera, "reference", StudyVariation(1.6, 2.4, 4.0, 4.0))
+    np.testing.assert_array_equal(calm.positions_mm, track.positions_mm)
+    for narrow, wide in ((calm, track), (track, wild)):
+        _whole(narrow)
+        for before, after in (
+            (narrow.covariance_mm2, wide.covariance_mm2),
+            (narrow.relative_covariance_mm2, wide.relative_covariance_mm2),
+        ):
+            assert before is not None
+            assert after is not None
+            sizes = [np.trace(of, axis1=-2, axis2=-1)[track.located] for of in (before, after)]
+            assert (sizes[0] <= sizes[1] + 1e-9).all()
+    breath = in_study(track, camera, "reference", replace(StudyVariation(), breathing=2.0))
+    assert np.trace(breath.covariance_mm2, axis1=-2, axis2=-1)[track.located].min() > 0
+    assert (breath.covariance_mm2 - track.covariance_mm2)[track.located].max() > 0.5
+    # Breathing displaces all catheters alike: it cancels in positions from the reference catheter.
+    assert breath.relative_covariance_mm2 is not None
+    assert track.relative_covariance_mm2 is not None
+    np.testing.assert_allclose(breath.relative_covariance_mm2, track.relative_covariance_mm2, atol=0.05)
+
+
+def test_without_a_study_the_variation_is_that_of_any_study() -> None:
+    belief = header_belief(UncertaintyParams())
+    assert astuple(belief.variation) == pytest.approx(astuple(StudyVariation()), abs=1e-3)

@@ -91,3 +91,23 @@ def test_never_more_chains_than_catheters():
 
 def test_an_empty_run():
     assert track_chains([], np.zeros(0), 3) == ()
+
+
+def test_a_rejected_track_leaves_its_place_to_the_catheter_that_it_kept_out():
+    right, false = chain(POINTS + 100), chain(POINTS[:, ::-1] + 300)
+
+    def search(frame, known, shift, reach_px, taken):
+        return None if any(np.allclose(known.pixels_uv, other.pixels_uv) for other in taken) else known
+
+    found = run([[false] if frame < 8 else [right] for frame in range(20)])
+    assert len({one.track for entry in track_chains(found, times(20), 1, search) for one in entry.chains}) <= 2
+    entries = track_chains(
+        found, times(20), 1, search, accepts=lambda chains: chains[max(chains)].pixels_uv[0, 0] < 200
+    )
+    assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
+
+
+def test_an_accepted_track_is_there_in_most_frames():
+    found = run([[chain(POINTS + 100)] if frame < 8 else [] for frame in range(20)])
+    assert track_chains(found, times(20), 1)[0].chains
+    assert not track_chains(found, times(20), 1, accepts=lambda chains: True)[0].chains

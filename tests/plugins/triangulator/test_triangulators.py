@@ -20,7 +20,7 @@ from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import GANTRY_KINDS, UncertaintyParams
 
 NOISE_PX = 0.5
 BOTH = pytest.mark.parametrize("plugin", [Linear, MaximumLikelihood])
@@ -96,17 +96,22 @@ def test_ellipsoids_hold_the_truth_in_as_many_hearts_as_they_say(plugin: type, c
     rng = np.random.default_rng(7)
     inside, inside_relative, errors, relative_errors = [], [], [], []
     params = UncertaintyParams()
+    shares = [kind.share for kind in GANTRY_KINDS]
     for _ in range(100):
         points = heart(rng)
+        kind = GANTRY_KINDS[rng.choice(len(GANTRY_KINDS), p=shares)]
+        centres = {name: rng.normal(0, params.tip_centre_sd_mm) for name in points}
         views, breaths = [], []
         for one in cameras:
             breaths.append(rng.normal(0, [1, 1, 4]))
-            offset = rng.normal(0, params.isocentre_sd_mm, 3)
-            turn = np.radians(rng.normal(0, params.gantry_angle_sd_deg, 3))
+            offset = kind.offset * rng.normal(0, params.isocentre_sd_mm, 3)
+            turn = kind.angle * np.radians(rng.normal(0, params.gantry_angle_sd_deg, 3))
             moved = {
                 name: at + breaths[-1] + offset + rng.normal(0, params.beat_sd_mm, 3) * bend(name) + np.cross(turn, at)
                 for name, at in points.items()
             }
+            for name, at in moved.items():
+                at[0] += centres[name] * (at[0] - at[1]) / np.linalg.norm(at[0] - at[1])
             views.append(observation(one, moved, rng))
         matched = site(views[0], views[1], cameras)
         (located,) = plugin(params).triangulate((matched,), DEFAULT_CATALOGUE, Silent()).sites
@@ -250,7 +255,8 @@ def test_a_moment_is_less_certain_where_the_heart_moves_fast(plugin: type) -> No
 @BOTH
 def test_the_budget_adds_up_to_the_covariances(plugin: type) -> None:
     matched = beating_site(np.random.default_rng(2))
-    answer = plugin(UncertaintyParams()).triangulate((matched,), DEFAULT_CATALOGUE, Silent())
+    params = UncertaintyParams(tip_centre_sd_mm=0)
+    answer = plugin(params).triangulate((matched,), DEFAULT_CATALOGUE, Silent())
     budget = answer.budget
     assert budget is not None
     shares = (
@@ -305,7 +311,8 @@ def test_another_pairing_that_cannot_be_ruled_out_widens_the_ellipsoid_and_lower
     plain = site(a, b, LATERAL_AND_FRONTAL)
     unsure = site(a, b, LATERAL_AND_FRONTAL, alternative=Alternative(PhasePair(0.8, a, other), 0.3))
     before, after = (
-        plugin(UncertaintyParams()).triangulate((one,), DEFAULT_CATALOGUE, Silent()).sites[0] for one in (plain, unsure)
+        plugin(UncertaintyParams(gantry_angle_sd_deg=0.25)).triangulate((one,), DEFAULT_CATALOGUE, Silent()).sites[0]
+        for one in (plain, unsure)
     )
     for name in ("reference", "pacing"):
         first, second = before.point(name, 2), after.point(name, 2)

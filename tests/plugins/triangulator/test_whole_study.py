@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap.contracts import (
+    CHI2_95_3D,
     Array,
     Grade,
     MatchedSite,
@@ -25,6 +26,8 @@ from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
+from fluoromap.triangulator.study_equations import site_equations
+from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
@@ -56,6 +59,7 @@ def matched_sites(
     rng: np.random.Generator,
     displaced: Array | None = None,
     shifts: dict[int, Array] | None = None,
+    noise_px: float = NOISE_PX,
 ) -> tuple[MatchedSite, ...]:
     """Return all sites as both views show them.
 
@@ -65,17 +69,17 @@ def matched_sites(
     sites = []
     for index, points in enumerate(by_site):
         moved = {name: at + (shifts or {}).get(index, np.zeros(3)) for name, at in points.items()}
-        a, b = observation(CAMERAS[0], points, rng), observation(true_b, moved, rng)
+        a, b = observation(CAMERAS[0], points, rng, noise_px), observation(true_b, moved, rng, noise_px)
         pair = PhasePair(0.8, a, b)
         sites.append(MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
     return tuple(sites)
 
 
-def observation(by: Camera, points: Points, rng: np.random.Generator) -> Observation:
+def observation(by: Camera, points: Points, rng: np.random.Generator, noise_px: float = NOISE_PX) -> Observation:
     chains = []
     for name, at in points.items():
-        noise = np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(at), 2, 2))
-        pixels = by.project(at) + rng.normal(0, NOISE_PX, (len(at), 2))
+        noise = np.broadcast_to(noise_px**2 * np.eye(2), (len(at), 2, 2))
+        pixels = by.project(at) + rng.normal(0, noise_px, (len(at), 2))
         chains.append(NamedChain(name, tuple(range(1, len(at) + 1)), pixels, noise))
     return Observation(0, 0.8, tuple(chains))
 
@@ -130,11 +134,14 @@ def test_a_gantry_wrong_by_one_degree_and_two_millimetres_is_found_and_reported(
         true_turn = Rotation.from_matrix(displaced[:3, :3]).as_rotvec(degrees=True)
         assert found.rotation_deg == pytest.approx(true_turn, abs=0.6)
         points, true = errors(answer, by_site)
-        assert rms(points - true) <= 1.0
+        # The catalogue's gaps are not exact, so that no gap shows an offset along a ray.
+        assert rms(points - true) <= 1.5
         left.append(rms(aligned(points, true) - true))
         true_b = Camera(CAMERAS[1].matrix @ displaced, 512, 512)
         apart = answer.sites[0].camera_b.project(true) - true_b.project(true)
-        assert np.abs(apart).mean() < np.abs(CAMERAS[1].project(true) - true_b.project(true)).mean() / 2
+        before = np.abs(CAMERAS[1].project(true) - true_b.project(true))
+        # View b's camera is right along the axis that both views show. Nothing shows an offset across it.
+        assert np.abs(apart)[:, 1].mean() < before[:, 1].mean() / 2
         (note,) = answer.notes
         assert "degrees" in note
         assert "mm" in note
@@ -149,6 +156,74 @@ def test_breathing_between_the_runs_is_not_taken_for_a_wrong_gantry() -> None:
     assert answer.calibration is not None
     assert not answer.calibration.applied
     assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
+
+
+def unequal_pixels(sites: tuple[MatchedSite, ...], rng: np.random.Generator) -> tuple[MatchedSite, ...]:
+    """Return the sites with pixels that are known unequally well.
+
+    Some are known to 0.06 px, some to 0.8 px.
+    """
+    found = []
+    for site in sites:
+        views = []
+        for view in (site.diastole.a, site.diastole.b):
+            chains = []
+            for chain in view.chains:
+                sd_px = rng.choice([0.06, 0.15, 0.8], len(chain.electrodes), p=[0.7, 0.2, 0.1])
+                pixels = chain.pixels_uv + rng.normal(size=(len(sd_px), 2)) * sd_px[:, None]
+                covariances = sd_px[:, None, None] ** 2 * np.eye(2)
+                chains.append(replace(chain, pixels_uv=pixels, covariance_px2=covariances))
+            views.append(replace(view, chains=tuple(chains)))
+        found.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+    return tuple(found)
+
+
+@pytest.mark.parametrize("seed", [51, 52, 53, 54, 55, 56])
+def test_breathing_is_no_fault_of_the_study_where_pixels_are_known_unequally_well(seed: int) -> None:
+    """The heart moves by several millimetres between the runs, as in every study without held breath."""
+    rng = np.random.default_rng(seed)
+    by_site = electrodes(seed, sites=8)
+    breaths = {index: rng.normal(0, [1.4, 1.4, 4.0]) for index in range(len(by_site))}
+    sites = matched_sites(by_site, rng, shifts=breaths, noise_px=0.02)
+    answer = located(unequal_pixels(sites, rng))
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+    assert not any(
+        reason in (Reason.TABLE_MOVED, Reason.GEOMETRY_DOUBTFUL, Reason.SPACING_MISMATCH)
+        for site in answer.sites
+        for point in site.points
+        for reason in (*site.reasons, *point.reasons)
+    )
+    for site, points in zip(answer.sites, by_site, strict=True):
+        origin = points["reference"].mean(axis=0)
+        for point in site.points:
+            assert point.relative_mm is not None
+            assert point.relative_covariance_mm2 is not None
+            assert np.linalg.norm(point.relative_mm - (points[point.catheter][point.electrode - 1] - origin)) < 1.0
+            assert grade_of(point.relative_covariance_mm2, point.reasons) in (Grade.A, Grade.B)
+
+
+@pytest.mark.parametrize("seed", [61, 62, 63])
+def test_a_site_with_wrong_electrodes_leaves_the_uncertainty_of_the_others(seed: int) -> None:
+    by_site = electrodes(seed, sites=8)
+    sites = list(matched_sites(by_site, np.random.default_rng(seed)))
+    before = located(tuple(sites))
+    view = sites[2].diastole.b
+    chains = [
+        replace(chain, pixels_uv=chain.pixels_uv + np.array([[0, 20], [0, 0], [0, 0], [0, -20]]))
+        for chain in view.chains
+    ]
+    wrong = replace(view, chains=tuple(chains))
+    sites[2] = replace(sites[2], diastole=replace(sites[2].diastole, b=wrong))
+    answer = located(tuple(sites))
+    assert Reason.GEOMETRY_DOUBTFUL in answer.sites[2].reasons
+    for index in (0, 1, 3, 4, 5, 6, 7):
+        assert Reason.GEOMETRY_DOUBTFUL not in answer.sites[index].reasons
+        ratios = [
+            np.trace(point.covariance_mm2) / np.trace(known.covariance_mm2)
+            for point, known in zip(answer.sites[index].points, before.sites[index].points, strict=True)
+        ]
+        assert max(ratios) < 1.3
 
 
 def test_a_difference_that_no_gantry_explains_is_not_corrected_but_doubted() -> None:
@@ -177,6 +252,33 @@ def test_beats_that_displace_catheters_are_no_doubt_where_pixels_are_known_unequ
     answer = located(tuple(sites))
     assert len(answer.sites) == len(sites)
     assert not any(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in answer.sites)
+
+
+@pytest.mark.parametrize("seed", [71, 72, 73])
+def test_pixels_known_well_do_not_hide_how_far_whole_catheters_move(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    follows = np.linspace(1.0, 0.5, 4)[:, None]
+    by_site, sites = electrodes(seed), []
+    for site in matched_sites(by_site, rng, noise_px=0.05):
+        views = []
+        for camera, view in zip(CAMERAS, (site.diastole.a, site.diastole.b), strict=True):
+            chains = [
+                replace(chain, pixels_uv=chain.pixels_uv + follows * rng.normal(0, 0.25 * camera.px_per_mm, 2))
+                for chain in view.chains
+            ]
+            views.append(replace(view, chains=tuple(chains)))
+        sites.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+    assert located(tuple(sites)).sites[0].variation.beats > 0.75
+
+
+def test_an_electrodes_own_bend_is_no_beat() -> None:
+    """It does not grow with the beats, else precise pixels would show calm beats where whole catheters move."""
+    (site,) = matched_sites(electrodes(74, sites=1), np.random.default_rng(74))
+    params = UncertaintyParams(beat_sd_mm=0.0)
+    equations = site_equations(CAMERAS, pixels_in_both_views(site.diastole), DEFAULT_CATALOGUE, (), params)
+    assert (equations.beats == 0).all()
+    assert np.linalg.eigvalsh(equations.fixed - np.diag(equations.pixel_variance)).min() > 0
+    assert params.scaled(1.0, 2.0).bend_sd_mm == params.bend_sd_mm
 
 
 def test_a_study_whose_catheters_are_all_described_wrongly_is_refused_with_the_cause() -> None:
@@ -245,6 +347,69 @@ def test_a_heart_displaced_in_both_views_is_no_moved_table() -> None:
     by_site[3] = {name: at + np.array([12.0, -12.0, 5.0]) for name, at in by_site[3].items()}
     answer = located(matched_sites(by_site, np.random.default_rng(9)))
     assert not any(Reason.TABLE_MOVED in site.reasons for site in answer.sites)
+
+
+@pytest.mark.parametrize(("error_mm", "contradicted"), [(0.0, False), (0.3, False), (0.5, True)])
+def test_a_tip_off_the_catalogue_by_more_than_its_error_is_a_contradiction(error_mm: float, contradicted: bool) -> None:
+    by_site = electrodes(14, sites=8)
+    for points in by_site:
+        at = points["mapping"] = points["mapping"].copy()
+        at[0] += error_mm * (at[0] - at[1]) / np.linalg.norm(at[0] - at[1])
+    answer = located(matched_sites(by_site, np.random.default_rng(14)))
+    for site in answer.sites:
+        for point in site.points:
+            expected = contradicted and point.catheter == "mapping"
+            assert (Reason.CATALOGUE_CONTRADICTED in point.reasons) == expected
+            assert Reason.SPACING_MISMATCH not in point.reasons
+    assert any("contradict the description" in note for note in answer.notes) == contradicted
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23])
+def test_gaps_wrong_alike_at_all_sites_do_not_correct_a_right_header(seed: int) -> None:
+    """Every catheter is bent: its last chord is 0.3 mm shorter than the catalogue's arc."""
+    by_site = electrodes(seed)
+    for points in by_site:
+        for name, at in points.items():
+            points[name] = at = at.copy()
+            at[3] += 0.3 * (at[2] - at[3]) / np.linalg.norm(at[2] - at[3])
+    answer = located(matched_sites(by_site, np.random.default_rng(seed)))
+    assert answer.calibration is not None
+    assert not answer.calibration.applied
+
+
+def test_a_gantry_that_no_electrode_shows_is_in_the_ellipsoids() -> None:
+    """A header wrong by 1 degree and 2 mm in both views: the common displacement stays, and the ellipsoids contain it."""
+    inside = []
+    for seed in range(31, 43):
+        by_site = electrodes(seed)
+        rng = np.random.default_rng(seed)
+        turns = [turn(1.0, 2.0, 10 * seed + view) for view in (0, 1)]
+        sites = []
+        for index, points in enumerate(by_site):
+            a, b = (
+                observation(Camera(camera.matrix @ of_view, 512, 512), points, rng)
+                for camera, of_view in zip(CAMERAS, turns, strict=True)
+            )
+            pair = PhasePair(0.8, a, b)
+            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+        answer = located(tuple(sites))
+        found, true = errors(answer, by_site)
+        covariances = np.array([point.covariance_mm2 for site in answer.sites for point in site.points])
+        apart = found - true
+        distance = np.einsum("ni,ni->n", apart, np.linalg.solve(covariances, apart[..., None])[..., 0])
+        inside.append((distance <= CHI2_95_3D).mean())
+        assert rms(aligned(found, true) - true) <= 0.3
+    # With the stated gantry alone, 0 to 43 % were inside.
+    assert np.mean(inside) > 0.8
+
+
+def test_a_table_displaced_between_all_runs_of_the_two_views_is_suspected() -> None:
+    by_site = electrodes(16, sites=8)
+    shifts = dict.fromkeys(range(8), np.array([8.0, 0.0, 25.0]))
+    answer = located(matched_sites(by_site, np.random.default_rng(16), shifts=shifts))
+    for site in answer.sites:
+        assert {Reason.TABLE_MOVED, Reason.GEOMETRY_DOUBTFUL} & set(site.reasons)
+        assert all(grade_of(point.covariance_mm2, point.reasons) is Grade.C for point in site.points)
 
 
 def without(site: MatchedSite, catheter: str, hidden: tuple[int, ...]) -> MatchedSite:

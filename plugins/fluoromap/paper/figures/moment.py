@@ -26,6 +26,7 @@ from fluoromap.contracts import (
     Track,
 )
 from fluoromap.geometry import Camera
+from fluoromap.monoplane.track_samples import in_study
 from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy
 from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.phantom.simulated_study import ACTIVATION_NOISE_MS
@@ -133,13 +134,15 @@ def _site_at(
         catalogue=catalogue,
         frame_times_ms=run.frame_times_ms,
         observations=(matched.track_a, matched.track_b)[view],
-        a_priori=located.points,
+        a_priori=located.a_priori,
         a_priori_frame=(located.frame_a, located.frame_b)[view],
         cycle=located.cycle,
         others=() if located.cycle is not None else others,
     )
     solver = build_monoplane(DEFAULTS["monoplane"], {})
-    track = solver.track(monoplane_view, Silent())
+    track = in_study(
+        solver.track(monoplane_view, Silent()), monoplane_view.camera, catalogue.reference, located.variation
+    )
     frame = int(np.argmin(np.abs((run.truth.phases - phase + 0.5) % 1.0 - 0.5)))
     truth = {name: points[frame] for name, points in run.truth.points_mm.items()}
     single_view = _electrodes_mm(catalogue, track, frame)

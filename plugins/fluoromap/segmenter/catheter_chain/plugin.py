@@ -1,4 +1,4 @@
-"""Segmenter ``catheter-chain``, the default: blobs linked to chains that fit the catalogue."""
+"""Segmenter ``catheter-chain``: blobs linked to chains that fit the catalogue."""
 
 from __future__ import annotations
 

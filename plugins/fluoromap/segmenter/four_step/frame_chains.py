@@ -95,7 +95,7 @@ class FourStepDetector:
         smallest, largest = 0.6 * self.px_per_mm**2, 24.0 * self.px_per_mm**2
         return find_blobs(image, inside, self.field.candidates, smallest, largest), diffused, k
 
-    def find_chains(self, x: Image, frame: int) -> FrameChains:
+    def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image, or the reason why there are none."""
         if min(x.shape) < 16:
             return FrameChains(frame, (), Reason.MANUAL_NEEDED)

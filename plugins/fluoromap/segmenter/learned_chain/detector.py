@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
-
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Chain, PixelFacts
+from fluoromap.contracts import PixelFacts
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.learned_chain.alternating import LONGEST_MS, AlternatingDetector, LatestNetwork
+from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, LatestNetwork
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import Trained
@@ -35,16 +33,8 @@ _IN_A_RUN = Acceptance(
 _ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
-_CONFIRMING_SCORE, _LEAST_CONFIRMING_SCORE = 0.5, 0.25
-_NEXT_FRAME_CELLS = 3
-"""A catheter moves so far in a frame of a fast run, 2 mm."""
 _COARSE_BITS = 8
 _COARSE_NOISE = 0.004
-
-
-def confirms(chain: Chain) -> bool:
-    """Return whether a chain that was found again clearly shows its catheter."""
-    return bool(np.median(chain.scores) >= _CONFIRMING_SCORE and chain.scores.min() >= _LEAST_CONFIRMING_SCORE)
 
 
 def electrode_chains(
@@ -55,7 +45,7 @@ def electrode_chains(
     trained: Trained,
     alone: bool,
     frame_ms: float = math.inf,
-) -> ChainDetector | AlternatingDetector:
+) -> FrameSearch:
     """Return the detector of one run.
 
     It finds electrodes by network and blobs, and the chains of them. ``alone`` : no other frame confirms a chain. ``frame_ms`` :
@@ -68,8 +58,9 @@ def electrode_chains(
 
     def ask(x: Image) -> JointEvidence:
         blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
-        reach = _NEXT_FRAME_CELLS if network.borrowed else 1
-        return JointEvidence(network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, reach)
+        return JointEvidence(
+            network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, network.reach_cells
+        )
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else _IN_A_RUN)
-    return AlternatingDetector(detector, network) if frame_ms <= LONGEST_MS else detector
+    return FrameSearch(detector, network, len(catalogue.catheters), frame_ms <= SHARED_MS)

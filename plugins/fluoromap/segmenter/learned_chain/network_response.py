@@ -49,8 +49,15 @@ class NetworkResponse:
     def of_image(cls, x: Image, trained: Trained, px_per_mm: float) -> NetworkResponse:
         """Ask the network about a log image, reduced to the network's scale."""
         scale = network_scale(px_per_mm)
-        picture = normalise(resampled(x, scale))
-        answers = answer(trained, picture)
+        return cls.of_reduced(resampled(x, scale), trained, scale)
+
+    @classmethod
+    def of_reduced(cls, small: Image, trained: Trained, scale: float) -> NetworkResponse:
+        """Ask the network about a reduced log image.
+
+        It has ``scale`` times the size of the frame.
+        """
+        answers = answer(trained, normalise(small))
         odds = trained.odds_gain * answers[..., _HEAT] + trained.odds_offset
         probability = 1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))
         cell_px, first_px = CELL_PX / scale, 0.5 / scale - 0.5

@@ -13,15 +13,14 @@ from pydantic import BaseModel, Field
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.learned_chain.detector import confirms, electrode_chains
+from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
+from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
 
-_LEAST_DETECTED = 0.7
-"""Beads of contrast medium are found again in every frame, but are a catheter for the network in some only."""
 _DIM_BELOW = 0.02
 """Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""
 
@@ -77,5 +76,6 @@ class LearnedChain:
         def detector_of(field: FieldMask) -> Detector:
             return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
 
-        found = segment_run(run, catalogue, marks, context, detector_of, True, _LEAST_DETECTED, confirms)
+        judge = None if alone else TrackEvidence(trained, run.px_per_mm, len(run.frames))
+        found = segment_run(run, catalogue, marks, context, detector_of, True, judge)
         return visible_part(found, _DIM_BELOW)

@@ -12,17 +12,23 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.requests import HTTPConnection
+from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from fluoromap_service import auth
 from fluoromap_service.api.http.problems import DATABASE_AWAY, answer, database_away
+from fluoromap_service.api.http.session import session_token
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 
-OPEN_PATHS = frozenset({"/v1/health", "/v1/ready"})
+SIGN_IN = "/sign-in"
+SESSION = "/session"
+OPEN_PATHS = frozenset(
+    {"/v1/health", "/v1/ready", SIGN_IN, "/assets/style.css", "/assets/icon.svg", "/assets/sign-in.js"}
+)
 """The paths that answer without a token."""
 
 log = structlog.get_logger(__name__)
@@ -47,8 +53,11 @@ class Doorkeeper:
         connection = HTTPConnection(scope)
         try:
             caller = await to_thread.run_sync(_identify, connection, self._sign_ins, limiter=_threads())
-            _demand(caller, Scope.READ if scope.get("method") in _READING else Scope.WRITE)
+            _demand(caller, Scope.READ if _only_reads(scope) else Scope.WRITE)
         except Problem as problem:
+            if problem.status == 401 and _opens_page(connection):
+                await RedirectResponse(SIGN_IN, 303)(scope, receive, send)
+                return
             await answer(problem)(scope, receive, send)
             return
         except DATABASE_AWAY as error:
@@ -58,13 +67,30 @@ class Doorkeeper:
         await self._app(scope, receive, send)
 
 
-def _identify(connection: HTTPConnection, sign_ins: SignInLimit) -> Caller:
+def _only_reads(scope: AsgiScope) -> bool:
+    # A session begins and ends with any token.
+    return scope.get("method") in _READING or scope["path"] == SESSION
+
+
+def _opens_page(connection: HTTPConnection) -> bool:
+    headers = connection.headers
+    is_page = not connection.scope["path"].startswith("/v1/") and "text/html" in headers.get("accept", "")
+    return is_page and connection.scope.get("method") == "GET" and "authorization" not in headers
+
+
+def bearer_token(connection: HTTPConnection) -> str | None:
+    """Return the token of the header ``Authorization``; None without one."""
     scheme, _, credentials = connection.headers.get("authorization", "").partition(" ")
-    if scheme.lower() == "bearer" and credentials.strip():
-        token = hashlib.sha256(credentials.strip().encode()).hexdigest()
+    return (credentials.strip() or None) if scheme.lower() == "bearer" else None
+
+
+def _identify(connection: HTTPConnection, sign_ins: SignInLimit) -> Caller:
+    credentials = bearer_token(connection) or session_token(connection)
+    if credentials is not None:
+        token = hashlib.sha256(credentials.encode()).hexdigest()
         address = connection.client.host if connection.client else ""
         sign_ins.check(address, token)
-        caller = auth.verify(credentials.strip())
+        caller = auth.verify(credentials)
         if caller is not None:
             sign_ins.succeeded(address, token)
             return caller

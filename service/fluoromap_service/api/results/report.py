@@ -18,6 +18,12 @@ from fluoromap_service.store.renderings import kept_rendering
 
 router = APIRouter(tags=["results"])
 
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src data:; "
+    "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
+)
+"""Content-Security-Policy of the report, which contains its scripts and pictures and loads nothing."""
+
 
 @router.get(
     "/v1/jobs/{job_id}/report.html",
@@ -41,4 +47,6 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
         guessed = sites_by_row_order(session, job)
         depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None, guessed)
     page = kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
-    return file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)
+    response = file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)
+    response.headers["Content-Security-Policy"] = POLICY
+    return response

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import functools
-import gzip
 import hashlib
 import io
 import json
@@ -18,14 +17,15 @@ from PIL import Image
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import ChamberMap, Triangulation
-from fluoromap.drawing.colours import vertex_colours
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
 from fluoromap.drawing.png import encode_png
 from fluoromap.registry import Kind
 from fluoromap_service.api.jobs.job_answers import read_job
+from fluoromap_service.api.results.maps import activation_map
 from fluoromap_service.api.results.overlays import picture_of
 from fluoromap_service.api.results.points import points_of
+from fluoromap_service.api.results.report_modules import modules_sha256, packed_modules
 from fluoromap_service.api.results.report_tables import (
     budget_rows,
     calibration_line,
@@ -39,7 +39,7 @@ from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of, snapshot_of
 from fluoromap_service.results.fusion import fusion_of, located_views
-from fluoromap_service.results.maps import map_of
+from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
@@ -47,7 +47,6 @@ from fluoromap_service.store.models import Study
 from fluoromap_service.study.snapshot import SiteSnapshot
 
 WEB = Path(__file__).parents[2] / "web"
-SCRIPTS = {"core": "three.core.js", "three": "three.module.js", "controls": "OrbitControls.js"}
 BINDINGS = {
     "explicit": "set by hand",
     "csv": "named in the table of activation times",
@@ -63,15 +62,16 @@ JPEG_QUALITY = 88
 def report_page(job_id: str) -> str:
     """Return the page of an ended job, with all results that the job has."""
     values = _values(job_id)
-    chamber = values.pop("map")
-    values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None}
+    chamber, scene = values.pop("map"), values.pop("scene_map")
+    values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None, "title": None}
     if chamber is not None:
         values |= {
             "chamber": _figures(chamber),
             "map_png": _inline(encode_png(draw_map_views(chamber)), "image/png"),
             "overlays": _overlays(job_id),
-            "scene": _json(_scene(chamber)),
-            "scripts": _json({name: _packed(file) for name, file in SCRIPTS.items()}),
+            "scene": _json(scene),
+            "scripts": _json(packed_modules()),
+            "title": _json(f"{values['label']}: for research"),
         }
     return _environment().get_template("report.html.j2").render(values)
 
@@ -80,10 +80,10 @@ def _values(job_id: str) -> dict[str, Any]:
     with reading() as session:
         job = job_of(session, job_id)
         snapshot = snapshot_of(job)
-        chamber, no_map = None, ""
+        chamber, scene, no_map = None, None, ""
         try:
             finished = map_of(session, job)
-            chamber = finished.chamber
+            chamber, scene = finished.chamber, _scene(finished)
         except Problem as problem:
             no_map = str(problem.detail)
         triangulated = stage_of(session, job_id, "triangulate")
@@ -101,6 +101,7 @@ def _values(job_id: str) -> dict[str, Any]:
             "version": version("fluoromap"),
             "reference": snapshot.reference,
             "map": chamber,
+            "scene_map": scene,
             "no_map": no_map,
             "tips": rows,
             "located": sum(row["grade"] != "rejected" for row in rows),
@@ -157,13 +158,18 @@ def _overlays(job_id: str) -> list[dict[str, Any]]:
     return pictures
 
 
-def _scene(chamber: ChamberMap) -> dict[str, Any]:
-    return {
-        "vertices": chamber.vertices_mm.round(2).tolist(),
-        "faces": chamber.faces.tolist(),
-        "colours": vertex_colours(chamber).tolist(),
-        "sites": [site.position_mm.round(2).tolist() for site in chamber.sites],
-    }
+def _scene(finished: FinishedMap) -> dict[str, Any]:
+    """Return the map for the 3D view, its coordinates with two decimals."""
+    scene = activation_map(finished, Origin.REFERENCE).model_dump(mode="json")
+    for name in ("vertices_mm", "lat_ms", "lat_sd_ms"):
+        scene[name] = _rounded(scene[name])
+    return scene
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_rounded(item) for item in value]
+    return None if value is None else round(value, 2)
 
 
 def _jpeg(path: Path) -> str:
@@ -185,11 +191,6 @@ def _json(value: Any) -> Markup:
 
 
 @functools.cache
-def _packed(name: str) -> str:
-    return base64.b64encode(gzip.compress((WEB / "three" / name).read_bytes(), mtime=0)).decode()
-
-
-@functools.cache
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(WEB), autoescape=True, undefined=StrictUndefined, trim_blocks=True
@@ -200,8 +201,8 @@ def _environment() -> Environment:
 
 @functools.cache
 def template_sha256() -> str:
-    """Return the hash of the page's template."""
-    return hashlib.sha256((WEB / "report.html.j2").read_bytes()).hexdigest()
+    """Return the hash of the page's template and modules."""
+    return hashlib.sha256((WEB / "report.html.j2").read_bytes() + modules_sha256().encode()).hexdigest()
 
 
 def _number(value: float | None, digits: int) -> str:

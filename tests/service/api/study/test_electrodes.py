@@ -78,6 +78,23 @@ def test_by_hand_comes_before_automatic(service: TestClient, frame: str) -> None
     assert service.get(frame).json() == automatic
 
 
+def test_all_frames_of_a_run_in_one_answer(service: TestClient, frame: str) -> None:
+    run = frame.split("/frames/")[0]
+    assert service.get(f"{run}/electrodes").json() == []
+    _segmented(frame, 5.0)
+    pacing = {**TIP, "catheter": "pacing"}
+    service.put(frame.replace("/2/", "/3/"), json=[TIP])
+    service.put(frame, json=[pacing])
+    first, second = service.get(f"{run}/electrodes").json()
+    assert (first["frame"], second["frame"]) == (2, 3)
+    # The catheter that nobody marked is still shown as detected.
+    assert [(e["catheter"], e["source"]) for e in first["electrodes"]] == [
+        ("mapping", "automatic"), ("mapping", "automatic"), ("pacing", "manual"),
+    ]  # fmt: skip
+    assert second["electrodes"] == [{**TIP, "source": "manual"}]
+    assert service.get(f"{run}1/electrodes").status_code == 404
+
+
 def test_versions_keep_author_and_time(service: TestClient, frame: str) -> None:
     headers = {"Authorization": f"Bearer {auth.create_token('dr-a', ['write'])}"}
     service.put(frame, json=[TIP], headers=headers)

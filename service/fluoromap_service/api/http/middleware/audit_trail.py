@@ -18,8 +18,21 @@ from fluoromap_service.store.engine import writing
 
 FLUSH_SECONDS = 0.5
 
-NOT_RECORDED = frozenset({"/v1/health", "/v1/ready", "/v1/plugins", "/v1/openapi.json", "/metrics", NO_ROUTE})
-"""Routes that touch no study."""
+NOT_RECORDED = frozenset(
+    {
+        "/v1/health",
+        "/v1/ready",
+        "/v1/plugins",
+        "/v1/openapi.json",
+        "/metrics",
+        NO_ROUTE,
+        "/",
+        "/sign-in",
+        "/studies/{study_id}",
+        "/assets/{name:path}",
+    }
+)
+"""Routes that touch no study. The page of a study holds none of its data; it asks for them by other routes."""
 
 
 class Acts:

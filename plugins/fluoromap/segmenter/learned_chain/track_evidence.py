@@ -1,0 +1,119 @@
+"""Whether a run shows a catheter along a track: the network judges pictures that are averaged along it.
+
+Quantum noise makes the network doubt a catheter in single frames. The average of frames that are moved onto each other has little
+noise: a catheter becomes clear in it, while beads of contrast medium stay as improbable as they are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import affine_transform
+
+from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
+from fluoromap.segmenter.learned_chain.resampling import resampled
+from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.proposals import log_odds
+
+_AVERAGED = 8
+_PICTURES = 2
+_MARGIN_PX = 40.0
+_SECTION = 5
+_KEPT_FRAMES = _PICTURES * _AVERAGED
+_LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.2, -2.0
+"""Log-odds of the middle electrode in each mean; less where half of the single frames show the catheter; of the worst electrode."""
+_LOW_QUANTILE = 0.1
+_CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
+
+
+@dataclass(slots=True, eq=False)
+class TrackEvidence:
+    """Judge of the tracks of one run.
+
+    frames : number of the run's frames.
+    """
+
+    trained: Trained
+    px_per_mm: float
+    frames: int
+    _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
+
+    def __call__(self, chains: Mapping[int, Chain], log_image: Callable[[int], Image]) -> bool:
+        """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
+        usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
+        frames = sorted(frame for frame, chain in chains.items() if chain.electrodes == usual)
+        paths = np.array([chains[frame].pixels_uv for frame in frames])
+        odds = np.array(
+            [
+                np.concatenate(
+                    [self.log_odds_along(frames[group], part, log_image) for part in _sections(paths[group])]
+                )
+                for group in _groups(len(frames))
+            ]
+        )
+        clear = sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames
+        low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
+        least = _LEAST_WHERE_CLEAR if clear else _LEAST_MEDIAN
+        return bool((np.median(odds, axis=1) >= least).all() and low >= _LEAST_LOW)
+
+    def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
+        """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
+        scale = network_scale(self.px_per_mm)
+        middle = path_uv[len(frames) // 2]
+        first = np.floor(middle.min(axis=0) - _MARGIN_PX / scale)
+        columns, rows = np.ceil((middle.max(axis=0) - first) * scale + _MARGIN_PX).astype(np.int64)
+        total = np.zeros((rows, columns), np.float32)
+        for frame, points in zip(frames, path_uv, strict=True):
+            turn, shift = _similarity(middle, points)
+            offset = (turn @ first + shift + 0.5) * scale - 0.5
+            small = self._small(frame, log_image, scale)
+            total += affine_transform(small, turn[::-1, ::-1], offset[::-1], total.shape, order=1, mode="nearest")
+        total /= len(frames)
+        seen = NetworkResponse.of_reduced(total, self.trained, scale)
+        return log_odds(seen.probability_at(middle - first))
+
+    def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
+        """Return a frame at the network's scale; the latest are kept for the other tracks."""
+        small = self._reduced.get(frame)
+        if small is None:
+            small = self._reduced[frame] = resampled(log_image(frame), scale)
+            if len(self._reduced) > _KEPT_FRAMES:
+                self._reduced.popitem(last=False)
+        return small
+
+
+def _is_clear(chain: Chain) -> bool:
+    """Return whether network and contrast show a chain in its frame."""
+    return bool(np.median(chain.scores) >= _CLEAR_SCORE and chain.scores.min() >= _LEAST_CLEAR_SCORE)
+
+
+def _groups(frames: int) -> list[slice]:
+    """Return the first and the last eight of a track's frames."""
+    size = min(_AVERAGED, frames)
+    count = min(_PICTURES, -(-frames // size))
+    return [slice(start, start + size) for start in np.linspace(0, frames - size, count).astype(np.int64).tolist()]
+
+
+def _sections(path_uv: Array) -> list[Array]:
+    """Split a path into sections of about five electrodes.
+
+    A path has the shape (frames, electrodes, 2). Long catheters bend as they move.
+    """
+    return np.array_split(path_uv, -(-path_uv.shape[1] // _SECTION), axis=1)
+
+
+def _similarity(points: Array, moved: Array) -> tuple[Array, Array]:
+    """Return the matrix and the shift that move points best.
+
+    The matrix (2, 2) turns and scales. Both sets of points have the shape (n, 2).
+    """
+    middle, to = points.mean(axis=0), moved.mean(axis=0)
+    flat, other = ((side @ np.array([1.0, 1.0j])) for side in (points - middle, moved - to))
+    factor = np.vdot(flat, other) / max(float(np.vdot(flat, flat).real), 1e-9)
+    turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    return turn, to - turn @ middle

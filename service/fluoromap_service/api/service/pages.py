@@ -1,0 +1,113 @@
+"""The routes of the pages for people, their assets, and the browser's session.
+
+The pages use the public API as any client does.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from fastapi import APIRouter, Request, Response
+
+import fluoromap_service
+from fluoromap_service.api.http.etags import is_known
+from fluoromap_service.api.http.security import SESSION, SIGN_IN, Reader, bearer_token
+from fluoromap_service.api.http.session import begin_session, end_session
+from fluoromap_service.problem import not_found
+
+router = APIRouter(include_in_schema=False)
+
+ASSETS = Path(fluoromap_service.__file__).resolve().parent / "web" / "assets"
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+"""Content-Security-Policy of the pages: they load from this service only and contain no script."""
+
+MEDIA_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Asset:
+    """One file of the pages."""
+
+    content: bytes
+    media_type: str
+    etag: str
+
+
+def asset(name: str) -> Asset | None:
+    """Return a file of the pages; None when there is no such file."""
+    path = (ASSETS / name).resolve()
+    if not (path.is_relative_to(ASSETS) and path.suffix in MEDIA_TYPES and path.is_file()):
+        return None
+    return _read(path, path.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=256)
+def _read(path: Path, changed_ns: int) -> Asset:
+    content = path.read_bytes()
+    return Asset(content, MEDIA_TYPES[path.suffix], f'"{hashlib.sha256(content).hexdigest()[:32]}"')
+
+
+def _send(request: Request, name: str) -> Response:
+    found = asset(name)
+    if found is None:
+        raise not_found("file")
+    headers = {"ETag": found.etag, "Cache-Control": "no-cache"}
+    if name.endswith(".html"):
+        headers["Content-Security-Policy"] = PAGE_POLICY
+    if is_known(request, found.etag):
+        # A browser replaces the headers of its copy by those of this answer (RFC 9111 section 3.2).
+        return Response(status_code=304, headers=headers)
+    return Response(found.content, media_type=found.media_type, headers=headers)
+
+
+@router.get("/")
+def get_studies_page(request: Request, caller: Reader) -> Response:
+    """Return the page of all studies."""
+    return _send(request, "studies.html")
+
+
+@router.get("/studies/{study_id}")
+def get_study_page(study_id: str, request: Request, caller: Reader) -> Response:
+    """Return the page of one study."""
+    return _send(request, "study.html")
+
+
+@router.get(SIGN_IN)
+def get_sign_in_page(request: Request) -> Response:
+    """Return the page that asks for a token."""
+    return _send(request, "sign-in.html")
+
+
+@router.get("/assets/{name:path}")
+def get_asset(name: str, request: Request) -> Response:
+    """Return a file of the pages."""
+    return _send(request, name)
+
+
+@router.post(SESSION, status_code=204, response_class=Response)
+def post_session(request: Request, caller: Reader) -> Response:
+    """Begin a session of this browser with the token of the header."""
+    response = Response(status_code=204)
+    token = bearer_token(request)
+    if token is not None:
+        begin_session(response, token, secure=request.url.scheme == "https")
+    return response
+
+
+@router.delete(SESSION, status_code=204, response_class=Response)
+def delete_session(caller: Reader) -> Response:
+    """End the session of this browser."""
+    response = Response(status_code=204)
+    end_session(response)
+    return response

@@ -1,0 +1,76 @@
+/** The map with its buttons: directions, colours, uncertainty, and the time that runs. */
+import { button, element, field, select } from "../shared/elements.js";
+import { number } from "../shared/words.js";
+import { timesOf } from "./colour-scale.js";
+import { VIEWS } from "./orbit.js";
+import { MapScene } from "./scene.js";
+
+/**
+ * @param {import("../shared/types.js").ChamberMap} map
+ * @param {string} title What is on the map, for the picture itself: study and kind of data.
+ */
+export function mapPanel(map, title) {
+  const place = element("div", { class: "scene" });
+  const tools = element("div", { class: "fields" });
+  const panel = element("div", {}, place, tools, facts(map));
+  panel.scene = null;
+  // A canvas gets its size from the page: make the scene when it is there.
+  requestAnimationFrame(() => {
+    let scene;
+    try {
+      scene = new MapScene(place, map);
+    } catch (error) {
+      place.append(element("p", { class: "notice problem" }, `This browser cannot show the map in 3D (${error instanceof Error ? error.message : error}). The pictures below show it.`));
+      return;
+    }
+    panel.scene = scene;
+    place.append(element("p", { class: "note" }, `${title}. Grey with stripes: no site is near.`));
+    tools.append(...toolsOf(scene, map));
+    panel.dispatchEvent(new Event("made"));
+  });
+  return panel;
+}
+
+/** @param {MapScene} scene @param {import("../shared/types.js").ChamberMap} map */
+function toolsOf(scene, map) {
+  const views = element("div", { class: "row", role: "group", "aria-label": "Direction" }, ...VIEWS.map(([name, title, azimuth, elevation]) => button(name, () => scene.orbit.look(azimuth, elevation), { title })));
+  const colours = select([["safe", "yellow early, violet late"], ["red-early", "red early, violet late"]], "safe", {
+    onchange: () => { scene.palette = /** @type {any} */ (colours.value); scene.recolour(); },
+  });
+  const uncertainty = element("input", { type: "checkbox", onchange: () => { scene.uncertainty = uncertainty.checked; scene.recolour(); } });
+  const times = timesOf(map, "safe");
+  const shown = element("span", {}, "all times");
+  const slider = element("input", { type: "range", min: times.start, max: times.stop, value: times.stop, step: 1, "aria-label": "Activated until, ms" });
+  const show = () => {
+    const all = Number(slider.value) >= times.stop;
+    shown.textContent = all ? "all times" : `until ${number(Number(slider.value), 0)} ms`;
+    scene.showUntil(all ? null : Number(slider.value));
+  };
+  slider.addEventListener("input", show);
+  let running = 0;
+  const play = button("Run", () => {
+    cancelAnimationFrame(running);
+    const start = performance.now();
+    /** @param {number} now */
+    const step = (now) => {
+      slider.value = String(times.start + ((now - start) / 4000) * (times.stop - times.start));
+      show();
+      if (Number(slider.value) < times.stop) running = requestAnimationFrame(step);
+    };
+    running = requestAnimationFrame(step);
+  }, { title: "Let the activation run over the wall, slowed down" });
+  return [views, field("Colours", colours), element("label", { class: "row" }, uncertainty, "uncertainty instead of time"),
+    element("div", { class: "row", role: "group", "aria-label": "Activation" }, play, slider, shown)];
+}
+
+/** @param {import("../shared/types.js").ChamberMap} map */
+function facts(map) {
+  const earliest = map.earliest[0];
+  const words = [
+    `${map.sites.length} sites`, `total activation time ${number(map.total_activation_time_ms, 0)} ms`,
+    earliest && `earliest: ${earliest.site} with ${Math.round(100 * earliest.probability)} % probability`,
+    map.leave_one_out_rms_ms !== null && `leave-one-site-out error ${number(map.leave_one_out_rms_ms, 1)} ms`,
+    `volume ${number(map.volume_ml, 0)} ml`, `area ${number(map.area_cm2, 0)} cm²`, `${Math.round(100 * map.coverage)} % covered`,
+  ];
+  return element("p", {}, words.filter(Boolean).join(" · "));
+}

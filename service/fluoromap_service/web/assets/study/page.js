@@ -1,0 +1,71 @@
+/** The page of one study: four steps as tabs. */
+import { get, getAll } from "../shared/api.js";
+import { attempt, byId, element } from "../shared/elements.js";
+import { header } from "../shared/header.js";
+import { jobPanel } from "../jobs/panel.js";
+import { resultsPanel } from "../results/panel.js";
+import { runsPanel } from "./runs.js";
+import { tabs } from "./tabs.js";
+import { viewerPanel } from "../viewer/panel.js";
+
+/**
+ * The study as its panels share it. `changed` fires after each change of runs or sites, `job` when a job has ended, `compute`
+ * when a person asks for a new job, `chosen` when a person chooses another site.
+ */
+export class StudyState extends EventTarget {
+  /** @param {import("../shared/types.js").Study} study */
+  constructor(study) {
+    super();
+    this.study = study;
+    this.path = `/v1/studies/${study.id}`;
+    /** @type {import("../shared/types.js").Run[]} */
+    this.runs = [];
+    /** @type {import("../shared/types.js").Site[]} */
+    this.sites = [];
+    /** @type {import("../shared/types.js").Job[]} */
+    this.jobs = [];
+    /** @type {string|null} The site that a person looks at. */
+    this.chosen = null;
+  }
+
+  async load() {
+    const study = this.study.id;
+    [this.study, this.runs, this.sites, this.jobs] = await Promise.all([
+      get(this.path), getAll(`${this.path}/instances`), getAll(`${this.path}/sites`), get(`/v1/jobs?study=${study}&limit=20`).then((page) => page.items),
+    ]);
+    this.dispatchEvent(new Event("changed"));
+  }
+
+  /** The newest job with results. */
+  get finished() {
+    return this.jobs.find((job) => job.state === "succeeded") ?? null;
+  }
+
+  /** @param {string|null} site */
+  choose(site) {
+    if (site === this.chosen) return;
+    this.chosen = site;
+    this.dispatchEvent(new Event("chosen"));
+  }
+}
+
+await attempt(async () => {
+  const study = await get(`/v1/studies/${location.pathname.split("/")[2]}`);
+  const state = new StudyState(study);
+  byId("top").append(header(element("span", { "aria-current": "page" }, study.label)));
+  byId("title").textContent = study.label;
+  document.title = `${study.label} – fluoromap`;
+  // After a correction there is nothing to choose: the third step starts at once.
+  const compute = () => {
+    show("compute");
+    state.dispatchEvent(new Event("compute"));
+  };
+  const show = tabs(byId("content"), [
+    ["runs", "1 Runs and times", () => runsPanel(state, () => show("electrodes"), () => show("compute"))],
+    ["electrodes", "2 Look and correct", () => viewerPanel(state, compute)],
+    ["compute", "3 Compute", () => jobPanel(state, () => show("map"))],
+    ["map", "4 Map and results", () => resultsPanel(state, () => show("electrodes"))],
+  ]);
+  await state.load();
+});
+document.body.dataset.ready = "yes";

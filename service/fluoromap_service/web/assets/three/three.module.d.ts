@@ -1,0 +1,2 @@
+// The types of the vendored library; only the check of types reads this file.
+export * from "three";

@@ -1,0 +1,99 @@
+/** Paints one frame with its contrast, its electrodes and an epipolar line. */
+import { catheterColour } from "./catheter-colours.js";
+
+/** @typedef {import("../shared/types.js").Electrode} Electrode */
+
+export class FramePainter {
+  /** @param {import("../shared/types.js").Run} run */
+  constructor(run) {
+    this.run = run;
+    this.picture = new OffscreenCanvas(run.columns, run.rows);
+    this.context = /** @type {OffscreenCanvasRenderingContext2D} */ (this.picture.getContext("2d"));
+    this.image = this.context.createImageData(run.columns, run.rows);
+    this.words = new Uint32Array(this.image.data.buffer);
+    this.greys = new Uint32Array(256);
+    this.setContrast(128, 256);
+  }
+
+  /** @param {number} centre @param {number} width Both in displayed grey levels, 0 to 255. */
+  setContrast(centre, width) {
+    this.centre = centre;
+    this.width = width;
+    for (let level = 0; level < 256; level += 1) {
+      const grey = Math.max(0, Math.min(255, Math.round(((level - centre) / width + 0.5) * 255)));
+      this.greys[level] = 0xff000000 | (grey << 16) | (grey << 8) | grey;
+    }
+  }
+
+  /** @param {Uint8Array} pixels */
+  setPixels(pixels) {
+    for (let k = 0; k < pixels.length; k += 1) this.words[k] = this.greys[/** @type {number} */ (pixels[k])] ?? 0;
+    this.context.putImageData(this.image, 0, 0);
+  }
+
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {import("./placement.js").Placement} placement
+   * @param {import("../shared/types.js").Study} study
+   * @param {Electrode[]} electrodes
+   * @param {{chosen: string|null, line: {start: number[], end: number[], colour: string}|null}} marks `chosen`: key of an electrode.
+   */
+  paint(canvas, placement, study, electrodes, marks) {
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    context.fillStyle = "#000";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    const scale = placement.scale(canvas, this.run);
+    const origin = placement.origin(canvas, this.run);
+    context.imageSmoothingEnabled = scale < 4;
+    context.drawImage(this.picture, origin.x, origin.y, scale * this.run.columns, scale * this.run.rows);
+    const unit = window.devicePixelRatio || 1;
+    if (marks.line) this.#line(context, canvas, placement, marks.line, unit);
+    for (const electrode of electrodes) {
+      const { x, y } = placement.toCanvas(canvas, this.run, electrode.u_px, electrode.v_px);
+      this.#electrode(context, x, y, electrode, catheterColour(study, electrode.catheter), keyOf(electrode) === marks.chosen, unit);
+    }
+  }
+
+  /** @param {CanvasRenderingContext2D} context @param {number} x @param {number} y @param {Electrode} electrode @param {string} colour @param {boolean} chosen @param {number} unit */
+  #electrode(context, x, y, electrode, colour, chosen, unit) {
+    const radius = (electrode.electrode === 1 ? 6.5 : 5) * unit;
+    const outline = new Path2D();
+    // Set by hand: a square. Detected: a circle. So they differ without colour too.
+    if (electrode.source === "manual") outline.rect(x - radius, y - radius, 2 * radius, 2 * radius);
+    else outline.arc(x, y, radius, 0, 2 * Math.PI);
+    context.lineWidth = 4 * unit;
+    context.strokeStyle = "rgba(0,0,0,.75)";
+    context.stroke(outline);
+    context.lineWidth = (chosen ? 3 : 1.6) * unit;
+    context.strokeStyle = chosen ? "#fff" : colour;
+    context.stroke(outline);
+    if (electrode.electrode === 1 || chosen) {
+      context.font = `600 ${12 * unit}px system-ui`;
+      const text = chosen ? `${electrode.catheter ?? "unnamed"} ${electrode.electrode}` : (electrode.catheter ?? "?");
+      context.lineWidth = 3 * unit;
+      context.strokeStyle = "rgba(0,0,0,.8)";
+      context.strokeText(text, x + radius + 3 * unit, y - radius);
+      context.fillStyle = colour;
+      context.fillText(text, x + radius + 3 * unit, y - radius);
+    }
+    context.fillStyle = colour;
+    context.fillRect(x - unit, y - unit, 2 * unit, 2 * unit);
+  }
+
+  /** @param {CanvasRenderingContext2D} context @param {HTMLCanvasElement} canvas @param {any} placement @param {{start: number[], end: number[], colour: string}} line @param {number} unit */
+  #line(context, canvas, placement, line, unit) {
+    const start = placement.toCanvas(canvas, this.run, line.start[0], line.start[1]);
+    const end = placement.toCanvas(canvas, this.run, line.end[0], line.end[1]);
+    for (const [colour, width] of /** @type {[string, number][]} */ ([["rgba(0,0,0,.7)", 4], [line.colour, 1.5]])) {
+      context.strokeStyle = colour;
+      context.lineWidth = width * unit;
+      context.beginPath();
+      context.moveTo(start.x, start.y);
+      context.lineTo(end.x, end.y);
+      context.stroke();
+    }
+  }
+}
+
+/** @param {Electrode} electrode */
+export const keyOf = (electrode) => `${electrode.catheter ?? ""}/${electrode.electrode}`;

@@ -1,0 +1,100 @@
+/** The electrodes of one run: detected, or set by hand; each change is stored at once and can be undone. */
+import { get, send } from "../shared/api.js";
+
+/** @typedef {import("../shared/types.js").Electrode} Electrode */
+
+export class Marks extends EventTarget {
+  /** @param {string} studyPath @param {import("../shared/types.js").Run} run */
+  constructor(studyPath, run) {
+    super();
+    this.run = run;
+    this.path = `${studyPath}/instances/${run.sop_instance_uid}`;
+    /** @type {Map<number, Electrode[]>} Frame (from 1) -> electrodes. */
+    this.frames = new Map();
+    /** @type {{frame: number, before: Electrode[], after: Electrode[]}[]} */
+    this.done = [];
+    /** @type {{frame: number, before: Electrode[], after: Electrode[]}[]} */
+    this.undone = [];
+    this.stored = Promise.resolve();
+  }
+
+  async load() {
+    const frames = await get(`${this.path}/electrodes`);
+    this.frames = new Map(frames.map((/** @type {any} */ each) => [each.frame, each.electrodes]));
+    this.dispatchEvent(new Event("changed"));
+  }
+
+  /** @param {number} frame @returns {Electrode[]} */
+  of(frame) {
+    return this.frames.get(frame) ?? [];
+  }
+
+  /** @param {number} frame */
+  isManual(frame) {
+    return this.of(frame).some((each) => each.source === "manual");
+  }
+
+  /** Frames with electrodes set by hand. */
+  get manualFrames() {
+    return [...this.frames.keys()].filter((frame) => this.isManual(frame)).sort((a, b) => a - b);
+  }
+
+  /**
+   * Replace one catheter's electrodes in a frame. The other catheters stay as they are, so that a wrong name that nobody looked
+   * at is not taken for a person's word.
+   *
+   * @param {number} frame
+   * @param {string} catheter
+   * @param {Electrode[]} electrodes Of this catheter.
+   */
+  change(frame, catheter, electrodes) {
+    const others = this.of(frame).filter((each) => each.catheter !== catheter);
+    const after = [...others, ...electrodes.map((each) => ({ ...each, catheter, source: /** @type {const} */ ("manual") }))];
+    this.done.push({ frame, before: this.of(frame), after });
+    this.undone = [];
+    return this.#put(frame, after);
+  }
+
+  /** Return a frame to the automatic electrodes. @param {number} frame */
+  reset(frame) {
+    this.done.push({ frame, before: this.of(frame), after: [] });
+    this.undone = [];
+    return this.#put(frame, []);
+  }
+
+  undo() {
+    const step = this.done.pop();
+    if (!step) return Promise.resolve(null);
+    this.undone.push(step);
+    return this.#put(step.frame, step.before).then(() => step.frame);
+  }
+
+  redo() {
+    const step = this.undone.pop();
+    if (!step) return Promise.resolve(null);
+    this.done.push(step);
+    return this.#put(step.frame, step.after).then(() => step.frame);
+  }
+
+  /** @param {number} frame @param {Electrode[]} electrodes */
+  #put(frame, electrodes) {
+    this.frames.set(frame, electrodes);
+    this.dispatchEvent(new Event("changed"));
+    const manual = electrodes.filter((each) => each.source === "manual");
+    const address = `${this.path}/frames/${frame}/electrodes`;
+    // One request after the other: the last change has to be the last that the service stores.
+    this.stored = this.stored.catch(() => undefined).then(async () => {
+      try {
+        if (manual.length) await send("PUT", address, manual);
+        else this.frames.set(frame, await send("DELETE", address));
+      } catch (error) {
+        // The view must not show a change that the service refused.
+        await this.load();
+        throw error;
+      }
+      this.dispatchEvent(new Event("changed"));
+      this.dispatchEvent(new Event("stored"));
+    });
+    return this.stored;
+  }
+}

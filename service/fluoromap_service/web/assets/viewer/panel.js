@@ -1,0 +1,129 @@
+/** The second step: both views of a site side by side, and the tools that correct electrodes. */
+import { get } from "../shared/api.js";
+import { attempt, button, element, field, select } from "../shared/elements.js";
+import { catheterColour } from "./catheter-colours.js";
+import { control, KEYS } from "./controls.js";
+import { View } from "./view.js";
+
+/** @typedef {import("../study/page.js").StudyState} StudyState */
+
+/** @param {StudyState} state @param {() => void} compute */
+export function viewerPanel(state, compute) {
+  const pen = { catheter: state.study.mapping, tool: "edit", next: 1 };
+  /** @type {View[]} */
+  let views = [];
+  let active = 0;
+  const place = element("div", { class: "views" });
+  const hint = element("p", { class: "soft", "aria-live": "polite" });
+  const site = select([], "", { "aria-label": "Site" });
+  const catheter = select([], "", {});
+  const legend = element("p", { class: "row" });
+  const tools = [["edit", "Move electrodes"], ["mark", "Mark from the tip"], ["contrast", "Contrast"], ["pan", "Move picture"]].map(([name, label]) =>
+    button(label ?? "", () => setTool(name ?? ""), { "aria-pressed": String(name === pen.tool), "data-tool": name }));
+
+  const showHint = () => {
+    const count = state.study.catheters.find((each) => each.name === pen.catheter)?.electrodes ?? 0;
+    hint.textContent = {
+      edit: "Drag an electrode to move it. Circle: found by the service. Square: set by hand. A change counts from this frame on; the next computation tracks the run again from here.",
+      mark: `Click electrode ${pen.next} of ${count} of the catheter "${pen.catheter}"${pen.next === 1 ? ", which is its tip" : ""}. Esc ends.`,
+      contrast: "Drag left and right for the width, up and down for the centre of the grey levels.",
+      pan: "Drag to move the picture; the wheel zooms.",
+    }[pen.tool] ?? "";
+  };
+  /** @param {string} tool */
+  const setTool = (tool) => {
+    pen.tool = tool;
+    pen.next = 1;
+    for (const each of tools) each.setAttribute("aria-pressed", String(each.dataset["tool"] === tool));
+    showHint();
+  };
+  /** @param {"mark"|"end"|"marked"} act */
+  const onPen = (act) => {
+    const count = state.study.catheters.find((each) => each.name === pen.catheter)?.electrodes ?? 0;
+    if (act !== "marked") return setTool(act === "mark" ? "mark" : "edit");
+    pen.next += 1;
+    if (pen.next > count) setTool("edit");
+    showHint();
+  };
+
+  /** Draw the line of the chosen electrode in the other view. @param {View} from @param {View} other @param {any} electrode */
+  const showLine = async (from, other, electrode) => {
+    const wanted = from.chosen;
+    other.line = null;
+    other.draw();
+    if (!electrode) return;
+    try {
+      const query = `other=${other.run.sop_instance_uid}&u_px=${electrode.u_px.toFixed(2)}&v_px=${electrode.v_px.toFixed(2)}`;
+      const line = await get(`${state.path}/instances/${from.run.sop_instance_uid}/epipolar-line?${query}`);
+      if (from.chosen !== wanted) return;
+      other.line = { start: line.start_px, end: line.end_px, colour: catheterColour(state.study, electrode.catheter) };
+      other.draw();
+    } catch {
+      // Without geometry there is no line; the first step says what is missing.
+    }
+  };
+
+  const open = () => {
+    for (const view of views) view.close();
+    const chosen = state.sites[Number(site.value)];
+    const uids = chosen ? [chosen.view_a, chosen.view_b] : [];
+    const loose = Number(site.value) < 0 ? [state.runs[-1 - Number(site.value)]?.sop_instance_uid ?? null] : [];
+    const wanted = [...uids, ...loose];
+    views = wanted.flatMap((uid, index) => {
+      const run = state.runs.find((each) => each.sop_instance_uid === uid);
+      return run ? [new View(index === 0 ? "a" : "b", state, run, pen)] : [];
+    });
+    views.forEach((view, index) => {
+      control(view, onPen);
+      view.canvas.addEventListener("focus", () => (active = index));
+      const other = views[1 - index];
+      if (other) view.addEventListener("chosen", (event) => showLine(view, other, /** @type {CustomEvent} */ (event).detail));
+    });
+    active = 0;
+    place.replaceChildren(...views.map((view) => view.element));
+    if (!views.length) place.replaceChildren(element("p", { class: "card" }, "There is nothing to look at yet. Drop runs into the first step."));
+    state.choose(chosen?.site ?? null);
+  };
+
+  const fill = () => {
+    const names = state.study.catheters.map((each) => /** @type {[string, string]} */ ([each.name, `${each.name} (${each.electrodes})`]));
+    catheter.replaceChildren(...select(names, pen.catheter).children);
+    legend.replaceChildren(...state.study.catheters.map((each) => {
+      const swatch = element("span", { class: "swatch" });
+      swatch.style.background = catheterColour(state.study, each.name);
+      return element("span", {}, swatch, each.name);
+    }));
+    const bound = new Set(state.sites.flatMap((each) => [each.view_a, each.view_b]));
+    /** @type {[string, string][]} */
+    const choices = state.sites.map((each, index) => [String(index), each.site ? `site ${each.site}` : `pair ${each.pair}`]);
+    state.runs.forEach((run, index) => bound.has(run.sop_instance_uid) || choices.push([String(-1 - index), `run ${index + 1} without site`]));
+    const wanted = state.sites.findIndex((each) => each.site !== null && each.site === state.chosen);
+    const before = site.value || (wanted < 0 ? "" : String(wanted));
+    site.replaceChildren(...select(choices, "").children);
+    site.value = choices.some(([value]) => value === before) ? before : (choices[0]?.[0] ?? "");
+    const now = [state.sites[Number(site.value)]?.view_a, state.sites[Number(site.value)]?.view_b].filter(Boolean).join();
+    if (!views.length || site.value !== before || now !== views.map((view) => view.run.sop_instance_uid).join()) open();
+  };
+
+  site.addEventListener("change", open);
+  catheter.addEventListener("change", () => { pen.catheter = catheter.value; pen.next = 1; showHint(); });
+  state.addEventListener("changed", fill);
+  state.addEventListener("job", () => views.forEach((view) => attempt(() => view.marks.load())));
+  state.addEventListener("chosen", () => {
+    const index = state.sites.findIndex((each) => each.site !== null && each.site === state.chosen);
+    if (index >= 0 && String(index) !== site.value) { site.value = String(index); open(); }
+  });
+  fill();
+  showHint();
+  const current = () => views[active];
+  const keys = element("dl", { class: "keys" }, ...KEYS.flatMap(([key, act]) => [element("dt", {}, key), element("dd", {}, act)]));
+  const help = element("details", {}, element("summary", {}, "Keys and buttons"), keys);
+  place.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => { if (event.key.toLowerCase() === "h") help.open = !help.open; });
+  return element("div", {},
+    element("div", { class: "fields" }, field("Site", site), field("Catheter to mark", catheter),
+      element("div", { class: "row", role: "group", "aria-label": "Tool" }, ...tools),
+      button("Undo", () => current()?.step(-1)), button("Redo", () => current()?.step(1)),
+      button("Automatic again", () => current()?.resetFrame(), { title: "Forget the electrodes set by hand in this frame" }),
+      button("Compute the map again", compute, { class: "main" })),
+    legend, hint, place, help);
+}

@@ -1,0 +1,30 @@
+"""Motion between the sites as a sign of the reference catheter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fluoromap.matching.identity import CLEARLY_STILLER, stiller
+
+
+def places(own_sd_mm: float, common: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(0, own_sd_mm, common.shape) + common
+
+
+def test_the_catheter_that_moves_less_is_stiller() -> None:
+    rng = np.random.default_rng(1)
+    breathing = rng.normal(0, [0.5, 0.5, 2.0], (8, 3))
+    still, moving = places(0.2, breathing, rng), places(1.5, breathing, rng)
+    assert stiller(still, moving) > CLEARLY_STILLER
+    assert stiller(moving, still) == pytest.approx(-stiller(still, moving))
+
+
+def test_a_moved_table_hides_the_stiller_catheter_but_never_exchanges_it() -> None:
+    wrong = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        table = np.where(np.arange(5)[:, None] < rng.integers(1, 5), 0.0, rng.uniform(-30, 30, 3))
+        still, moving = places(0.2, table, rng), places(0.8, table, rng)
+        wrong += stiller(moving, still) > CLEARLY_STILLER
+    assert wrong == 0

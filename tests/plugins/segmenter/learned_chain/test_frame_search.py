@@ -1,0 +1,84 @@
+"""Frames searched one after the other: means of neighbours in noise, and shared answers of the network in fast runs."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from fluoromap.contracts import Chain, FrameChains
+from fluoromap.reasons import Reason
+from fluoromap.segmenter.learned_chain.frame_search import FrameSearch, LatestNetwork
+from fluoromap.segmenter.proposals import Likeness
+
+POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
+X = np.zeros((32, 32), np.float32)
+
+
+def chain(shift=0.0):
+    return Chain((1, 2, 3, 4), POINTS + shift, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), (("reference", 1.0),))
+
+
+class Detector:
+    """Shows a catheter in images of mean ``level`` only; ``likeness`` of an image is the same everywhere."""
+
+    def __init__(self, network, level):
+        self.network, self.level = network, level
+        self.likeness = lambda x: 10.0
+        self.searched, self.found_again = [], []
+
+    def forget_image(self):
+        pass
+
+    def find_chains(self, x, frame):
+        self.network(x)
+        self.searched.append(float(x.mean()))
+        shown = np.isclose(x.mean(), self.level)
+        return FrameChains(frame, (chain(),) if shown else (), None if shown else Reason.MANUAL_NEEDED)
+
+    def image_evidence(self, x):
+        return SimpleNamespace(likeness=Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0))
+
+    def find_again(self, x, known, shift, reach_px, taken):
+        self.found_again.append((float(x.mean()), known))
+        return chain(1.0)
+
+
+def search(level, shares):
+    asked = []
+    network = LatestNetwork(lambda x: asked.append(float(x.mean())) or len(asked))
+    detector = Detector(network, level)
+    return FrameSearch(detector, network, 1, shares), detector, asked
+
+
+def test_a_frame_without_its_catheter_is_searched_in_the_mean_and_the_chain_found_again_in_the_frame():
+    frames, detector, _ = search(2.0, shares=False)
+    entry = frames.find_chains(X + 1, 0, [X + 2, X + 3])
+    assert detector.searched == [1.0, 2.0]
+    ((at, known),) = detector.found_again
+    assert at == 1.0
+    assert np.allclose(entry.chains[0].pixels_uv, POINTS + 1)
+    # The frame is part of the mean, so the mean's place must hardly count.
+    assert known.covariance_px2[0, 0, 0] > 5.0
+    frames.find_chains(X + 1, 1, [X + 2, X + 3])
+    assert detector.searched == [1.0, 2.0, 2.0]
+
+
+def test_a_catheter_that_only_the_neighbours_show_is_not_found_in_the_frame():
+    frames, detector, _ = search(2.0, shares=False)
+    detector.likeness = lambda x: 12.0 if np.isclose(x.mean(), 2.0) else 2.0
+    assert frames.find_chains(X + 1, 0, [X + 2, X + 3]).chains == ()
+    detector.likeness = lambda x: 12.0 if np.isclose(x.mean(), 2.0) else 7.0
+    assert len(frames.find_chains(X + 1, 0, [X + 2, X + 3]).chains) == 1
+
+
+def test_a_clear_frame_and_one_without_neighbours_are_searched_once():
+    frames, detector, _ = search(1.0, shares=False)
+    assert frames.find_chains(X + 1, 0, [X + 2, X + 3]).manual_needed is None
+    assert frames.find_chains(X + 5, 1).manual_needed is Reason.MANUAL_NEEDED
+    assert detector.searched == [1.0, 5.0]
+
+
+def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
+    frames, _, asked = search(1.0, shares=True)
+    for frame in range(6):
+        assert frames.find_chains(X + 1, frame).chains
+    assert len(asked) == 3

@@ -1,0 +1,75 @@
+"""Tracks judged by pictures averaged along them, in noise and where nothing is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fluoromap.contracts import Chain, PixelFacts
+from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.field_mask import find_field
+from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
+from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.log_image import LogTransform
+
+FRAMES = 8
+PX_PER_MM = 512 / 178 * 2
+FACTS = PixelFacts(False, 12, False)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    spec = StudySpec(313, sites=1, frames=FRAMES, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA"), dose=0.25)
+    return simulate_study(spec).sites[0].runs[1]
+
+
+@pytest.fixture(scope="module")
+def images(noisy):
+    frames = [noisy.frames[k] for k in range(FRAMES)]
+    field = find_field(noisy.frames, FACTS)
+    transform = LogTransform.of_run(FACTS, field.mean_level)
+    return [field.fill(transform(frame)) for frame in frames]
+
+
+def chains(path_uv):
+    count = path_uv.shape[1]
+    numbers = tuple(range(1, count + 1))
+    covariance = np.tile(np.eye(2), (count, 1, 1))
+    return {
+        frame: Chain(numbers, points, covariance, np.ones(count), (("reference", 1.0),))
+        for frame, points in enumerate(path_uv)
+    }
+
+
+def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
+    trained = read_weights(Path(SHIPPED))
+    judge = TrackEvidence(trained, PX_PER_MM, FRAMES)
+    alone = [NetworkResponse.of_image(image, trained, PX_PER_MM) for image in images]
+    for path_uv in noisy.truth.pixels_uv.values():
+        assert judge(chains(path_uv), lambda frame: images[frame])
+        odds = judge.log_odds_along(list(range(FRAMES)), path_uv, lambda frame: images[frame])
+        single = [np.median(seen.probability_at(points)) for seen, points in zip(alone, path_uv, strict=True)]
+        assert 1.0 / (1.0 + np.exp(-np.median(odds))) > np.median(single)
+
+
+def test_a_track_beside_the_catheters_is_rejected(noisy, images):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    path_uv = noisy.truth.pixels_uv["reference"]
+    for shift in ([0.0, 60.0], [70.0, 0.0], [-55.0, -40.0]):
+        beside = path_uv + np.array(shift)
+        assert not judge(chains(beside), lambda frame: images[frame])
+
+
+def test_a_long_catheter_is_judged_in_sections(images):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    row = np.stack([np.linspace(100.0, 400.0, 20), np.full(20, 200.0)], axis=1)
+    path_uv = np.repeat(row[None], FRAMES, axis=0)
+    assert not judge(chains(path_uv), lambda frame: images[frame])
+
+
+def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    track = chains(noisy.truth.pixels_uv["reference"])
+    track[2] = next(iter(chains(noisy.truth.pixels_uv["reference"][2:3, :3]).values()))
+    assert judge(track, lambda frame: images[frame])

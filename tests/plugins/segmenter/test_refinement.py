@@ -1,0 +1,28 @@
+"""Sub-pixel positions: a catheter whose foreshortening changes along it is not pulled straight."""
+
+import numpy as np
+
+from fluoromap.catheters import catheter_type
+from fluoromap.segmenter.refinement import refine
+
+PX_PER_MM = 3.5
+
+
+def test_a_long_catheter_s_ends_stay_where_its_foreshortening_changes():
+    catheter = catheter_type("decapolar-2-5-2", "cs")
+    ratios = np.linspace(0.5, 0.9, catheter.electrodes - 1)
+    along = np.concatenate([[0.0], np.cumsum(np.asarray(catheter.spacing_mm) * ratios)]) * PX_PER_MM
+    points = np.stack([40.0 + along, np.full(len(along), 40.0)], axis=1)
+    v, u = np.mgrid[:80, : int(points[-1, 0]) + 60].astype(np.float64)
+    image = np.zeros(v.shape)
+    for k, (at, _) in enumerate(points):
+        ratio = ratios[min(k, len(ratios) - 1)]
+        half = 0.5 * (catheter.tip_mm if k == 0 else catheter.ring_mm) * PX_PER_MM * ratio
+        band = np.clip(0.5 + (half - np.abs(u - at)) / 2.0, 0.0, 1.0)
+        image -= 0.5 * band * (np.abs(v - 40.0) < 3.5)
+    image += np.random.default_rng(3).normal(0.0, 0.1, image.shape)
+    nothing = np.zeros((1, catheter.electrodes), np.bool_)
+    fit = refine(image.astype(np.float32), points[None], catheter, PX_PER_MM, 0.1, nothing, nothing)
+    error = fit.points_uv[0] - points
+    assert np.abs(error[[0, 1, -2, -1], 0]).max() < 1.0
+    assert np.sqrt((error[:, 0] ** 2).mean()) < 0.6
