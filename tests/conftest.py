@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import os
 import uuid
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -105,11 +106,14 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "data"
     monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(folder))
     monkeypatch.delenv("FLUOROMAP_DATABASE_URL", raising=False)
+    from fluoromap_service.jobs import stage_results
     from fluoromap_service.settings import settings
     from fluoromap_service.store.engine import engine
     from fluoromap_service.store.models import Base
 
     settings.cache_clear()
+    # Results of equal content have the same address in the folders of all tests.
+    monkeypatch.setattr(stage_results, "_remembered", OrderedDict())
     Base.metadata.create_all(engine())
     yield folder
     engine().dispose()
