@@ -144,8 +144,8 @@ def filters(view: str, frame: NDArray[np.uint16], px_per_mm: float) -> None:
         print(f"  {name:30}{mine:8.2f}{theirs:10.1f}{theirs / mine:6.0f}x   {beside}")
     chain = milliseconds(lambda: steps.blobs(x))
     print(f"  {'four steps and labels':30}{chain:8.2f}{twins:10.1f}{twins / chain:6.0f}x   goal 14 ms, 30x")
-    print(f"  {'four-step, chains':30}{milliseconds(lambda: steps.chains(x, 0)):8.2f}")
-    print(f"  {'catheter-chain, chains':30}{milliseconds(lambda: blobs.chains(x, 0)):8.2f}")
+    print(f"  {'four-step, chains':30}{milliseconds(lambda: steps.find_chains(x, 0)):8.2f}")
+    print(f"  {'catheter-chain, chains':30}{milliseconds(lambda: blobs.find_chains(x, 0)):8.2f}")
     print(f"  {'field mask, once a run':30}{milliseconds(lambda: find_field(run.frames, run.pixels)):8.2f}")
 
 
