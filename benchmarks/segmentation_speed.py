@@ -13,9 +13,13 @@ All times are processor time of one thread, so that a busy machine gives nearly 
 
 from __future__ import annotations
 
+import os
+
+# One core, as in a worker: threads of the matrix products would only wait for each other.
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
+
 import importlib
 import importlib.util
-import os
 import subprocess
 import sys
 import tempfile
