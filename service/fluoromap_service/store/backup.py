@@ -92,11 +92,16 @@ def restore(source: Path) -> BackedUp:
     Raises
     ------
     BackupFailed
-        When the data folder has a database already, or the archive is damaged or newer than this version.
+        When the data folder has a database or its log already, or the archive is damaged or newer than this version.
     """
     database = _sqlite_path()
-    if database.exists():
-        raise BackupFailed(f"{database} exists. Restore into an empty folder: give another one with --data-dir.")
+    # SQLite would write a write-ahead log that is left from another database into the restored one.
+    for path in (
+        database,
+        *(database.with_name(f"{database.name}{suffix}") for suffix in ("-wal", "-shm", "-journal")),
+    ):
+        if path.exists():
+            raise BackupFailed(f"{path} exists. Restore into an empty folder: give another one with --data-dir.")
     make_private_folder(settings().data_dir)
     count = 0
     with _staging() as folder:

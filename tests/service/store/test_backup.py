@@ -94,6 +94,15 @@ def test_a_backup_restores_everything(archive: Any, use: Callable[..., Path]) ->
         restore(target)
 
 
+def test_a_left_write_ahead_log_is_not_mixed_into_the_backup(archive: Any, use: Callable[..., Path]) -> None:
+    target, _ = archive
+    folder = use("restored")
+    folder.mkdir()
+    (folder / "fluoromap.sqlite-wal").write_bytes(b"rows of the lost database")
+    with pytest.raises(BackupFailed, match="sqlite-wal exists"):
+        restore(target)
+
+
 def test_a_copy_of_the_database_file_alone_would_not_do(archive: Any) -> None:
     """The write-ahead log has the newest rows: the reason for the command."""
     assert (settings().data_dir / "fluoromap.sqlite-wal").exists()
