@@ -90,5 +90,8 @@ def _alone() -> Iterator[Connection]:
                     raw.execute("PRAGMA foreign_keys=ON")
     else:
         with engine().begin() as connection:
+            # A migration of another process may last longer than any other lock.
+            connection.execute(text("SET LOCAL lock_timeout = 0"))
             connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _POSTGRESQL_LOCK})
+            connection.execute(text("SET LOCAL lock_timeout TO DEFAULT"))
             yield connection

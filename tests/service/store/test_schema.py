@@ -6,6 +6,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, select, text
+from sqlalchemy import create_engine, inspect, select, text
 
 from fluoromap_service import auth
 from fluoromap_service.jobs import job_life
@@ -21,7 +22,7 @@ from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import engine as store_engine
 from fluoromap_service.store import schema
-from fluoromap_service.store.engine import engine, reading, writing
+from fluoromap_service.store.engine import engine, forget_engine, reading, writing
 from fluoromap_service.store.models import (
     Base,
     Correction,
@@ -105,6 +106,35 @@ def test_processes_that_migrate_at_once_all_succeed() -> None:
     errors = [process.communicate()[1].decode() for process in started]
     assert [process.returncode for process in started] == [0, 0, 0], errors
     assert set(inspect(engine()).get_table_names()) == {*Base.metadata.tables, "alembic_version"}
+
+
+def test_a_process_waits_for_a_long_migration_of_another_one(
+    postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """PostgreSQL ends every other wait for a lock soon."""
+    monkeypatch.setitem(store_engine.POSTGRESQL, "options", "-c lock_timeout=50ms")
+    monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("FLUOROMAP_DATABASE_URL", postgres_url)
+    settings.cache_clear()
+    waits = text(
+        "SELECT count(*) FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND datname = current_database()"
+        " AND clock_timestamp() - query_start > interval '200 ms'"
+    )
+    other = create_engine(postgres_url)
+    try:
+        with ThreadPoolExecutor(1) as threads, other.connect() as migrating, other.connect() as watching:
+            migrating.execute(text("SELECT pg_advisory_lock(:lock)"), {"lock": schema._POSTGRESQL_LOCK})
+            upgrade = threads.submit(schema.upgrade)
+            while not upgrade.done() and not watching.scalar(waits):
+                watching.rollback()
+            migrating.execute(text("SELECT pg_advisory_unlock(:lock)"), {"lock": schema._POSTGRESQL_LOCK})
+            upgrade.result()
+        with engine().connect() as connection:
+            assert connection.scalar(text("SHOW lock_timeout")) == "50ms"
+    finally:
+        other.dispose()
+        forget_engine()
+        settings.cache_clear()
 
 
 def test_history_is_one_line() -> None:
