@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap_service.problem import Problem, not_found
+from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.models import ENDED_JOB, Job, Rendering, StageRow, Study, StudyInstance
 from fluoromap_service.study.catheters import set_catalogue
 from fluoromap_service.study.instances import forget_instances
@@ -46,7 +47,7 @@ def get(session: Session, study_id: str) -> Study:
 
 
 def lock(session: Session, study_id: str) -> Study:
-    """Return a study as :func:`get` does, and lock it.
+    """Return a study as :func:`get` does, lock it for a change, and note the time of the change.
 
     Other transactions cannot change it until this one ends.
     """
@@ -55,6 +56,8 @@ def lock(session: Session, study_id: str) -> Study:
     study = session.scalars(query.execution_options(populate_existing=True)).one_or_none()
     if study is None:
         raise not_found("study")
+    # Its runs, sites and corrections have no times of their own.
+    study.updated = session.scalars(select(db_now())).one()
     return study
 
 

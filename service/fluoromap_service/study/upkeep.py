@@ -57,6 +57,9 @@ def delete_old_studies(days: float) -> int:
     for study_id in found:
         try:
             with writing() as session:
+                # Somebody may have changed it since the search.
+                if session.scalar(old.where(Study.id == study_id).with_for_update(of=Study)) is None:
+                    continue
                 unreferenced = studies.remove(session, study_id)
                 audit.append(session, [Act("retention", "delete study", study=study_id)])
         except Problem:

@@ -21,6 +21,7 @@ from fluoromap_service.store import audit, disk, files
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Idempotency, Instance, Job, Rendering, StageResult, StageRow, Study
+from fluoromap_service.study import upkeep
 from fluoromap_service.study.check import examine, mend
 from fluoromap_service.study.upkeep import clean_up, delete_old_studies, delete_renderings
 
@@ -117,6 +118,39 @@ def test_a_recent_job_keeps_an_old_study(service: TestClient) -> None:
     with writing() as session:
         session.execute(update(Study).values(updated=db_now() - 31 * 86400))
     assert delete_old_studies(30) == 0
+
+
+@pytest.mark.parametrize("change", ["upload", "activation-times"])
+def test_a_change_of_its_content_keeps_an_old_study(
+    service: TestClient, study_path: str, upload: Callable[..., Any], change: str
+) -> None:
+    _make_older(31)
+    if change == "upload":
+        assert upload((1, 0.0)).status_code == 201
+    else:
+        table = service.put(
+            f"{study_path}/activation-times", content=b"site,lat_ms\nS01,1.0\n", headers={"Content-Type": "text/csv"}
+        )
+        assert table.status_code == 200
+    assert delete_old_studies(30) == 0
+
+
+def test_a_study_that_changes_during_the_deletion_stays(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    for label in ("first", "second"):
+        service.post("/v1/studies", json={"label": label})
+    _make_older(31)
+
+    def change_the_rest(hashes: object) -> None:
+        with writing() as session:
+            session.execute(update(Study).values(updated=db_now()))
+
+    monkeypatch.setattr(upkeep, "unlink_unreferenced", change_the_rest)
+    assert delete_old_studies(30) == 1
+
+
+def _make_older(days: float) -> None:
+    with writing() as session:
+        session.execute(update(Study).values(updated=db_now() - days * 86400))
 
 
 def test_a_low_disk_costs_pictures_only(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
