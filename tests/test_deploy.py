@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -54,6 +55,12 @@ def test_every_manifest_is_applied() -> None:
     assert {path.name for path in FOLDER.glob("*.yaml")} == {*CUSTOMIZATION["resources"], "kustomization.yaml"}
 
 
+def test_the_page_applies_the_customization() -> None:
+    """With ``--filename`` the image of ``kustomization.yaml`` does not count, and the API refuses that file itself."""
+    commands = re.findall(r"kubectl apply [^`\n]+", (FOLDER / "README.md").read_text())
+    assert commands == ["kubectl apply --kustomize deploy/kubernetes/"]
+
+
 def _containers() -> list[tuple[str, dict[str, Any]]]:
     return [
         (pod, container)
@@ -85,6 +92,20 @@ def test_commands_are_the_programs(pod: str, container: dict[str, Any]) -> None:
     from test_house import _parse
 
     _parse(container["args"])
+
+
+def test_a_worker_is_alive_as_in_docker_compose() -> None:
+    compose = yaml.safe_load((TOP / "docker-compose.yml").read_text())["services"]["worker"]["healthcheck"]["test"]
+    (container,) = PODS["worker"]["containers"]
+    assert ["CMD", *container["livenessProbe"]["exec"]["command"]] == compose
+
+
+def test_a_worker_s_stages_fit_into_its_container() -> None:
+    (container,) = PODS["worker"]["containers"]
+    stages = next(int(each["value"]) for each in container["env"] if each["name"] == "FLUOROMAP_WORKERS")
+    assert stages == int(container["resources"]["requests"]["cpu"])
+    limit_mib = 1024 * int(container["resources"]["limits"]["memory"].removesuffix("Gi"))
+    assert stages * Settings.model_fields["worker_memory_mib"].default <= limit_mib
 
 
 def test_proxy_file_follows_the_specification() -> None:

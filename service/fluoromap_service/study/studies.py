@@ -47,9 +47,9 @@ def get(session: Session, study_id: str) -> Study:
 
 
 def lock(session: Session, study_id: str) -> Study:
-    """Return a study as :func:`get` does, lock it for a change, and note the time of the change.
+    """Return a study as :func:`get` does, locked for a change.
 
-    Other transactions cannot change it until this one ends.
+    Other transactions cannot change it until this one ends. The time of the change is stored.
     """
     query = select(Study).where(Study.id == study_id).with_for_update()
     # Read it again under the lock: it may have changed since this session read it.
