@@ -153,20 +153,23 @@ def _staging() -> Iterator[Path]:
 
 
 def _take_snapshot(database: Path, folder: Path) -> list[str]:
-    """Link all files and copy the database at one moment.
+    """Link all files and copy the database, both of one moment.
 
     Return the hashes of missing files.
     """
     missing = []
-    # Nobody can delete a file or commit a row until this transaction ends.
-    with writing() as session:
-        for sha256 in session.scalars(select(File.sha256)):
-            try:
-                os.link(files.path_of(sha256), folder / sha256)
-            except FileNotFoundError:
-                missing.append(sha256)
-        with closing(sqlite3.connect(database)) as live, closing(sqlite3.connect(folder / DATABASE)) as copy:
-            live.backup(copy)
+    with closing(sqlite3.connect(database)) as live, closing(sqlite3.connect(folder / DATABASE)) as copy:
+        # Nobody can delete a file or commit a row until this transaction ends.
+        with writing() as session:
+            for sha256 in session.scalars(select(File.sha256)):
+                try:
+                    os.link(files.path_of(sha256), folder / sha256)
+                except FileNotFoundError:
+                    missing.append(sha256)
+            # A transaction reads the database of its first statement: the service may write during the copy.
+            live.execute("BEGIN")
+            live.execute("SELECT count(*) FROM alembic_version")
+        live.backup(copy)
     with writing() as session:
         audit.append(session, [Act("command line", "backup")])
     return missing

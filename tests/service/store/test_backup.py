@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import shutil
+import sqlite3
 import subprocess
 import tarfile
 from collections.abc import Callable, Iterator
@@ -19,8 +21,9 @@ from fluoromap_service.api.app import create_app
 from fluoromap_service.settings import settings
 from fluoromap_service.store import files, schema
 from fluoromap_service.store.backup import BackupFailed, backup, restore
-from fluoromap_service.store.engine import forget_engine, reading
-from fluoromap_service.store.models import File
+from fluoromap_service.store.engine import forget_engine, reading, writing
+from fluoromap_service.store.models import File, Study
+from fluoromap_service.study import studies
 from fluoromap_service.study.check import examine
 
 PAGE = Path(__file__).parents[3] / "docs" / "operations.md"
@@ -92,6 +95,26 @@ def test_a_backup_restores_everything(archive: Any, use: Callable[..., Path]) ->
     assert _content() == content
     with pytest.raises(BackupFailed, match="exists"):
         restore(target)
+
+
+def test_the_service_writes_while_the_database_is_copied(
+    archive: Any, use: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, content = archive
+
+    class Copied(sqlite3.Connection):
+        def backup(self, target: sqlite3.Connection) -> None:  # type: ignore[override]
+            with writing() as session:
+                studies.create(session, "late")
+            super().backup(target)
+
+    monkeypatch.setattr(sqlite3, "connect", functools.partial(sqlite3.connect, factory=Copied))
+    backup(tmp_path / "second.tar")
+    with reading() as session:
+        assert set(session.scalars(select(Study.label))) == {"kept", "late"}
+    use("restored")
+    restore(tmp_path / "second.tar")
+    assert _content() == content
 
 
 def test_a_left_write_ahead_log_is_not_mixed_into_the_backup(archive: Any, use: Callable[..., Path]) -> None:
