@@ -8,12 +8,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import shutil
 import sqlite3
 import tarfile
-import tempfile
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -64,7 +61,7 @@ def backup(target: Path) -> BackedUp:
     """
     database = _sqlite_path()
     part = target.with_name(f"{target.name}.part")
-    with _staging() as folder:
+    with files.incoming_files() as folder:
         broken = _take_snapshot(database, folder)
         names = sorted(path.name for path in folder.iterdir() if path.name != DATABASE)
         try:
@@ -104,7 +101,7 @@ def restore(source: Path) -> BackedUp:
             raise BackupFailed(f"{path} exists. Restore into an empty folder: give another one with --data-dir.")
     make_private_folder(settings().data_dir)
     count = 0
-    with _staging() as folder:
+    with files.incoming_files() as folder:
         try:
             with tarfile.open(source, "r:") as archive:
                 for member in archive:
@@ -140,16 +137,6 @@ def _sqlite_path() -> Path:
             "This command serves SQLite. For PostgreSQL use pg_dump and copy the folder of the files, as docs/operations.md shows."
         )
     return Path(url.database)
-
-
-@contextmanager
-def _staging() -> Iterator[Path]:
-    # On the disk of the files, so that a hard link can hold each of them.
-    folder = Path(tempfile.mkdtemp(prefix=".backup-", dir=settings().data_dir))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _take_snapshot(database: Path, folder: Path) -> list[str]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import shutil
 import tempfile
 import threading
 import time
@@ -56,10 +57,7 @@ def incoming() -> Iterator[Path]:
 
     The file is removed at the end unless it was kept.
     """
-    folder = incoming_folder()
-    make_private_folder(folder.parent)
-    folder.mkdir(exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=folder)
+    handle, name = tempfile.mkstemp(dir=_made_incoming_folder())
     path = Path(name)
     try:
         # The lock ends with this process, so that a clean-up recognises the files of a process that was killed.
@@ -70,21 +68,48 @@ def incoming() -> Iterator[Path]:
         os.close(handle)
 
 
+@contextmanager
+def incoming_files() -> Iterator[Path]:
+    """Give a folder on the store's own disk for many files, as :func:`incoming` does for one."""
+    folder = Path(tempfile.mkdtemp(dir=_made_incoming_folder()))
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(handle)
+
+
 def incoming_folder() -> Path:
     """Return the folder of the files that have not arrived whole."""
     return settings().files_dir / "incoming"
 
 
+def _made_incoming_folder() -> Path:
+    folder = incoming_folder()
+    make_private_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 def remove_abandoned() -> int:
-    """Remove the incoming files of processes that have died, and return how many."""
+    """Remove the incoming files and folders of processes that have died, and return how many."""
     removed = 0
     for path in incoming_folder().glob("*"):
-        with suppress(OSError), path.open("rb") as stream:
-            if time.time() - path.stat().st_mtime < ABANDONED_SECONDS:
-                continue
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()
-            removed += 1
+        with suppress(OSError):
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                if time.time() - os.fstat(handle).st_mtime < ABANDONED_SECONDS:
+                    continue
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+                removed += 1
+            finally:
+                os.close(handle)
     return removed
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import functools
+import os
 import re
 import shutil
+import signal
 import sqlite3
 import subprocess
+import sys
 import tarfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +28,7 @@ from fluoromap_service.store.engine import forget_engine, reading, writing
 from fluoromap_service.store.models import File, Study
 from fluoromap_service.study import studies
 from fluoromap_service.study.check import examine
+from fluoromap_service.study.upkeep import clean_up
 
 PAGE = Path(__file__).parents[3] / "docs" / "operations.md"
 
@@ -89,7 +93,7 @@ def archive(use: Callable[..., Path], upload_to: Any, tmp_path: Path) -> tuple[P
 def test_a_backup_restores_everything(archive: Any, use: Callable[..., Path]) -> None:
     target, content = archive
     assert target.stat().st_mode & 0o077 == 0
-    assert not list(settings().data_dir.glob(".backup-*"))
+    assert not list(files.incoming_folder().iterdir())
     use("restored")
     assert restore(target).files == 2
     assert _content() == content
@@ -115,6 +119,24 @@ def test_the_service_writes_while_the_database_is_copied(
     use("restored")
     restore(tmp_path / "second.tar")
     assert _content() == content
+
+
+def test_a_killed_backup_leaves_no_patient_data_for_long(archive: Any, tmp_path: Path) -> None:
+    """Hard links would keep the runs of a study that is deleted later."""
+    folder = settings().data_dir
+    before = set(folder.rglob("*"))
+    program = (
+        "import os, pathlib, signal, sys; from fluoromap_service.store import audit, backup; "
+        "audit.append = lambda *_: os.kill(os.getpid(), signal.SIGKILL); backup.backup(pathlib.Path(sys.argv[1]))"
+    )
+    killed = subprocess.run([sys.executable, "-c", program, str(tmp_path / "second.tar")], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    left = set(folder.rglob("*")) - before
+    assert len([path for path in left if path.is_file() and re.fullmatch("[0-9a-f]{64}", path.name)]) == 2
+    for path in left:
+        os.utime(path, (0, 0))
+    clean_up()
+    assert set(folder.rglob("*")) - before == set()
 
 
 def test_a_left_write_ahead_log_is_not_mixed_into_the_backup(archive: Any, use: Callable[..., Path]) -> None:
