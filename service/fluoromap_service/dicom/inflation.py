@@ -77,10 +77,11 @@ def have_same_data_set(path: Path, other: Path) -> bool:
 def _inflate(source: IO[bytes], target: IO[bytes], most_bytes: int) -> None:
     """Write the inflated rest of a file (RFC 1951) into another file."""
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-    written = 0
+    written, piece = 0, b""
     data = source.read(_CHUNK_BYTES)
     try:
-        while not inflater.eof and data:
+        # A full piece may leave bytes in the inflater after the last one was read.
+        while not inflater.eof and (data or len(piece) == _CHUNK_BYTES):
             piece = inflater.decompress(data, _CHUNK_BYTES)
             written += target.write(piece)
             if written > most_bytes:

@@ -23,8 +23,9 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, JPE
 
 from fluoromap.contracts import FrameSource
 from fluoromap.geometry import Gantry
-from fluoromap_service.dicom import InstanceFacts, deterministic_uid, open_frames, read_instance, write_cine
+from fluoromap_service.dicom import InstanceFacts, deterministic_uid, inflation, open_frames, read_instance, write_cine
 from fluoromap_service.dicom.codestream import decode
+from fluoromap_service.dicom.header import data_set_start
 from fluoromap_service.dicom.pixel_layout import PixelLayout
 from fluoromap_service.problem import Problem
 
@@ -243,6 +244,21 @@ def test_syntaxes_of_old_archives(make_xa: MakeXa, syntax: str, dtype: type) -> 
     np.testing.assert_array_equal(np.stack(list(opened)), frames)
     np.testing.assert_array_equal(opened[1], frames[1])
     np.testing.assert_array_equal(pydicom.dcmread(path).pixel_array, frames)
+
+
+def test_a_deflated_run_that_ends_in_black(make_xa: MakeXa, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One code can stand for 258 equal pixels: the inflater has them when its input has ended."""
+    random = np.random.default_rng(4)
+    # The end of the last code falls on another bit in each file.
+    for _ in range(32):
+        frames = np.zeros((2, 24, 32), np.uint8)
+        frames[:, 3:9, 3:9] = random.integers(0, 255, (6, 6))
+        path = make_xa(frames, syntax=DeflatedExplicitVRLittleEndian)
+        with inflation.open_dicom(path) as file:
+            inflated_bytes = len(file.read()) - data_set_start(file)[1]
+        with monkeypatch.context() as patched:
+            patched.setattr(inflation, "_CHUNK_BYTES", inflated_bytes - 130)
+            np.testing.assert_array_equal(np.stack(list(open_frames(path, read_instance(path)))), frames)
 
 
 def test_more_pixel_data_than_announced(make_xa: MakeXa) -> None:
