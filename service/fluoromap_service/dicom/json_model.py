@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pydicom
+from pydicom.dataelem import DataElement
+from pydicom.dataset import Dataset
 
 Json = dict[str, Any]
 
@@ -17,8 +19,12 @@ _BINARY = frozenset({"OB", "OD", "OF", "OL", "OV", "OW", "UN"})
 def header_json(path: Path) -> Json:
     """Return the header of a file in the DICOM JSON model."""
     header = pydicom.dcmread(path, stop_before_pixels=True)
-    for element in list(header):
-        if element.VR in _BINARY and len(element.value or b"") > LARGEST_VALUE_BYTES:
-            del header[element.tag]
+    header.walk(_delete_when_long)
     answer: Json = header.to_json_dict(suppress_invalid_tags=True, bulk_data_element_handler=None)
     return answer
+
+
+def _delete_when_long(dataset: Dataset, element: DataElement) -> None:
+    """Delete an element that is bulk data; an icon has its pixels in an item of a sequence."""
+    if element.VR in _BINARY and len(element.value or b"") > LARGEST_VALUE_BYTES:
+        del dataset[element.tag]
