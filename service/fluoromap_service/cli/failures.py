@@ -6,6 +6,7 @@ from pydantic import ValidationError
 
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import Settings
+from fluoromap_service.store.disk import FULL
 
 
 class CommandFailed(Exception):
@@ -28,6 +29,8 @@ def sentence_of(error: Exception) -> str | None:
     if isinstance(error, ValidationError) and error.title == Settings.__name__:
         settings = "; ".join(f"FLUOROMAP_{part['loc'][0]}".upper() + f": {part['msg']}" for part in error.errors())
         return f"A setting is wrong ({settings}); correct the environment variable."
+    if isinstance(error, OSError) and error.errno in FULL:
+        return "The disk is full; free space on it, then call the command again."
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}."
     return None

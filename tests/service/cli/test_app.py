@@ -20,6 +20,7 @@ from fluoromap_service.cli import app, environment
 from fluoromap_service.cli.failures import CommandFailed, sentence_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import Settings, settings
+from fluoromap_service.store.disk import NoSpace
 
 
 @pytest.mark.parametrize("name", app.COMMANDS)
@@ -88,6 +89,8 @@ def _wrong_setting() -> ValidationError:
         (Problem(409, "busy", "Wait."), r"Wait\."),
         (Problem(422, "wrong", "Correct it.", [("row 7", "no number")]), r"Correct it\. \(row 7: no number\)"),
         (OSError(errno.ENOENT, "No such file or directory", "a.csv"), r"a\.csv: No such file or directory\."),
+        (OSError(errno.ENOSPC, "No space left on device"), r"The disk is full; .+"),
+        (NoSpace(), r"The disk is full; .+"),
         (_wrong_setting(), r"A setting is wrong \(FLUOROMAP_PORT: .+\); correct .+"),
     ],
 )
