@@ -29,8 +29,8 @@ def sentence_of(error: Exception) -> str | None:
     if isinstance(error, ValidationError) and error.title == Settings.__name__:
         settings = "; ".join(f"FLUOROMAP_{part['loc'][0]}".upper() + f": {part['msg']}" for part in error.errors())
         return f"A setting is wrong ({settings}); correct the environment variable."
-    if isinstance(error, OSError) and error.errno in FULL:
-        return "The disk is full; free space on it, then call the command again."
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}."
+    if isinstance(error, OSError) and error.errno in FULL:
+        return "The disk is full; free space on it, then call the command again."
     return None
