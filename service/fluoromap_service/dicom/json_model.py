@@ -25,6 +25,9 @@ def header_json(path: Path) -> Json:
 
 
 def _delete_when_long(dataset: Dataset, element: DataElement) -> None:
-    """Delete an element that is bulk data; an icon has its pixels in an item of a sequence."""
+    """Delete an element that is bulk data.
+
+    An icon has its pixels in an item of a sequence.
+    """
     if element.VR in _BINARY and len(element.value or b"") > LARGEST_VALUE_BYTES:
         del dataset[element.tag]

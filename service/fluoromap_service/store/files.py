@@ -70,7 +70,10 @@ def incoming() -> Iterator[Path]:
 
 @contextmanager
 def incoming_files() -> Iterator[Path]:
-    """Give a folder on the store's own disk for many files, as :func:`incoming` does for one."""
+    """Give a folder on the store's own disk for arriving files.
+
+    The folder is removed at the end with the files that were not moved.
+    """
     folder = Path(tempfile.mkdtemp(dir=_made_incoming_folder()))
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -94,7 +97,10 @@ def _made_incoming_folder() -> Path:
 
 
 def remove_abandoned() -> int:
-    """Remove the incoming files and folders of processes that have died, and return how many."""
+    """Remove the incoming files and folders of dead processes.
+
+    Return how many.
+    """
     removed = 0
     for path in incoming_folder().glob("*"):
         with suppress(OSError):
