@@ -14,7 +14,7 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
-from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
@@ -78,6 +78,7 @@ ROUTERS = (
     store.router,
     search.router,
     retrieve.router,
+    rendered.router,
     pages.router,
 )
 

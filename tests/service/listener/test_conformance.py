@@ -9,7 +9,7 @@ from pathlib import Path
 from fastapi.routing import APIRoute
 from pydicom.uid import UID
 
-from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
 from fluoromap_service.settings import Settings
@@ -45,7 +45,7 @@ def test_statuses() -> None:
 
 def transactions() -> list[tuple[str, str, str]]:
     """Return name, method and path of each DICOMweb route."""
-    modules = {"store": store, "search": search, "retrieve": retrieve}
+    modules = {"store": store, "search": search, "retrieve": retrieve, "render": rendered}
     return [
         (name, method, route.path)
         for name, module in modules.items()
@@ -56,7 +56,7 @@ def transactions() -> list[tuple[str, str, str]]:
 
 
 def test_transactions() -> None:
-    rows = re.findall(r"^\| (store|search|retrieve) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
+    rows = re.findall(r"^\| (store|search|retrieve|render) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
     assert rows == transactions()
 
 

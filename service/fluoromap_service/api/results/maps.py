@@ -188,7 +188,10 @@ def get_map(
 
 
 def map_picture_of(job_id: str, finished: FinishedMap) -> KeptFile:
-    """Return the kept PNG of the map from six sides; it is drawn when none is kept."""
+    """Return the kept PNG of the map from six sides.
+
+    The picture is drawn when none is kept.
+    """
     return kept_rendering(
         job_id,
         map_picture_dependencies(finished.sha256),
