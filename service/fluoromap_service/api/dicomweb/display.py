@@ -126,7 +126,7 @@ def _picture(pixels: NDArray[np.uint8], display: Display) -> bytes:
 
 
 def _fitted(pixels: NDArray[np.uint8], viewport: Viewport) -> NDArray[np.uint8]:
-    """Return a part of a frame as large as the viewport permits, with its own proportions."""
+    """Scale a part of a frame into the viewport; keep its proportions."""
     left, top, width, height = viewport.region or (0.0, 0.0, float(pixels.shape[1]), float(pixels.shape[0]))
     scale = min(viewport.width / abs(width), viewport.height / abs(height))
     size = max(1, round(abs(width) * scale)), max(1, round(abs(height) * scale))

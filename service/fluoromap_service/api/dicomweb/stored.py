@@ -214,7 +214,10 @@ def instances_of(
 
 
 def _results(study_uid: str | None) -> Iterator[StoredResult]:
-    """Yield the DICOM objects of the jobs over a DICOM study, or of all jobs whose objects are made."""
+    """Yield the DICOM objects of the jobs over a DICOM study.
+
+    Without ``study_uid`` these are the objects of all jobs that have them already.
+    """
     query = (
         select(Job.id)
         .join(StudyInstance, StudyInstance.study_id == Job.study_id)

@@ -129,7 +129,7 @@ def test_same_job_gives_the_same_bytes(client: TestClient, study: FinishedStudy)
 
 
 def _read_with(program: str, *arguments: str) -> str:
-    """Return what an installed program prints about a file; skip where it is not installed."""
+    """Return the output of an installed program about a file; skip without the program."""
     if shutil.which(program) is None:
         pytest.skip(f"{program} is not installed, so it cannot check the DICOM objects")
     result = subprocess.run([program, *arguments], capture_output=True, text=True, timeout=60, check=False)
