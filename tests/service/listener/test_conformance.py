@@ -10,6 +10,7 @@ from fastapi.routing import APIRoute
 from pydicom.uid import UID
 
 from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
+from fluoromap_service.dicom.header import MACROS
 from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
 from fluoromap_service.settings import Settings
@@ -36,6 +37,11 @@ def test_storage_classes() -> None:
 def test_transfer_syntaxes() -> None:
     rows = re.findall(r"^\| (.+) \| `([\d.]+)` \|$", section("Storage"), re.M)
     assert rows == [(UID(uid).name, uid) for uid in server.TRANSFER_SYNTAXES]
+
+
+def test_functional_groups() -> None:
+    rows = re.findall(r"^\| (\w+Sequence) \| (.+) \|$", section("Geometry"), re.M)
+    assert rows == [(macro, ", ".join(keywords)) for macro, keywords in MACROS.items()]
 
 
 def test_statuses() -> None:
