@@ -47,7 +47,7 @@ def objects_zip(job_id: str) -> KeptFile:
 def _zip(job_id: str) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
-        for name, content in run_in_pool(Task.WRITE_DICOM, job_objects, _results(job_id)):
+        for name, content in run_in_pool(Task.WRITE_DICOM, job_objects, results_of(job_id)):
             entry = zipfile.ZipInfo(name, _DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
@@ -55,7 +55,14 @@ def _zip(job_id: str) -> bytes:
     return stream.getvalue()
 
 
-def _results(job_id: str) -> JobResults:
+def results_of(job_id: str) -> JobResults:
+    """Return the results of a job that become DICOM objects.
+
+    Raises
+    ------
+    Problem
+        409 where the job has no result to report, or somebody deleted one of its runs.
+    """
     with reading() as session:
         job = ended_job_of(session, job_id, "DICOM zip")
         snapshot = snapshot_of(job)
