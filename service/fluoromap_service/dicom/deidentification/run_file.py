@@ -33,8 +33,8 @@ _CHUNK_BYTES = 2**20
 def deidentify_file(source: Path, target: Path, pseudonyms: Pseudonyms) -> dict[str, str]:
     """Write a de-identified copy of a run.
 
-    Memory does not grow with the number of frames. Attributes after the pixel data, such as digital signatures, are left out. A deflated file becomes Explicit VR Little
-    Endian.
+    Memory does not grow with the number of frames. Attributes after the pixel data, such as digital signatures, are left
+    out. A deflated file becomes Explicit VR Little Endian.
 
     Returns
     -------
