@@ -14,7 +14,7 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
-from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
 from fluoromap_service.api.http.middleware.audit_trail import FLUSH_SECONDS, Acts, AuditTrail
@@ -27,7 +27,7 @@ from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
-from fluoromap_service.api.results import archive, dicom_files, maps, overlays, points, report, tracks
+from fluoromap_service.api.results import archive, deidentified, dicom_files, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
@@ -71,6 +71,7 @@ ROUTERS = (
     report.router,
     archive.router,
     dicom_files.router,
+    deidentified.router,
     plugins.router,
     reasons.router,
     health.router,
@@ -78,6 +79,7 @@ ROUTERS = (
     store.router,
     search.router,
     retrieve.router,
+    rendered.router,
     pages.router,
 )
 

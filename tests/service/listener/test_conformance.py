@@ -7,9 +7,13 @@ import re
 from pathlib import Path
 
 from fastapi.routing import APIRoute
+from pydicom.dataset import Dataset
 from pydicom.uid import UID
 
-from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
+from fluoromap_service.dicom.deidentification.dataset import deidentify
+from fluoromap_service.dicom.deidentification.pseudonyms import Dates, Pseudonyms
+from fluoromap_service.dicom.header import MACROS
 from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
 from fluoromap_service.settings import Settings
@@ -38,6 +42,23 @@ def test_transfer_syntaxes() -> None:
     assert rows == [(UID(uid).name, uid) for uid in server.TRANSFER_SYNTAXES]
 
 
+def test_functional_groups() -> None:
+    rows = re.findall(r"^\| (\w+Sequence) \| (.+) \|$", section("Geometry"), re.M)
+    assert rows == [(macro, ", ".join(keywords)) for macro, keywords in MACROS.items()]
+
+
+def test_options_of_deidentification() -> None:
+    listed = set(re.findall(r"^\| .+ \| `(\d{6})` \| .+ \|$", section("De-identification"), re.M))
+    written = set()
+    for dates in Dates:
+        dataset = Dataset()
+        block = dataset.private_block(0x0019, "DLX_SERIE_01", create=True)
+        block.add_new(0x21, "DS", "84")
+        deidentify(dataset, Pseudonyms(b"secret", "patient", "", dates))
+        written |= {item.CodeValue for item in dataset.DeidentificationMethodCodeSequence}
+    assert listed == written
+
+
 def test_statuses() -> None:
     rows = re.findall(r"^\| `([0-9A-F]{4})` \| (.+) \|$", section("Statuses of C-STORE"), re.M)
     assert rows == [(f"{status:04X}", status_meanings()[status]) for status in StoreStatus]
@@ -45,7 +66,7 @@ def test_statuses() -> None:
 
 def transactions() -> list[tuple[str, str, str]]:
     """Return name, method and path of each DICOMweb route."""
-    modules = {"store": store, "search": search, "retrieve": retrieve}
+    modules = {"store": store, "search": search, "retrieve": retrieve, "render": rendered}
     return [
         (name, method, route.path)
         for name, module in modules.items()
@@ -56,7 +77,7 @@ def transactions() -> list[tuple[str, str, str]]:
 
 
 def test_transactions() -> None:
-    rows = re.findall(r"^\| (store|search|retrieve) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
+    rows = re.findall(r"^\| (store|search|retrieve|render) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
     assert rows == transactions()
 
 
