@@ -40,6 +40,9 @@ class Settings(BaseSettings):
     dicom_associations: int = Field(
         16, ge=1, description="Associations that the DICOM listener serves at the same time."
     )
+    delivery_targets: str = Field(
+        "", description="TOML file of the targets that results are sent to; empty: 'up' starts no sender."
+    )
     max_upload_bytes: int = Field(
         4 * 2**30, gt=0, description="Largest request body or DICOM object accepted, in bytes."
     )

@@ -25,7 +25,7 @@ from fluoromap_service.api.http.middleware.security_headers import SecurityHeade
 from fluoromap_service.api.http.query_names import check_query_names
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
-from fluoromap_service.api.jobs import events, jobs
+from fluoromap_service.api.jobs import deliveries, events, jobs
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import archive, dicom_files, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
@@ -64,6 +64,7 @@ ROUTERS = (
     sites.router,
     jobs.router,
     events.router,
+    deliveries.router,
     points.router,
     tracks.router,
     maps.router,

@@ -52,6 +52,12 @@ def get_dicom(job_id: JobId, caller: Reader) -> Response:
     The zip contains `report.dcm` (Comprehensive 3D SR), and where the job has a map `overlays-1.dcm` (secondary capture)
     and `chamber.dcm` (encapsulated STL). The answer is 409 until the job has ended. The same job gives the same bytes.
     """
+    headers = {"Content-Disposition": f'attachment; filename="fluoromap-{job_id}-dicom.zip"'}
+    return Response(zipped_objects(job_id), media_type="application/zip", headers=headers)
+
+
+def zipped_objects(job_id: str) -> bytes:
+    """Return the DICOM files of an ended job as a zip."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, content in run_in_pool(Task.WRITE_DICOM, job_objects, _results(job_id)):
@@ -59,8 +65,7 @@ def get_dicom(job_id: JobId, caller: Reader) -> Response:
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content)
-    headers = {"Content-Disposition": f'attachment; filename="fluoromap-{job_id}-dicom.zip"'}
-    return Response(stream.getvalue(), media_type="application/zip", headers=headers)
+    return stream.getvalue()
 
 
 def _results(job_id: str) -> JobResults:
