@@ -18,6 +18,7 @@ class Reason(StrEnum):
     NO_ACTIVATION_TIME = "no_activation_time"
     ONE_VIEW_ONLY = "one_view_only"
     VIEWS_PARALLEL = "views_parallel"
+    GANTRY_TURNED = "gantry_turned"
     NO_GEOMETRY = "no_geometry"
     NO_A_PRIORI = "no_a_priori"
     PAIRING_FAILED = "pairing_failed"
@@ -61,6 +62,7 @@ _SENTENCES: dict[Reason, str] = {
     Reason.NO_ACTIVATION_TIME: "This site has no activation time; send one with the activation-time table.",
     Reason.ONE_VIEW_ONLY: "This site has only one run; a second view at least 30 degrees away is needed.",
     Reason.VIEWS_PARALLEL: "The two views are less than 20 degrees apart, which gives no depth; record a view farther away.",
+    Reason.GANTRY_TURNED: "The gantry turned during one of the two runs; record this view with a gantry at rest.",
     Reason.NO_GEOMETRY: "The gantry geometry is incomplete; complete the instance's missing values.",
     Reason.NO_A_PRIORI: "No biplane position is known here; a single view gives no depth.",
     Reason.PAIRING_FAILED: "The catheters of the two views do not belong together; check which runs are paired at this site.",

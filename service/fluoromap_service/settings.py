@@ -19,6 +19,9 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         Path.home() / ".fluoromap", description="Folder of the files, and of the embedded database and broker."
     )
+    config: str = Field(
+        "", description="TOML file with the targets of deliveries and the rules that start jobs; empty: none."
+    )
     database_url: str = Field("", description="SQLAlchemy URL; empty: SQLite in the data folder.")
     broker_url: str = Field(
         "", description="Celery broker URL; empty: files in the data folder; 'eager': jobs run at once."
@@ -39,9 +42,6 @@ class Settings(BaseSettings):
     )
     dicom_associations: int = Field(
         16, ge=1, description="Associations that the DICOM listener serves at the same time."
-    )
-    delivery_targets: str = Field(
-        "", description="TOML file of the targets that results are sent to; empty: 'up' starts no sender."
     )
     max_upload_bytes: int = Field(
         4 * 2**30, gt=0, description="Largest request body or DICOM object accepted, in bytes."

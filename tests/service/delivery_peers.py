@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pydicom
@@ -18,10 +19,17 @@ from pynetdicom import AE, AllStoragePresentationContexts, evt
 from pynetdicom.sop_class import StudyRootQueryRetrieveInformationModelFind
 from python_multipart import MultipartParser
 
-from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget
+from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget, WebhookTarget
 
 QUICK = {"first_wait_seconds": 1e-3, "longest_wait_seconds": 1e-3, "timeout_seconds": 60.0}
 """Waits of a target in tests."""
+
+TARGETS = (
+    CStoreTarget(name="pacs", kind="dicom", host="192.0.2.8", port=104, aet="PACS"),
+    StowTarget(name="archive", kind="dicomweb", url="https://archive.example/dicom-web"),
+    WebhookTarget(name="hook", kind="webhook", url="https://registry.example", secret_file=Path("/nonexistent")),
+)
+"""A target of each kind that does not exist."""
 
 Arrival = Callable[[Dataset], int | None]
 """Called with an object before it counts as stored. A status refuses the object."""
@@ -78,7 +86,7 @@ def dicom_node(
     )
     try:
         yield CStoreTarget(
-            name="pacs", kind="c-store", host="127.0.0.1", port=server.server_address[1], called_aet="PACS", **QUICK
+            name="pacs", kind="dicom", host="127.0.0.1", port=server.server_address[1], aet="PACS", **QUICK
         )
     finally:
         server.shutdown()
@@ -107,7 +115,7 @@ def dicomweb_server(archive: Archive) -> Iterator[StowTarget]:
             self.answer(200, [{"00080018": {"vr": "UI", "Value": [uid]}}]) if uid in archive.uids else self.answer(204)
 
     with _serving(Handler) as url:
-        yield StowTarget(name="archive", kind="stow-rs", url=f"{url}/dicom-web", **QUICK)
+        yield StowTarget(name="archive", kind="dicomweb", url=f"{url}/dicom-web", **QUICK)
 
 
 @dataclass

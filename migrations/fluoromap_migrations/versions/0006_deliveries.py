@@ -1,4 +1,4 @@
-"""Deliveries of results, and the jobs that rules started."""
+"""Deliveries of results."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -13,6 +13,7 @@ def upgrade() -> None:
     op.create_table(
         "delivery_target",
         sa.Column("name", sa.String(64), nullable=False),
+        sa.Column("kind", sa.String(10), nullable=False),
         sa.Column("since", sa.Float(53), nullable=False),
         sa.PrimaryKeyConstraint("name", name="pk_delivery_target"),
     )
@@ -43,6 +44,7 @@ def upgrade() -> None:
         "delivery_object",
         sa.Column("sop_instance_uid", sa.String(64), nullable=False),
         sa.Column("name", sa.String(64), nullable=False),
+        sa.Column("attempts", sa.Integer(), nullable=False),
         sa.Column("state", sa.String(10), nullable=False),
         sa.Column("delivered", sa.Float(53), nullable=True),
         sa.UniqueConstraint("delivery_id", "sop_instance_uid", name="uq_delivery_object"),
@@ -55,15 +57,6 @@ def upgrade() -> None:
         sa.Column("detail", sa.Text(), nullable=True),
     )
     op.create_index("ix_delivery_attempt_delivery_id", "delivery_attempt", ["delivery_id"])
-    op.create_table(
-        "rule_start",
-        sa.Column("study_id", sa.String(32), nullable=False),
-        sa.Column("rule", sa.String(64), nullable=False),
-        sa.Column("job_id", sa.String(32), nullable=False),
-        sa.PrimaryKeyConstraint("study_id", "rule", name="pk_rule_start"),
-        sa.ForeignKeyConstraint(["study_id"], ["study.id"], name="fk_rule_start_study_id_study", ondelete="CASCADE"),
-        sa.ForeignKeyConstraint(["job_id"], ["job.id"], name="fk_rule_start_job_id_job", ondelete="CASCADE"),
-    )
     op.create_index("ix_job_finished", "job", ["finished"])
 
 

@@ -14,7 +14,7 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
-from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
@@ -25,9 +25,9 @@ from fluoromap_service.api.http.middleware.security_headers import SecurityHeade
 from fluoromap_service.api.http.query_names import check_query_names
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
-from fluoromap_service.api.jobs import deliveries, events, jobs
+from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
-from fluoromap_service.api.results import archive, dicom_files, maps, overlays, points, report, tracks
+from fluoromap_service.api.results import archive, deliveries, dicom_files, maps, overlays, points, report, tracks
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
@@ -44,11 +44,14 @@ from fluoromap_service.api.study import (
     studies,
 )
 from fluoromap_service.jobs import queue
+from fluoromap_service.jobs.rule_watch import RuleWatch
+from fluoromap_service.jobs.start_rules import read_rules
 from fluoromap_service.settings import settings
 from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
 CLEAN_UP_SECONDS = 60.0
+RULE_SECONDS = 2.0
 
 ROUTERS = (
     studies.router,
@@ -79,6 +82,7 @@ ROUTERS = (
     store.router,
     search.router,
     retrieve.router,
+    rendered.router,
     pages.router,
 )
 
@@ -86,7 +90,13 @@ log = structlog.get_logger(__name__)
 
 
 def create_app() -> FastAPI:
-    """Make the application."""
+    """Make the application.
+
+    Raises
+    ------
+    Problem
+        422 when the configuration file cannot be used.
+    """
     # FastAPI's documentation pages fetch scripts from the internet; hospital networks are closed.
     app = FastAPI(
         title="fluoromap",
@@ -102,6 +112,8 @@ def create_app() -> FastAPI:
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
     app.state.acts, app.state.counts, app.state.sign_ins = acts, counts, sign_ins
+    rules = read_rules()
+    app.state.rules = RuleWatch(rules) if rules else None
     problems.install(app)
     for router in ROUTERS:
         app.include_router(router)
@@ -149,6 +161,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         asyncio.create_task(_repeat("audit_not_written", acts.flush, FLUSH_SECONDS)),
         asyncio.create_task(_repeat("clean_up_failed", clean_up, CLEAN_UP_SECONDS)),
     ]
+    rules: RuleWatch | None = app.state.rules
+    if rules is not None:
+        tasks.append(asyncio.create_task(_repeat("rules_not_applied", rules.look, RULE_SECONDS)))
     if not settings().eager:
         tasks += [
             asyncio.create_task(_repeat("sweep_failed", queue.sweep, SWEEP_SECONDS)),

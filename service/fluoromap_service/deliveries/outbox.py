@@ -1,6 +1,6 @@
 """The outbox of deliveries. SQL is the truth, and its times are the database's.
 
-A committed row in state ``waiting`` may be claimed. A claim lasts as long as its lease is extended, and each attempt has a
+A committed row in state ``pending`` may be claimed. A claim lasts as long as its lease is extended, and each attempt has a
 number: a sender that lost its claim changes nothing. An object is marked as ``sending`` before its first byte leaves. After a
 crash the next sender therefore knows which object the target may have already, and asks the target.
 """
@@ -16,6 +16,7 @@ from sqlalchemy import and_, exists, or_, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session, defer
 
+from fluoromap_service.deliveries.targets import Target
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.settings import settings
 from fluoromap_service.store import audit, tally
@@ -60,10 +61,15 @@ class Failure:
 _LOST = Failure("sender_lost", "The sender ended in the middle of this attempt; another attempt follows by itself.")
 
 
-def register(session: Session, target: str) -> None:
-    """Add a target. Jobs that end from now on are delivered to it."""
+def register(session: Session, targets: Iterable[Target]) -> None:
+    """Add the targets that are new.
+
+    Jobs that end from now on are delivered to them.
+    """
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
-    session.execute(insert(DeliveryTarget).values(name=target, since=db_now()).on_conflict_do_nothing())
+    for target in sorted(targets, key=lambda target: target.name):
+        row = insert(DeliveryTarget).values(name=target.name, kind=target.kind, since=db_now())
+        session.execute(row.on_conflict_do_update(index_elements=["name"], set_={"kind": target.kind}))
 
 
 def needs_work(session: Session, target: str, job_ends: Iterable[str]) -> bool:
@@ -99,7 +105,7 @@ def _unplanned(target: str, job_ends: Iterable[str]) -> Any:
 
 
 def _add(session: Session, target: str, job_id: str) -> Delivery:
-    delivery = Delivery(id=uuid.uuid4().hex, target=target, job_id=job_id, state=DeliveryState.WAITING)
+    delivery = Delivery(id=uuid.uuid4().hex, target=target, job_id=job_id, state=DeliveryState.PENDING)
     session.add(delivery)
     session.flush()
     return delivery
@@ -117,7 +123,7 @@ def claim(session: Session, target: str, sender: str) -> Claim | None:
     found = session.scalar(oldest)
     row = session.execute(
         update(Delivery)
-        .where(Delivery.id == found, Delivery.state == DeliveryState.WAITING)
+        .where(Delivery.id == found, Delivery.state == DeliveryState.PENDING)
         .values(
             state=DeliveryState.SENDING,
             attempt=Delivery.attempt + 1,
@@ -134,8 +140,10 @@ def extend(session: Session, held: Claim) -> bool:
     return _change(session, held, lease_until=db_now() + settings().lease_seconds)
 
 
-def set_objects(session: Session, held: Claim, objects: Mapping[str, str]) -> dict[str, ObjectState]:
-    """Store the objects of a delivery and return the state of each.
+def begin_objects(session: Session, held: Claim, objects: Mapping[str, str]) -> dict[str, ObjectState]:
+    """Return the state of each object of a delivery whose attempt begins.
+
+    The attempt counts for the objects that have not arrived.
 
     Parameters
     ----------
@@ -149,13 +157,24 @@ def set_objects(session: Session, held: Claim, objects: Mapping[str, str]) -> di
     ClaimLost
     """
     _demand(session, held)
-    known = {row.sop_instance_uid: row.state for row in objects_of(session, held.delivery_id)}
+    add_objects(session, held.delivery_id, objects)
+    session.execute(
+        update(DeliveryObject)
+        .where(DeliveryObject.delivery_id == held.delivery_id, DeliveryObject.state != ObjectState.DELIVERED)
+        .values(attempts=DeliveryObject.attempts + 1)
+    )
+    return {row.sop_instance_uid: ObjectState(row.state) for row in objects_of(session, held.delivery_id)}
+
+
+def add_objects(session: Session, delivery_id: str, objects: Mapping[str, str]) -> None:
+    """Add the objects of a delivery that it lacks; SOP Instance UID -> file name."""
+    known = {row.sop_instance_uid for row in objects_of(session, delivery_id)}
     session.add_all(
-        DeliveryObject(delivery_id=held.delivery_id, sop_instance_uid=uid, name=name, state=ObjectState.WAITING)
+        DeliveryObject(delivery_id=delivery_id, sop_instance_uid=uid, name=name, state=ObjectState.PENDING)
         for uid, name in objects.items()
         if uid not in known
     )
-    return {uid: ObjectState(known.get(uid, ObjectState.WAITING)) for uid in objects}
+    session.flush()
 
 
 def set_object_state(session: Session, held: Claim, uid: str, state: ObjectState) -> None:
@@ -212,7 +231,7 @@ def fail(session: Session, held: Claim, failure: Failure, *, wait_seconds: float
     changed = _change(
         session,
         held,
-        state=DeliveryState.FAILED if over else DeliveryState.WAITING,
+        state=DeliveryState.FAILED if over else DeliveryState.PENDING,
         error={"code": failure.code, "detail": failure.detail},
         lease_until=None,
         failures=Delivery.failures + 1,
@@ -247,7 +266,7 @@ def reap(session: Session, target: str) -> int:
     freed = session.execute(
         update(Delivery)
         .where(Delivery.target == target, _expired())
-        .values(state=DeliveryState.WAITING, lease_until=None, due=db_now())
+        .values(state=DeliveryState.PENDING, lease_until=None, due=db_now())
         .returning(Delivery.id, Delivery.job_id, Delivery.target, Delivery.attempt)
     ).all()
     for row in freed:
@@ -258,47 +277,61 @@ def reap(session: Session, target: str) -> int:
 def retry(session: Session, delivery_id: str) -> Delivery:
     """Try a delivery again at once.
 
-    Its time before it is given up begins anew.
+    Its time before it is given up begins anew. A delivery that has arrived is not changed.
 
     Raises
     ------
     Problem
-        404 when there is none; 409 ``delivered`` when everything has arrived.
+        404 when there is none.
     """
-    delivery = session.scalars(select(Delivery).where(Delivery.id == delivery_id).with_for_update()).one_or_none()
+    # A sender may hold the row; the new values must not meet an old copy of it.
+    query = select(Delivery).where(Delivery.id == delivery_id).with_for_update()
+    delivery = session.scalars(query.execution_options(populate_existing=True)).one_or_none()
     if delivery is None:
         raise not_found("delivery")
     if delivery.state == DeliveryState.DELIVERED:
-        raise Problem(409, "delivered", "Everything of this delivery has arrived already; nothing is sent again.")
+        return delivery
     now = session.scalar(select(db_now())) or 0.0
     delivery.since, delivery.failures = now, 0
     if delivery.state != DeliveryState.SENDING:
-        delivery.state, delivery.due, delivery.finished = DeliveryState.WAITING, now, None
+        delivery.state, delivery.due, delivery.finished = DeliveryState.PENDING, now, None
     session.flush()
     return delivery
+
+
+def target_kind(session: Session, job_id: str, target: str) -> str:
+    """Return the kind of a target that a job can be delivered to.
+
+    Raises
+    ------
+    Problem
+        404 when there is no such job; 409 ``not_ready`` while it runs; 422 ``unknown_target``.
+    """
+    job = session.get(Job, job_id, options=[defer(Job.snapshot)])
+    if job is None:
+        raise not_found("job")
+    row = session.get(DeliveryTarget, target)
+    if row is None:
+        raise Problem(
+            422, "unknown_target", "There is no such target; add it to the configuration file and start the service again.",
+            [("target", "unknown")],
+        )  # fmt: skip
+    if job.state not in ENDED_JOB:
+        raise Problem(409, "not_ready", "The job has not ended yet; follow the job and ask again.")
+    return row.kind
 
 
 def request(session: Session, job_id: str, target: str) -> Delivery:
     """Ask for the delivery of an ended job to a target.
 
-    The job may have ended before the target was registered.
+    The job may have ended before the target was registered. A delivery that exists is tried again.
 
     Raises
     ------
     Problem
-        404 when there is no such job; 409 ``not_ready`` while it runs; 422 ``unknown_target``; as :func:`retry` when the
-        delivery exists.
+        As :func:`target_kind`.
     """
-    job = session.get(Job, job_id, options=[defer(Job.snapshot)])
-    if job is None:
-        raise not_found("job")
-    if session.get(DeliveryTarget, target) is None:
-        raise Problem(
-            422, "unknown_target", "There is no such target; name it in the file of targets and start the sender.",
-            [("target", "unknown")],
-        )  # fmt: skip
-    if job.state not in ENDED_JOB:
-        raise Problem(409, "not_ready", "The job has not ended yet; follow the job and ask again.")
+    target_kind(session, job_id, target)
     known = session.scalar(select(Delivery.id).where(Delivery.job_id == job_id, Delivery.target == target))
     return _add(session, target, job_id) if known is None else retry(session, known)
 
@@ -316,7 +349,7 @@ def attempts_of(session: Session, delivery_id: str) -> Sequence[DeliveryAttempt]
 
 
 def _due() -> Any:
-    return and_(Delivery.state == DeliveryState.WAITING, Delivery.due <= db_now())
+    return and_(Delivery.state == DeliveryState.PENDING, Delivery.due <= db_now())
 
 
 def _expired() -> Any:

@@ -62,8 +62,10 @@ _SENTENCES: dict[HeaderWarning, str] = {
     HeaderWarning.ORIENTATION_UNUSABLE: (
         "PatientOrientation or FieldOfViewRotation does not fit the gantry angles; the service assumes an upright image."
     ),
-    HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; the service uses its first position only.",
-    HeaderWarning.TABLE_MOVED: "The table moved during this run; the service uses its first position only.",
+    HeaderWarning.POSITIONER_MOVED: "The gantry turned during this run; a job cannot use it.",
+    HeaderWarning.TABLE_MOVED: (
+        "The table moved during this run; the service uses its first position only, and trusts the site less."
+    ),
     HeaderWarning.PIXEL_INTENSITY_UNKNOWN: (
         "PixelIntensityRelationship is missing; the service assumes pixels prepared for display."
     ),

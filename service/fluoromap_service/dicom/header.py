@@ -40,7 +40,7 @@ _PIXEL_DATA = 0x7FE00010
 _FRAME_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
 
 # Functional group macros of Enhanced XA and RF, PS3.3 C.8.19.6, and the attributes read from each.
-_MACROS: dict[str, tuple[str, ...]] = {
+MACROS: dict[str, tuple[str, ...]] = {
     "PositionerPositionSequence": ("PositionerPrimaryAngle", "PositionerSecondaryAngle"),
     "XRayGeometrySequence": ("DistanceSourceToDetector", "DistanceSourceToIsocenter"),
     "FramePixelDataPropertiesSequence": (
@@ -61,10 +61,16 @@ _MACROS: dict[str, tuple[str, ...]] = {
         "CollimatorUpperHorizontalEdge", "CollimatorLowerHorizontalEdge", "CenterOfCircularCollimator",
         "RadiusOfCircularCollimator", "VerticesOfThePolygonalCollimator",
     ),
+    "FrameDisplayShutterSequence": (
+        "ShutterShape", "ShutterLeftVerticalEdge", "ShutterRightVerticalEdge", "ShutterUpperHorizontalEdge",
+        "ShutterLowerHorizontalEdge", "CenterOfCircularShutter", "RadiusOfCircularShutter", "VerticesOfThePolygonalShutter",
+    ),
     "FrameVOILUTSequence": ("WindowCenter", "WindowWidth"),
-    "FrameContentSequence": ("FrameAcquisitionDateTime",),
+    "FrameContentSequence": ("FrameAcquisitionDateTime", "FrameReferenceDateTime"),
+    "PatientOrientationInFrameSequence": ("PatientOrientation",),
 }  # fmt: skip
-_MACRO_OF = {keyword: macro for macro, keywords in _MACROS.items() for keyword in keywords}
+"""The functional groups that the service reads, and the attributes of each."""
+_MACRO_OF = {keyword: macro for macro, keywords in MACROS.items() for keyword in keywords}
 
 _PLAIN = (
     "ImageType", "SOPClassUID", "SOPInstanceUID", "StudyInstanceUID", "SeriesInstanceUID", "SeriesNumber", "Modality",
@@ -72,10 +78,8 @@ _PLAIN = (
     "TimezoneOffsetFromUTC", "FrameTime", "FrameTimeVector", "FrameIncrementPointer", "CineRate",
     "RecommendedDisplayFrameRate", "PlaneIdentification", "PositionerMotion", "PositionerPrimaryAngleIncrement",
     "PositionerSecondaryAngleIncrement", "DistanceSourceToPatient", "EstimatedRadiographicMagnificationFactor",
-    "IntensifierSize", "FieldOfViewDimensions", "PatientOrientation", "TableMotion", "TableVerticalIncrement",
-    "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "ShutterShape", "ShutterLeftVerticalEdge",
-    "ShutterRightVerticalEdge", "ShutterUpperHorizontalEdge", "ShutterLowerHorizontalEdge", "CenterOfCircularShutter",
-    "RadiusOfCircularShutter", "VerticesOfThePolygonalShutter", "SamplesPerPixel", "PhotometricInterpretation",
+    "IntensifierSize", "FieldOfViewDimensions", "TableMotion", "TableVerticalIncrement",
+    "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "SamplesPerPixel", "PhotometricInterpretation",
     "PatientPosition", "TableAngle",
     "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
 )  # fmt: skip

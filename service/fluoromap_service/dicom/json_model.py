@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pydicom
 
@@ -14,9 +14,9 @@ LARGEST_VALUE_BYTES = 4096
 _BINARY = frozenset({"OB", "OD", "OF", "OL", "OV", "OW", "UN"})
 
 
-def header_json(path: Path) -> Json:
+def header_json(file: Path | IO[bytes]) -> Json:
     """Return the header of a file in the DICOM JSON model."""
-    header = pydicom.dcmread(path, stop_before_pixels=True)
+    header = pydicom.dcmread(file, stop_before_pixels=True)
     for element in list(header):
         if element.VR in _BINARY and len(element.value or b"") > LARGEST_VALUE_BYTES:
             del header[element.tag]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from fluoromap.geometry.gantry import LEAST_SOURCE_MM, UPRIGHT, ImageAxes
@@ -169,32 +170,52 @@ def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
     """Warn when gantry or table moved during the run.
 
     Legacy XA has increments (0018,1520), (0018,1521), (0018,1135) to (0018,1137); Enhanced XA has functional groups that
-    differ between frames.
+    differ between frames. A cine that is DYNAMIC without such values has moved by an unknown amount.
     """
-    gantry_moved = any(
-        _spread(header, f"{axis}Increment", axis) > _STILL_DEG
+    gantry = [
+        _changes(header, "PositionerMotion", f"{axis}Increment", axis)
         for axis in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")
-    )
-    if gantry_moved:
+    ]
+    detector = max(_spread_of_frames(header, "DistanceSourceToDetector"), default=0.0)
+    if _moved(header, "PositionerMotion", gantry, _STILL_DEG) or detector > _STILL_MM:
         _warn(warnings, HeaderWarning.POSITIONER_MOVED)
-    axes = (("Lateral", "X"), ("Longitudinal", "Z"), ("Vertical", "Y"))
-    table_moved = any(
-        _spread(header, f"Table{name}Increment", f"TableTop{name}Position", f"Table{letter}PositionToIsocenter")
-        > _STILL_MM
-        for name, letter in axes
-    )
-    if table_moved:
+    table = [
+        _changes(
+            header,
+            "TableMotion",
+            f"Table{name}Increment",
+            f"TableTop{name}Position",
+            f"Table{letter}PositionToIsocenter",
+        )
+        for name, letter in (("Lateral", "X"), ("Longitudinal", "Z"), ("Vertical", "Y"))
+    ]
+    if _moved(header, "TableMotion", table, _STILL_MM):
         _warn(warnings, HeaderWarning.TABLE_MOVED)
 
 
-def _spread(header: Header, increments: str, *per_frame: str) -> float:
-    """Return the largest change of a value during the run.
+def _moved(header: Header, motion: str, changes: list[list[float]], still: float) -> bool:
+    stated = [change for axis in changes for change in axis]
+    if not stated:
+        return header.text(motion) == "DYNAMIC" and (header.integer("NumberOfFrames") or 1) > 1
+    return max(stated) > still
 
-    Legacy XA gives each frame's difference from the first frame (``increments``): the largest absolute value counts.
+
+def _changes(header: Header, motion: str, increments: str, *per_frame: str) -> list[float]:
+    """Return the largest change of a value by each attribute that states it.
+
+    Legacy XA gives each frame's difference from the first frame (``increments``): the largest absolute value counts. Some
+    systems write the difference from the frame before: where the motion is DYNAMIC, the sum of the differences counts too.
     Enhanced XA gives the value of each frame (``per_frame``): the largest value less the smallest counts.
     """
-    spreads = [max((abs(value) for value in header.numbers(increments)), default=0.0)]
+    values = header.numbers(increments)
+    changes = [max(abs(value) for value in values)] if values else []
+    if values and header.text(motion) == "DYNAMIC":
+        changes.append(max(abs(total) for total in itertools.accumulate(values)))
     for keyword in per_frame:
-        values = [numbers[0] for numbers in header.numbers_per_frame(keyword) if numbers]
-        spreads.append(max(values) - min(values) if values else 0.0)
-    return max(spreads)
+        changes += _spread_of_frames(header, keyword)
+    return changes
+
+
+def _spread_of_frames(header: Header, keyword: str) -> list[float]:
+    values = [numbers[0] for numbers in header.numbers_per_frame(keyword) if numbers]
+    return [max(values) - min(values)] if values else []

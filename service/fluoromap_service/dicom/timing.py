@@ -54,9 +54,13 @@ def _frame_time_vector(header: Header, frames: int) -> tuple[float, ...] | None:
 
 
 def _frame_clocks(header: Header, frames: int) -> tuple[float, ...] | None:
-    clocks = [
-        _clock(values[0], UTC) if values else None for values in header.texts_per_frame("FrameAcquisitionDateTime")
-    ]
+    return _clock_steps(header, frames, "FrameAcquisitionDateTime") or _clock_steps(
+        header, frames, "FrameReferenceDateTime"
+    )
+
+
+def _clock_steps(header: Header, frames: int, keyword: str) -> tuple[float, ...] | None:
+    clocks = [_clock(values[0], UTC) if values else None for values in header.texts_per_frame(keyword)]
     known = [clock for clock in clocks if clock is not None]
     if len(known) != frames or not all(
         0 < (later - earlier).total_seconds() * 1000 <= _LONGEST_INTERVAL_MS

@@ -60,6 +60,13 @@ def map_picture_dependencies(map_sha256: str) -> Dependencies:
     return {"kind": "map_picture", "drawing": drawing.VERSION, "map": map_sha256}
 
 
+RESULT_OBJECTS: Dependencies = {"kind": "dicom"}
+"""The dependencies of the DICOM objects of a job: none.
+
+A later version of the service may draw other pictures, but an object never changes under its UID.
+"""
+
+
 def report_dependencies(
     template_sha256: str, job_version: int, label: str | None, guessed_sites: tuple[str, ...]
 ) -> Dependencies:

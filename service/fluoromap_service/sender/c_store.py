@@ -15,8 +15,9 @@ from pynetdicom import AE
 from pynetdicom.association import Association
 from pynetdicom.sop_class import StudyRootQueryRetrieveInformationModelFind  # type: ignore[attr-defined]
 
+from fluoromap_service.api.results.delivery_objects import OutgoingObject
 from fluoromap_service.deliveries.targets import CStoreTarget
-from fluoromap_service.sender.peers import NotDelivered, Peer, ResultObject
+from fluoromap_service.sender.peers import NotDelivered, Peer
 from fluoromap_service.settings import settings
 
 CONNECT_SECONDS = 10.0
@@ -26,7 +27,7 @@ _PENDING = frozenset({0xFF00, 0xFF01})
 
 
 @contextmanager
-def associated(target: CStoreTarget, objects: Sequence[ResultObject]) -> Iterator[Peer]:
+def associated(target: CStoreTarget, objects: Sequence[OutgoingObject]) -> Iterator[Peer]:
     """Open an association with a target for its objects.
 
     Raises
@@ -42,7 +43,7 @@ def associated(target: CStoreTarget, objects: Sequence[ResultObject]) -> Iterato
         for syntax in (ExplicitVRLittleEndian, ImplicitVRLittleEndian):
             entity.add_requested_context(sop_class, syntax)
     entity.add_requested_context(StudyRootQueryRetrieveInformationModelFind)
-    association = entity.associate(target.host, target.port, ae_title=target.called_aet, tls_args=_tls(target))
+    association = entity.associate(target.host, target.port, ae_title=target.aet, tls_args=_tls(target))
     try:
         _check(association, objects)
         yield _Node(association)
@@ -60,12 +61,12 @@ def _tls(target: CStoreTarget) -> tuple[ssl.SSLContext, str] | None:
             context.load_cert_chain(target.certificate_file, target.key_file)
     except OSError as error:
         raise NotDelivered(
-            "configuration", "The sender cannot read the certificates of this target; correct the file of targets."
+            "configuration", "The sender cannot read the certificates of this target; correct the configuration file."
         ) from error
     return context, target.host
 
 
-def _check(association: Association, objects: Sequence[ResultObject]) -> None:
+def _check(association: Association, objects: Sequence[OutgoingObject]) -> None:
     if association.is_rejected:
         answer: Any = association.acceptor.primitive
         raise NotDelivered(
@@ -92,7 +93,7 @@ class _Node:
     def __init__(self, association: Association) -> None:
         self._association = association
 
-    def has(self, item: ResultObject) -> bool | None:
+    def has(self, item: OutgoingObject) -> bool | None:
         model = StudyRootQueryRetrieveInformationModelFind
         if model not in {context.abstract_syntax for context in self._association.accepted_contexts}:
             return None
@@ -111,7 +112,7 @@ class _Node:
         # Without an end of the answers nobody knows whether it has the object.
         return bool(matches) if status == 0x0000 else None
 
-    def store(self, item: ResultObject) -> None:
+    def store(self, item: OutgoingObject) -> None:
         try:
             answer = self._association.send_c_store(pydicom.dcmread(io.BytesIO(item.content)))
         except (RuntimeError, ValueError) as error:

@@ -64,7 +64,8 @@ def secret_of(path: Path) -> str:
 def unreadable_secret() -> NotDelivered:
     """Return the failure of a target whose secret or certificate cannot be read."""
     return NotDelivered(
-        "configuration", "The sender cannot read a secret or certificate of this target; correct the file of targets."
+        "configuration",
+        "The sender cannot read a secret or certificate of this target; correct the configuration file.",
     )
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass
 from typing import Protocol
 
-import pydicom
-
+from fluoromap_service.api.results.delivery_objects import OutgoingObject
 from fluoromap_service.deliveries.outbox import Failure
 
 
@@ -19,32 +16,13 @@ class NotDelivered(Exception):
         self.failure = Failure(code, detail)
 
 
-@dataclass(frozen=True, slots=True)
-class ResultObject:
-    """A DICOM file with the UIDs by which a peer knows it."""
-
-    name: str
-    content: bytes
-    sop_class_uid: str
-    study_instance_uid: str
-    series_instance_uid: str
-    sop_instance_uid: str
-
-    @classmethod
-    def of_file(cls, name: str, content: bytes) -> ResultObject:
-        """Read the UIDs of a DICOM file."""
-        keywords = ["SOPClassUID", "StudyInstanceUID", "SeriesInstanceUID", "SOPInstanceUID"]
-        header = pydicom.dcmread(io.BytesIO(content), stop_before_pixels=True, specific_tags=list(keywords))
-        return cls(name, content, *(str(header[keyword].value) for keyword in keywords))
-
-
 class Peer(Protocol):
     """An open connection to a target."""
 
-    def has(self, item: ResultObject) -> bool | None:
+    def has(self, item: OutgoingObject) -> bool | None:
         """Return whether the peer has an object; None when it answers no such question."""
 
-    def store(self, item: ResultObject) -> None:
+    def store(self, item: OutgoingObject) -> None:
         """Send an object.
 
         Raises

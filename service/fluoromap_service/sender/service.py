@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import socket
 import threading
-import zipfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from importlib.metadata import version
 from types import TracebackType
 
 import structlog
 from sqlalchemy.exc import SQLAlchemyError
 
-from fluoromap_service.api.results.dicom_files import zipped_objects
+from fluoromap_service.api.results.delivery_objects import OutgoingObject, delivery_objects
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.deliveries.outbox import Claim, ClaimLost
 from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget, Target, WebhookTarget
 from fluoromap_service.problem import Problem
 from fluoromap_service.sender import webhook
 from fluoromap_service.sender.c_store import associated
-from fluoromap_service.sender.peers import NotDelivered, Peer, ResultObject
+from fluoromap_service.sender.peers import NotDelivered, Peer
 from fluoromap_service.sender.stow import open_server
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import ObjectState
-from fluoromap_service.store.renderings import kept_rendering
 
 LOOK_SECONDS = 1.0
 """Time between two looks into the outbox."""
@@ -130,9 +126,9 @@ def _send(target: Target, held: Claim) -> None:
     if isinstance(target, WebhookTarget):
         webhook.send(target, held)
         return
-    objects = result_objects(held.job_id)
+    objects = delivery_objects(held.job_id)
     with writing() as session:
-        states = outbox.set_objects(session, held, {item.sop_instance_uid: item.name for item in objects})
+        states = outbox.begin_objects(session, held, {item.sop_instance_uid: item.name for item in objects})
     waiting = [item for item in objects if states[item.sop_instance_uid] != ObjectState.DELIVERED]
     if not waiting:
         return
@@ -148,19 +144,8 @@ def _send(target: Target, held: Claim) -> None:
                 outbox.set_object_state(session, held, uid, ObjectState.DELIVERED)
 
 
-def _peer(target: CStoreTarget | StowTarget, objects: Sequence[ResultObject]) -> AbstractContextManager[Peer]:
+def _peer(target: CStoreTarget | StowTarget, objects: Sequence[OutgoingObject]) -> AbstractContextManager[Peer]:
     return associated(target, objects) if isinstance(target, CStoreTarget) else open_server(target)
-
-
-def result_objects(job_id: str) -> list[ResultObject]:
-    """Return the DICOM objects of a job.
-
-    They are kept until the disk is nearly full, so that an attempt does not draw them again.
-    """
-    depends_on = {"delivery": "dicom", "version": version("fluoromap")}
-    kept = kept_rendering(job_id, depends_on, lambda: zipped_objects(job_id))
-    with zipfile.ZipFile(io.BytesIO(kept.path.read_bytes())) as archive:
-        return [ResultObject.of_file(name, archive.read(name)) for name in archive.namelist()]
 
 
 class _Lease:

@@ -9,9 +9,10 @@ from typing import Any
 
 import httpx
 
+from fluoromap_service.api.results.delivery_objects import OutgoingObject
 from fluoromap_service.deliveries.targets import StowTarget
 from fluoromap_service.sender.http_targets import connected, refused, secret_of
-from fluoromap_service.sender.peers import Peer, ResultObject
+from fluoromap_service.sender.peers import Peer
 
 _FAILED, _REASON = "00081198", "00081197"  # FailedSOPSequence, FailureReason: PS3.18 annex I.2.2
 _DUPLICATE = 0x0111
@@ -40,7 +41,7 @@ class _Server:
     def __init__(self, client: httpx.Client, base: str) -> None:
         self._client, self._base = client, base
 
-    def has(self, item: ResultObject) -> bool | None:
+    def has(self, item: OutgoingObject) -> bool | None:
         answer = self._client.get(
             f"{self._base}/studies/{item.study_instance_uid}/series/{item.series_instance_uid}/instances",
             params={"SOPInstanceUID": item.sop_instance_uid},
@@ -50,7 +51,7 @@ class _Server:
         found = _json(answer) if answer.status_code == 200 else None
         return bool(found) if isinstance(found, list) else None
 
-    def store(self, item: ResultObject) -> None:
+    def store(self, item: OutgoingObject) -> None:
         boundary = secrets.token_hex(16)
         head = f"--{boundary}\r\nContent-Type: application/dicom\r\n\r\n".encode()
         tail = f"\r\n--{boundary}--\r\n".encode()

@@ -64,7 +64,7 @@ class StageState(StrEnum):
 class DeliveryState(StrEnum):
     """The state of a delivery."""
 
-    WAITING = "waiting"  # may be claimed from its due time on; a committed waiting row is the outbox
+    PENDING = "pending"  # may be claimed from its due time on; a committed pending row is the outbox
     SENDING = "sending"  # claimed; alive while its lease is extended
     DELIVERED = "delivered"
     FAILED = "failed"  # given up; somebody may ask for another try
@@ -73,7 +73,7 @@ class DeliveryState(StrEnum):
 class ObjectState(StrEnum):
     """The state of one object of a delivery."""
 
-    WAITING = "waiting"
+    PENDING = "pending"
     SENDING = "sending"  # after a crash nobody knows whether the target has it
     DELIVERED = "delivered"
 
@@ -298,6 +298,7 @@ class DeliveryTarget(Base):
 
     __tablename__ = "delivery_target"
     name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(10))  # dicom, dicomweb or webhook
     since: Mapped[float]  # jobs that ended later are delivered by themselves
 
 
@@ -334,6 +335,7 @@ class DeliveryObject(Base):
     delivery_id: Mapped[str] = mapped_column(ForeignKey("delivery.id", ondelete="CASCADE"))
     sop_instance_uid: Mapped[str] = mapped_column(String(64))
     name: Mapped[str] = mapped_column(String(64))  # file name in the results: report.dcm
+    attempts: Mapped[int] = mapped_column(default=0)  # attempts of the delivery that had to send it
     state: Mapped[str] = mapped_column(String(10))
     delivered: Mapped[float | None]
 
@@ -348,15 +350,6 @@ class DeliveryAttempt(Base):
     ended: Mapped[float] = mapped_column(default=db_now())
     code: Mapped[str | None] = mapped_column(String(40))
     detail: Mapped[str | None] = mapped_column(Text)
-
-
-class RuleStart(Base):
-    """A job that a rule started; each rule starts one job of a study."""
-
-    __tablename__ = "rule_start"
-    study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"), primary_key=True)
-    rule: Mapped[str] = mapped_column(String(64), primary_key=True)
-    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"))
 
 
 class Idempotency(Base):

@@ -36,7 +36,7 @@ def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], b
     make : callable
         Makes the content. It is called outside any transaction.
     """
-    key = hashlib.sha256(json.dumps([job_id, depends_on], sort_keys=True).encode()).hexdigest()
+    key = _key(job_id, depends_on)
     kept = _find(key)
     if kept is not None:
         return kept
@@ -56,6 +56,15 @@ def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], b
             raise
         return kept
     return KeptFile(sha256, files.path_of(sha256))
+
+
+def find_rendering(job_id: str, depends_on: dict[str, Any]) -> KeptFile | None:
+    """Return the kept rendering of a job; None when there is none."""
+    return _find(_key(job_id, depends_on))
+
+
+def _key(job_id: str, depends_on: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([job_id, depends_on], sort_keys=True).encode()).hexdigest()
 
 
 def _find(key: str) -> KeptFile | None:

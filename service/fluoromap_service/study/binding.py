@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
+from fluoromap_service.dicom.facts import HeaderWarning
 from fluoromap_service.problem import not_found
 from fluoromap_service.store.models import Site, Study
 from fluoromap_service.study import pairing
@@ -140,6 +141,8 @@ def _run_value(run: StudyRun) -> pairing.Run:
         file_name=run.link.file_name,
         site=run.link.site,
         site_by=run.link.site_by,
+        gantry_turned=HeaderWarning.POSITIONER_MOVED in run.facts.warnings,
+        table_moved=HeaderWarning.TABLE_MOVED in run.facts.warnings,
     )
 
 
@@ -207,6 +210,8 @@ def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
     if runs.a is None or runs.b is None:
         return None, None
     angle_deg = pairing.view_angle_deg(runs.a, runs.b)
+    if runs.a.gantry_turned or runs.b.gantry_turned:
+        return Reason.GANTRY_TURNED, angle_deg
     if angle_deg is not None and angle_deg < PARALLEL_BELOW_DEG:
         return Reason.VIEWS_PARALLEL, angle_deg
     return None, angle_deg
@@ -214,9 +219,10 @@ def _pair_check(runs: SiteRuns) -> tuple[Reason | None, float | None]:
 
 def _doubts(runs: SiteRuns) -> tuple[Reason, ...]:
     """Return why the positions of a usable pair deserve less trust."""
-    if runs.a is None or runs.b is None or pairing.tables_comparable(runs.a, runs.b):
+    if runs.a is None or runs.b is None:
         return ()
-    return (Reason.TABLE_MOVED,)
+    moved = runs.a.table_moved or runs.b.table_moved or not pairing.tables_comparable(runs.a, runs.b)
+    return (Reason.TABLE_MOVED,) if moved else ()
 
 
 def site_of(session: Session, study: Study, name: str, *, also_empty: bool = False) -> BoundSite:

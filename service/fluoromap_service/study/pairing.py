@@ -52,6 +52,8 @@ class Run:
         Name of the uploaded file.
     site, site_by : str or None
         Site that the upload ("upload") or a PATCH ("explicit") gave.
+    gantry_turned, table_moved : bool
+        Whether the gantry or the table moved during the run.
     """
 
     uid: str
@@ -63,6 +65,8 @@ class Run:
     file_name: str | None = None
     site: str | None = None
     site_by: str | None = None
+    gantry_turned: bool = False
+    table_moved: bool = False
 
 
 @dataclass(frozen=True, slots=True)

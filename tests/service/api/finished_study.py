@@ -37,7 +37,7 @@ from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrac
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study
+from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study, StudyInstance
 from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
     GantrySnapshot,
@@ -178,6 +178,8 @@ def make_study() -> FinishedStudy:
         session.add(study)
         session.flush()
         runs = {uid: _stored_run(session, uid, view) for (_, view), uid in uids.items()}
+        session.flush()
+        session.add_all(StudyInstance(study_id=study.id, sop_instance_uid=uid) for uid in runs)
         plugin = PluginSnapshot(name="by-hand", version="1", params={})
         snapshot = Snapshot(
             study=study.id,

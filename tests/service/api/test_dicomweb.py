@@ -12,6 +12,7 @@ import numpy as np
 import pydicom
 import pytest
 from fastapi.testclient import TestClient
+from PIL import Image
 from pydicom.dataset import Dataset
 from small_runs import COLUMNS, FRAMES, ROWS, STUDY_UID, edited, run_uid, small_run
 from sqlalchemy import func, select
@@ -44,8 +45,12 @@ def parts_of(answer: Any) -> list[bytes]:
 
 def found(service: TestClient, path: str) -> list[Dataset]:
     answer = service.get(path)
+    if answer.status_code == 204:
+        assert answer.content == b""
+        return []
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/dicom+json"
+    assert answer.json() != []
     return [Dataset.from_json(entry) for entry in answer.json()]
 
 
@@ -184,6 +189,20 @@ def test_frames_are_the_stored_pixels(service: TestClient, two_runs: list[bytes]
         sent[2].tolist(),
         sent[0].tolist(),
     ]
+
+
+def test_rendered_frames_follow_the_photometric_interpretation(service: TestClient, tmp_path: Path) -> None:
+    pictures = []
+    for number, interpretation in ((1, "MONOCHROME1"), (2, "MONOCHROME2")):
+        file = edited(small_run(tmp_path, number, 0.0), PhotometricInterpretation=interpretation)
+        assert store(service, file).status_code == 200
+        answer = service.get(f"{address(file)}/frames/2/rendered?window=2048,4096,linear-exact&accept=image/png")
+        stored = pydicom.dcmread(io.BytesIO(file)).pixel_array[1] / 4096 * 255
+        shown = np.asarray(Image.open(io.BytesIO(answer.content)), dtype=np.float64)
+        pictures.append((shown, stored))
+    (inverted, first), (plain, second) = pictures
+    np.testing.assert_allclose(255 - inverted, first, atol=0.51)
+    np.testing.assert_allclose(plain, second, atol=0.51)
 
 
 def test_what_is_not_there_or_not_offered(service: TestClient, two_runs: list[bytes]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from delivery_peers import TARGETS
 from finished_study import make_study
 from program import Program, one_sentence
 from typer.testing import CliRunner
@@ -20,15 +21,14 @@ def test_list_show_retry_and_send(data_dir: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(schema, "check", lambda: None)
     monkeypatch.setenv("COLUMNS", "250")
     with writing() as session:
-        outbox.register(session, "pacs")
-        outbox.register(session, "archive")
+        outbox.register(session, TARGETS)
     study = make_study()
     study.finish()
     with writing() as session:
         outbox.plan(session, "pacs", ["succeeded"])
         held = outbox.claim(session, "pacs", "tester")
         assert held is not None
-        outbox.set_objects(session, held, {"1.2.3": "report.dcm"})
+        outbox.begin_objects(session, held, {"1.2.3": "report.dcm"})
         outbox.fail(session, held, Failure("unreachable", "No answer."), wait_seconds=None, give_up_days=7)
 
     def run(*arguments: str) -> str:
@@ -40,16 +40,19 @@ def test_list_show_retry_and_send(data_dir: Path, monkeypatch: pytest.MonkeyPatc
     assert all(text in listed for text in (held.delivery_id, "pacs", study.job_id, "unreachable"))
     assert held.delivery_id not in run("list", "--target", "archive")
     shown = run("show", held.delivery_id)
-    assert shown.splitlines()[:2] == [f"failed: job {study.job_id} to pacs", "  report.dcm  waiting"]
+    assert shown.splitlines()[:2] == [f"failed: job {study.job_id} to pacs", "  report.dcm  pending"]
     assert "unreachable: No answer." in shown
     run("retry", held.delivery_id)
-    assert "waiting" in run("show", held.delivery_id)
+    assert "pending" in run("show", held.delivery_id)
     sent = run("send", study.job_id, "archive").strip()
-    assert sent in run("list", "--state", "waiting", "--target", "archive")
+    assert sent in run("list", "--state", "pending", "--target", "archive")
 
 
-def test_sender_needs_a_file_of_targets(fluoromap: Program, tmp_path: Path) -> None:
-    assert "--targets" in one_sentence(fluoromap("sender"))
-    wrong = tmp_path / "targets.toml"
-    wrong.write_text("[[target]]\nname = 'x'\n")
-    assert "targets.toml cannot be used" in one_sentence(fluoromap("sender", "--targets", str(wrong)))
+def test_sender_needs_targets(fluoromap: Program, tmp_path: Path) -> None:
+    assert "[targets.NAME]" in one_sentence(fluoromap("sender"))
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("[targets.pacs]\nkind = 'ftp'\n")
+    for command in ("sender", "up", "api"):
+        fluoromap("db", "upgrade")
+        answer = fluoromap(command, FLUOROMAP_CONFIG=str(wrong))
+        assert "wrong.toml cannot be used (targets.pacs" in one_sentence(answer)

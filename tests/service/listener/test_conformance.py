@@ -9,7 +9,8 @@ from pathlib import Path
 from fastapi.routing import APIRoute
 from pydicom.uid import UID
 
-from fluoromap_service.api.dicomweb import retrieve, search, store
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
+from fluoromap_service.dicom.header import MACROS
 from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
 from fluoromap_service.settings import Settings
@@ -38,6 +39,11 @@ def test_transfer_syntaxes() -> None:
     assert rows == [(UID(uid).name, uid) for uid in server.TRANSFER_SYNTAXES]
 
 
+def test_functional_groups() -> None:
+    rows = re.findall(r"^\| (\w+Sequence) \| (.+) \|$", section("Geometry"), re.M)
+    assert rows == [(macro, ", ".join(keywords)) for macro, keywords in MACROS.items()]
+
+
 def test_statuses() -> None:
     rows = re.findall(r"^\| `([0-9A-F]{4})` \| (.+) \|$", section("Statuses of C-STORE"), re.M)
     assert rows == [(f"{status:04X}", status_meanings()[status]) for status in StoreStatus]
@@ -45,7 +51,7 @@ def test_statuses() -> None:
 
 def transactions() -> list[tuple[str, str, str]]:
     """Return name, method and path of each DICOMweb route."""
-    modules = {"store": store, "search": search, "retrieve": retrieve}
+    modules = {"store": store, "search": search, "retrieve": retrieve, "render": rendered}
     return [
         (name, method, route.path)
         for name, module in modules.items()
@@ -56,7 +62,7 @@ def transactions() -> list[tuple[str, str, str]]:
 
 
 def test_transactions() -> None:
-    rows = re.findall(r"^\| (store|search|retrieve) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
+    rows = re.findall(r"^\| (store|search|retrieve|render) \| (\w+) \| `(.+)` \|$", section("DICOMweb"), re.M)
     assert rows == transactions()
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from delivery_peers import TARGETS
 from finished_study import FinishedStudy, make_study
 
 from fluoromap_service.api.http import file_pool
@@ -24,8 +25,7 @@ def file_processes() -> Iterator[None]:
 def study(data_dir: Path, file_processes: None) -> FinishedStudy:
     """A job that succeeded after the targets were registered."""
     with writing() as session:
-        for target in ("pacs", "archive", "hook"):
-            outbox.register(session, target)
+        outbox.register(session, TARGETS)
     made = make_study()
     made.finish()
     return made

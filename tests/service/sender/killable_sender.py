@@ -16,7 +16,7 @@ from fluoromap_service.sender.service import send_next
 
 def main() -> None:
     logs.configure()
-    kind = {"c-store": CStoreTarget, "stow-rs": StowTarget}[sys.argv[1]]
+    kind = {"dicom": CStoreTarget, "dicomweb": StowTarget}[sys.argv[1]]
     target = kind.model_validate_json(sys.stdin.readline())
     for _ in sys.stdin:
         process = os.fork()

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -25,13 +24,12 @@ from pydicom.dataset import Dataset
 from pynetdicom import evt
 from sqlalchemy import select, update
 
-from fluoromap_service.api.results.dicom_files import zipped_objects
+from fluoromap_service.api.results.delivery_objects import delivery_objects
 from fluoromap_service.cli.supervisor import free_port
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget, WebhookTarget
 from fluoromap_service.jobs import job_life
-from fluoromap_service.problem import Problem
-from fluoromap_service.sender.service import result_objects, send_next
+from fluoromap_service.sender.service import send_next
 from fluoromap_service.settings import settings
 from fluoromap_service.store import audit, tally
 from fluoromap_service.store.clock import db_now
@@ -41,15 +39,14 @@ from fluoromap_service.study import studies
 from fluoromap_service.study.snapshot import Snapshot
 
 Serve = Callable[[Archive], AbstractContextManager[CStoreTarget | StowTarget]]
-BOTH = pytest.mark.parametrize("serve", [dicom_node, dicomweb_server], ids=["c-store", "stow-rs"])
+BOTH = pytest.mark.parametrize("serve", [dicom_node, dicomweb_server], ids=["dicom", "dicomweb"])
 OUT_OF_RESOURCES = 0xA700
 SECRET = "0123456789abcdef"
 
 
 def objects_of(study: FinishedStudy) -> dict[str, Dataset]:
     """Return the result objects of a job by their SOP Instance UID."""
-    with zipfile.ZipFile(io.BytesIO(zipped_objects(study.job_id))) as archive:
-        read = [pydicom.dcmread(io.BytesIO(archive.read(name))) for name in archive.namelist()]
+    read = [pydicom.dcmread(io.BytesIO(item.content)) for item in delivery_objects(study.job_id)]
     return {item.SOPInstanceUID: item for item in read}
 
 
@@ -87,27 +84,25 @@ def test_objects_arrive_as_they_are(study: FinishedStudy, serve: Serve) -> None:
         assert send_next(target)
         assert not send_next(target)
     assert {item.SOPInstanceUID: item for item in archive.stored} == objects_of(study)
-    assert len(archive.stored) == 3
+    assert len(archive.stored) == len(objects_of(study))
     assert archive.questions == 0
     row = delivery(study.job_id)
     assert (row.state, row.attempt, row.error, history(study.job_id)) == ("delivered", 1, None, [None])
     with reading() as session:
         sums = tally.all_sums(session)
         acts = [(act.who, act.what, act.study, act.job) for act in audit.entries(session)]
-    assert sums[f"delivered_objects|{target.name}"] == 3
+    assert sums[f"delivered_objects|{target.name}"] == len(archive.stored)
     assert acts == [("sender", f"delivery to {target.name}: delivered", study.study_id, study.job_id)]
 
 
 def test_target_that_was_away_for_a_day(study: FinishedStudy) -> None:
     archive, port = Archive(), free_port()
-    away = CStoreTarget(
-        name="pacs", kind="c-store", host="127.0.0.1", port=port, called_aet="PACS", first_wait_seconds=30
-    )
+    away = CStoreTarget(name="pacs", kind="dicom", host="127.0.0.1", port=port, aet="PACS", first_wait_seconds=30)
     for failures in range(1, 25):
         assert send_next(away) if failures == 1 else attempt_again(away) is None
         row = delivery(study.job_id)
         assert row.error is not None
-        assert (row.state, row.failures, row.error["code"]) == ("waiting", failures, "unreachable")
+        assert (row.state, row.failures, row.error["code"]) == ("pending", failures, "unreachable")
         with reading() as session:
             wait = session.scalar(select(Delivery.due - db_now()))
         expected = min(30 * 2 ** (failures - 1), 3600)
@@ -122,7 +117,7 @@ def test_target_that_was_away_for_a_day(study: FinishedStudy) -> None:
 
 def test_given_up_after_days_and_tried_again_on_request(study: FinishedStudy) -> None:
     archive, port = Archive(), free_port()
-    away = CStoreTarget(name="pacs", kind="c-store", host="127.0.0.1", port=port, called_aet="PACS")
+    away = CStoreTarget(name="pacs", kind="dicom", host="127.0.0.1", port=port, aet="PACS")
     assert send_next(away)
     with writing() as session:
         session.execute(update(Delivery).values(since=Delivery.since - 7 * outbox.DAY_SECONDS))
@@ -135,15 +130,16 @@ def test_given_up_after_days_and_tried_again_on_request(study: FinishedStudy) ->
         with writing() as session:
             outbox.retry(session, row.id)
         assert send_next(away)
-    assert len(archive.stored) == 3
-    with writing() as session, pytest.raises(Problem, match="arrived already"):
-        outbox.retry(session, row.id)
+    assert len(archive.stored) == len(objects_of(study))
+    with writing() as session:
+        assert outbox.retry(session, row.id).state == "delivered"
+    assert not send_next(away)
 
 
 @BOTH
 def test_refused_object_is_sent_again_and_no_other(study: FinishedStudy, serve: Serve) -> None:
-    refusals = [None, OUT_OF_RESOURCES, OUT_OF_RESOURCES, None, None]
-    archive = Archive(arrival=lambda item: refusals.pop(0))
+    refusals = [None, OUT_OF_RESOURCES, OUT_OF_RESOURCES]
+    archive = Archive(arrival=lambda item: refusals.pop(0) if refusals else None)
     with serve(archive) as target:
         send_next(target)
         assert len(archive.stored) == 1
@@ -161,7 +157,7 @@ def test_target_that_has_an_object_already_counts_as_delivered(study: FinishedSt
 
 @pytest.mark.parametrize(
     ("options", "changes", "code"),
-    [({}, {"called_aet": "OTHER"}, "association_rejected"), ({"classes": 5}, {}, "class_not_accepted")],
+    [({}, {"aet": "OTHER"}, "association_rejected"), ({"classes": 5}, {}, "class_not_accepted")],
     ids=["title", "classes"],
 )
 def test_refusals_of_the_negotiation(study: FinishedStudy, options: Any, changes: Any, code: str) -> None:
@@ -208,8 +204,8 @@ def test_answer_that_was_lost_is_asked_for(study: FinishedStudy) -> None:
 
 
 def test_target_without_queries_gets_an_uncertain_object_again(study: FinishedStudy) -> None:
-    statuses = [OUT_OF_RESOURCES, None, None, None]
-    archive = Archive(arrival=lambda item: statuses.pop(0))
+    statuses = [OUT_OF_RESOURCES]
+    archive = Archive(arrival=lambda item: statuses.pop(0) if statuses else None)
     with dicom_node(archive, answers_questions=False) as target:
         send_next(target)
         attempt_again(target)
@@ -232,7 +228,7 @@ def test_sender_killed_twenty_times_delivers_everything_once(study: FinishedStud
     jobs = [study, *(another_job(study) for _ in range(3))]
     for more in jobs[1:]:
         more.finish()
-    expected = Counter(item.sop_instance_uid for job in jobs for item in result_objects(job.job_id))
+    expected = Counter(item.sop_instance_uid for job in jobs for item in delivery_objects(job.job_id))
     kills, seen = Counter[str](), Counter[str]()
     running: list[int] = []
 
@@ -274,38 +270,6 @@ def test_sender_killed_twenty_times_delivers_everything_once(study: FinishedStud
     assert sum(history(job.job_id).count("sender_lost") for job in jobs) == 20
 
 
-def test_of_two_senders_one_has_a_delivery(study: FinishedStudy) -> None:
-    with writing() as session:
-        assert outbox.plan(session, "pacs", ["succeeded"]) == 1
-        held = outbox.claim(session, "pacs", "first")
-        assert held is not None
-        assert outbox.claim(session, "pacs", "second") is None
-        assert outbox.plan(session, "pacs", ["succeeded"]) == 0
-    with writing() as session:
-        session.execute(update(Delivery).values(lease_until=db_now() - 1))
-        assert outbox.reap(session, "pacs") == 1
-        again = outbox.claim(session, "pacs", "second")
-        assert again is not None
-    with writing() as session:
-        # The first sender comes back and changes nothing.
-        assert not outbox.extend(session, held)
-        assert not outbox.finish(session, held)
-        with pytest.raises(outbox.ClaimLost):
-            outbox.set_objects(session, held, {"1.2.3": "report.dcm"})
-        assert outbox.finish(session, again)
-
-
-def test_lease_of_a_clock_that_was_set_back_is_cut(study: FinishedStudy) -> None:
-    with writing() as session:
-        outbox.plan(session, "pacs", ["succeeded"])
-        outbox.claim(session, "pacs", "first")
-        session.execute(update(Delivery).values(lease_until=db_now() + 86400))
-        assert outbox.reap(session, "pacs") == 0
-    with reading() as session:
-        left = session.scalar(select(Delivery.lease_until - db_now()))
-        assert left <= settings().lease_seconds
-
-
 def test_jobs_from_before_the_target_are_sent_on_request_only(study: FinishedStudy) -> None:
     archive = Archive()
     with writing() as session:
@@ -315,7 +279,7 @@ def test_jobs_from_before_the_target_are_sent_on_request_only(study: FinishedStu
         with writing() as session:
             outbox.request(session, study.job_id, "pacs")
         assert send_next(target)
-    assert len(archive.stored) == 3
+    assert len(archive.stored) == len(objects_of(study))
 
 
 def test_job_without_objects_fails_at_once(study: FinishedStudy) -> None:
@@ -381,7 +345,7 @@ def test_webhook_hears_of_failed_jobs_too(data_dir: Path, tmp_path: Path) -> Non
     with webhook_receiver(inbox) as url:
         target = hook(tmp_path, url)
         with writing() as session:
-            outbox.register(session, "hook")
+            outbox.register(session, [target])
         study = make_study()
         for uid in study.uids.values():
             study.fail("segment", uid)

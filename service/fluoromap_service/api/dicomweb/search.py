@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 from pydicom.datadict import dictionary_VR, tag_for_keyword
 
@@ -47,18 +47,20 @@ class _Search:
 
 
 @router.get("/studies")
-def search_studies(request: Request, caller: Reader) -> JSONResponse:
+def search_studies(request: Request, caller: Reader) -> Response:
     """Search for studies."""
     search = _search(request)
+    stored = instances_of()
+    wholes = _grouped(stored, "study_uid")
     results = []
-    for study_uid, runs in _grouped(_matching(instances_of(), search), "study_uid").items():
-        whole = instances_of(study_uid)
-        result = _chosen(runs[0].header, STUDY_KEYWORDS, search)
+    for study_uid, members in _grouped(_matching(stored, search), "study_uid").items():
+        whole = wholes[study_uid]
+        result = _chosen(members[0].header, STUDY_KEYWORDS, search)
         result |= {
             "00080056": {"vr": "CS", "Value": ["ONLINE"]},
-            "00080061": {"vr": "CS", "Value": sorted({_text(run.header, _tag("Modality")) for run in whole})},
+            "00080061": {"vr": "CS", "Value": sorted({_text(each.header, _tag("Modality")) for each in whole})},
             "00081190": {"vr": "UR", "Value": [study_url(str(request.base_url), study_uid)]},
-            "00201206": {"vr": "IS", "Value": [len({run.series_uid for run in whole})]},
+            "00201206": {"vr": "IS", "Value": [len({each.series_uid for each in whole})]},
             "00201208": {"vr": "IS", "Value": [len(whole)]},
         }
         results.append(result)
@@ -66,57 +68,58 @@ def search_studies(request: Request, caller: Reader) -> JSONResponse:
 
 
 @router.get("/series")
-def search_all_series(request: Request, caller: Reader) -> JSONResponse:
+def search_all_series(request: Request, caller: Reader) -> Response:
     """Search for series of all studies."""
     return _series(request, instances_of(), (*STUDY_KEYWORDS, *SERIES_KEYWORDS))
 
 
 @router.get("/studies/{study_uid}/series")
-def search_series(study_uid: str, request: Request, caller: Reader) -> JSONResponse:
+def search_series(study_uid: str, request: Request, caller: Reader) -> Response:
     """Search for series of one study."""
     return _series(request, instances_of(study_uid), ("StudyInstanceUID", *SERIES_KEYWORDS))
 
 
-def _series(request: Request, runs: list[StoredInstance], keywords: tuple[str, ...]) -> JSONResponse:
+def _series(request: Request, stored: list[StoredInstance], keywords: tuple[str, ...]) -> Response:
     search = _search(request)
+    wholes = _grouped(stored, "series_uid")
     results = []
-    for series_uid, members in _grouped(_matching(runs, search), "series_uid").items():
+    for series_uid, members in _grouped(_matching(stored, search), "series_uid").items():
         url = series_url(str(request.base_url), members[0].study_uid, series_uid)
         result = _chosen(members[0].header, keywords, search)
         result |= {
             "00081190": {"vr": "UR", "Value": [url]},
-            "00201209": {"vr": "IS", "Value": [len(instances_of(members[0].study_uid, series_uid))]},
+            "00201209": {"vr": "IS", "Value": [len(wholes[series_uid])]},
         }
         results.append(result)
     return _page(results, search)
 
 
 @router.get("/instances")
-def search_all_instances(request: Request, caller: Reader) -> JSONResponse:
+def search_all_instances(request: Request, caller: Reader) -> Response:
     """Search for instances of all studies."""
     return _instances(request, instances_of(), (*STUDY_KEYWORDS, *SERIES_KEYWORDS, *INSTANCE_KEYWORDS))
 
 
 @router.get("/studies/{study_uid}/instances")
-def search_instances_of_study(study_uid: str, request: Request, caller: Reader) -> JSONResponse:
+def search_instances_of_study(study_uid: str, request: Request, caller: Reader) -> Response:
     """Search for instances of one study."""
     keywords = ("StudyInstanceUID", *SERIES_KEYWORDS, *INSTANCE_KEYWORDS)
     return _instances(request, instances_of(study_uid), keywords)
 
 
 @router.get("/studies/{study_uid}/series/{series_uid}/instances")
-def search_instances(study_uid: str, series_uid: str, request: Request, caller: Reader) -> JSONResponse:
+def search_instances(study_uid: str, series_uid: str, request: Request, caller: Reader) -> Response:
     """Search for instances of one series."""
     keywords = ("StudyInstanceUID", "SeriesInstanceUID", *INSTANCE_KEYWORDS)
     return _instances(request, instances_of(study_uid, series_uid), keywords)
 
 
-def _instances(request: Request, runs: list[StoredInstance], keywords: tuple[str, ...]) -> JSONResponse:
+def _instances(request: Request, stored: list[StoredInstance], keywords: tuple[str, ...]) -> Response:
     search = _search(request)
     results = []
-    for run in _matching(runs, search):
-        result = _chosen(run.header, keywords, search)
-        url = instance_url(str(request.base_url), run.study_uid, run.series_uid, run.uid)
+    for each in _matching(stored, search):
+        result = _chosen(each.header, keywords, search)
+        url = instance_url(str(request.base_url), each.study_uid, each.series_uid, each.uid)
         result["00081190"] = {"vr": "UR", "Value": [url]}
         result["00080056"] = {"vr": "CS", "Value": ["ONLINE"]}
         results.append(result)
@@ -170,8 +173,8 @@ def _tag(name: str) -> str | None:
     return None if number is None else f"{number:08X}"
 
 
-def _matching(runs: Iterable[StoredInstance], search: _Search) -> Iterator[StoredInstance]:
-    return (run for run in runs if all(_matches(run.header, tag, text) for tag, text in search.matches.items()))
+def _matching(stored: Iterable[StoredInstance], search: _Search) -> Iterator[StoredInstance]:
+    return (each for each in stored if all(_matches(each.header, tag, text) for tag, text in search.matches.items()))
 
 
 def _matches(header: Json, tag: str, wanted: str) -> bool:
@@ -202,10 +205,10 @@ def _text(header: Json, tag: str | None) -> str:
     return str(first.get("Alphabetic", "") if isinstance(first, dict) else first)
 
 
-def _grouped(runs: Iterable[StoredInstance], field: str) -> dict[str, list[StoredInstance]]:
+def _grouped(stored: Iterable[StoredInstance], field: str) -> dict[str, list[StoredInstance]]:
     groups: dict[str, list[StoredInstance]] = {}
-    for run in runs:
-        groups.setdefault(getattr(run, field), []).append(run)
+    for each in stored:
+        groups.setdefault(getattr(each, field), []).append(each)
     return groups
 
 
@@ -222,8 +225,10 @@ def _chosen(header: Json, keywords: Iterable[str], search: _Search) -> Json:
     return shown
 
 
-def _page(results: list[Json], search: _Search) -> JSONResponse:
+def _page(results: list[Json], search: _Search) -> Response:
     page = results[search.offset : search.offset + search.limit]
+    if not page:
+        return Response(status_code=204)  # PS3.18 section 8.3.4.4.1
     headers = {}
     if len(results) > search.offset + len(page):
         headers["Warning"] = '299 fluoromap "There are more results; ask for them with offset."'

@@ -1,33 +1,84 @@
-"""The stored instances as DICOMweb shows them: their place in study and series, and their headers."""
+"""The stored instances as DICOMweb shows them: runs and results, their place in study and series, and their headers."""
 
 from __future__ import annotations
 
 import threading
+import zipfile
 from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from pydicom.uid import ExplicitVRLittleEndian
 from sqlalchemy import select
 
+from fluoromap_service.api.dicomweb.display import Display, render_result, render_run, result_frame_bytes
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.results.result_objects import objects_zip
 from fluoromap_service.dicom import InstanceFacts
+from fluoromap_service.dicom.frames import frame_bytes
 from fluoromap_service.dicom.json_model import header_json
-from fluoromap_service.problem import not_found
+from fluoromap_service.problem import Problem, not_found
+from fluoromap_service.results.dependencies import RESULT_OBJECTS
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import Instance
+from fluoromap_service.store.models import Instance, Job, JobState, StudyInstance
+from fluoromap_service.store.renderings import KeptFile, find_rendering
 
 Json = dict[str, Any]
 
 _REMEMBERED_HEADERS = 2000
-_headers: OrderedDict[str, Json] = OrderedDict()
+_headers: OrderedDict[tuple[str, str], Json] = OrderedDict()
 _lock = threading.Lock()
 
 
+class StoredInstance(Protocol):
+    """A run that somebody sent, or a result of a job."""
+
+    @property
+    def study_uid(self) -> str:
+        """Study Instance UID."""
+
+    @property
+    def series_uid(self) -> str:
+        """Series Instance UID."""
+
+    @property
+    def uid(self) -> str:
+        """SOP Instance UID."""
+
+    @property
+    def header(self) -> Json:
+        """The header in the DICOM JSON model; the content of a file never changes, so it is read once."""
+
+    @property
+    def transfer_syntax(self) -> str:
+        """UID of the file's encoding."""
+
+    @property
+    def frames(self) -> int:
+        """Number of frames; 0 for an object without pictures."""
+
+    def chunks(self) -> Iterator[bytes]:
+        """Return the content of the file, piece by piece."""
+
+    def frame(self, index: int) -> bytes:
+        """Return the uncompressed pixels of a frame, little endian.
+
+        ``index`` counts from 0.
+        """
+
+    def rendered(self, index: int, display: Display) -> bytes:
+        """Return a frame as a picture file.
+
+        ``index`` counts from 0.
+        """
+
+
 @dataclass(frozen=True, slots=True)
-class StoredInstance:
-    """One stored instance."""
+class StoredRun:
+    """A stored run."""
 
     study_uid: str
     series_uid: str
@@ -36,24 +87,92 @@ class StoredInstance:
     facts: InstanceFacts
 
     @property
-    def path(self) -> Path:
-        """Path of the file, after a check of its hash."""
-        return files.checked_path(self.sha256)
+    def header(self) -> Json:
+        """The header in the DICOM JSON model."""
+        # A hostile header can take any time, so another process reads it.
+        return _remembered((self.sha256, ""), lambda: run_in_pool(Task.READ_FILE, header_json, self._path))
 
     @property
-    def header(self) -> Json:
-        """The header in the DICOM JSON model; the content of a file never changes, so it is read once."""
-        with _lock:
-            if self.sha256 in _headers:
-                _headers.move_to_end(self.sha256)
-                return _headers[self.sha256]
-        # A hostile header can take any time, so another process reads it.
-        header = run_in_pool(Task.READ_FILE, header_json, self.path)
-        with _lock:
-            _headers[self.sha256] = header
-            while len(_headers) > _REMEMBERED_HEADERS:
-                _headers.popitem(last=False)
-        return header
+    def transfer_syntax(self) -> str:
+        """UID of the file's encoding."""
+        return self.facts.transfer_syntax
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return self.facts.frames
+
+    def chunks(self) -> Iterator[bytes]:
+        """Return the content of the file, piece by piece."""
+        return _chunks(self._path)
+
+    def frame(self, index: int) -> bytes:
+        """Return the uncompressed pixels of a frame."""
+        return run_in_pool(Task.DRAW_PICTURE, frame_bytes, self._path, self.facts, index)
+
+    def rendered(self, index: int, display: Display) -> bytes:
+        """Return a frame as a picture file."""
+        inverted = self.header.get("00280004", {}).get("Value") == ["MONOCHROME1"]
+        return run_in_pool(Task.DRAW_PICTURE, render_run, self._path, self.facts, inverted, index, display)
+
+    @property
+    def _path(self) -> Path:
+        return files.checked_path(self.sha256)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredResult:
+    """A DICOM object of a job: a member of the job's zip, with its header."""
+
+    archive: Path
+    name: str
+    header: Json
+
+    @property
+    def study_uid(self) -> str:
+        """Study Instance UID."""
+        return self._value("0020000D")
+
+    @property
+    def series_uid(self) -> str:
+        """Series Instance UID."""
+        return self._value("0020000E")
+
+    @property
+    def uid(self) -> str:
+        """SOP Instance UID."""
+        return self._value("00080018")
+
+    @property
+    def transfer_syntax(self) -> str:
+        """UID of the file's encoding; all results have the same."""
+        return ExplicitVRLittleEndian
+
+    @property
+    def frames(self) -> int:
+        """Number of frames; 0 for a report or a surface."""
+        return int(self.header.get("00280008", {"Value": [0]})["Value"][0])
+
+    def chunks(self) -> Iterator[bytes]:
+        """Return the content of the file, piece by piece."""
+        with zipfile.ZipFile(self.archive) as archive, archive.open(self.name) as stream:
+            yield from iter(lambda: stream.read(files.CHUNK_BYTES), b"")
+
+    def frame(self, index: int) -> bytes:
+        """Return the uncompressed pixels of a frame."""
+        return run_in_pool(Task.DRAW_PICTURE, result_frame_bytes, self.archive, self.name, index)
+
+    def rendered(self, index: int, display: Display) -> bytes:
+        """Return a frame as a picture file."""
+        return run_in_pool(Task.DRAW_PICTURE, render_result, self.archive, self.name, index, display)
+
+    def _value(self, tag: str) -> str:
+        return str(self.header[tag]["Value"][0])
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as stream:
+        yield from iter(lambda: stream.read(files.CHUNK_BYTES), b"")
 
 
 def instances_of(
@@ -61,11 +180,10 @@ def instances_of(
 ) -> list[StoredInstance]:
     """Return the stored instances in the order of their UIDs.
 
-    Each argument limits them to a DICOM study, to a series, or to one UID.
+    Each argument limits them to a DICOM study, to a series, or to one UID. The results of a job are made when somebody asks
+    for its DICOM study. Without ``study_uid`` the list has only results that are made already.
     """
-    query = select(Instance).order_by(
-        Instance.study_instance_uid, Instance.series_instance_uid, Instance.sop_instance_uid
-    )
+    query = select(Instance)
     if study_uid is not None:
         query = query.where(Instance.study_instance_uid == study_uid)
     if series_uid is not None:
@@ -73,8 +191,8 @@ def instances_of(
     if uid is not None:
         query = query.where(Instance.sop_instance_uid == uid)
     with reading() as session:
-        return [
-            StoredInstance(
+        runs: list[StoredInstance] = [
+            StoredRun(
                 row.study_instance_uid,
                 row.series_instance_uid,
                 row.sop_instance_uid,
@@ -83,6 +201,77 @@ def instances_of(
             )
             for row in session.scalars(query)
         ]
+    # Results have their own series, so a series of runs needs none.
+    results = [] if series_uid is not None and runs else _results(study_uid)
+    found = [
+        result
+        for result in results
+        if study_uid in (None, result.study_uid)
+        and series_uid in (None, result.series_uid)
+        and uid in (None, result.uid)
+    ]
+    return sorted([*runs, *found], key=lambda each: (each.study_uid, each.series_uid, each.uid))
+
+
+def _results(study_uid: str | None) -> Iterator[StoredResult]:
+    """Yield the DICOM objects of the jobs over a DICOM study.
+
+    Without ``study_uid`` these are the objects of all jobs that have them already.
+    """
+    query = (
+        select(Job.id)
+        .join(StudyInstance, StudyInstance.study_id == Job.study_id)
+        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
+        .where(Job.state == JobState.SUCCEEDED)
+        .distinct()
+    )
+    if study_uid is not None:
+        query = query.where(Instance.study_instance_uid == study_uid)
+    with reading() as session:
+        jobs = list(session.scalars(query))
+    for job_id in jobs:
+        kept = find_rendering(job_id, RESULT_OBJECTS) if study_uid is None else _made(job_id)
+        if kept is None:
+            continue
+        with zipfile.ZipFile(kept.path) as archive:
+            for name in archive.namelist():
+                yield StoredResult(kept.path, name, _header_of_result(kept, archive, name))
+
+
+def _made(job_id: str) -> KeptFile | None:
+    """Return the zip of a job's DICOM objects.
+
+    None for a job without results, or whose runs are damaged: the other instances of the study are shown nevertheless.
+    """
+    try:
+        return objects_zip(job_id)
+    except files.BrokenFile:
+        return None
+    except Problem as problem:
+        if problem.status in (429, 503):
+            raise
+        return None
+
+
+def _header_of_result(kept: KeptFile, archive: zipfile.ZipFile, name: str) -> Json:
+    def read() -> Json:
+        with archive.open(name) as stream:
+            return header_json(stream)
+
+    return _remembered((kept.sha256, name), read)
+
+
+def _remembered(key: tuple[str, str], read: Callable[[], Json]) -> Json:
+    with _lock:
+        if key in _headers:
+            _headers.move_to_end(key)
+            return _headers[key]
+    header = read()
+    with _lock:
+        _headers[key] = header
+        while len(_headers) > _REMEMBERED_HEADERS:
+            _headers.popitem(last=False)
+    return header
 
 
 def existing(study_uid: str, series_uid: str | None = None, uid: str | None = None) -> list[StoredInstance]:

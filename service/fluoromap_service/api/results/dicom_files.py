@@ -2,36 +2,15 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-from datetime import UTC, datetime
+from fastapi import APIRouter, Request, Response
 
-import numpy as np
-from fastapi import APIRouter, Response
-
-from fluoromap.drawing.overlay import Look
-from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.etags import file_response
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.results.overlays import picture_of
-from fluoromap_service.dicom.objects.job_results import JobResults, job_objects
-from fluoromap_service.dicom.objects.report_site import ReportSite
-from fluoromap_service.problem import Problem
-from fluoromap_service.results.finished import ended_job_of, snapshot_of
-from fluoromap_service.results.fusion import fusion_of, located_views
-from fluoromap_service.results.maps import map_of
-from fluoromap_service.results.mesh_files import MeshFormat, mesh_of
-from fluoromap_service.results.origins import Origin
-from fluoromap_service.results.points import point_rows
-from fluoromap_service.store import files
-from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import Point
+from fluoromap_service.api.results.result_objects import objects_zip
 
 router = APIRouter(tags=["results"])
-
-_DATE = (1980, 1, 1, 0, 0, 0)
-"""The date of every file in the zip, so that the same results give the same bytes."""
 
 
 @router.get(
@@ -43,67 +22,16 @@ _DATE = (1980, 1, 1, 0, 0, 0)
             "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
             "description": "A zip.",
         },
+        304: {"description": "Unchanged since the ETag sent."},
         **responses(401, 403, 404, 409, 422, 429),
     },
 )
-def get_dicom(job_id: JobId, caller: Reader) -> Response:
+def get_dicom(job_id: JobId, request: Request, caller: Reader) -> Response:
     """Return the results of a job as DICOM files in a zip.
 
-    The zip contains `report.dcm` (Comprehensive 3D SR), and where the job has a map `overlays-1.dcm` (secondary capture)
-    and `chamber.dcm` (encapsulated STL). The answer is 409 until the job has ended. The same job gives the same bytes.
+    The zip contains `report.dcm` (Comprehensive 3D SR), and where the job has a map `overlays-1.dcm` and `map.dcm`
+    (secondary captures) and `chamber.dcm` (encapsulated STL). The answer is 409 until the job has ended. The same job
+    gives the same bytes.
     """
-    headers = {"Content-Disposition": f'attachment; filename="fluoromap-{job_id}-dicom.zip"'}
-    return Response(zipped_objects(job_id), media_type="application/zip", headers=headers)
-
-
-def zipped_objects(job_id: str) -> bytes:
-    """Return the DICOM files of an ended job as a zip."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        for name, content in run_in_pool(Task.WRITE_DICOM, job_objects, _results(job_id)):
-            entry = zipfile.ZipInfo(name, _DATE)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, content)
-    return stream.getvalue()
-
-
-def _results(job_id: str) -> JobResults:
-    with reading() as session:
-        job = ended_job_of(session, job_id, "DICOM zip")
-        snapshot = snapshot_of(job)
-        tips = [row for row in point_rows(session, job) if (row.catheter, row.electrode) == (snapshot.mapping, 1)]
-        sites = tuple(site for row in tips if (site := _site(row)) is not None)
-        if not sites:
-            raise Problem(409, "no_map", "No site could be located, so there is nothing to report; see the points.")
-        runs = dict.fromkeys(uid for row in tips for uid in (row.view_a, row.view_b) if uid in snapshot.runs)
-        finished = datetime.fromtimestamp(int(job.finished or 0), UTC)
-        try:
-            chamber = map_of(session, job)
-            fusions = [fusion_of(session, job, view.uid, None) for view in located_views(session, job)]
-        except Problem as problem:
-            if problem.code not in ("not_ready", "no_map"):
-                raise
-            chamber, fusions = None, []
-        hashes = [snapshot.runs[uid].sha256 for uid in runs]
-    if not all(files.path_of(sha256).exists() for sha256 in hashes):
-        raise Problem(409, "run_deleted", "Somebody deleted a run of this job; upload it again and start a new job.")
-    return JobResults(
-        job_id,
-        finished,
-        tuple(files.checked_path(sha256) for sha256 in hashes),
-        sites,
-        None if chamber is None else chamber.chamber.volume_ml,
-        tuple(picture_of(job_id, fusion, Look()).path for fusion in fusions),
-        None if chamber is None else mesh_of(job_id, chamber, MeshFormat.STL, Origin.REFERENCE).path,
-    )
-
-
-def _site(row: Point) -> ReportSite | None:
-    """Return a located tip from the reference catheter; None where it has no position."""
-    if row.relative_mm is None or row.relative_covariance_mm2 is None:
-        return None
-    xx, xy, xz, yy, yz, zz = row.relative_covariance_mm2
-    covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    x, y, z = row.relative_mm
-    return ReportSite(row.site, (x, y, z), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])), row.lat_ms)
+    kept = objects_zip(job_id)
+    return file_response(request, kept.path, kept.sha256, "application/zip", f"fluoromap-{job_id}-dicom.zip")

@@ -135,7 +135,7 @@ def _deliveries(session: Session, sums: Mapping[str, float]) -> Iterable[Metric]
     ended = Metric("fluoromap_deliveries_total", "counter", "Deliveries that ended, by their state.")
     failures = Metric("fluoromap_delivery_failures_total", "counter", "Attempts of deliveries that failed.")
     objects = Metric("fluoromap_delivered_objects_total", "counter", "DICOM objects that targets confirmed.")
-    open_states = (DeliveryState.WAITING, DeliveryState.SENDING)
+    open_states = (DeliveryState.PENDING, DeliveryState.SENDING)
     counts = (
         select(Delivery.target, Delivery.state, func.count(), func.max(db_now() - Delivery.since))
         .where(Delivery.state.in_(open_states))

@@ -49,7 +49,7 @@ def list_deliveries(
         rows = session.scalars(query).all()
     table = Table("id", "target", "job", "state", "attempts", "next attempt", "ended", "error")
     for row in rows:
-        due = row.due if row.state == DeliveryState.WAITING else None
+        due = row.due if row.state == DeliveryState.PENDING else None
         error = (row.error or {}).get("code", "")
         table.add_row(
             row.id, row.target, row.job_id, row.state, str(row.attempt), _second(due), _second(row.finished), error

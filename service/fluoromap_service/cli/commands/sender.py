@@ -16,7 +16,6 @@ from fluoromap_service.cli.options import DataDir
 from fluoromap_service.cli.supervisor import stop_on_signals
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.deliveries.targets import read_targets
-from fluoromap_service.settings import settings
 from fluoromap_service.store import schema
 from fluoromap_service.store.engine import writing
 
@@ -25,29 +24,30 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def sender(
-    targets: Annotated[Path | None, typer.Option(help="TOML file of the targets (FLUOROMAP_DELIVERY_TARGETS).")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with the targets (FLUOROMAP_CONFIG).")] = None,
     data_dir: DataDir = None,
 ) -> None:
     """Send the results of jobs to the configured targets."""
     end_with_supervisor()
     apply_options(data_dir=data_dir)
-    apply_settings(delivery_targets=targets)
+    apply_settings(config=config)
     logs.configure()
-    if not settings().delivery_targets:
-        raise CommandFailed("There is no file of targets; name it with --targets or FLUOROMAP_DELIVERY_TARGETS.")
-    configured = read_targets(Path(settings().delivery_targets))
+    targets = read_targets()
+    if not targets:
+        raise CommandFailed(
+            "There are no targets; add a table [targets.NAME] to the file of --config or FLUOROMAP_CONFIG."
+        )
     with explain_database_failures():
         schema.check()
         with writing() as session:
-            for target in configured:
-                outbox.register(session, target.name)
+            outbox.register(session, targets)
     # Importing pynetdicom takes a second: the help does not need it.
     from fluoromap_service.sender.service import Sender
 
     stop = stop_on_signals()
-    running = Sender(configured)
+    running = Sender(targets)
     running.start()
-    typer.echo(f"fluoromap: sending results to {', '.join(target.name for target in configured)}")
+    typer.echo(f"fluoromap: sending results to {', '.join(target.name for target in targets)}")
     stop.wait()
     running.stop()
     file_pool.close()

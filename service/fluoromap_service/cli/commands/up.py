@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import typer
 
@@ -25,7 +24,7 @@ def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     """Run the API and a worker.
 
     By default they use SQLite and files, no server. A part that dies or hangs is started again. The DICOM listener runs too
-    when FLUOROMAP_DICOM_ALLOW names its senders, and the sender of results when FLUOROMAP_DELIVERY_TARGETS names its targets.
+    when FLUOROMAP_DICOM_ALLOW names its senders, and the sender of results when the file of FLUOROMAP_CONFIG names its targets.
     """
     apply_options(host, port, data_dir)
     host, port = settings().host, settings().port
@@ -38,9 +37,7 @@ def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
         dicom = bool(settings().dicom_allow.strip())
         if dicom:
             check_port(settings().dicom_host, settings().dicom_port)
-        if settings().delivery_targets:
-            read_targets(Path(settings().delivery_targets))
-        supervisor = Supervisor(host, port, os.environ, dicom=dicom, sender=bool(settings().delivery_targets))
+        supervisor = Supervisor(host, port, os.environ, dicom=dicom, sender=bool(read_targets()))
         typer.echo(f"fluoromap: starting with the data in {settings().data_dir}")
         if not has_token:
             typer.echo("fluoromap: open to every user of this machine, because no access token exists yet")

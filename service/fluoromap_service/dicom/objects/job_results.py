@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fluoromap_service.dicom.objects.identity import ResultSource
-from fluoromap_service.dicom.objects.pictures import pictures_file
+from fluoromap_service.dicom.objects.pictures import Pictures, pictures_file
 from fluoromap_service.dicom.objects.report_site import ReportSite
 from fluoromap_service.dicom.objects.surface import surface_file
 
@@ -21,7 +21,8 @@ from fluoromap_service.dicom.objects.surface import surface_file
 class JobResults:
     """The results of a job that become DICOM objects.
 
-    runs : files of the source runs. overlays : PNG files. stl : file of the surface, None without a map.
+    runs : files of the source runs. overlays : PNG files of the map on fluoroscopy. map_picture : PNG file of the map from
+    six sides. stl : file of the surface. Without a map the last two are None.
     """
 
     job_id: str
@@ -30,6 +31,7 @@ class JobResults:
     sites: tuple[ReportSite, ...]
     volume_ml: float | None
     overlays: tuple[Path, ...]
+    map_picture: Path | None
     stl: Path | None
 
 
@@ -44,8 +46,13 @@ def job_objects(results: JobResults) -> list[tuple[str, bytes]]:
     headers = tuple(pydicom.dcmread(path, stop_before_pixels=True) for path in results.runs)
     source = ResultSource(results.job_id, results.finished, headers)
     objects = [("report.dcm", report_file(source, results.sites, results.volume_ml))]
-    for number, pictures in enumerate(_by_size(results.overlays), start=1):
-        objects.append((f"overlays-{number}.dcm", pictures_file(source, number, pictures)))
+    for number, pixels in enumerate(_by_size(results.overlays), start=1):
+        drawn = Pictures(f"overlays-{number}", 9010 + number, "Activation map drawn into fluoroscopy frames", pixels)
+        objects.append((f"{drawn.name}.dcm", pictures_file(source, drawn)))
+    if results.map_picture is not None:
+        (pixels,) = _by_size((results.map_picture,))
+        drawn = Pictures("map", 9010, "Activation map of the chamber from six sides", pixels)
+        objects.append(("map.dcm", pictures_file(source, drawn)))
     if results.stl is not None:
         objects.append(("chamber.dcm", surface_file(source, results.stl.read_bytes())))
     return objects

@@ -12,6 +12,7 @@ def surface_file(source: ResultSource, stl: bytes) -> bytes:
     """Return the surface as a DICOM file; ``stl`` is in mm (LPS), from the reference catheter."""
     dataset = Dataset()
     set_identity(dataset, source, EncapsulatedSTLStorage, "chamber", 9020, "M3D")
+    del dataset.BodyPartExamined  # The Encapsulated Document Series module has none (PS3.3 C.24.1).
     dataset.FrameOfReferenceUID = source.frame_of_reference
     dataset.PositionReferenceIndicator = None
     dataset.AcquisitionDateTime = f"{source.finished:%Y%m%d%H%M%S}+0000"

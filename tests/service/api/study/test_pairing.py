@@ -251,6 +251,29 @@ def test_what_makes_a_site_unusable(service: TestClient, study_path: str, upload
     assert snapshot.runs[run_uid(1)].gantry.camera().rows == 48
 
 
+def test_runs_that_moved_are_not_taken_as_still(
+    service: TestClient, study_path: str, upload: Upload, tmp_path: Path
+) -> None:
+    upload((1, LAT), (2, PA))
+    turned = edited(
+        small_run(tmp_path, 3, LAT), PositionerMotion="DYNAMIC", PositionerPrimaryAngleIncrement=["0", "2", "4"]
+    )
+    panned = edited(small_run(tmp_path, 4, PA), TableMotion="DYNAMIC", TableLateralIncrement=["0", "3", "6"])
+    for file in (turned, panned):
+        service.post(f"{study_path}/instances", content=file, headers={"Content-Type": "application/dicom"})
+    for site, view_a, view_b in (("turned", 3, 2), ("panned", 1, 4)):
+        body = {"lat_ms": 1, "view_a": run_uid(view_a), "view_b": run_uid(view_b)}
+        assert service.put(f"{study_path}/sites/{site}", json=body).status_code in (200, 201)
+    sites = {site["site"]: site for site in service.get(f"{study_path}/sites").json()["items"]}
+    assert (sites["turned"]["ready"], sites["turned"]["warnings"]) == (False, ["gantry_turned"])
+    assert (sites["panned"]["ready"], sites["panned"]["warnings"]) == (True, ["table_moved"])
+    assert _reasons(study_path, "turned") == (Reason.GANTRY_TURNED,)
+    with writing() as session:
+        snapshot = freeze(session, studies.get(session, study_path.rsplit("/", 1)[1]), PipelineRequest())
+    assert {site.site: site.reasons for site in snapshot.rejected} == {"turned": (Reason.GANTRY_TURNED,)}
+    assert {site.site: site.doubts for site in snapshot.sites} == {"panned": (Reason.TABLE_MOVED,)}
+
+
 def test_a_pair_between_20_and_30_degrees_is_computed(service: TestClient, study_path: str, upload: Upload) -> None:
     upload((1, 0.0), (2, 25.0))
     body = {"lat_ms": 1, "view_a": run_uid(1), "view_b": run_uid(2)}

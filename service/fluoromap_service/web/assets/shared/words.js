@@ -23,10 +23,11 @@ const BOUND_BY = {
 const WARNINGS = {
   paired_by_order: "runs and times were paired in order of time",
   table_moved: "the table may have moved",
+  gantry_turned: "the gantry turned during one of the runs; record this view again",
   views_parallel: "the two views are less than 20° apart, which shows no depth",
   unbound: "no site uses this run",
   frame_time_assumed: "no frame rate in the file; 15 frames a second are assumed",
-  positioner_moved: "the gantry turned during the run; only its first position is used",
+  positioner_moved: "the gantry turned during the run, so a job cannot use it",
   geometry_implausible: "the file has a geometry value that no C-arm can have; it counts as missing",
 };
 
