@@ -107,7 +107,10 @@ def service(folder: Path, *, sites: int) -> Iterator[None]:
 
 
 def send_times(client: httpx.Client, times: list[dict[str, str]], runs: list[Path]) -> None:
-    """Send the table as the recording system does, which knows the runs by their series numbers."""
+    """Send the table as the recording system does.
+
+    It knows the runs by their series numbers.
+    """
     numbers = {path.name: pydicom.dcmread(path, stop_before_pixels=True).SeriesNumber for path in runs}
     (study,) = client.get(f"{SERVICE}/v1/studies").json()["items"]
     rows = [f"{row['site']},{row['lat_ms']},{numbers[row['view_a']]},{numbers[row['view_b']]}" for row in times]
@@ -137,7 +140,7 @@ def objects_of(client: httpx.Client, job: str) -> dict[str, Dataset]:
 
 
 def check_pixels(client: httpx.Client, runs: list[Path], objects: dict[str, Dataset]) -> None:
-    """Check that Orthanc finds every object by QIDO-RS, with the content that was sent."""
+    """Check that Orthanc finds every object by QIDO-RS, as it was sent."""
     sent = [pydicom.dcmread(path) for path in runs] + list(objects.values())
     for item in sent:
         (match,) = found(client, runs[0], {"SOPInstanceUID": item.SOPInstanceUID})
