@@ -27,7 +27,17 @@ from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
-from fluoromap_service.api.results import archive, deliveries, dicom_files, maps, overlays, points, report, tracks
+from fluoromap_service.api.results import (
+    archive,
+    deidentified,
+    deliveries,
+    dicom_files,
+    maps,
+    overlays,
+    points,
+    report,
+    tracks,
+)
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
@@ -75,6 +85,7 @@ ROUTERS = (
     report.router,
     archive.router,
     dicom_files.router,
+    deidentified.router,
     plugins.router,
     reasons.router,
     health.router,

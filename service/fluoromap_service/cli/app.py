@@ -32,6 +32,7 @@ COMMANDS = {
     "token": "Manage access tokens.",
     "backup": "Write database and files into one archive, while the service runs.",
     "restore": "Bring a backup into an empty data folder.",
+    "export": "Write the runs and results of a job without the patient's identity.",
     "check": "Check every stored file, and mend the store.",
     "audit": "Read the audit trail: who did what to which study.",
     "plugins": "List the installed plugins, and why a broken plugin does not load.",

@@ -15,7 +15,7 @@ from pynetdicom import AE
 from pynetdicom.association import Association
 from pynetdicom.sop_class import StudyRootQueryRetrieveInformationModelFind  # type: ignore[attr-defined]
 
-from fluoromap_service.api.results.delivery_objects import OutgoingObject
+from fluoromap_service.api.results.result_objects import OutgoingObject
 from fluoromap_service.deliveries.targets import CStoreTarget
 from fluoromap_service.sender.peers import NotDelivered, Peer
 from fluoromap_service.settings import settings

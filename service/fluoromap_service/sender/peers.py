@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fluoromap_service.api.results.delivery_objects import OutgoingObject
+from fluoromap_service.api.results.result_objects import OutgoingObject
 from fluoromap_service.deliveries.outbox import Failure
 
 

@@ -13,7 +13,7 @@ from types import TracebackType
 import structlog
 from sqlalchemy.exc import SQLAlchemyError
 
-from fluoromap_service.api.results.delivery_objects import OutgoingObject, delivery_objects
+from fluoromap_service.api.results.result_objects import OutgoingObject, delivery_objects
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.deliveries.outbox import Claim, ClaimLost
 from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget, Target, WebhookTarget

@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 
-from fluoromap_service.api.results.delivery_objects import OutgoingObject
+from fluoromap_service.api.results.result_objects import OutgoingObject
 from fluoromap_service.deliveries.targets import StowTarget
 from fluoromap_service.sender.http_targets import connected, refused, secret_of
 from fluoromap_service.sender.peers import Peer

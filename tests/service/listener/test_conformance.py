@@ -7,9 +7,12 @@ import re
 from pathlib import Path
 
 from fastapi.routing import APIRoute
+from pydicom.dataset import Dataset
 from pydicom.uid import UID
 
 from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
+from fluoromap_service.dicom.deidentification.dataset import deidentify
+from fluoromap_service.dicom.deidentification.pseudonyms import Dates, Pseudonyms
 from fluoromap_service.dicom.header import MACROS
 from fluoromap_service.dicom.store_statuses import StoreStatus
 from fluoromap_service.listener import server
@@ -42,6 +45,18 @@ def test_transfer_syntaxes() -> None:
 def test_functional_groups() -> None:
     rows = re.findall(r"^\| (\w+Sequence) \| (.+) \|$", section("Geometry"), re.M)
     assert rows == [(macro, ", ".join(keywords)) for macro, keywords in MACROS.items()]
+
+
+def test_options_of_deidentification() -> None:
+    listed = set(re.findall(r"^\| .+ \| `(\d{6})` \| .+ \|$", section("De-identification"), re.M))
+    written = set()
+    for dates in Dates:
+        dataset = Dataset()
+        block = dataset.private_block(0x0019, "DLX_SERIE_01", create=True)
+        block.add_new(0x21, "DS", "84")
+        deidentify(dataset, Pseudonyms(b"secret", "patient", "", dates))
+        written |= {item.CodeValue for item in dataset.DeidentificationMethodCodeSequence}
+    assert listed == written
 
 
 def test_statuses() -> None:

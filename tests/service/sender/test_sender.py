@@ -24,7 +24,7 @@ from pydicom.dataset import Dataset
 from pynetdicom import evt
 from sqlalchemy import select, update
 
-from fluoromap_service.api.results.delivery_objects import delivery_objects
+from fluoromap_service.api.results.result_objects import delivery_objects
 from fluoromap_service.cli.supervisor import free_port
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget, WebhookTarget

@@ -15,7 +15,7 @@ from fluoromap_service.api.http.paths import DeliveryId, JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
-from fluoromap_service.api.results.delivery_objects import delivery_objects
+from fluoromap_service.api.results.result_objects import delivery_objects
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.problem import not_found
 from fluoromap_service.store.engine import reading, writing

@@ -22,6 +22,10 @@ _COPIED = (
     "StudyTime", "AccessionNumber", "ReferringPhysicianName", "StudyID",
 )  # fmt: skip
 _REQUIRED = frozenset(_COPIED) - {"SpecificCharacterSet"}
+_DEIDENTIFICATION = (
+    "PatientIdentityRemoved", "DeidentificationMethod", "DeidentificationMethodCodeSequence",
+    "LongitudinalTemporalInformationModified",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +66,16 @@ def set_identity(
     dataset.InstanceNumber = 1
     dataset.Modality = modality
     dataset.BodyPartExamined = "HEART"
+    set_deidentification(dataset, source)
     set_equipment(dataset)
     set_dates(dataset, source)
+
+
+def set_deidentification(dataset: Dataset, source: ResultSource) -> None:
+    """Copy what the source says of its de-identification (PS3.3 C.7.1.1, C.12.1)."""
+    for keyword in _DEIDENTIFICATION:
+        if keyword in source.headers[0]:
+            setattr(dataset, keyword, source.headers[0][keyword].value)
 
 
 def set_equipment(dataset: Dataset) -> None:

@@ -26,6 +26,7 @@ from fluoromap_service.dicom.objects.identity import (
     ResultSource,
     file_bytes,
     set_dates,
+    set_deidentification,
     set_equipment,
 )
 from fluoromap_service.dicom.objects.report_site import ReportSite
@@ -72,6 +73,7 @@ def report_file(source: ResultSource, sites: tuple[ReportSite, ...], volume_ml: 
         is_final=False,
         is_verified=False,
     )
+    set_deidentification(report, source)
     set_equipment(report)
     set_dates(report, source)
     # highdicom adds itself with the time of the writing.
