@@ -16,6 +16,7 @@ from fluoromap_service.api.app import create_app
 from fluoromap_service.api.jobs.job_answers import job_answer
 from fluoromap_service.api.results import points, tracks
 from fluoromap_service.cli.app import COMMANDS
+from fluoromap_service.deliveries import outbox
 from fluoromap_service.dicom.errors import DicomCode
 from fluoromap_service.dicom.facts import HeaderWarning
 from fluoromap_service.jobs.pipeline import PIPELINE
@@ -262,11 +263,23 @@ def test_page_of_errors_lists_every_code_of_a_stage_with_its_status() -> None:
         assert (error.code, error.status) == (code, status)
 
 
+def test_page_of_errors_lists_every_code_of_a_delivery() -> None:
+    codes = set()
+    for path in [*(TOP / "service" / "fluoromap_service").glob("sender/*.py"), Path(outbox.__file__)]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("NotDelivered", "Failure") and node.args:
+                code = node.args[0]
+                if isinstance(code, ast.Constant):
+                    codes.add(code.value)
+    rows = table_under(DOCS / "errors.md", "Errors of a delivery")
+    assert [code.strip("` ") for code, *_ in rows] == sorted(codes)
+
+
 def test_every_error_has_a_cause_and_a_remedy() -> None:
-    for heading in ("Answers of the service", "Errors of a stage"):
+    for heading, cells in (("Answers of the service", 4), ("Errors of a stage", 4), ("Errors of a delivery", 3)):
         for row in table_under(DOCS / "errors.md", heading):
-            assert len(row) == 4, row
-            assert all(len(cell.split()) >= 2 and cell.endswith(".") for cell in row[2:]), row
+            assert len(row) == cells, row
+            assert all(len(cell.split()) >= 2 and cell.endswith(".") for cell in row[-2:]), row
 
 
 # --- words, paths and commands -----------------------------------------------------------------------------------------

@@ -19,6 +19,9 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         Path.home() / ".fluoromap", description="Folder of the files, and of the embedded database and broker."
     )
+    config: str = Field(
+        "", description="TOML file with the targets of deliveries and the rules that start jobs; empty: none."
+    )
     database_url: str = Field("", description="SQLAlchemy URL; empty: SQLite in the data folder.")
     broker_url: str = Field(
         "", description="Celery broker URL; empty: files in the data folder; 'eager': jobs run at once."
@@ -39,6 +42,13 @@ class Settings(BaseSettings):
     )
     dicom_associations: int = Field(
         16, ge=1, description="Associations that the DICOM listener serves at the same time."
+    )
+    dicom_tls_certificate: str = Field(
+        "", description="PEM file with the certificate of the DICOM listener; empty: no TLS."
+    )
+    dicom_tls_key: str = Field("", description="PEM file with the private key of that certificate.")
+    dicom_tls_ca: str = Field(
+        "", description="PEM file of authorities: senders need a certificate of one of them; empty: they need none."
     )
     max_upload_bytes: int = Field(
         4 * 2**30, gt=0, description="Largest request body or DICOM object accepted, in bytes."

@@ -27,7 +27,17 @@ from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
-from fluoromap_service.api.results import archive, deidentified, dicom_files, maps, overlays, points, report, tracks
+from fluoromap_service.api.results import (
+    archive,
+    deidentified,
+    deliveries,
+    dicom_files,
+    maps,
+    overlays,
+    points,
+    report,
+    tracks,
+)
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
@@ -44,11 +54,14 @@ from fluoromap_service.api.study import (
     studies,
 )
 from fluoromap_service.jobs import queue
+from fluoromap_service.jobs.rule_watch import RuleWatch
+from fluoromap_service.jobs.start_rules import read_rules
 from fluoromap_service.settings import settings
 from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
 CLEAN_UP_SECONDS = 60.0
+RULE_SECONDS = 2.0
 
 ROUTERS = (
     studies.router,
@@ -64,6 +77,7 @@ ROUTERS = (
     sites.router,
     jobs.router,
     events.router,
+    deliveries.router,
     points.router,
     tracks.router,
     maps.router,
@@ -87,7 +101,13 @@ log = structlog.get_logger(__name__)
 
 
 def create_app() -> FastAPI:
-    """Make the application."""
+    """Make the application.
+
+    Raises
+    ------
+    Problem
+        422 when the configuration file cannot be used.
+    """
     # FastAPI's documentation pages fetch scripts from the internet; hospital networks are closed.
     app = FastAPI(
         title="fluoromap",
@@ -103,6 +123,8 @@ def create_app() -> FastAPI:
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
     app.state.acts, app.state.counts, app.state.sign_ins = acts, counts, sign_ins
+    rules = read_rules()
+    app.state.rules = RuleWatch(rules) if rules else None
     problems.install(app)
     for router in ROUTERS:
         app.include_router(router)
@@ -150,6 +172,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         asyncio.create_task(_repeat("audit_not_written", acts.flush, FLUSH_SECONDS)),
         asyncio.create_task(_repeat("clean_up_failed", clean_up, CLEAN_UP_SECONDS)),
     ]
+    rules: RuleWatch | None = app.state.rules
+    if rules is not None:
+        tasks.append(asyncio.create_task(_repeat("rules_not_applied", rules.look, RULE_SECONDS)))
     if not settings().eager:
         tasks += [
             asyncio.create_task(_repeat("sweep_failed", queue.sweep, SWEEP_SECONDS)),

@@ -26,6 +26,8 @@ COMMANDS = {
     "api": "Run the API alone.",
     "worker": "Run a worker, which computes the stages of jobs.",
     "dicom-listener": "Receive X-ray runs by DICOM C-STORE.",
+    "sender": "Send the results of jobs to the configured targets.",
+    "deliveries": "Show and repeat the deliveries of results to targets.",
     "db": "Manage the database.",
     "token": "Manage access tokens.",
     "backup": "Write database and files into one archive, while the service runs.",

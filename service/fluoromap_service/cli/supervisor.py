@@ -1,4 +1,4 @@
-"""The API, a worker and the DICOM listener as child processes of one command."""
+"""The API, a worker, the DICOM listener and the sender as child processes of one command."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ class _Child:
 class Supervisor:
     """The parent of the service's processes: it starts them, restarts each when it dies or hangs, and stops them.
 
-    They are the API, the worker, and the DICOM listener where it is wanted.
+    They are the API, the worker, and where they are wanted the DICOM listener and the sender of results.
 
     Parameters
     ----------
@@ -151,8 +151,9 @@ class Supervisor:
         Environment of the children, with the FLUOROMAP_* settings.
     log_folder : Path, optional
         Folder of ``worker.log`` and ``api.log``, the output of the children. By default they use this process's output.
-    dicom : bool, optional
-        Whether to run the DICOM listener too. The supervisor restarts it when it dies; it does not look whether it hangs.
+    dicom, sender : bool, optional
+        Whether to run the DICOM listener and the sender too. The supervisor restarts them when they die; it does not look
+        whether they hang.
     """
 
     def __init__(
@@ -163,14 +164,14 @@ class Supervisor:
         log_folder: Path | None = None,
         *,
         dicom: bool = False,
+        sender: bool = False,
     ) -> None:
         settings = dict(environment) | {"FLUOROMAP_HOST": host, "FLUOROMAP_PORT": str(port)}
         self._worker = _Child(["worker"], log_folder and log_folder / "worker.log", settings)
         self._api = _Child(["api"], log_folder and log_folder / "api.log", settings)
         self._children = [self._api, self._worker]
-        if dicom:
-            log = log_folder and log_folder / "dicom-listener.log"
-            self._children.append(_Child(["dicom-listener"], log, settings))
+        for name in ["dicom-listener"] * dicom + ["sender"] * sender:
+            self._children.append(_Child([name], log_folder and log_folder / f"{name}.log", settings))
         self._log_folder = log_folder
         self._was_ready = False
         self._next_look = self._last_answer = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import ssl
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -20,6 +21,7 @@ from fluoromap_service.dicom.reading import CAPTURES, PROJECTIONS
 from fluoromap_service.dicom.store_statuses import StoreStatus, status_of
 from fluoromap_service.listener.allow_list import AllowList
 from fluoromap_service.listener.arriving import ArrivingFile
+from fluoromap_service.listener.tls import ServerContext
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store.audit import Act
@@ -44,10 +46,12 @@ _REJECTED_PERMANENT, _BY_USER, _CALLING_TITLE = 0x01, 0x01, 0x03  # PS3.8 sectio
 log = structlog.get_logger(__name__)
 
 
-def start(host: str, port: int, title: str, allow: AllowList) -> ThreadedAssociationServer:
+def start(
+    host: str, port: int, title: str, allow: AllowList, tls: ServerContext | None = None
+) -> ThreadedAssociationServer:
     """Start the listener in threads of its own and return it.
 
-    Its ``ae.shutdown()`` ends it and its associations.
+    Its ``ae.shutdown()`` ends it and its associations. With ``tls`` it speaks TLS only.
 
     Raises
     ------
@@ -70,26 +74,47 @@ def start(host: str, port: int, title: str, allow: AllowList) -> ThreadedAssocia
     for storage_class in STORAGE_CLASSES:
         entity.add_supported_context(storage_class, list(TRANSFER_SYNTAXES))
     handlers: list[tuple[evt.EventType, Callable[..., Any]]] = [
-        (evt.EVT_CONN_OPEN, _limit_pdus),
+        (evt.EVT_CONN_OPEN, _prepare_connection),
         (evt.EVT_REQUESTED, lambda event: _check_sender(event, allow)),
         (evt.EVT_C_STORE, _store),
         (evt.EVT_CONN_CLOSE, _discard_unfinished),
     ]
-    server = entity.start_server((host, port), block=False, evt_handlers=cast(Any, handlers))
+    server = entity.start_server((host, port), block=False, ssl_context=tls, evt_handlers=cast(Any, handlers))
     assert server is not None
     return server
 
 
-def _limit_pdus(event: evt.Event) -> None:
-    connection = cast(Any, event.assoc.dul.socket)
-    receive = connection.recv
+def _prepare_connection(event: evt.Event) -> None:
+    """Do the TLS handshake of a connection, and limit its silence and the length of its PDUs."""
+    association = cast(Any, event.assoc)
+    connection, stream = association.dul.socket, association.dul.socket.socket
+    if isinstance(stream, ssl.SSLSocket):
+        stream.settimeout(NEGOTIATION_SECONDS)
+        try:
+            stream.do_handshake()
+        except OSError as error:
+            log.warning(
+                "tls_handshake_failed", address=association.requestor.address_info.address, error=type(error).__name__
+            )
+            connection.close()
+            return
+    # A sender that falls silent in the middle of a PDU would hold its association for ever.
+    stream.settimeout(IDLE_SECONDS)
 
-    def receive_limited(count: int) -> bytes:
+    def receive(count: int) -> bytearray:
         if count > LONGEST_PDU_BYTES:
             raise OSError("the PDU is longer than the listener accepts")
-        return cast(bytes, receive(count))
+        content = bytearray(count)
+        with memoryview(content) as view:
+            arrived = 0
+            while arrived < count:
+                more = stream.recv_into(view[arrived:])
+                if not more:
+                    return bytearray(view[:arrived])
+                arrived += more
+        return content
 
-    connection.recv = receive_limited
+    connection.recv = receive
 
 
 def _check_sender(event: evt.Event, allow: AllowList) -> None:

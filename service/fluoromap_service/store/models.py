@@ -61,6 +61,23 @@ class StageState(StrEnum):
     CANCELLED = "cancelled"
 
 
+class DeliveryState(StrEnum):
+    """The state of a delivery."""
+
+    PENDING = "pending"  # may be claimed from its due time on; a committed pending row is the outbox
+    SENDING = "sending"  # claimed; alive while its lease is extended
+    DELIVERED = "delivered"
+    FAILED = "failed"  # given up; somebody may ask for another try
+
+
+class ObjectState(StrEnum):
+    """The state of one object of a delivery."""
+
+    PENDING = "pending"
+    SENDING = "sending"  # after a crash nobody knows whether the target has it
+    DELIVERED = "delivered"
+
+
 ENDED_JOB = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED})
 ENDED_STAGE = frozenset({StageState.DONE, StageState.FAILED, StageState.CANCELLED})
 
@@ -178,6 +195,7 @@ class Job(Base):
     __table_args__ = (
         Index("ix_job_created_id", "created", "id"),
         Index("ix_job_study_created_id", "study_id", "created", "id"),
+        Index("ix_job_finished", "finished"),
     )
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     study_id: Mapped[str] = mapped_column(ForeignKey("study.id", ondelete="CASCADE"))
@@ -273,6 +291,65 @@ class Rendering(Base):
     job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
     key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of the job and of all dependencies
     sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
+
+
+class DeliveryTarget(Base):
+    """A target of deliveries, by its name in the file of targets. The file has its address and secrets."""
+
+    __tablename__ = "delivery_target"
+    name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(10))  # dicom, dicomweb or webhook
+    since: Mapped[float]  # jobs that ended later are delivered by themselves
+
+
+class Delivery(Base):
+    """The delivery of a job's results to one target."""
+
+    __tablename__ = "delivery"
+    __table_args__ = (
+        UniqueConstraint("target", "job_id", name="uq_delivery"),
+        Index("ix_delivery_state_target", "state", "target"),
+        Index("ix_delivery_created_id", "created", "id"),
+    )
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    target: Mapped[str] = mapped_column(ForeignKey("delivery_target.name"))
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
+    state: Mapped[str] = mapped_column(String(10))
+    attempt: Mapped[int] = mapped_column(default=0)
+    failures: Mapped[int] = mapped_column(default=0)  # since the first try, or since somebody asked for another one
+    since: Mapped[float] = mapped_column(default=db_now())  # the time for giving up counts from here
+    due: Mapped[float] = mapped_column(default=db_now())
+    lease_until: Mapped[float | None]
+    sender: Mapped[str | None] = mapped_column(String(100))
+    error: Mapped[Json | None]
+    created: Mapped[float] = mapped_column(default=db_now())
+    finished: Mapped[float | None]
+
+
+class DeliveryObject(Base):
+    """A DICOM object of a delivery."""
+
+    __tablename__ = "delivery_object"
+    __table_args__ = (UniqueConstraint("delivery_id", "sop_instance_uid", name="uq_delivery_object"),)
+    id: Mapped[int] = mapped_column(primary_key=True)
+    delivery_id: Mapped[str] = mapped_column(ForeignKey("delivery.id", ondelete="CASCADE"))
+    sop_instance_uid: Mapped[str] = mapped_column(String(64))
+    name: Mapped[str] = mapped_column(String(64))  # file name in the results: report.dcm
+    attempts: Mapped[int] = mapped_column(default=0)  # attempts of the delivery that had to send it
+    state: Mapped[str] = mapped_column(String(10))
+    delivered: Mapped[float | None]
+
+
+class DeliveryAttempt(Base):
+    """An attempt of a delivery that has ended; ``code`` null: all objects arrived."""
+
+    __tablename__ = "delivery_attempt"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    delivery_id: Mapped[str] = mapped_column(ForeignKey("delivery.id", ondelete="CASCADE"), index=True)
+    number: Mapped[int]
+    ended: Mapped[float] = mapped_column(default=db_now())
+    code: Mapped[str | None] = mapped_column(String(40))
+    detail: Mapped[str | None] = mapped_column(Text)
 
 
 class Idempotency(Base):

@@ -102,6 +102,17 @@ def freeze(
     )
 
 
+def check_pipeline(pipeline: PipelineRequest) -> None:
+    """Check that the plugins of a pipeline exist and accept their parameters.
+
+    Raises
+    ------
+    Problem
+        422 ``unknown_plugin`` or ``invalid_parameter``.
+    """
+    _plugin_snapshots(pipeline)
+
+
 def _plugin_snapshots(pipeline: PipelineRequest) -> dict[Any, PluginSnapshot]:
     chosen: dict[Any, PluginSnapshot] = {}
     errors: list[tuple[str, str]] = []

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pydicom
 import pytest
@@ -247,16 +247,67 @@ def test_pdu_of_absurd_length_ends_its_association_only(
         assert association.send_c_echo().Status == 0x0000
 
 
+def test_sender_that_falls_silent_in_a_pdu_loses_its_association(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "IDLE_SECONDS", 0.5)
+    listener = server.start("127.0.0.1", 0, "FLUOROMAP", AllowList.from_text("XA_ROOM_1"))
+    closed = threading.Event()
+    listener.bind(evt.EVT_CONN_CLOSE, lambda event: closed.set())
+    entity = AE(ae_title="XA_ROOM_1")
+    entity.add_requested_context(XRayAngiographicImageStorage, ExplicitVRLittleEndian)
+    try:
+        association = entity.associate("127.0.0.1", listener.server_address[1], ae_title="FLUOROMAP")
+        assert association.is_established
+        # A P-DATA PDU of 1000 bytes, of which 10 come (PS3.8 section 9.3.5).
+        association.dul.socket.socket.sendall(b"\x04\x00\x00\x00\x03\xe8" + bytes(10))
+        assert closed.wait(60)
+    finally:
+        listener.ae.shutdown()
+    assert_nothing_stored()
+
+
+def test_command_for_another_class_than_its_context_stores_nothing(open_association: Open, tmp_path: Path) -> None:
+    request = _request(dataset(small_run(tmp_path, 1, 0.0)), run_uid(1))
+    request.AffectedSOPClassUID = CTImageStorage
+    with open_association() as association:
+        association._reactor_checkpoint.clear()
+        _send(association, request)
+        _, answer = association.dimse.get_msg(block=True)
+        association._reactor_checkpoint.set()
+        assert answer.Status != 0x0000
+        assert association.send_c_echo().Status == 0x0000
+    assert_nothing_stored()
+
+
+@pytest.mark.parametrize("kept_bytes", [200, 1500, -1000])
+def test_truncated_data_set_is_refused_and_its_association_lives(
+    open_association: Open, tmp_path: Path, kept_bytes: int
+) -> None:
+    run = dataset(small_run(tmp_path, 1, 0.0))
+    request = _request(run, run_uid(1))
+    whole = cast(io.BytesIO, request.DataSet).getvalue()
+    request.DataSet = io.BytesIO(whole[:kept_bytes])
+    with open_association() as association:
+        association._reactor_checkpoint.clear()
+        _send(association, request)
+        _, answer = association.dimse.get_msg(block=True)
+        association._reactor_checkpoint.set()
+        assert answer.Status in (StoreStatus.CANNOT_UNDERSTAND, StoreStatus.NOT_OF_THIS_CLASS)
+        assert_nothing_stored()
+        assert association.send_c_store(run).Status == 0x0000
+
+
 def test_many_associations_at_once_are_served_or_rejected(open_association: Open) -> None:
-    together = threading.Barrier(40)
+    together = threading.Barrier(200)
 
     def call(_: int) -> str:
         with open_association() as association:
             together.wait(60)
             return "served" if association.is_established else "rejected"
 
-    with ThreadPoolExecutor(40) as threads:
-        outcomes = list(threads.map(call, range(40)))
+    with ThreadPoolExecutor(200) as threads:
+        outcomes = list(threads.map(call, range(200)))
     # An association that is being rejected counts until its connection has ended, so that fewer may be served.
     assert 1 <= outcomes.count("served") <= settings().dicom_associations
     with open_association() as association:

@@ -14,11 +14,11 @@ from sqlalchemy import ColumnElement, select, tuple_
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.problem import Problem
-from fluoromap_service.store.models import Job, Study
+from fluoromap_service.store.models import Delivery, Job, Study
 
 Item = TypeVar("Item")
 Model = TypeVar("Model")
-Created = TypeVar("Created", Study, Job)
+Created = TypeVar("Created", Study, Job, Delivery)
 
 
 class Page(BaseModel, Generic[Item]):

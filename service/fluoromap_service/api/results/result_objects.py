@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import zipfile
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
+import pydicom
 
 from fluoromap.drawing.overlay import Look
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
@@ -102,3 +104,34 @@ def _site(row: Point) -> ReportSite | None:
     covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     x, y, z = row.relative_mm
     return ReportSite(row.site, (x, y, z), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])), row.lat_ms)
+
+
+@dataclass(frozen=True, slots=True)
+class OutgoingObject:
+    """A DICOM file with the UIDs by which a peer knows it."""
+
+    name: str
+    content: bytes
+    sop_class_uid: str
+    study_instance_uid: str
+    series_instance_uid: str
+    sop_instance_uid: str
+
+    @classmethod
+    def of_file(cls, name: str, content: bytes) -> OutgoingObject:
+        """Read the UIDs of a DICOM file."""
+        keywords = ["SOPClassUID", "StudyInstanceUID", "SeriesInstanceUID", "SOPInstanceUID"]
+        header = pydicom.dcmread(io.BytesIO(content), stop_before_pixels=True, specific_tags=list(keywords))
+        return cls(name, content, *(str(header[keyword].value) for keyword in keywords))
+
+
+def delivery_objects(job_id: str) -> list[OutgoingObject]:
+    """Return the DICOM objects of a job in the order of sending.
+
+    Raises
+    ------
+    Problem
+        As ``objects_zip``.
+    """
+    with zipfile.ZipFile(io.BytesIO(objects_zip(job_id).path.read_bytes())) as archive:
+        return [OutgoingObject.of_file(name, archive.read(name)) for name in archive.namelist()]

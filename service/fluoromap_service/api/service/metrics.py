@@ -19,7 +19,17 @@ from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.store import disk, tally
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import ENDED_JOB, Job, JobState, StageRow, StageState, WorkerSeen
+from fluoromap_service.store.models import (
+    ENDED_JOB,
+    Delivery,
+    DeliveryState,
+    DeliveryTarget,
+    Job,
+    JobState,
+    StageRow,
+    StageState,
+    WorkerSeen,
+)
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 router = APIRouter(tags=["service"])
@@ -66,7 +76,8 @@ def _number(value: float) -> str:
 def metrics(request: Request, caller: Reader) -> Response:
     """Return queues, durations, failures, disk and requests; no label holds patient data."""
     with reading() as session:
-        shown = [*_work(session), *_sums(tally.all_sums(session))]
+        sums = tally.all_sums(session)
+        shown = [*_work(session), *_sums(sums), *_deliveries(session, sums)]
     shown += [*_disk(), *_requests(request.app.state.counts, request.app.state.sign_ins.failures)]
     return Response("".join(f"{line}\n" for metric in shown for line in metric.lines()), media_type=MEDIA_TYPE)
 
@@ -116,6 +127,30 @@ def _sums(sums: Mapping[str, float]) -> Iterable[Metric]:
     for job_state in sorted(ENDED_JOB):
         jobs.add(sums.get(f"jobs|{job_state}", 0.0), state=job_state)
     return [ended, seconds, reaped, jobs]
+
+
+def _deliveries(session: Session, sums: Mapping[str, float]) -> Iterable[Metric]:
+    waiting = Metric("fluoromap_deliveries", "gauge", "Deliveries that wait for their target or are being sent.")
+    oldest = Metric("fluoromap_oldest_delivery_seconds", "gauge", "Age of the oldest delivery that has not ended.")
+    ended = Metric("fluoromap_deliveries_total", "counter", "Deliveries that ended, by their state.")
+    failures = Metric("fluoromap_delivery_failures_total", "counter", "Attempts of deliveries that failed.")
+    objects = Metric("fluoromap_delivered_objects_total", "counter", "DICOM objects that targets confirmed.")
+    open_states = (DeliveryState.PENDING, DeliveryState.SENDING)
+    counts = (
+        select(Delivery.target, Delivery.state, func.count(), func.max(db_now() - Delivery.since))
+        .where(Delivery.state.in_(open_states))
+        .group_by(Delivery.target, Delivery.state)
+    )
+    found = {(target, state): (float(n), age) for target, state, n, age in session.execute(counts)}
+    for target in session.scalars(select(DeliveryTarget.name).order_by(DeliveryTarget.name)):
+        for state in open_states:
+            waiting.add(found.get((target, state), (0.0, 0.0))[0], target=target, state=state)
+        oldest.add(max(0.0, *(found.get((target, state), (0.0, 0.0))[1] for state in open_states)), target=target)
+        for state in (DeliveryState.DELIVERED, DeliveryState.FAILED):
+            ended.add(sums.get(f"deliveries|{target}|{state}", 0.0), target=target, state=state)
+        failures.add(sums.get(f"delivery_failures|{target}", 0.0), target=target)
+        objects.add(sums.get(f"delivered_objects|{target}", 0.0), target=target)
+    return [waiting, oldest, ended, failures, objects]
 
 
 def _disk() -> Iterable[Metric]:

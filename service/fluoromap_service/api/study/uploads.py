@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import hashlib
 import os
@@ -155,13 +156,23 @@ async def _receive_raw(request: Request, stack: ExitStack) -> Part:
 
 
 async def write_all(request: Request, write: Callable[[bytes], None]) -> None:
-    """Write a body in large parts, because each part waits once for a thread."""
+    """Write a body in large parts; the next part arrives while a thread writes the one before."""
     waiting = bytearray()
-    async for chunk in request.stream():
-        waiting += chunk
-        if len(waiting) >= PART_BYTES:
-            await in_upload_thread(_write_part, write, bytes(waiting))
-            waiting.clear()
+    writing: asyncio.Task[None] | None = None
+    try:
+        async for chunk in request.stream():
+            waiting += chunk
+            if len(waiting) >= PART_BYTES:
+                if writing is not None:
+                    await writing
+                writing = asyncio.create_task(in_upload_thread(_write_part, write, bytes(waiting)))
+                waiting.clear()
+    finally:
+        # Nobody may close the file under the thread that writes it.
+        if writing is not None:
+            await asyncio.wait({writing})
+    if writing is not None:
+        writing.result()
     if waiting:
         await in_upload_thread(_write_part, write, bytes(waiting))
 

@@ -16,8 +16,11 @@ from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options, end_with_supervisor, keep_compiled_kernels
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir, Host, Port
+from fluoromap_service.deliveries import outbox
+from fluoromap_service.deliveries.targets import read_targets
 from fluoromap_service.settings import settings
 from fluoromap_service.store import schema
+from fluoromap_service.store.engine import writing
 
 STOP_SECONDS = 5
 """Time that open requests get at the end."""
@@ -35,6 +38,9 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     with explain_database_failures():
         schema.check()
         auth.check_may_start(settings().host)
+        # A request may name a target before the sender has started.
+        with writing() as session:
+            outbox.register(session, read_targets())
     service = create_app()
     config = uvicorn.Config(
         service,

@@ -14,6 +14,7 @@ from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir
 from fluoromap_service.cli.supervisor import stop_on_signals
 from fluoromap_service.listener.allow_list import AllowList
+from fluoromap_service.listener.tls import server_context
 from fluoromap_service.settings import settings
 from fluoromap_service.store import schema
 
@@ -35,7 +36,10 @@ def dicom_listener(
     ] = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Receive X-ray runs by DICOM C-STORE."""
+    """Receive X-ray runs by DICOM C-STORE.
+
+    It speaks TLS when FLUOROMAP_DICOM_TLS_CERTIFICATE names its certificate.
+    """
     end_with_supervisor()
     apply_options(data_dir=data_dir)
     apply_settings(dicom_host=host, dicom_port=port, dicom_aet=aet, dicom_allow=",".join(allow) if allow else None)
@@ -45,6 +49,7 @@ def dicom_listener(
         raise CommandFailed(
             f"Listening on {settings().dicom_host} needs the senders; name them with --allow AET or --allow AET@address."
         )
+    tls = server_context(settings().dicom_tls_certificate, settings().dicom_tls_key, settings().dicom_tls_ca)
     with explain_database_failures():
         schema.check()
     # Importing pynetdicom takes a second: the help does not need it.
@@ -52,7 +57,7 @@ def dicom_listener(
 
     stop = stop_on_signals()
     try:
-        listener = server.start(settings().dicom_host, settings().dicom_port, settings().dicom_aet, allowed)
+        listener = server.start(settings().dicom_host, settings().dicom_port, settings().dicom_aet, allowed, tls)
     except OSError as error:
         raise CommandFailed(
             f"The DICOM listener cannot listen on {settings().dicom_host} port {settings().dicom_port} "

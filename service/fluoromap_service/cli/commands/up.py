@@ -12,6 +12,7 @@ from fluoromap_service.cli.environment import apply_options
 from fluoromap_service.cli.folder_lock import only_one
 from fluoromap_service.cli.options import DataDir, Host, Port
 from fluoromap_service.cli.supervisor import Supervisor, check_port, run_until_stopped, stop_on_signals
+from fluoromap_service.deliveries.targets import read_targets
 from fluoromap_service.settings import settings
 from fluoromap_service.store import schema
 
@@ -23,7 +24,7 @@ def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     """Run the API and a worker.
 
     By default they use SQLite and files, no server. A part that dies or hangs is started again. The DICOM listener runs too
-    when FLUOROMAP_DICOM_ALLOW names its senders.
+    when FLUOROMAP_DICOM_ALLOW names its senders, and the sender of results when the file of FLUOROMAP_CONFIG names its targets.
     """
     apply_options(host, port, data_dir)
     host, port = settings().host, settings().port
@@ -36,7 +37,7 @@ def up(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
         dicom = bool(settings().dicom_allow.strip())
         if dicom:
             check_port(settings().dicom_host, settings().dicom_port)
-        supervisor = Supervisor(host, port, os.environ, dicom=dicom)
+        supervisor = Supervisor(host, port, os.environ, dicom=dicom, sender=bool(read_targets()))
         typer.echo(f"fluoromap: starting with the data in {settings().data_dir}")
         if not has_token:
             typer.echo("fluoromap: open to every user of this machine, because no access token exists yet")

@@ -40,7 +40,8 @@ class RequestBody:
             if ended:
                 return await receive()
             try:
-                message = await asyncio.wait_for(receive(), SILENCE_SECONDS)
+                async with asyncio.timeout(SILENCE_SECONDS):
+                    message = await receive()
             except TimeoutError:
                 raise HTTPException(408, "The body did not arrive in time; send the request again.") from None
             ended = message["type"] == "http.disconnect" or not message.get("more_body", False)

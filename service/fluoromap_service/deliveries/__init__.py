@@ -1,0 +1,1 @@
+"""Deliveries of results: the targets of the configuration, and the outbox in the database."""

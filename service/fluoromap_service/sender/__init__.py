@@ -1,0 +1,1 @@
+"""The sender: it takes deliveries from the outbox and sends them to their targets."""
