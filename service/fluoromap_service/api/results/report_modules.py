@@ -11,8 +11,8 @@ from pathlib import Path
 ASSETS = Path(__file__).parents[2] / "web" / "assets"
 
 MODULES = (
-    "three/three.core.js",
-    "three/three.module.js",
+    "three/three.core.min.js",
+    "three/three.module.min.js",
     "shared/elements.js",
     "shared/words.js",
     "map/colour-scale.js",

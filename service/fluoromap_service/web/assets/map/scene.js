@@ -1,5 +1,5 @@
 /** The map in 3D: wall, sites with name and time, orientation, colour bar. The study page and the report use it. */
-import * as THREE from "../three/three.module.js";
+import * as THREE from "../three/three.module.min.js";
 import { drawColourBar } from "./colour-bar.js";
 import { deviationsOf, timesOf } from "./colour-scale.js";
 import { Orbit } from "./orbit.js";

@@ -1,5 +1,5 @@
 /** The wall of the chamber: bands and lines of equal time, drawn for each pixel, and a hatch where no site is near. */
-import * as THREE from "../three/three.module.js";
+import * as THREE from "../three/three.module.min.js";
 
 const MOST_BANDS = 32;
 
