@@ -27,7 +27,7 @@ from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
-from fluoromap_service.api.results import archive, dicom_files, maps, overlays, points, report, tracks
+from fluoromap_service.api.results import archive, dicom_files, maps, overlays, placements, points, report, tracks
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
@@ -68,6 +68,7 @@ ROUTERS = (
     tracks.router,
     maps.router,
     overlays.router,
+    placements.router,
     report.router,
     archive.router,
     dicom_files.router,

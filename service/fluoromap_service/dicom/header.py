@@ -76,7 +76,7 @@ _PLAIN = (
     "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "ShutterShape", "ShutterLeftVerticalEdge",
     "ShutterRightVerticalEdge", "ShutterUpperHorizontalEdge", "ShutterLowerHorizontalEdge", "CenterOfCircularShutter",
     "RadiusOfCircularShutter", "VerticesOfThePolygonalShutter", "SamplesPerPixel", "PhotometricInterpretation",
-    "PatientPosition", "TableAngle",
+    "PatientPosition", "TableAngle", "Manufacturer", "ManufacturerModelName",
     "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
 )  # fmt: skip
 

@@ -17,6 +17,7 @@ from PIL import Image
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import ChamberMap, Triangulation
+from fluoromap.drawing.annotations import purpose_text
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
 from fluoromap.drawing.png import encode_png
@@ -38,9 +39,10 @@ from fluoromap_service.api.results.tracks import read_tracks
 from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of, snapshot_of
-from fluoromap_service.results.fusion import fusion_of, located_views
+from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.placement import located_views
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
@@ -67,11 +69,11 @@ def report_page(job_id: str) -> str:
     if chamber is not None:
         values |= {
             "chamber": _figures(chamber),
-            "map_png": _inline(encode_png(draw_map_views(chamber)), "image/png"),
+            "map_png": _inline(encode_png(draw_map_views(chamber, simulated=values["simulated"])), "image/png"),
             "overlays": _overlays(job_id),
             "scene": _json(scene),
             "scripts": _json(packed_modules()),
-            "title": _json(f"{values['label']}: for research"),
+            "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
         }
     return _environment().get_template("report.html.j2").render(values)
 
@@ -80,10 +82,10 @@ def _values(job_id: str) -> dict[str, Any]:
     with reading() as session:
         job = job_of(session, job_id)
         snapshot = snapshot_of(job)
-        chamber, scene, no_map = None, None, ""
+        chamber, scene, simulated, no_map = None, None, False, ""
         try:
             finished = map_of(session, job)
-            chamber, scene = finished.chamber, _scene(finished)
+            chamber, scene, simulated = finished.chamber, _scene(finished), finished.simulated
         except Problem as problem:
             no_map = str(problem.detail)
         triangulated = stage_of(session, job_id, "triangulate")
@@ -103,6 +105,7 @@ def _values(job_id: str) -> dict[str, Any]:
             "map": chamber,
             "scene_map": scene,
             "no_map": no_map,
+            "simulated": simulated,
             "tips": rows,
             "located": sum(row["grade"] != "rejected" for row in rows),
             "grades": [(grade, sum(row["grade"] == grade for row in rows)) for grade in ("A", "B", "C", "rejected")],
