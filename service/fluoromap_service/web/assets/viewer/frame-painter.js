@@ -1,5 +1,5 @@
 /** Paints one frame with its contrast, its electrodes and an epipolar line. */
-import { catheterColour } from "./catheter-colours.js";
+import { catheterColour } from "../shared/catheter-colours.js";
 
 /** @typedef {import("../shared/types.js").Electrode} Electrode */
 
@@ -48,9 +48,10 @@ export class FramePainter {
     context.drawImage(this.picture, origin.x, origin.y, scale * this.run.columns, scale * this.run.rows);
     const unit = window.devicePixelRatio || 1;
     if (marks.line) this.#line(context, canvas, placement, marks.line, unit);
+    const names = study.catheters.map((each) => each.name);
     for (const electrode of electrodes) {
       const { x, y } = placement.toCanvas(canvas, this.run, electrode.u_px, electrode.v_px);
-      this.#electrode(context, x, y, electrode, catheterColour(study, electrode.catheter), keyOf(electrode) === marks.chosen, unit);
+      this.#electrode(context, x, y, electrode, catheterColour(names, electrode.catheter), keyOf(electrode) === marks.chosen, unit);
     }
   }
 

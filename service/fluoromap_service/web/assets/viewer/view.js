@@ -5,6 +5,7 @@ import { Cine } from "./cine.js";
 import { FramePainter, keyOf } from "./frame-painter.js";
 import { Marks } from "./marks.js";
 import { Placement } from "./placement.js";
+import { FRAME_MS, Playback } from "./playback.js";
 
 /** @typedef {import("../shared/types.js").Electrode} Electrode */
 
@@ -24,7 +25,7 @@ export class View extends EventTarget {
     this.run = run;
     this.pen = pen;
     this.frame = 1;
-    this.playing = false;
+    this.playback = new Playback(run.frame_time_ms ?? FRAME_MS, (frames) => this.show(this.frame + frames));
     /** @type {string|null} */
     this.chosen = null;
     /** @type {{start: number[], end: number[], colour: string}|null} */
@@ -70,25 +71,15 @@ export class View extends EventTarget {
     this.draw();
   }
 
+  get playing() {
+    return this.playback.playing;
+  }
+
   /** @param {boolean} playing */
   play(playing) {
-    if (playing === this.playing) return;
-    this.playing = playing;
+    this.playback.play(playing);
     this.playButton.textContent = playing ? "Pause" : "Play";
     this.playButton.setAttribute("aria-label", `${this.playButton.textContent} view ${this.letter}`);
-    const every = this.run.frame_time_ms ?? 66;
-    let last = performance.now();
-    /** @param {number} now */
-    const step = (now) => {
-      if (!this.playing) return;
-      const frames = Math.floor((now - last) / every);
-      if (frames > 0) {
-        last += frames * every;
-        this.show(this.frame + frames);
-      }
-      requestAnimationFrame(step);
-    };
-    if (playing) requestAnimationFrame(step);
   }
 
   get electrodes() {
