@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
-from fluoromap.contracts import Array
+from fluoromap.contracts import Array, NamedChain
 from fluoromap_service.api.http.paths import InstanceUid, JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
@@ -22,12 +23,24 @@ router = APIRouter(tags=["results"])
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
+class FrameElectrode(BaseModel):
+    """An electrode in one frame."""
+
+    catheter: str
+    electrode: int = Field(description="1 is the tip.")
+    u_px: float
+    v_px: float
+
+
 class FramePlace(BaseModel):
     """The place of the map in one frame."""
 
     frame: int = Field(description="Counted from 1.")
     shift_mm: Position = Field(description="World minus map: the reference catheter's position in this frame.")
     tip_px: tuple[float, float] | None = Field(description="Pixel (u, v) of the mapping tip.")
+    electrodes: list[FrameElectrode] = Field(
+        description="The electrodes that the job used in this frame, some of them interpolated between frames."
+    )
 
 
 class Placement(BaseModel):
@@ -46,7 +59,14 @@ class Placement(BaseModel):
                         [0.0, 0.0, -1707.0, 191488.0],
                         [1.0, 0.0, 0.0, 750.0],
                     ],
-                    "frames": [{"frame": 1, "shift_mm": [2.1, -14.0, 7.5], "tip_px": [301.5, 244.0]}],
+                    "frames": [
+                        {
+                            "frame": 1,
+                            "shift_mm": [2.1, -14.0, 7.5],
+                            "tip_px": [301.5, 244.0],
+                            "electrodes": [{"catheter": "mapping", "electrode": 1, "u_px": 301.5, "v_px": 244.0}],
+                        }
+                    ],
                 }
             ]
         }
@@ -85,11 +105,22 @@ def get_placement(job_id: JobId, uid: InstanceUid, caller: Reader) -> Placement:
         projection=placement.camera.matrix.tolist(),
         frames=[
             FramePlace(
-                frame=frame + 1, shift_mm=placement.shift_mm(frame).tolist(), tip_px=_pixel(placement.tip_uv(frame))
+                frame=frame + 1,
+                shift_mm=placement.shift_mm(frame).tolist(),
+                tip_px=_pixel(placement.tip_uv(frame)),
+                electrodes=_electrodes(placement.chains.get(frame, {})),
             )
             for frame in range(count)
         ],
     )
+
+
+def _electrodes(chains: Mapping[str, NamedChain]) -> list[FrameElectrode]:
+    return [
+        FrameElectrode(catheter=name, electrode=electrode, u_px=u, v_px=v)
+        for name, chain in chains.items()
+        for electrode, (u, v) in zip(chain.electrodes, chain.pixels_uv.tolist(), strict=True)
+    ]
 
 
 def _pixel(uv: Array | None) -> tuple[float, float] | None:

@@ -30,6 +30,9 @@ def test_every_frame_is_where_its_overlay_is(client: TestClient, study: Finished
             assert fusion.tip_uv is not None
             np.testing.assert_allclose(each["shift_mm"], fusion.shift_mm)
             np.testing.assert_allclose(each["tip_px"], fusion.tip_uv)
+            for name, places in fusion.electrodes_uv.items():
+                own = [[one["u_px"], one["v_px"]] for one in each["electrodes"] if one["catheter"] == name]
+                np.testing.assert_allclose(np.array(own).reshape(-1, 2), places)
             point = fusion.chamber.vertices_mm[0]
             *pixel, depth = np.array(placement["projection"]) @ [*(point + each["shift_mm"]), 1.0]
             np.testing.assert_allclose(np.array(pixel) / depth, fusion.camera.project(point + fusion.shift_mm))

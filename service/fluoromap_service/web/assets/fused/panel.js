@@ -1,6 +1,7 @@
 /** The map over both fluoroscopy views of a site: it follows the frames while they play. */
 import { get } from "../shared/api.js";
 import { attempt, button, element, field, select } from "../shared/elements.js";
+import { drawColourBar } from "../map/colour-bar.js";
 import { distanceText } from "../results/tip-distance.js";
 import { FusedView } from "./view.js";
 import { WallPainter } from "./wall-painter.js";
@@ -33,7 +34,7 @@ export class FusedPanel {
     const names = [...new Set(overlays.map((each) => each.site))];
     this.choice = select(names.map((name) => [name, name]), "", { onchange: () => this.open(this.choice.value) });
     this.playButton = button("Play", () => this.play(!this.playing), { "aria-label": "Play the map over fluoroscopy" });
-    this.electrodes = element("input", { type: "checkbox", onchange: () => attempt(() => this.#showElectrodes()) });
+    this.electrodes = element("input", { type: "checkbox", onchange: () => this.#showElectrodes() });
     this.distance = element("p", { "aria-live": "polite", class: "distance" });
     this.links = element("p", { class: "row" });
     this.place = element("div", { class: "views" });
@@ -42,7 +43,11 @@ export class FusedPanel {
       this.distance, this.place,
       element("p", { class: "soft" }, "Star: tip of this site. Dot: near wall. Ring: far wall. Dashed: from the tip to the earliest site. A click on a site finds it in every view; the wheel zooms, dragging moves the picture, space plays."),
       this.links);
-    this.redraw = () => this.views.forEach((view) => view.draw());
+    this.bar = element("canvas", { class: "bar" });
+    this.redraw = () => {
+      drawColourBar(this.bar, look.scale, look.uncertainty ? "± SD, ms" : "time, ms");
+      for (const view of this.views) view.draw();
+    };
     look.addEventListener("changed", this.redraw);
   }
 
@@ -62,7 +67,7 @@ export class FusedPanel {
       const distance = distanceText(this.tips, wanted, earliest);
       this.views = places.flatMap((each) => {
         const run = this.state.runs.find((other) => other.sop_instance_uid === each.sop_instance_uid);
-        return run && this.wall ? [new FusedView(this.state, run, each, this.wall, { earliest, distance: distance?.short ?? "" })] : [];
+        return run && this.wall ? [new FusedView(this.state, run, each, this.wall, each.view === "b" ? this.bar : null, { earliest, distance: distance?.short ?? "" })] : [];
       });
       for (const view of this.views) {
         view.addEventListener("chosen", (event) => this.#choose(/** @type {CustomEvent} */ (event).detail));
@@ -74,7 +79,8 @@ export class FusedPanel {
         element("a", { href: own[k]?.href ?? "", target: "_blank", onclick: (/** @type {MouseEvent} */ event) => {
           /** @type {HTMLAnchorElement} */ (event.currentTarget).href = this.#picture(own[k]?.href ?? "", kind, view);
         } }, `View ${view.place.view} as a ${title}`))));
-      await this.#showElectrodes();
+      this.#showElectrodes();
+      this.redraw();
     });
   }
 
@@ -96,12 +102,8 @@ export class FusedPanel {
     this.keeps = false;
   }
 
-  async #showElectrodes() {
-    for (const view of this.views) {
-      const frames = this.electrodes.checked ? await get(`${view.cine.path.replace(/frames$/, "electrodes")}`) : null;
-      view.electrodes = frames && new Map(frames.map((/** @type {any} */ each) => [each.frame, each.electrodes]));
-      view.draw();
-    }
+  #showElectrodes() {
+    for (const view of this.views) view.showElectrodes(this.electrodes.checked);
   }
 
   /** @param {boolean} playing */

@@ -10,7 +10,10 @@ import { drawLabels } from "./labels.js";
 import { Projection } from "./projection.js";
 
 /** @typedef {import("../shared/types.js").Run} Run @typedef {import("../shared/types.js").MapSite} MapSite */
-/** @typedef {{site: string, view: string, frame: number, projection: number[][], frames: {frame: number, shift_mm: number[], tip_px: number[]|null}[]}} MapPlacement */
+/**
+ * @typedef {{site: string, view: string, frame: number, projection: number[][], frames: {frame: number, shift_mm: number[], tip_px: number[]|null,
+ *   electrodes: {catheter: string, electrode: number, u_px: number, v_px: number}[]}[]}} MapPlacement
+ */
 
 const REACH_PX = 16;
 const DOUBTFUL = "#ffb040";
@@ -22,9 +25,10 @@ export class FusedView extends EventTarget {
    * @param {Run} run
    * @param {MapPlacement} place
    * @param {import("./wall-painter.js").WallPainter} wall
+   * @param {HTMLCanvasElement|null} bar Colour bar to show in this view.
    * @param {{earliest: string|null, distance: string}} goal The earliest site, and its distance from the tip of this run in words.
    */
-  constructor(state, run, place, wall, goal) {
+  constructor(state, run, place, wall, bar, goal) {
     super();
     this.state = state;
     this.run = run;
@@ -35,8 +39,7 @@ export class FusedView extends EventTarget {
     this.projection = new Projection(place.projection);
     this.frame = place.frame;
     this.shownFrames = 0;
-    /** @type {Map<number, import("../shared/types.js").Electrode[]>|null} Frame -> found electrodes; null hides them. */
-    this.electrodes = null;
+    this.showsElectrodes = false;
     this.painter = new FramePainter(run);
     this.placement = new Placement();
     this.cine = new Cine(state.path, run, () => this.draw());
@@ -47,7 +50,7 @@ export class FusedView extends EventTarget {
     this.count = element("span", {});
     this.element = element("div", { class: "view fused", "data-view": place.view },
       element("div", { class: "caption" }, element("strong", {}, `View ${place.view}`), `${direction(run.gantry)} of site ${place.site}`),
-      this.canvas, element("div", { class: "caption" }, this.slider, this.count));
+      element("div", { class: "picture" }, this.canvas, bar), element("div", { class: "caption" }, this.slider, this.count));
     this.#listen();
     new ResizeObserver(() => this.#fit()).observe(this.canvas);
     this.show(this.frame);
@@ -81,11 +84,17 @@ export class FusedView extends EventTarget {
       this.shownFrames += 1;
       this.element.dataset.frames = String(this.shownFrames);
     }
-    const electrodes = this.electrodes?.get(this.frame) ?? [];
-    this.painter.paint(this.canvas, this.placement, this.state.study, electrodes, { chosen: null, line: null });
+    this.painter.paintFrame(this.canvas, this.placement);
     const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
     this.wall.paint(context, this.placement, this.run, this.projection, this.shift);
+    if (this.showsElectrodes) this.painter.paintElectrodes(this.canvas, this.placement, this.state.study, this.place.frames[this.frame - 1]?.electrodes ?? [], null);
     this.#sites(context);
+  }
+
+  /** @param {boolean} shown */
+  showElectrodes(shown) {
+    this.showsElectrodes = shown;
+    this.draw();
   }
 
   get shift() {

@@ -47,7 +47,8 @@ export class MapScene extends EventTarget {
     this.sun = new THREE.DirectionalLight(0xffffff, 2);
     this.world.add(this.surface.mesh, this.catheters.group, this.sun, new THREE.AmbientLight(0xffffff, 1.1));
     this.dots = this.map.sites.map((site) => this.#dot(site, sphere.radius));
-    this.names = this.map.sites.map((site) => this.#label(siteText(site)));
+    const earliest = this.map.earliest[0]?.site;
+    this.names = this.map.sites.map((site) => this.#label(`${siteText(site)}${site.site === earliest ? ", earliest" : ""}`));
     /** @type {HTMLElement[]} */
     this.catheterNames = [];
     this.orbit = new Orbit(this.canvas, sphere.center.clone(), sphere.radius, () => this.draw());

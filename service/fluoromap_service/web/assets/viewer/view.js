@@ -93,7 +93,9 @@ export class View extends EventTarget {
       this.shownFrames += 1;
       this.element.dataset.frames = String(this.shownFrames);
     }
-    this.painter.paint(this.canvas, this.placement, this.state.study, this.electrodes, { chosen: this.chosen, line: this.line });
+    this.painter.paintFrame(this.canvas, this.placement);
+    if (this.line) this.painter.paintLine(this.canvas, this.placement, this.line);
+    this.painter.paintElectrodes(this.canvas, this.placement, this.state.study, this.electrodes, this.chosen);
     this.element.dataset.electrodes = String(this.electrodes.length);
   }
 
