@@ -46,6 +46,7 @@ export class FusedPanel {
     this.bar = element("canvas", { class: "bar" });
     this.redraw = () => {
       drawColourBar(this.bar, look.scale, look.uncertainty ? "± SD, ms" : "time, ms");
+      this.wall?.update();
       for (const view of this.views) view.draw();
     };
     look.addEventListener("changed", this.redraw);

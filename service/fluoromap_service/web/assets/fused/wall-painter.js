@@ -21,8 +21,11 @@ export class WallPainter {
     this.camera.matrixAutoUpdate = false;
     this.edges = edgesOf(look.map);
     this.normals = look.map.faces.map((face) => faceOf(look.map, face));
-    this.update = () => this.surface.update();
-    look.addEventListener("changed", this.update);
+  }
+
+  /** Take the colours and the time of the look. */
+  update() {
+    this.surface.update();
   }
 
   /**
@@ -86,7 +89,6 @@ export class WallPainter {
   }
 
   close() {
-    this.look.removeEventListener("changed", this.update);
     this.surface.close();
     this.renderer.dispose();
     this.renderer.forceContextLoss();

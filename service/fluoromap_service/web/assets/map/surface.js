@@ -31,7 +31,8 @@ void main() {
     if (vTime <= until) {
       for (int k = 0; k < ${MOST_BANDS}; k++) if (k == band) colour = colours[k];
       float away = abs(fract(position + 0.5) - 0.5) / max(fwidth(position), 1e-6);
-      float line = 1.0 - smoothstep(0.6, 1.4, away);
+      // At the rim the values are those of neighbours: lines there mean nothing.
+      float line = vKnown > 0.999 ? 1.0 - smoothstep(0.6, 1.4, away) : 0.0;
       share = mix(0.32, 0.5, line);
       colour = mix(colour, vec3(1.0), line);
     }
