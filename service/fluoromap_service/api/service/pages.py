@@ -21,6 +21,9 @@ from fluoromap_service.problem import not_found
 router = APIRouter(include_in_schema=False)
 
 ASSETS = Path(fluoromap_service.__file__).resolve().parent / "web" / "assets"
+PAGE = "page.html"
+"""The file of all pages behind the sign-in; its script reads the address."""
+
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
@@ -74,13 +77,13 @@ def _send(request: Request, name: str) -> Response:
 @router.get("/")
 def get_studies_page(request: Request, caller: Reader) -> Response:
     """Return the page of all studies."""
-    return _send(request, "studies.html")
+    return _send(request, PAGE)
 
 
 @router.get("/studies/{study_id}")
 def get_study_page(study_id: str, request: Request, caller: Reader) -> Response:
     """Return the page of one study."""
-    return _send(request, "study.html")
+    return _send(request, PAGE)
 
 
 @router.get(SIGN_IN)

@@ -65,8 +65,8 @@ export class Orbit {
   /** @param {number} width @param {number} height */
   fit(width, height) {
     this.camera.aspect = width / height;
-    // A narrow picture shows the whole chamber too, beside the colour bar.
-    const narrow = Math.max(1, 1.55 / this.camera.aspect);
+    // A narrow picture shows the whole chamber too, with space for the labels beside it.
+    const narrow = Math.max(1, 1.25 / this.camera.aspect);
     this.camera.fov = (2 * Math.atan(Math.tan(Math.PI / 12) * narrow) * 180) / Math.PI;
     this.camera.updateProjectionMatrix();
   }

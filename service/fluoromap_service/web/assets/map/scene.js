@@ -7,8 +7,8 @@ import { drawOrientation } from "./orientation.js";
 import { siteText } from "./site-text.js";
 import { rendererOf, Surface } from "./surface.js";
 
-const LINE_PX = 13;
-const LABEL_PX = 70;
+const LINE_PX = 15;
+const BESIDE_PX = 8;
 const REACH_PX = 16;
 
 /** The event `chosen` has the name of the site that a person clicked. */
@@ -147,13 +147,17 @@ export class MapScene extends EventTarget {
     this.canvas.dataset["drawn"] = "yes";
   }
 
-  /** Put a label beside a point, below the labels that are there already. @param {HTMLElement} label @param {THREE.Vector3} point @param {number[][]} taken */
+  /** Put a label beside a point, below the labels that are there already. @param {HTMLElement} label @param {THREE.Vector3} point @param {number[][]} taken Left, top and width of each. */
   #put(label, point, taken) {
     const at = point.clone().project(this.orbit.camera);
-    const x = ((at.x + 1) / 2) * this.canvas.clientWidth + 8;
-    let y = ((1 - at.y) / 2) * this.canvas.clientHeight - 8;
-    while (taken.some(([otherX = 0, otherY = 0]) => Math.abs(otherX - x) < LABEL_PX && Math.abs(otherY - y) < LINE_PX)) y += LINE_PX;
-    taken.push([x, y]);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const own = label.offsetWidth;
+    const beside = ((at.x + 1) / 2) * width;
+    const x = beside + BESIDE_PX + own > width ? beside - BESIDE_PX - own : beside + BESIDE_PX;
+    let y = ((1 - at.y) / 2) * height - BESIDE_PX;
+    // A label that nobody sees takes no space.
+    while (own && taken.some(([otherX = 0, otherY = 0, other = 0]) => otherX < x + own && x < otherX + other && Math.abs(otherY - y) < LINE_PX)) y += LINE_PX;
+    if (own) taken.push([x, y, own]);
     label.style.transform = `translate(${x.toFixed(0)}px, ${y.toFixed(0)}px)`;
   }
 
