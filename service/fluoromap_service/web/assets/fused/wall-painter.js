@@ -11,7 +11,7 @@ export class WallPainter {
   constructor(look) {
     this.look = look;
     this.canvas = document.createElement("canvas");
-    this.renderer = rendererOf(this.canvas);
+    this.renderer = rendererOf(this.canvas, false);
     this.renderer.setPixelRatio(1);
     this.surface = new Surface(look, true);
     this.surface.mesh.frustumCulled = false;

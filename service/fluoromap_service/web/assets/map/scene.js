@@ -38,7 +38,7 @@ export class MapScene extends EventTarget {
     this.labels = made("div", "labels");
     this.figure = /** @type {HTMLCanvasElement} */ (made("canvas", "figure"));
     this.bar = /** @type {HTMLCanvasElement} */ (made("canvas", "bar"));
-    this.renderer = rendererOf(this.canvas);
+    this.renderer = rendererOf(this.canvas, true);
     this.world = new THREE.Scene();
     this.surface = new Surface(look, false);
     const { sphere } = this.surface;

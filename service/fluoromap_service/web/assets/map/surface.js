@@ -29,7 +29,7 @@ void main() {
     colour = vec3(0.93);
     share = 0.0;
     if (vTime <= until) {
-      for (int k = 0; k < ${MOST_BANDS}; k++) if (k == band) colour = colours[k];
+      colour = colours[band];
       float away = abs(fract(position + 0.5) - 0.5) / max(fwidth(position), 1e-6);
       // At the rim the values are those of neighbours: lines there mean nothing.
       float line = vKnown > 0.999 ? 1.0 - smoothstep(0.6, 1.4, away) : 0.0;
@@ -101,10 +101,10 @@ export class Surface {
   }
 }
 
-/** A renderer whose colours are those of the colour bar. @param {HTMLCanvasElement} canvas */
-export function rendererOf(canvas) {
+/** A renderer whose colours are those of the colour bar. @param {HTMLCanvasElement} canvas @param {boolean} smooth Smooth edges, and a picture that stays: for a canvas that the page shows. */
+export function rendererOf(canvas, smooth) {
   THREE.ColorManagement.enabled = false;
-  const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
+  const renderer = new THREE.WebGLRenderer({ canvas, antialias: smooth, alpha: true, preserveDrawingBuffer: smooth });
   renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
   return renderer;
 }

@@ -1,5 +1,5 @@
 /** Frames of all runs of the page in one place. What was not used for long is dropped, so that memory stays bounded. */
-const MOST_BYTES = 192 * 2 ** 20;
+export const MOST_BYTES = 192 * 2 ** 20;
 
 /** @type {Map<string, Uint8Array>} Address -> frames; the order is that of the last use. */
 const parts = new Map();
@@ -27,7 +27,7 @@ export function storePart(address, content) {
   }
 }
 
-/** Bytes of the frames that are here. */
+/** Bytes of the frames that are here: at most MOST_BYTES, unless one part is larger. */
 export function storedBytes() {
   let bytes = 0;
   for (const each of parts.values()) bytes += each.length;
