@@ -135,5 +135,5 @@ def node_modules() -> Path:
     """Return the folder of the checks that come from npm."""
     folder = Path(os.environ.get("FLUOROMAP_NODE_MODULES", Path(__file__).parent / "node_modules"))
     if not (folder / "typescript").exists():
-        pytest.skip("the checks from npm are not installed: npm install --prefix tests/pages")
+        pytest.skip("types and accessibility of the pages are not checked: run npm install --prefix tests/pages")
     return folder

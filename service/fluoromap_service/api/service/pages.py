@@ -16,6 +16,7 @@ import fluoromap_service
 from fluoromap_service.api.http.etags import is_known
 from fluoromap_service.api.http.security import SESSION, SIGN_IN, Reader, bearer_token
 from fluoromap_service.api.http.session import begin_session, end_session
+from fluoromap_service.auth import OPEN
 from fluoromap_service.problem import not_found
 
 router = APIRouter(include_in_schema=False)
@@ -96,6 +97,12 @@ def get_sign_in_page(request: Request) -> Response:
 def get_asset(name: str, request: Request) -> Response:
     """Return a file of the pages."""
     return _send(request, name)
+
+
+@router.get(SESSION)
+def get_session(caller: Reader) -> dict[str, str | None]:
+    """Return the name of the token that this browser signed in with; null where the service is open."""
+    return {"name": None if caller == OPEN.name else caller}
 
 
 @router.post(SESSION, status_code=204, response_class=Response)
