@@ -13,6 +13,7 @@ import { resultSites } from "./sites-table.js";
 export function resultsPanel(state, correct) {
   const place = element("div", {});
   const choice = select([], "", {});
+  const choiceField = field("Computation of", choice);
   let shown = "";
   let forget = () => {};
 
@@ -71,6 +72,7 @@ export function resultsPanel(state, correct) {
     const jobs = state.jobs.filter((job) => job.state === "succeeded");
     choice.replaceChildren(...select(jobs.map((job) => [job.id, new Date(job.created).toLocaleString()]), jobs[0]?.id ?? "").children);
     const newest = jobs[0];
+    choiceField.hidden = !newest;
     if (!newest) return place.replaceChildren(element("p", { class: "card" }, "There is no map yet. Start the computation in the third step."));
     if (newest.id === shown) return undefined;
     shown = newest.id;
@@ -83,5 +85,5 @@ export function resultsPanel(state, correct) {
   });
   state.addEventListener("changed", fill);
   fill();
-  return element("div", {}, field("Computation of", choice), place);
+  return element("div", {}, choiceField, place);
 }
