@@ -34,6 +34,7 @@ export class FusedView extends EventTarget {
     this.run = run;
     this.place = place;
     this.wall = wall;
+    this.bar = bar;
     this.goal = goal;
     this.map = wall.look.map;
     this.projection = new Projection(place.projection);
@@ -135,13 +136,15 @@ export class FusedView extends EventTarget {
       else drawDot(context, at, colour, (chosen ? 6 : 3.5) * unit, near, unit);
       if (chosen && !own) ring(context, at, 10 * unit, unit);
     }
+    // On a phone the colour bar is below the picture.
+    const right = this.bar && this.bar.offsetTop < this.canvas.clientHeight ? this.bar.offsetLeft * unit : this.canvas.width;
     drawLabels(context, shown.sort((a, b) => Number(b.chosen) - Number(a.chosen) || Number(b.own) - Number(a.own)).map(({ site, own, near, chosen, at }) => ({
       at,
       text: chosen || own || site.site === this.goal.earliest ? `${siteText(site)}${site.site === this.goal.earliest ? ", earliest" : ""}` : timeText(site).replace(" ms", ""),
       chosen, faint: !near && !own && !chosen,
-    })), unit);
+    })), unit, right);
     if (star && earliest && !earliest.own) {
-      drawLabels(context, [{ at: { x: (star.x + earliest.at.x) / 2, y: (star.y + earliest.at.y) / 2 }, text: this.goal.distance, chosen: false, faint: false }], unit);
+      drawLabels(context, [{ at: { x: (star.x + earliest.at.x) / 2, y: (star.y + earliest.at.y) / 2 }, text: this.goal.distance, chosen: false, faint: false }], unit, right);
     }
     this.#edges(context, unit);
   }

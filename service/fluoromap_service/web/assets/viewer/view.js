@@ -43,7 +43,7 @@ export class View extends EventTarget {
     this.playButton = button("Play", () => this.play(!this.playing), { "aria-label": `Play view ${letter}` });
     this.status = element("span", { class: "status", "aria-live": "polite" });
     this.element = element("div", { class: "view", "data-view": letter },
-      element("div", { class: "caption" }, element("strong", {}, `View ${letter}`), direction(run.gantry), element("span", { class: "grow" }), this.status),
+      element("div", { class: "caption" }, element("strong", {}, `View ${letter}`), `${direction(run.gantry)}${run.simulated ? ", simulated data" : ""}`, element("span", { class: "grow" }), this.status),
       this.canvas, element("div", { class: "caption" }, this.playButton, this.slider, this.count));
     this.marks.addEventListener("changed", () => this.draw());
     this.marks.addEventListener("stored", () => (this.status.textContent = "stored"));
