@@ -29,6 +29,10 @@ KNOWN = {
     "4": {
         "overlay": "d39d7ec81c9304149de4146cfc6657473c3dedafbbca6fdc246a40c4510255a2",
         "map picture": "7aac6152c4e046f263d20050c6025a7a16f4034570f74a5e01569ade7821a3f2",
+    },
+    "5": {
+        "overlay": "d39d7ec81c9304149de4146cfc6657473c3dedafbbca6fdc246a40c4510255a2",
+        "map picture": "7aac6152c4e046f263d20050c6025a7a16f4034570f74a5e01569ade7821a3f2",
         "simulated overlay with electrodes": "d4b6eb66f29e729b85cd98c080fc55192cf1953f655b3ebd9ee3066aaafddbf8",
         "simulated map picture": "297f858f3da35788b36984b8a04aef97d1b3f69afcb49eb1b5dfe060675f96b2",
     },
