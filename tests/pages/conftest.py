@@ -12,6 +12,8 @@ import pytest
 import servers
 from processes import embedded, environment_of, wait_until_ready
 
+from fluoromap_service.cli.client import Client
+
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test opens the pages")
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -115,9 +117,23 @@ def new_study() -> Callable[[Any, str], str]:
 
 
 @pytest.fixture(scope="session")
+def mapped_study(service_url: str, simulated_study: Path) -> tuple[str, str]:
+    """Return the ids of a study with a map and of its job."""
+    with Client(service_url) as client:
+        study = client.make_study("With a map")
+        for path in sorted(simulated_study.rglob("*.dcm")):
+            client.upload(study, path)
+        client.put_activation_times(study, simulated_study / "activation_times.csv")
+        job = client.start_job(study)
+        states = [each["state"] for each in client.follow(job)]
+        assert states[-1] == "succeeded", states
+    return study, job
+
+
+@pytest.fixture(scope="session")
 def node_modules() -> Path:
     """Return the folder of the checks that come from npm."""
     folder = Path(os.environ.get("FLUOROMAP_NODE_MODULES", Path(__file__).parent / "node_modules"))
     if not (folder / "typescript").exists():
-        pytest.skip("the checks from npm are not installed: npm install --prefix tests/pages")
+        pytest.skip("types and accessibility of the pages are not checked: run npm install --prefix tests/pages")
     return folder

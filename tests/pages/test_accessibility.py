@@ -27,19 +27,22 @@ def filled_study(page: Any, tmp_path: Path) -> str:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing_serious(
-    browser: Any, service_url: str, filled_study: str, node_modules: Path, scheme: str
+    browser: Any, service_url: str, filled_study: str, mapped_study: tuple[str, str], node_modules: Path, scheme: str
 ) -> None:
     script = (node_modules / "axe-core" / "axe.min.js").read_text()
     addresses = ["/", "/sign-in", "/docs", *(f"{filled_study}#{step}" for step in STEPS)]
+    with_map = f"/studies/{mapped_study[0]}#map"
     found = []
     # The policy of the pages would keep the checker itself out.
     with browser.new_context(base_url=service_url, color_scheme=scheme, bypass_csp=True) as context:
-        for address in addresses:
+        for address in (*addresses, with_map):
             opened = context.new_page()
             opened.goto(address)
             opened.locator("h1").wait_for()
             if address not in ("/sign-in", "/docs"):
                 opened.locator("body[data-ready]").wait_for()
+            if address == with_map:
+                opened.locator(".fused[data-frames]").nth(1).wait_for()
             opened.evaluate(script)
             for finding in opened.evaluate("axe.run()")["violations"]:
                 if finding["impact"] in ("serious", "critical"):
@@ -48,12 +51,15 @@ def test_axe_finds_nothing_serious(
     assert not found, json.dumps(found, indent=1)
 
 
-def test_pages_fit_a_phone(page: Any, filled_study: str) -> None:
+def test_pages_fit_a_phone(page: Any, filled_study: str, mapped_study: tuple[str, str]) -> None:
     page.set_viewport_size({"width": 390, "height": 800})
-    for address in ("/", *(f"{filled_study}#{step}" for step in STEPS)):
+    with_map = f"/studies/{mapped_study[0]}#map"
+    for address in ("/", with_map, *(f"{filled_study}#{step}" for step in STEPS)):
         page.goto("about:blank")
         page.goto(address)
         page.locator("body[data-ready]").wait_for()
+        if address == with_map:
+            page.locator(".fused[data-frames]").nth(1).wait_for()
         assert page.locator("html").evaluate("root => root.scrollWidth") <= 390, address
 
 

@@ -44,7 +44,7 @@ def _run(folder: Path, frames: list[np.ndarray[Any, Any]], number: int) -> Path:
         series_number=number,
         sop_instance_uid=deterministic_uid("tests", "real run", str(number)),
     )
-    path.write_bytes(edited(path.read_bytes(), **dict.fromkeys(GEOMETRY)))
+    path.write_bytes(edited(path.read_bytes(), **dict.fromkeys((*GEOMETRY, "Manufacturer"))))
     return path
 
 

@@ -55,6 +55,7 @@ def test_a_browser_signs_in_and_out(browser: Any, closed_service: tuple[str, str
         page.get_by_label("Name of the study").fill("Signed in")
         page.get_by_role("button", name="Create the study").click()
         page.wait_for_url("**/studies/*")
+        page.get_by_text("Signed in as doctor").wait_for()
         page.get_by_role("button", name="Sign out").click()
         page.wait_for_url("**/sign-in")
         page.goto("/")

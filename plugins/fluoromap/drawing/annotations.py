@@ -11,12 +11,16 @@ from fluoromap.contracts import Array
 from fluoromap.drawing.lettering import BLACK, WHITE, Box, halo_text, text_size
 from fluoromap.geometry import Camera
 
-PURPOSE = "for research"
 LEGEND = "star: tip of this site    dot: near wall    ring: far wall"
 _ENDS = (("L", "R"), ("P", "A"), ("H", "F"))
 """Letters of the positive and negative ends of the axes of LPS."""
 _LEAST_SHARE = 0.35
 """Smallest component of a unit vector that gets a letter."""
+
+
+def purpose_text(*, simulated: bool) -> str:
+    """Return the words that every picture carries about its data and its purpose."""
+    return "simulated data, for research" if simulated else "for research"
 
 
 def direction_text(camera: Camera) -> str:

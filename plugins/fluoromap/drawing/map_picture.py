@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, ChamberMap
-from fluoromap.drawing.annotations import PURPOSE
+from fluoromap.drawing.annotations import purpose_text
 from fluoromap.drawing.colour_bar import draw_colour_bar
 from fluoromap.drawing.colours import Scale, scale_of
 from fluoromap.drawing.isochrones import Isochrone, isochrones
@@ -51,6 +51,8 @@ def draw_map_views(
     views: Sequence[Direction] = VIEWS,
     like: ChamberMap | None = None,
     times: Scale | None = None,
+    *,
+    simulated: bool = False,
 ) -> NDArray[np.uint8]:
     """Draw the map from several directions.
 
@@ -66,6 +68,8 @@ def draw_map_views(
         Another map whose middle and size place this one in its panels, so that pictures of both can be compared.
     times : Scale or None
         Colour scale that several pictures share; None chooses the map's own.
+    simulated : bool
+        Write below the map that the data are simulated.
 
     Returns
     -------
@@ -89,7 +93,7 @@ def draw_map_views(
     _scale_bar(ImageDraw.Draw(picture), px_per_mm, (width + 14.0, height + 0.55 * FOOTER_PX))
     draw_colour_bar(picture, times, 14, dark=False)
     place = (width / 2, height + 0.4 * FOOTER_PX)
-    line_with_squares(ImageDraw.Draw(picture), place, _figures(chamber), 14, INK)
+    line_with_squares(ImageDraw.Draw(picture), place, _figures(chamber, simulated), 14, INK)
     return np.asarray(picture)
 
 
@@ -170,9 +174,9 @@ def _scale_bar(draw: ImageDraw.ImageDraw, px_per_mm: float, start: Point) -> Non
     draw.text(((left + right) / 2, level - 12), f"{length_mm} mm", fill=INK, font=font(12), anchor="mm")
 
 
-def _figures(chamber: ChamberMap) -> str:
+def _figures(chamber: ChamberMap, simulated: bool) -> str:
     parts = [
-        PURPOSE,
+        purpose_text(simulated=simulated),
         f"{len(chamber.sites)} sites",
         f"total activation time {chamber.total_activation_time_ms:.0f} ms",
         f"volume {chamber.volume_ml:.0f} ml",

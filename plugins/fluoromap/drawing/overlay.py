@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array, BoolArray, ChamberMap
-from fluoromap.drawing.annotations import PURPOSE, annotation_boxes, direction_text, draw_annotations
+from fluoromap.drawing.annotations import annotation_boxes, direction_text, draw_annotations, purpose_text
 from fluoromap.drawing.colour_bar import bar_box, draw_colour_bar
 from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
+from fluoromap.drawing.electrodes import draw_electrodes
 from fluoromap.drawing.isochrones import isochrones
 from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Box, Labels, Point, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
@@ -43,7 +44,9 @@ class Look:
     scale : pixels of the picture per pixel of the frame, along each side. palette, step_ms : of the isochrones; a step of
     None suits the map. covariances_mm2 : site -> (3, 3) of its position, drawn as the 95 % ellipse. until_ms : the wall is
     coloured only where it is activated by this time, and the front is a thick line; None colours all. times : colour scale
-    that several pictures share, instead of palette and step.
+    that several pictures share, instead of palette and step. electrodes_uv : catheter -> (k, 2)
+    pixels of its electrodes in the frame, drawn as rings; the order of the catheters gives the colours. simulated : the
+    caption says that the data are simulated.
     """
 
     scale: int = 1
@@ -52,6 +55,8 @@ class Look:
     covariances_mm2: Mapping[str, Array] = field(default_factory=dict)
     until_ms: float | None = None
     times: Scale | None = None
+    electrodes_uv: Mapping[str, Array] = field(default_factory=dict)
+    simulated: bool = False
 
     def __post_init__(self) -> None:
         if self.scale < 1:
@@ -79,6 +84,7 @@ def draw_overlay(
     - every site with its time in ms: a dot on the wall that faces the viewer, a ring on the far wall; the time is amber with a
       question mark where the site is in doubt,
     - a star at the highlighted site's tip,
+    - the electrodes of the frame where ``look`` has them, with the names of their catheters,
     - a colour bar,
     - site, direction of the view and purpose, the orientation of the patient, and the meaning of the symbols.
 
@@ -124,8 +130,9 @@ def draw_overlay(
     raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
     _tint(image, pixel_bands(raster, chamber, times, canvas.unit, look.until_ms), times)
     _draw_lines(image, canvas, chamber, facing, times, look)
-    caption = f"{highlight_site}    {direction_text(camera)}    {PURPOSE}"
+    caption = f"{highlight_site}    {direction_text(camera)}    {purpose_text(simulated=look.simulated)}"
     words = annotation_boxes(image.size, canvas.letters, caption)
+    draw_electrodes(image, {name: canvas.to_picture(uv) for name, uv in look.electrodes_uv.items()}, canvas.unit)
     _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms, words)
     draw_annotations(image, camera, caption, canvas.letters)
     if look.until_ms is not None:

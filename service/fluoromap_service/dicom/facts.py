@@ -17,6 +17,9 @@ Plane = Literal["single", "A", "B"]
 Pair = tuple[float, float]
 Point = tuple[float, float, float]
 
+SIMULATED_EQUIPMENT = ("fluoromap", "simulated C-arm")
+"""Manufacturer (0008,0070) and ManufacturerModelName (0008,1090) of simulated runs."""
+
 _UID = re.compile(r"[0-9]+(\.[0-9]+)*")
 
 
@@ -125,6 +128,8 @@ class InstanceFacts:
     warnings : tuple of HeaderWarning
     table_origin : TableOrigin or None
         The attributes that state ``table_mm``; None where the position is unknown.
+    simulated : bool
+        True for a run that ``fluoromap simulate`` wrote.
 
     Raises
     ------
@@ -159,6 +164,7 @@ class InstanceFacts:
     missing: tuple[str, ...]
     warnings: tuple[HeaderWarning, ...]
     table_origin: TableOrigin | None = None
+    simulated: bool = False
 
     def __post_init__(self) -> None:
         uids = (self.sop_class_uid, self.sop_instance_uid, self.study_instance_uid, self.series_instance_uid)

@@ -80,7 +80,7 @@ _PLAIN = (
     "PositionerSecondaryAngleIncrement", "DistanceSourceToPatient", "EstimatedRadiographicMagnificationFactor",
     "IntensifierSize", "FieldOfViewDimensions", "TableMotion", "TableVerticalIncrement",
     "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "SamplesPerPixel", "PhotometricInterpretation",
-    "PatientPosition", "TableAngle",
+    "PatientPosition", "TableAngle", "Manufacturer", "ManufacturerModelName",
     "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
 )  # fmt: skip
 

@@ -16,7 +16,7 @@ from pydicom.uid import (
 )
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
-from fluoromap_service.dicom.facts import HeaderWarning, InstanceFacts, Plane, is_uid
+from fluoromap_service.dicom.facts import SIMULATED_EQUIPMENT, HeaderWarning, InstanceFacts, Plane, is_uid
 from fluoromap_service.dicom.frames import read_frame
 from fluoromap_service.dicom.header import Header, read_header
 from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
@@ -133,6 +133,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
         missing=gantry.missing,
         warnings=tuple(dict.fromkeys(warnings)),
         table_origin=table_origin,
+        simulated=_is_simulated(header),
     )
 
 
@@ -141,6 +142,11 @@ def _uid(header: Header, keyword: str) -> str:
     if not is_uid(value):
         raise _lacks(keyword)
     return value
+
+
+def _is_simulated(header: Header) -> bool:
+    """Return True for a run of the equipment that :func:`fluoromap_service.dicom.writing.write_cine` names."""
+    return (header.text("Manufacturer"), header.text("ManufacturerModelName")) == SIMULATED_EQUIPMENT
 
 
 def _plane(header: Header) -> Plane:

@@ -16,7 +16,7 @@ from pydicom.uid import UID, ExplicitVRLittleEndian, XRayAngiographicImageStorag
 from pydicom.valuerep import DSfloat
 
 from fluoromap.geometry import Gantry
-from fluoromap_service.dicom.facts import Plane
+from fluoromap_service.dicom.facts import SIMULATED_EQUIPMENT, Plane
 from fluoromap_service.dicom.orientation import field_of_view_of, patient_orientation
 
 _PLANES: dict[Plane, str] = {"single": "SINGLE PLANE", "A": "BIPLANE A", "B": "BIPLANE B"}
@@ -142,8 +142,7 @@ def _identify(
     dataset.SeriesDate, dataset.SeriesTime = date, time
     dataset.BodyPartExamined = "HEART"
     dataset.PatientPosition = "HFS"
-    dataset.Manufacturer = "fluoromap"
-    dataset.ManufacturerModelName = "simulated C-arm"
+    dataset.Manufacturer, dataset.ManufacturerModelName = SIMULATED_EQUIPMENT
     dataset.SoftwareVersions = "simulation"
     dataset.InstanceNumber = 1
     dataset.ContentDate, dataset.ContentTime = date, time

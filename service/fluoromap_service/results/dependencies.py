@@ -22,11 +22,11 @@ from fluoromap_service.results.origins import Origin
 Dependencies = dict[str, Any]
 """JSON values."""
 
-_BY_HASH = frozenset({"facts", "chamber", "covariances_mm2"})
+_BY_HASH = frozenset({"facts", "chamber", "covariances_mm2", "electrodes_uv"})
 """Fields of a fusion that other dependencies replace.
 
 The hash of the run's file replaces ``facts``, and the hash of the map replaces ``chamber``. The look says whether a picture
-shows ``covariances_mm2``; they are the same in all pictures of a job.
+shows ``covariances_mm2``, which are the same in all pictures of a job, and ``electrodes_uv``, which it contains.
 """
 
 
@@ -55,9 +55,9 @@ def mesh_dependencies(map_sha256: str, mesh_format: str, origin: Origin) -> Depe
     }
 
 
-def map_picture_dependencies(map_sha256: str) -> Dependencies:
+def map_picture_dependencies(map_sha256: str, *, simulated: bool) -> Dependencies:
     """Return the dependencies of the picture of the map from six sides."""
-    return {"kind": "map_picture", "drawing": drawing.VERSION, "map": map_sha256}
+    return {"kind": "map_picture", "drawing": drawing.VERSION, "map": map_sha256, "simulated": simulated}
 
 
 RESULT_OBJECTS: Dependencies = {"kind": "dicom"}

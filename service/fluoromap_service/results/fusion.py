@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from sqlalchemy.orm import Session
 
-from fluoromap.contracts import Array, ChamberMap, LocatedSite, Matching, NamedChain, Triangulation, View
+from fluoromap.contracts import Array, ChamberMap, Triangulation
 from fluoromap.drawing.animation import draw_propagation
-from fluoromap.drawing.map_placement import map_shift_mm, tip_pixel
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.drawing.png import encode_png
 from fluoromap.geometry import Camera
-from fluoromap.monoplane.track_samples import reference_origins
 from fluoromap_service.dicom import InstanceFacts, frame_to_8bit, open_frames
-from fluoromap_service.jobs.stage_results import SiteTracks, load, stage_of
-from fluoromap_service.problem import Problem, not_found
-from fluoromap_service.results.finished import done_stage, snapshot_of
-from fluoromap_service.results.maps import map_of
-from fluoromap_service.store.models import Job, StageState
-from fluoromap_service.study.snapshot import Snapshot
-
-VIEWS: tuple[View, ...] = ("a", "b")
+from fluoromap_service.problem import Problem
+from fluoromap_service.results.placement import placement_of
+from fluoromap_service.store.models import Job
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +24,7 @@ class Fusion:
 
     uid, sha256, facts : of the run. frame : counted from 0. map_sha256 : hash of the stored result that holds ``chamber``.
     shift_mm : (3,) world = map + shift. tip_uv : (2,) pixel of the mapping tip. covariances_mm2 : (3, 3) of each site.
+    electrodes_uv : (k, 2) pixels of each catheter's electrodes in the frame.
     """
 
     uid: str
@@ -45,28 +38,7 @@ class Fusion:
     site: str
     tip_uv: Array | None
     covariances_mm2: dict[str, Array]
-
-
-@dataclass(frozen=True, slots=True)
-class LocatedView:
-    """One view of a located site; ``frame`` is the diastolic frame, counted from 0."""
-
-    site: str
-    view: View
-    uid: str
-    frame: int
-
-
-def located_views(session: Session, job: Job) -> list[LocatedView]:
-    """Return both views of each located site.
-
-    Raises
-    ------
-    Problem
-        409 while there is no map.
-    """
-    map_of(session, job)
-    return _located_views(load(Triangulation, done_stage(session, job, "triangulate")), snapshot_of(job))
+    electrodes_uv: dict[str, Array]
 
 
 def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion:
@@ -86,38 +58,27 @@ def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion
     Problem
         404 for a run that is not a view of a located site, 422 for a frame that the run does not have, 409 without a map.
     """
-    finished = map_of(session, job)
-    snapshot = snapshot_of(job)
-    triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
-    entry = next((each for each in _located_views(triangulation, snapshot) if each.uid == uid), None)
-    if entry is None:
-        raise not_found("overlay: the run is no view of a located site")
+    placement = placement_of(session, job, uid)
+    snapshot = placement.snapshot
     run = snapshot.runs[uid]
     facts = InstanceFacts.from_json(run.facts)
-    index = entry.frame if frame is None else frame - 1
+    index = placement.view.frame if frame is None else frame - 1
     if not 0 <= index < facts.frames:
         detail = f"This run has the frames 1 to {facts.frames}; choose one of them."
         raise Problem(422, "no_such_frame", detail, [("frame", "out of range")])
-    site = next(each for each in triangulation.sites if each.site == entry.site)
-    camera = site.camera(entry.view)
-    chains = _chains(session, job, entry, index)
-    tracked_mm = (
-        None if index == entry.frame else _tracked_reference_mm(session, job, snapshot, site, entry.view, index)
-    )
-    mean_mm = np.zeros(3) if finished.reference_mm is None else finished.reference_mm
-    shift_mm = map_shift_mm(site, camera, chains.get(snapshot.reference), tracked_mm, mean_mm)
     return Fusion(
         uid=uid,
         sha256=run.sha256,
         facts=facts,
         frame=index,
-        camera=camera,
-        map_sha256=finished.sha256,
-        chamber=finished.chamber,
-        shift_mm=shift_mm,
-        site=entry.site,
-        tip_uv=tip_pixel(site, camera, snapshot.mapping, chains.get(snapshot.mapping), shift_mm),
-        covariances_mm2=_covariances(triangulation, snapshot.mapping),
+        camera=placement.camera,
+        map_sha256=placement.finished.sha256,
+        chamber=placement.finished.chamber,
+        shift_mm=placement.shift_mm(index),
+        site=placement.view.site,
+        tip_uv=placement.tip_uv(index),
+        covariances_mm2=_covariances(placement.triangulation, snapshot.mapping),
+        electrodes_uv=placement.electrodes_uv(index),
     )
 
 
@@ -125,15 +86,8 @@ def draw_fusion(path: Path, fusion: Fusion, look: Look, moving: bool) -> bytes:
     """Return an overlay as PNG, or its propagation as GIF, from the run's file."""
     frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
     parts = (frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv)
+    look = replace(look, simulated=fusion.facts.simulated)
     return draw_propagation(*parts, look) if moving else encode_png(draw_overlay(*parts, look))
-
-
-def _located_views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView]:
-    return [
-        LocatedView(site.site, view, snapshot.site(site.site).run(view), site.diastolic_frame(view))
-        for site in triangulation.sites
-        for view in VIEWS
-    ]
 
 
 def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]:
@@ -147,39 +101,3 @@ def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]
         for site, tip in tips.items()
         if tip is not None
     }
-
-
-def _tracked_reference_mm(
-    session: Session, job: Job, snapshot: Snapshot, site: LocatedSite, view: View, frame: int
-) -> Array | None:
-    """Return the reference catheter's position (3,) by the view's track.
-
-    None in frames that do not show it.
-    """
-    stage = stage_of(session, job.id, "monoplane", site.site)
-    if stage is None or stage.state != StageState.DONE:
-        return None
-    track = next((each.track for each in load(SiteTracks, stage).views if each.view == view), None)
-    if track is None or frame >= len(track.located):
-        return None
-    origins = reference_origins(track, site, snapshot.reference, None)
-    if not origins.same_frame[frame]:
-        return None
-    position: Array = origins.positions_mm[frame]
-    return position
-
-
-def _chains(session: Session, job: Job, entry: LocatedView, frame: int) -> dict[str, NamedChain]:
-    """Return the catheters that one frame shows, by name."""
-    matching = load(Matching, done_stage(session, job, "match"))
-    site = next((each for each in matching.sites if each.site == entry.site), None)
-    if site is None:
-        return {}
-    diastole = site.diastole.a if entry.view == "a" else site.diastole.b
-    track = site.track_a if entry.view == "a" else site.track_b
-    chains: dict[str, NamedChain] = {}
-    for observation in (diastole, *track):
-        if observation.frame == frame:
-            for chain in observation.chains:
-                chains.setdefault(chain.catheter, chain)
-    return chains

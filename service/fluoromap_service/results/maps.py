@@ -23,13 +23,14 @@ class FinishedMap:
 
     chamber : relative to the reference catheter. reference_mm : (3,) mean position of that catheter over the sites, from the
     isocentre; None where no site has a located reference catheter, and then the map counts from the isocentre. sha256 : hash
-    of the stored result. warnings : of the map and of the job.
+    of the stored result. warnings : of the map and of the job. simulated : True where all runs of the job are simulated.
     """
 
     chamber: ChamberMap
     reference_mm: Array | None
     sha256: str
     warnings: tuple[Reason, ...]
+    simulated: bool
 
     def shift_mm(self, origin: Origin) -> Array:
         """Return the vector (3,) to add to the map's coordinates.
@@ -56,4 +57,7 @@ def map_of(session: Session, job: Job) -> FinishedMap:
         raise Problem(409, "no_map", outcome.message or "The sites of this study support no map.", extra=reasons)
     reference_mm = None if outcome.reference_mm is None else np.array(outcome.reference_mm)
     warnings = (*outcome.chamber.warnings, *warnings_of(session, job))
-    return FinishedMap(outcome.chamber, reference_mm, str(stage.result), warnings)
+    # Validating the whole snapshot would take longer than everything else here.
+    runs = job.snapshot["runs"].values()
+    simulated = bool(runs) and all(run["facts"].get("simulated", False) for run in runs)
+    return FinishedMap(outcome.chamber, reference_mm, str(stage.result), warnings, simulated)

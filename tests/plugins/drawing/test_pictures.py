@@ -14,6 +14,7 @@ from vtkmodules.vtkIOImage import vtkPNGReader
 from fluoromap.drawing.animation import PICTURES, draw_propagation
 from fluoromap.drawing.colour_bar import bar_box
 from fluoromap.drawing.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
+from fluoromap.drawing.electrodes import CATHETERS_RGB
 from fluoromap.drawing.isochrones import isochrones
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look, draw_overlay
@@ -312,6 +313,20 @@ class TestOverlay:
         pixels = np.stack([u, v], axis=1)
         star = pixels[np.linalg.norm(pixels - tip, axis=1) < 9]
         assert np.linalg.norm(star.mean(axis=0) - tip) <= 1
+
+    def test_a_ring_lies_around_each_electrode_in_its_catheters_colour(self, ball):
+        view = camera()
+        electrodes = {"reference": np.array([[40.0, 200.0], [60.0, 230.0]]), "mapping": np.array([[90.0, 420.0]])}
+        look = Look(electrodes_uv=electrodes)
+        plain = draw_overlay(grey(view), view, ball, SHIFT, "S05", None).astype(int)
+        drawn = draw_overlay(grey(view), view, ball, SHIFT, "S05", None, look).astype(int)
+        for (_, places), colour in zip(electrodes.items(), CATHETERS_RGB, strict=False):
+            for place in places:
+                u, v = np.nonzero((drawn == colour).all(axis=2))[::-1]
+                ring = np.stack([u, v], axis=1)
+                ring = ring[np.linalg.norm(ring - place, axis=1) < 7]
+                assert np.linalg.norm(ring.mean(axis=0) - place) < 1
+                assert (drawn[int(place[1]), int(place[0])] == plain[int(place[1]), int(place[0])]).all()
 
     @pytest.mark.parametrize("primary", [0, 90, 45])
     def test_each_dot_is_where_its_site_projects(self, primary):

@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +25,16 @@ KNOWN = {
     "3": {
         "overlay": "d39d7ec81c9304149de4146cfc6657473c3dedafbbca6fdc246a40c4510255a2",
         "map picture": "7aac6152c4e046f263d20050c6025a7a16f4034570f74a5e01569ade7821a3f2",
+    },
+    "4": {
+        "overlay": "d39d7ec81c9304149de4146cfc6657473c3dedafbbca6fdc246a40c4510255a2",
+        "map picture": "7aac6152c4e046f263d20050c6025a7a16f4034570f74a5e01569ade7821a3f2",
+    },
+    "5": {
+        "overlay": "d39d7ec81c9304149de4146cfc6657473c3dedafbbca6fdc246a40c4510255a2",
+        "map picture": "7aac6152c4e046f263d20050c6025a7a16f4034570f74a5e01569ade7821a3f2",
+        "simulated overlay with electrodes": "d4b6eb66f29e729b85cd98c080fc55192cf1953f655b3ebd9ee3066aaafddbf8",
+        "simulated map picture": "297f858f3da35788b36984b8a04aef97d1b3f69afcb49eb1b5dfe060675f96b2",
     },
 }
 """SHA-256 of the coarsened pixels under each version. After a change of the drawing raise VERSION and add a line here."""
@@ -91,8 +102,13 @@ def test_changed_pixels_need_a_new_version() -> None:
     camera = camera_from_gantry(Gantry(30.0, 10.0, 1000.0, 500.0, (0.6953125, 0.6953125), 512, 512))
     frame = (np.arange(512 * 512) // 512 // 4 + 60).astype(np.uint8).reshape(512, 512)
     look = Look(covariances_mm2={"S02": np.diag([1.0, 4.0, 2.0])})
+    electrodes = {"reference": np.array([[200.0, 220.0], [212.0, 226.0]]), "mapping": np.array([[300.0, 260.0]])}
+    simulated = replace(look, electrodes_uv=electrodes, simulated=True)
+    place = (frame, camera, chamber, [5.0, -5.0, 0.0], "S05", None)
     pixels = {
-        "overlay": coarse_sha256(draw_overlay(frame, camera, chamber, [5.0, -5.0, 0.0], "S05", None, look)),
+        "overlay": coarse_sha256(draw_overlay(*place, look)),
         "map picture": coarse_sha256(draw_map_views(chamber)),
+        "simulated overlay with electrodes": coarse_sha256(draw_overlay(*place, simulated)),
+        "simulated map picture": coarse_sha256(draw_map_views(chamber, simulated=True)),
     }
     assert pixels == KNOWN.get(VERSION), "the drawing changed: raise fluoromap.drawing.VERSION and add its hashes here"

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_runs import edited
 
 from fluoromap.geometry import Gantry
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap_service.cli.accuracy import accuracy, rms_mm
-from fluoromap_service.dicom import open_frames, read_instance
+from fluoromap_service.dicom import InstanceFacts, open_frames, read_instance
 from fluoromap_service.dicom.simulation import STARTED, SimulatedFiles, simulate
 
 
@@ -28,6 +29,30 @@ SPEC = StudySpec(seed=3, sites=2, frames=3, gantries=(_small(90.0), _small(0.0))
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFiles:
     return simulate(tmp_path_factory.mktemp("study"), SPEC, processes=1)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "simulated"),
+    [
+        ({}, True),
+        ({"Manufacturer": None}, False),
+        ({"ManufacturerModelName": None}, False),
+        # The files of results name the program as their manufacturer, and one may copy a real run with them.
+        ({"ManufacturerModelName": "fluoromap"}, False),
+        ({"Manufacturer": "GE MEDICAL SYSTEMS"}, False),
+    ],
+)
+def test_only_runs_of_the_simulated_equipment_are_simulated(
+    files: SimulatedFiles, tmp_path: Path, attributes: dict[str, str | None], simulated: bool
+) -> None:
+    path = tmp_path / "run.dcm"
+    path.write_bytes(edited(files.runs[0].read_bytes(), **attributes))
+    facts = read_instance(path)
+    assert facts.simulated is simulated
+    assert InstanceFacts.from_json(facts.to_json()) == facts
+    # A run that an earlier version read is not known to be simulated.
+    stored = {name: value for name, value in facts.to_json().items() if name != "simulated"}
+    assert InstanceFacts.from_json(stored).simulated is False
 
 
 def test_runs_are_readable_and_complete(files: SimulatedFiles) -> None:

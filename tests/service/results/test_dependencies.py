@@ -23,7 +23,7 @@ OTHER = camera_from_gantry(Gantry(30.0, 0.0, 1000.0, 700.0, (0.3, 0.3), 512, 512
 BY_HASH: Any = None
 FUSION = Fusion(
     uid="1.2", sha256="f" * 64, facts=BY_HASH, frame=3, camera=CAMERA, map_sha256="a" * 64, chamber=BY_HASH,
-    shift_mm=np.zeros(3), site="S01", tip_uv=None, covariances_mm2={},
+    shift_mm=np.zeros(3), site="S01", tip_uv=None, covariances_mm2={}, electrodes_uv={},
 )  # fmt: skip
 CHANGES: dict[str, Any] = {
     "uid": "1.3", "sha256": "e" * 64, "frame": 4, "camera": OTHER, "map_sha256": "b" * 64, "shift_mm": np.ones(3),
@@ -31,6 +31,7 @@ CHANGES: dict[str, Any] = {
 }  # fmt: skip
 LOOKS: dict[str, Any] = {
     "scale": 2, "palette": "red-early", "step_ms": 5.0, "covariances_mm2": {"S01": np.eye(3)}, "until_ms": 10.0,
+    "electrodes_uv": {"mapping": np.ones((4, 2))}, "simulated": True,
 }  # fmt: skip
 
 

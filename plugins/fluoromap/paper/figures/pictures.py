@@ -35,8 +35,8 @@ def in_space(moment: MomentInView) -> tuple[Picture, Picture]:
     """Draw both maps in 3D at one scale: exact depth, single-view depth."""
     times = shared_scale(moment.exact, moment.single_view)
     views = [view for view in VIEWS if view[0] in _DIRECTIONS]
-    exact = draw_map_views(moment.exact, views, times=times)
-    return exact, draw_map_views(moment.single_view, views, like=moment.exact, times=times)
+    exact = draw_map_views(moment.exact, views, times=times, simulated=True)
+    return exact, draw_map_views(moment.single_view, views, like=moment.exact, times=times, simulated=True)
 
 
 def on_frame(moment: MomentInView, site: str, stored: NDArray[np.uint16]) -> tuple[Picture, Picture]:
@@ -47,7 +47,7 @@ def on_frame(moment: MomentInView, site: str, stored: NDArray[np.uint16]) -> tup
     shown = moment.site(site)
     low, high = np.percentile(stored, [0.5, 99.5])
     frame = np.clip((stored - low) / (high - low) * 255, 0, 255).round().astype(np.uint8)
-    look = Look(_OVERLAY_SCALE, times=shared_scale(moment.exact, moment.single_view))
+    look = Look(_OVERLAY_SCALE, times=shared_scale(moment.exact, moment.single_view), simulated=True)
     exact = draw_overlay(frame, shown.camera, moment.exact, shown.exact_origin_mm, site, shown.tip_uv, look)
     single_view = draw_overlay(
         frame, shown.camera, moment.single_view, shown.single_view_origin_mm, site, shown.tip_uv, look

@@ -21,10 +21,11 @@ from fluoromap_service.api.results.report_page import report_page
 from fluoromap_service.api.results.tracks import read_tracks, tracks_csv
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import ended_job_of, job_of, snapshot_of
-from fluoromap_service.results.fusion import Fusion, LocatedView, fusion_of, located_views
+from fluoromap_service.results.fusion import Fusion, fusion_of
 from fluoromap_service.results.maps import map_of
 from fluoromap_service.results.mesh_files import MeshFormat, mesh_of
 from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 
@@ -79,7 +80,9 @@ def _map(job_id: str) -> Iterator[ArchiveFile]:
         if problem.code not in ("not_ready", "no_map"):
             raise
         return
-    yield ArchiveFile("map.png", encode_png(draw_map_views(finished.chamber)), compress=False)
+    yield ArchiveFile(
+        "map.png", encode_png(draw_map_views(finished.chamber, simulated=finished.simulated)), compress=False
+    )
     yield ArchiveFile("map.json", activation_map(finished, Origin.REFERENCE).model_dump_json().encode())
     for mesh_format in MeshFormat:
         mesh = mesh_of(job_id, finished, mesh_format, Origin.REFERENCE)

@@ -87,6 +87,7 @@ class ActivationMap(BaseModel):
                     "warnings": [],
                     "conduction_velocity": {"median_m_per_s": 0.78, "low_m_per_s": 0.7, "high_m_per_s": 0.87},
                     "cycle_length_ms": None,
+                    "simulated": False,
                 }
             ]
         }
@@ -110,6 +111,7 @@ class ActivationMap(BaseModel):
     cycle_length_ms: float | None = Field(
         description="Cycle length of a re-entry: times repeat after it, so early meets late."
     )
+    simulated: bool = Field(description="True where all runs of the job are simulated.")
 
 
 def activation_map(finished: FinishedMap, origin: Origin) -> ActivationMap:
@@ -133,6 +135,7 @@ def activation_map(finished: FinishedMap, origin: Origin) -> ActivationMap:
         warnings=list(finished.warnings),
         conduction_velocity=_velocity(chamber),
         cycle_length_ms=chamber.cycle_length_ms,
+        simulated=finished.simulated,
     )
 
 
@@ -194,13 +197,13 @@ def map_picture_of(job_id: str, finished: FinishedMap) -> KeptFile:
     """
     return kept_rendering(
         job_id,
-        map_picture_dependencies(finished.sha256),
-        lambda: run_in_pool(Task.DRAW_PICTURE, _map_picture, finished.chamber),
+        map_picture_dependencies(finished.sha256, simulated=finished.simulated),
+        lambda: run_in_pool(Task.DRAW_PICTURE, _map_picture, finished.chamber, finished.simulated),
     )
 
 
-def _map_picture(chamber: ChamberMap) -> bytes:
-    return encode_png(draw_map_views(chamber))
+def _map_picture(chamber: ChamberMap, simulated: bool) -> bytes:
+    return encode_png(draw_map_views(chamber, simulated=simulated))
 
 
 @router.get(

@@ -20,7 +20,8 @@ from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import overlay_dependencies
 from fluoromap_service.results.finished import job_of
-from fluoromap_service.results.fusion import Fusion, LocatedView, draw_fusion, fusion_of, located_views
+from fluoromap_service.results.fusion import Fusion, draw_fusion, fusion_of
+from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.renderings import KeptFile, kept_rendering
@@ -111,14 +112,16 @@ StepQuery = Annotated[
     Literal["5", "10"] | None, Query(description="Time between isochrones in ms; by default a step that suits the map.")
 ]
 EllipsesQuery = Annotated[bool, Query(description="Draw each site's 95 % ellipse.")]
+ElectrodesQuery = Annotated[bool, Query(description="Draw the electrodes that the service found in this frame.")]
 
 
-def _look(fusion: Fusion, scale: str, colours: Palette, step_ms: str | None, ellipses: bool) -> Look:
+def _look(fusion: Fusion, scale: str, colours: Palette, step_ms: str | None, ellipses: bool, electrodes: bool) -> Look:
     return Look(
         scale=int(scale),
         palette=colours,
         step_ms=None if step_ms is None else float(step_ms),
         covariances_mm2=fusion.covariances_mm2 if ellipses else {},
+        electrodes_uv=fusion.electrodes_uv if electrodes else {},
     )
 
 
@@ -147,6 +150,7 @@ def get_overlay(
     colours: ColoursQuery = "safe",
     step_ms: StepQuery = None,
     ellipses: EllipsesQuery = False,
+    electrodes: ElectrodesQuery = False,
     until_ms: Annotated[
         float | None,
         Query(
@@ -163,7 +167,7 @@ def get_overlay(
     """
     with reading() as session:
         fusion = fusion_of(session, job_of(session, job_id), uid, frame)
-    look = replace(_look(fusion, scale, colours, step_ms, ellipses), until_ms=until_ms)
+    look = replace(_look(fusion, scale, colours, step_ms, ellipses, electrodes), until_ms=until_ms)
     picture = picture_of(job_id, fusion, look)
     name = f"overlay-{plain_name(fusion.site)}-{fusion.frame + 1}.png"
     return file_response(request, picture.path, picture.sha256, "image/png", name, inline=True)
@@ -185,6 +189,7 @@ def get_propagation(
     colours: ColoursQuery = "safe",
     step_ms: StepQuery = None,
     ellipses: EllipsesQuery = False,
+    electrodes: ElectrodesQuery = False,
 ) -> Response:
     """Return the overlay as a moving picture of the activation.
 
@@ -192,6 +197,6 @@ def get_propagation(
     """
     with reading() as session:
         fusion = fusion_of(session, job_of(session, job_id), uid, frame)
-    picture = picture_of(job_id, fusion, _look(fusion, scale, colours, step_ms, ellipses), moving=True)
+    picture = picture_of(job_id, fusion, _look(fusion, scale, colours, step_ms, ellipses, electrodes), moving=True)
     name = f"propagation-{plain_name(fusion.site)}-{fusion.frame + 1}.gif"
     return file_response(request, picture.path, picture.sha256, "image/gif", name, inline=True)

@@ -11,15 +11,19 @@ from pathlib import Path
 ASSETS = Path(__file__).parents[2] / "web" / "assets"
 
 MODULES = (
-    "three/three.core.js",
-    "three/three.module.js",
+    "three/three.core.min.js",
+    "three/three.module.min.js",
     "shared/elements.js",
     "shared/words.js",
+    "shared/catheter-colours.js",
     "map/colour-scale.js",
     "map/colour-bar.js",
     "map/orientation.js",
     "map/orbit.js",
+    "map/look.js",
+    "map/site-text.js",
     "map/surface.js",
+    "map/catheters.js",
     "map/scene.js",
     "map/panel.js",
 )

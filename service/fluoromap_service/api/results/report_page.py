@@ -7,6 +7,7 @@ import functools
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
@@ -17,6 +18,7 @@ from PIL import Image
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import ChamberMap, Triangulation
+from fluoromap.drawing.annotations import purpose_text
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
 from fluoromap.drawing.png import encode_png
@@ -24,7 +26,7 @@ from fluoromap.registry import Kind
 from fluoromap_service.api.jobs.job_answers import read_job
 from fluoromap_service.api.results.maps import activation_map
 from fluoromap_service.api.results.overlays import picture_of
-from fluoromap_service.api.results.points import points_of
+from fluoromap_service.api.results.points import Point, points_of
 from fluoromap_service.api.results.report_modules import modules_sha256, packed_modules
 from fluoromap_service.api.results.report_tables import (
     budget_rows,
@@ -38,9 +40,10 @@ from fluoromap_service.api.results.tracks import read_tracks
 from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of, snapshot_of
-from fluoromap_service.results.fusion import fusion_of, located_views
+from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.placement import located_views
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
@@ -62,16 +65,16 @@ JPEG_QUALITY = 88
 def report_page(job_id: str) -> str:
     """Return the page of an ended job, with all results that the job has."""
     values = _values(job_id)
-    chamber, scene = values.pop("map"), values.pop("scene_map")
+    chamber, scene = values.pop("map"), values.pop("scene")
     values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None, "title": None}
     if chamber is not None:
         values |= {
             "chamber": _figures(chamber),
-            "map_png": _inline(encode_png(draw_map_views(chamber)), "image/png"),
+            "map_png": _inline(encode_png(draw_map_views(chamber, simulated=values["simulated"])), "image/png"),
             "overlays": _overlays(job_id),
             "scene": _json(scene),
             "scripts": _json(packed_modules()),
-            "title": _json(f"{values['label']}: for research"),
+            "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
         }
     return _environment().get_template("report.html.j2").render(values)
 
@@ -80,15 +83,16 @@ def _values(job_id: str) -> dict[str, Any]:
     with reading() as session:
         job = job_of(session, job_id)
         snapshot = snapshot_of(job)
-        chamber, scene, no_map = None, None, ""
+        finished, no_map = None, ""
         try:
             finished = map_of(session, job)
-            chamber, scene = finished.chamber, _scene(finished)
         except Problem as problem:
             no_map = str(problem.detail)
         triangulated = stage_of(session, job_id, "triangulate")
         triangulation = load(Triangulation, triangulated) if triangulated and triangulated.result else None
         points = points_of(session, job, Origin.REFERENCE) if triangulation else []
+        catheters = [catheter.name for catheter in snapshot.catheters]
+        chamber = finished.chamber if finished else None
         tracked = triangulation is not None and _all_tracked(session, job_id)
         study = session.get(Study, job.study_id)
         guessed = sites_by_row_order(session, job)
@@ -101,8 +105,9 @@ def _values(job_id: str) -> dict[str, Any]:
             "version": version("fluoromap"),
             "reference": snapshot.reference,
             "map": chamber,
-            "scene_map": scene,
+            "scene": _scene(finished, points, catheters) if finished else None,
             "no_map": no_map,
+            "simulated": finished is not None and finished.simulated,
             "tips": rows,
             "located": sum(row["grade"] != "rejected" for row in rows),
             "grades": [(grade, sum(row["grade"] == grade for row in rows)) for grade in ("A", "B", "C", "rejected")],
@@ -158,12 +163,17 @@ def _overlays(job_id: str) -> list[dict[str, Any]]:
     return pictures
 
 
-def _scene(finished: FinishedMap) -> dict[str, Any]:
-    """Return the map for the 3D view, its coordinates with two decimals."""
-    scene = activation_map(finished, Origin.REFERENCE).model_dump(mode="json")
+def _scene(finished: FinishedMap, points: Sequence[Point], catheters: list[str]) -> dict[str, Any]:
+    """Return map, electrodes and catheters' names for the 3D view, coordinates with two decimals."""
+    chamber = activation_map(finished, Origin.REFERENCE).model_dump(mode="json")
     for name in ("vertices_mm", "lat_ms", "lat_sd_ms"):
-        scene[name] = _rounded(scene[name])
-    return scene
+        chamber[name] = _rounded(chamber[name])
+    places = [
+        {"site": point.site, "catheter": point.catheter, "electrode": point.electrode}
+        | {name: _rounded(getattr(point, name)) for name in ("x_mm", "y_mm", "z_mm")}
+        for point in points
+    ]
+    return {"map": chamber, "points": places, "catheters": catheters}
 
 
 def _rounded(value: Any) -> Any:

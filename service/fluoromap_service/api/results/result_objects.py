@@ -19,10 +19,11 @@ from fluoromap_service.dicom.objects.report_site import ReportSite
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import RESULT_OBJECTS
 from fluoromap_service.results.finished import ended_job_of, snapshot_of
-from fluoromap_service.results.fusion import fusion_of, located_views
+from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.results.maps import map_of
 from fluoromap_service.results.mesh_files import MeshFormat, mesh_of
 from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.placement import located_views
 from fluoromap_service.results.points import point_rows
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading

@@ -16,11 +16,15 @@ import fluoromap_service
 from fluoromap_service.api.http.etags import is_known
 from fluoromap_service.api.http.security import SESSION, SIGN_IN, Reader, bearer_token
 from fluoromap_service.api.http.session import begin_session, end_session
+from fluoromap_service.auth import OPEN
 from fluoromap_service.problem import not_found
 
 router = APIRouter(include_in_schema=False)
 
 ASSETS = Path(fluoromap_service.__file__).resolve().parent / "web" / "assets"
+PAGE = "page.html"
+"""The file of all pages behind the sign-in; its script reads the address."""
+
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
@@ -74,13 +78,13 @@ def _send(request: Request, name: str) -> Response:
 @router.get("/")
 def get_studies_page(request: Request, caller: Reader) -> Response:
     """Return the page of all studies."""
-    return _send(request, "studies.html")
+    return _send(request, PAGE)
 
 
 @router.get("/studies/{study_id}")
 def get_study_page(study_id: str, request: Request, caller: Reader) -> Response:
     """Return the page of one study."""
-    return _send(request, "study.html")
+    return _send(request, PAGE)
 
 
 @router.get(SIGN_IN)
@@ -93,6 +97,12 @@ def get_sign_in_page(request: Request) -> Response:
 def get_asset(name: str, request: Request) -> Response:
     """Return a file of the pages."""
     return _send(request, name)
+
+
+@router.get(SESSION)
+def get_session(caller: Reader) -> dict[str, str | None]:
+    """Return the name of the token that this browser signed in with; null where the service is open."""
+    return {"name": None if caller == OPEN.name else caller}
 
 
 @router.post(SESSION, status_code=204, response_class=Response)

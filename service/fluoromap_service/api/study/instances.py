@@ -48,6 +48,7 @@ class InstanceOut(BaseModel):
     missing: list[str] = Field(
         description="DICOM keywords to complete by PATCH.", examples=[["DistanceSourceToDetector"]]
     )
+    simulated: bool = Field(description="True for a run that `fluoromap simulate` wrote.")
     warnings: list[str] = Field(
         description="Codes of oddities; 'unbound': no site has this run.", examples=[["table_moved"]]
     )
@@ -93,6 +94,7 @@ def instance_shape(run: StudyRun, views: dict[str, tuple[BoundSite, str]]) -> In
             "plane": run.facts.plane,
             "gantry": run.gantry,
             "missing": run.missing,
+            "simulated": run.facts.simulated,
             "warnings": list(dict.fromkeys(warnings)),
         }
     )

@@ -85,7 +85,17 @@ def test_the_file_name_has_site_and_frame_only(client: TestClient, study: Finish
 
 @pytest.mark.parametrize(
     "query",
-    ["frame=0", "frame=4", "scale=3", "frame=x", "colours=rainbow", "step_ms=7", "until_ms=nan", "ellipses=perhaps"],
+    [
+        "frame=0",
+        "frame=4",
+        "scale=3",
+        "frame=x",
+        "colours=rainbow",
+        "step_ms=7",
+        "until_ms=nan",
+        "ellipses=perhaps",
+        "electrodes=perhaps",
+    ],
 )
 def test_wrong_frames_and_scales(client: TestClient, study: FinishedStudy, query: str) -> None:
     study.mapped()
@@ -93,7 +103,7 @@ def test_wrong_frames_and_scales(client: TestClient, study: FinishedStudy, query
     assert answer.status_code == 422
 
 
-@pytest.mark.parametrize("query", ["colours=red-early", "step_ms=10", "until_ms=25"])
+@pytest.mark.parametrize("query", ["colours=red-early", "step_ms=10", "until_ms=25", "electrodes=true"])
 def test_each_wish_changes_the_picture(client: TestClient, study: FinishedStudy, query: str) -> None:
     study.mapped()
     path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"

@@ -10,7 +10,7 @@ import { parameterForm } from "./plugin-form.js";
 
 /** @type {[string, string][]} */
 const KINDS = [["segmenter", "Find electrodes"], ["triangulator", "Locate in 3D"], ["fuser", "Make the map"], ["monoplane", "Track one view"]];
-const ENDED = ["done", "failed", "cancelled"];
+const ENDED = ["done", "failed"];
 
 /** @param {Job} job */
 function progressOf(job) {
@@ -20,7 +20,8 @@ function progressOf(job) {
     const done = own.reduce((sum, stage) => sum + (ENDED.includes(stage.state) ? 1 : stage.progress), 0) / own.length;
     const failed = own.filter((stage) => stage.state === "failed").length;
     const reused = own.filter((stage) => stage.reused).length;
-    const remarks = [failed && `${failed} failed`, reused && `${reused} unchanged, not computed again`].filter(Boolean).join("; ");
+    const cancelled = own.filter((stage) => stage.state === "cancelled").length;
+    const remarks = [failed && `${failed} failed`, cancelled && `${cancelled} cancelled`, reused && `${reused} unchanged, not computed again`].filter(Boolean).join("; ");
     return element("div", { class: "stage" }, element("span", {}, `${STAGES[name] ?? name}: ${Math.round(100 * done)} %`, remarks && ` (${remarks})`),
       element("progress", { max: 1, value: done, "aria-label": STAGES[name] ?? name }));
   });
@@ -83,7 +84,7 @@ export function jobPanel(state, showMap) {
     await state.load();
     show(ended);
     state.dispatchEvent(new Event("job"));
-    announce(`The computation has ended: ${JOB_STATES[ended.state] ?? ended.state}.`, ended.state === "succeeded" ? "done" : "problem");
+    announce(`The computation has ended: ${JOB_STATES[ended.state] ?? ended.state}.`, ended.state === "failed" ? "problem" : "done");
   };
   const run = async () => {
     const pipeline = Object.fromEntries(Object.entries(chosen).map(([kind, entry]) => [kind, { name: entry.plugin.value, params: entry.form.value() }]));

@@ -12,7 +12,7 @@ const STEPS_MS = [5, 10, 20, 50];
 const MOST_BANDS = 13;
 
 /** @param {number} fraction 0 early, 1 late. @param {Palette} palette @returns {number[]} RGB, 0 to 255. */
-export function colourAt(fraction, palette) {
+function colourAt(fraction, palette) {
   const anchors = ANCHORS[palette];
   const position = Math.min(1, Math.max(0, fraction)) * (anchors.length - 1);
   const low = Math.min(anchors.length - 2, Math.floor(position));
@@ -24,7 +24,7 @@ export function colourAt(fraction, palette) {
 /** @typedef {{start: number, step: number, bands: number, stop: number, colours: number[][], unit: string}} Scale */
 
 /** @param {number[]} values @param {Palette} palette @param {number[]} [steps] @returns {Scale} */
-export function scaleOf(values, palette, steps = STEPS_MS) {
+function scaleOf(values, palette, steps = STEPS_MS) {
   const low = values.length ? Math.min(...values) : 0;
   const high = values.length ? Math.max(...values) : 0;
   let [start, step, bands] = [0, 1, 1];

@@ -1,5 +1,5 @@
 /** Turning the map about its centre, by pointer, wheel and keys; up is the patient's head. */
-import * as THREE from "../three/three.module.js";
+import * as THREE from "../three/three.module.min.js";
 
 /** Directions from the chamber to the eye, LPS: +X left, +Y back, +Z head. @type {[string, string, number, number][]} Name, title, angle to the patient's left, elevation, degrees. */
 export const VIEWS = [["AP", "from the front", 0, 0], ["PA", "from the back", 180, 0], ["LAO", "left anterior oblique 45°", 45, 0], ["RAO", "right anterior oblique 30°", -30, 0], ["LL", "from the left", 90, 0], ["HEAD", "from the head", 0, 89]];
@@ -65,8 +65,8 @@ export class Orbit {
   /** @param {number} width @param {number} height */
   fit(width, height) {
     this.camera.aspect = width / height;
-    // A narrow picture shows the whole chamber too, beside the colour bar.
-    const narrow = Math.max(1, 1.55 / this.camera.aspect);
+    // A narrow picture shows the whole chamber too, with space for the labels beside it.
+    const narrow = Math.max(1, 1.25 / this.camera.aspect);
     this.camera.fov = (2 * Math.atan(Math.tan(Math.PI / 12) * narrow) * 180) / Math.PI;
     this.camera.updateProjectionMatrix();
   }

@@ -1,5 +1,5 @@
 /** The small figure that shows how the map is turned. The words are spelled, so that R and A are no atrium. */
-import * as THREE from "../three/three.module.js";
+import * as THREE from "../three/three.module.min.js";
 
 /** @type {[string, number, number, number][]} */
 const ENDS = [["Left", 1, 0, 0], ["Right", -1, 0, 0], ["Back", 0, 1, 0], ["Front", 0, -1, 0], ["Head", 0, 0, 1], ["Feet", 0, 0, -1]];

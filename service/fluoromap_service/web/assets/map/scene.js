@@ -1,24 +1,28 @@
-/** The map in 3D: wall, sites with name and time, orientation, colour bar. The study page and the report use it. */
-import * as THREE from "../three/three.module.js";
+/** The map in 3D: wall, sites with name and time, catheters, orientation, colour bar. The study page and the report use it. */
+import * as THREE from "../three/three.module.min.js";
+import { Catheters } from "./catheters.js";
 import { drawColourBar } from "./colour-bar.js";
-import { deviationsOf, timesOf } from "./colour-scale.js";
 import { Orbit } from "./orbit.js";
 import { drawOrientation } from "./orientation.js";
-import { surfaceOf } from "./surface.js";
+import { siteText } from "./site-text.js";
+import { rendererOf, Surface } from "./surface.js";
 
-/** @typedef {import("../shared/types.js").ChamberMap} ChamberMap */
+const LINE_PX = 15;
+const BESIDE_PX = 8;
+const REACH_PX = 16;
 
-/** Reasons that put a site's time, position or catheter in doubt: its name gets a question mark, as in the pictures. */
-const DOUBTS = ["extra_catheter", "geometry_doubtful", "identity_uncertain", "pairing_failed", "spacing_mismatch", "table_moved", "view_mirrored", "lat_outlier"];
-
+/** The event `chosen` has the name of the site that a person clicked. */
 export class MapScene extends EventTarget {
-  /** @param {HTMLElement} place An element of class `scene`. @param {ChamberMap} map */
-  constructor(place, map) {
+  /**
+   * @param {HTMLElement} place An element of class `scene`.
+   * @param {import("./look.js").MapLook} look
+   * @param {import("../shared/types.js").Point[]} points Electrodes of all sites.
+   * @param {string[]} catheters Names in the order of the study.
+   */
+  constructor(place, look, points, catheters) {
     super();
-    this.map = map;
-    /** @type {"safe"|"red-early"} */
-    this.palette = "safe";
-    this.uncertainty = false;
+    this.look = look;
+    this.map = look.map;
     /** @type {string|null} */
     this.chosen = null;
     const made = (/** @type {string} */ tag, /** @type {string} */ name) => {
@@ -34,18 +38,27 @@ export class MapScene extends EventTarget {
     this.labels = made("div", "labels");
     this.figure = /** @type {HTMLCanvasElement} */ (made("canvas", "figure"));
     this.bar = /** @type {HTMLCanvasElement} */ (made("canvas", "bar"));
-    THREE.ColorManagement.enabled = false;
-    this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
-    this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    this.renderer = rendererOf(this.canvas, true);
     this.world = new THREE.Scene();
-    this.surface = surfaceOf(map);
-    this.world.add(this.surface.mesh);
-    this.surface.mesh.geometry.computeBoundingSphere();
-    const sphere = /** @type {THREE.Sphere} */ (this.surface.mesh.geometry.boundingSphere);
-    this.dots = map.sites.map((site) => this.#dot(site, sphere.radius));
-    this.names = map.sites.map((site) => this.#name(site));
+    this.surface = new Surface(look, false);
+    const { sphere } = this.surface;
+    this.catheters = new Catheters(points, catheters);
+    this.showsCatheters = true;
+    this.sun = new THREE.DirectionalLight(0xffffff, 2);
+    this.world.add(this.surface.mesh, this.catheters.group, this.sun, new THREE.AmbientLight(0xffffff, 1.1));
+    this.dots = this.map.sites.map((site) => this.#dot(site, sphere.radius));
+    const earliest = this.map.earliest[0]?.site;
+    this.names = this.map.sites.map((site) => this.#label(`${siteText(site)}${site.site === earliest ? ", earliest" : ""}`));
+    /** @type {HTMLElement[]} */
+    this.catheterNames = [];
     this.orbit = new Orbit(this.canvas, sphere.center.clone(), sphere.radius, () => this.draw());
     this.canvas.addEventListener("click", (event) => this.#pick(event));
+    this.recolour = () => {
+      this.surface.update();
+      drawColourBar(this.bar, look.scale, look.uncertainty ? "± SD, ms" : "time, ms");
+      this.draw();
+    };
+    look.addEventListener("changed", this.recolour);
     this.recolour();
     new ResizeObserver(() => this.fit()).observe(place);
     this.fit();
@@ -61,38 +74,39 @@ export class MapScene extends EventTarget {
     return dot;
   }
 
-  /** @param {import("../shared/types.js").MapSite} site */
-  #name(site) {
-    const name = document.createElement("span");
-    name.textContent = `${site.site} ${Math.round(site.lat_ms)} ms${site.reasons.some((code) => DOUBTS.includes(code)) ? " ?" : ""}`.replace("-", "−");
-    this.labels.append(name);
-    return name;
+  /** @param {string} text */
+  #label(text) {
+    const label = document.createElement("span");
+    label.textContent = text;
+    this.labels.append(label);
+    return label;
   }
 
   /** Give the memory of the graphics card back; a browser has few such contexts. */
   close() {
-    this.surface.mesh.geometry.dispose();
+    this.look.removeEventListener("changed", this.recolour);
+    this.surface.close();
+    this.catheters.close();
     this.renderer.dispose();
     this.renderer.forceContextLoss();
-  }
-
-  /** Choose the colours again. */
-  recolour() {
-    const scale = this.uncertainty ? deviationsOf(this.map) : timesOf(this.map, this.palette);
-    this.surface.show(scale, this.uncertainty ? this.map.lat_sd_ms : this.map.lat_ms);
-    drawColourBar(this.bar, scale, this.uncertainty ? "± SD, ms" : "time, ms");
-    this.draw();
-  }
-
-  /** Colour the wall only where it is activated by a time; null colours all. @param {number|null} ms */
-  showUntil(ms) {
-    this.surface.setUntil(ms ?? 1e9);
-    this.draw();
   }
 
   /** @param {string|null} site */
   choose(site) {
     this.chosen = site;
+    this.#showCatheters();
+  }
+
+  /** @param {boolean} shown */
+  showCatheters(shown) {
+    this.showsCatheters = shown;
+    this.#showCatheters();
+  }
+
+  #showCatheters() {
+    this.catheters.show(this.showsCatheters ? this.chosen : null);
+    for (const each of this.catheterNames) each.remove();
+    this.catheterNames = this.catheters.labels.map(({ name }) => this.#label(name));
     this.draw();
   }
 
@@ -108,33 +122,49 @@ export class MapScene extends EventTarget {
   draw() {
     if (!this.orbit) return;
     const { camera } = this.orbit;
+    this.sun.position.copy(camera.position);
     this.renderer.render(this.world, camera);
     drawOrientation(this.figure, camera);
-    const { clientWidth: width, clientHeight: height } = this.canvas;
     /** @type {number[][]} */
     const taken = [];
-    const nearFirst = this.map.sites.map((site, k) => ({ site, k, far: this.#isBehind(site) })).sort((a, b) => Number(a.far) - Number(b.far));
-    nearFirst.forEach(({ site, k, far }) => {
-      const label = this.names[k];
-      const dot = this.dots[k];
-      if (!label || !dot) return;
-      const at = dot.position.clone().project(camera);
+    const sites = this.map.sites.map((site, k) => ({ site, k, far: this.#isBehind(site) }));
+    // Labels of the near side keep their places; those of the far side give way. The chosen site comes first.
+    const rank = (/** @type {{site: {site: string}, far: boolean}} */ each) => (each.site.site === this.chosen ? 0 : each.far ? 2 : 1);
+    for (const { site, k, far } of sites.sort((a, b) => rank(a) - rank(b))) {
+      const [label, dot] = [this.names[k], this.dots[k]];
+      if (!label || !dot) continue;
       const chosen = site.site === this.chosen;
       label.className = chosen ? "chosen" : far ? "far" : "";
-      const x = ((at.x + 1) / 2) * width + 8;
-      let y = ((1 - at.y) / 2) * height - 8;
-      while (taken.some(([otherX, otherY]) => Math.abs((otherX ?? 0) - x) < 70 && Math.abs((otherY ?? 0) - y) < 13)) y += 13;
-      taken.push([x, y]);
-      label.style.transform = `translate(${x.toFixed(0)}px, ${y.toFixed(0)}px)`;
       dot.scale.setScalar(chosen ? 1.6 : 1);
+      this.#put(label, dot.position, taken);
+    }
+    this.catheters.labels.forEach(({ at }, k) => {
+      const label = this.catheterNames[k];
+      if (!label) return;
+      label.className = "catheter";
+      this.#put(label, at, taken);
     });
     this.canvas.dataset["drawn"] = "yes";
   }
 
-  /** Choose the site under the pointer: the event `chosen` has its name. @param {MouseEvent} event */
+  /** Put a label beside a point, below the labels that are there already. @param {HTMLElement} label @param {THREE.Vector3} point @param {number[][]} taken Left, top and width of each. */
+  #put(label, point, taken) {
+    const at = point.clone().project(this.orbit.camera);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const own = label.offsetWidth;
+    const beside = ((at.x + 1) / 2) * width;
+    const x = beside + BESIDE_PX + own > width ? beside - BESIDE_PX - own : beside + BESIDE_PX;
+    let y = ((1 - at.y) / 2) * height - BESIDE_PX;
+    // A label that nobody sees takes no space.
+    while (own && taken.some(([otherX = 0, otherY = 0, other = 0]) => otherX < x + own && x < otherX + other && Math.abs(otherY - y) < LINE_PX)) y += LINE_PX;
+    if (own) taken.push([x, y, own]);
+    label.style.transform = `translate(${x.toFixed(0)}px, ${y.toFixed(0)}px)`;
+  }
+
+  /** Choose the site under the pointer. @param {MouseEvent} event */
   #pick(event) {
     const box = this.canvas.getBoundingClientRect();
-    let [name, nearest] = ["", 16];
+    let [name, nearest] = ["", REACH_PX];
     this.map.sites.forEach((site, k) => {
       const at = this.dots[k]?.position.clone().project(this.orbit.camera);
       if (!at || this.#isBehind(site)) return;

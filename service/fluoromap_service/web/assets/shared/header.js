@@ -1,14 +1,20 @@
 /** The line at the top of every page. */
-import { send } from "./api.js";
+import { get, send } from "./api.js";
 import { attempt, button, element } from "./elements.js";
+
+async function signOut() {
+  await send("DELETE", "/session");
+  location.assign("/sign-in");
+}
 
 /** @param {Node[]} trail Links from the list of studies to this page. */
 export function header(...trail) {
-  const signOut = button("Sign out", () =>
-    attempt(async () => {
-      await send("DELETE", "/session");
-      location.assign("/sign-in");
-    }), { class: "quiet" });
+  const session = element("span", { class: "row" });
+  attempt(async () => {
+    const { name } = await get("/session");
+    // An open service knows nobody, so nobody can sign out.
+    if (name !== null) session.append(`Signed in as ${name}`, button("Sign out", () => attempt(signOut), { class: "quiet" }));
+  });
   return element(
     "header",
     { class: "top" },
@@ -16,6 +22,6 @@ export function header(...trail) {
     element("nav", { "aria-label": "Pages" }, element("a", { href: "/", class: "brand" }, "fluoromap"), ...trail),
     element("span", { class: "grow" }),
     element("a", { href: "/docs" }, "API"),
-    signOut,
+    session,
   );
 }

@@ -8,7 +8,7 @@
  *   notes: string|null, gantry: Gantry, created: string}} Study
  * @typedef {{sop_instance_uid: string, site: string|null, view: "a"|"b"|null, frames: number, rows: number, columns: number,
  *   frame_time_ms: number|null, acquired: string|null, plane: string, gantry: Gantry, missing: string[],
- *   warnings: string[]}} Run
+ *   warnings: string[], simulated: boolean}} Run
  * @typedef {{site: string|null, pair: number|null, lat_ms: number|null, view_a: string|null, view_b: string|null,
  *   bound_by: string|null, missing: string[], warnings: string[], angle_deg: number|null, ready: boolean}} Site
  * @typedef {{catheter: string|null, electrode: number, u_px: number, v_px: number, sd_px: number,
@@ -27,6 +27,6 @@
  * @typedef {{vertices_mm: number[][], faces: number[][], lat_ms: (number|null)[], lat_sd_ms: (number|null)[],
  *   covered: boolean[], sites: MapSite[], earliest: {site: string, probability: number}[],
  *   total_activation_time_ms: number, leave_one_out_rms_ms: number|null, volume_ml: number, area_cm2: number,
- *   coverage: number, warnings: string[], cycle_length_ms: number|null}} ChamberMap
+ *   coverage: number, warnings: string[], cycle_length_ms: number|null, simulated: boolean}} ChamberMap
  */
 export {};

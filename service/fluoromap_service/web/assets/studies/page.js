@@ -44,8 +44,11 @@ async function remove(study, item) {
   });
 }
 
-byId("top").append(header());
-await attempt(async () => {
+/** Fill the page. */
+export async function start() {
+  document.title = "Studies – fluoromap";
+  byId("title").textContent = "Studies";
+  byId("top").append(header());
   const [studies, types] = await Promise.all([getAll("/v1/studies"), getAll("/v1/catheter-types")]);
   const form = newStudyForm(types);
   const details = element("details", { class: "card", open: studies.length === 0 }, element("summary", {}, "New study"), form);
@@ -55,5 +58,4 @@ await attempt(async () => {
       ? element("ul", { class: "cards" }, ...studies.map(card))
       : element("p", {}, "There is no study yet. Make one: give it a name and say which catheters are in the heart."),
   );
-});
-document.body.dataset.ready = "yes";
+}

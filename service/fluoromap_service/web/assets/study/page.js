@@ -1,6 +1,6 @@
 /** The page of one study: four steps as tabs. */
 import { get, getAll } from "../shared/api.js";
-import { attempt, byId, element } from "../shared/elements.js";
+import { byId, element } from "../shared/elements.js";
 import { header } from "../shared/header.js";
 import { jobPanel } from "../jobs/panel.js";
 import { resultsPanel } from "../results/panel.js";
@@ -49,7 +49,8 @@ export class StudyState extends EventTarget {
   }
 }
 
-await attempt(async () => {
+/** Fill the page. */
+export async function start() {
   const study = await get(`/v1/studies/${location.pathname.split("/")[2]}`);
   const state = new StudyState(study);
   byId("top").append(header(element("span", { "aria-current": "page" }, study.label)));
@@ -67,5 +68,4 @@ await attempt(async () => {
     ["map", "4 Map and results", () => resultsPanel(state, () => show("electrodes"))],
   ]);
   await state.load();
-});
-document.body.dataset.ready = "yes";
+}

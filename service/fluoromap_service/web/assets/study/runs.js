@@ -9,9 +9,13 @@ import { uploadZone } from "./uploads.js";
 
 /** Say in words what a computation still lacks. @param {StudyState} state */
 function sentences(state) {
-  if (!state.runs.length) return ["This study has no runs yet. Drop its DICOM files into the box."];
+  if (!state.runs.length) return ["This study has no runs yet. Drop its DICOM files and the table of its activation times into the box.",
+    "To try it without data, write a simulated study with ./run fluoromap simulate study and drop that folder."];
   const ready = state.sites.filter((site) => site.ready && site.site !== null).length;
   const lines = [`${ready} of ${state.sites.length} sites are ready for the computation.`];
+  if (state.sites.length && state.sites.every((site) => site.lat_ms === null)) {
+    lines.push("The activation times are missing. Drop their table into the box, or type names and times below.");
+  }
   const open = state.runs.filter((run) => run.missing.length);
   if (open.length) {
     const values = [...new Set(open.flatMap((run) => run.missing))].map((keyword) => KEYWORDS[keyword] ?? keyword);
@@ -51,7 +55,11 @@ export function runsPanel(state, look, compute) {
       await state.load();
     });
   };
+  const goOn = button("Go on to the computation", compute, { class: "main" });
   const show = () => {
+    goOn.disabled = !state.sites.some((site) => site.ready && site.site !== null);
+    const isEmpty = !state.runs.length && !state.sites.length;
+    table.hidden = geometry.hidden = isEmpty;
     summary.replaceChildren(...sentences(state).map((line) => element("li", {}, line)));
     refill(table, () => sitesTable(state));
     refill(geometry, () => geometryForm(state));
@@ -60,6 +68,6 @@ export function runsPanel(state, look, compute) {
   show();
   return element("div", {},
     uploadZone(state.path, reload), element("h2", {}, "What is missing"), summary,
-    element("div", { class: "row" }, button("Look at the runs", look), button("Compute the map", compute, { class: "main" })),
+    element("div", { class: "row" }, button("Look at the runs", look), goOn),
     table, geometry);
 }

@@ -1,7 +1,7 @@
 /** Paints one frame with its contrast, its electrodes and an epipolar line. */
-import { catheterColour } from "./catheter-colours.js";
+import { catheterColour } from "../shared/catheter-colours.js";
 
-/** @typedef {import("../shared/types.js").Electrode} Electrode */
+/** @typedef {{catheter: string|null, electrode: number, u_px: number, v_px: number, source?: string}} Mark */
 
 export class FramePainter {
   /** @param {import("../shared/types.js").Run} run */
@@ -31,14 +31,8 @@ export class FramePainter {
     this.context.putImageData(this.image, 0, 0);
   }
 
-  /**
-   * @param {HTMLCanvasElement} canvas
-   * @param {import("./placement.js").Placement} placement
-   * @param {import("../shared/types.js").Study} study
-   * @param {Electrode[]} electrodes
-   * @param {{chosen: string|null, line: {start: number[], end: number[], colour: string}|null}} marks `chosen`: key of an electrode.
-   */
-  paint(canvas, placement, study, electrodes, marks) {
+  /** @param {HTMLCanvasElement} canvas @param {import("./placement.js").Placement} placement */
+  paintFrame(canvas, placement) {
     const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
     context.fillStyle = "#000";
     context.fillRect(0, 0, canvas.width, canvas.height);
@@ -46,15 +40,25 @@ export class FramePainter {
     const origin = placement.origin(canvas, this.run);
     context.imageSmoothingEnabled = scale < 4;
     context.drawImage(this.picture, origin.x, origin.y, scale * this.run.columns, scale * this.run.rows);
-    const unit = window.devicePixelRatio || 1;
-    if (marks.line) this.#line(context, canvas, placement, marks.line, unit);
+  }
+
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {import("./placement.js").Placement} placement
+   * @param {import("../shared/types.js").Study} study
+   * @param {Mark[]} electrodes
+   * @param {string|null} chosen Key of an electrode.
+   */
+  paintElectrodes(canvas, placement, study, electrodes, chosen) {
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    const names = study.catheters.map((each) => each.name);
     for (const electrode of electrodes) {
       const { x, y } = placement.toCanvas(canvas, this.run, electrode.u_px, electrode.v_px);
-      this.#electrode(context, x, y, electrode, catheterColour(study, electrode.catheter), keyOf(electrode) === marks.chosen, unit);
+      this.#electrode(context, x, y, electrode, catheterColour(names, electrode.catheter), keyOf(electrode) === chosen, window.devicePixelRatio || 1);
     }
   }
 
-  /** @param {CanvasRenderingContext2D} context @param {number} x @param {number} y @param {Electrode} electrode @param {string} colour @param {boolean} chosen @param {number} unit */
+  /** @param {CanvasRenderingContext2D} context @param {number} x @param {number} y @param {Mark} electrode @param {string} colour @param {boolean} chosen @param {number} unit */
   #electrode(context, x, y, electrode, colour, chosen, unit) {
     const radius = (electrode.electrode === 1 ? 6.5 : 5) * unit;
     const outline = new Path2D();
@@ -80,8 +84,10 @@ export class FramePainter {
     context.fillRect(x - unit, y - unit, 2 * unit, 2 * unit);
   }
 
-  /** @param {CanvasRenderingContext2D} context @param {HTMLCanvasElement} canvas @param {any} placement @param {{start: number[], end: number[], colour: string}} line @param {number} unit */
-  #line(context, canvas, placement, line, unit) {
+  /** Paint the line in this view on which an electrode of the other view lies. @param {HTMLCanvasElement} canvas @param {any} placement @param {{start: number[], end: number[], colour: string}} line */
+  paintLine(canvas, placement, line) {
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    const unit = window.devicePixelRatio || 1;
     const start = placement.toCanvas(canvas, this.run, line.start[0], line.start[1]);
     const end = placement.toCanvas(canvas, this.run, line.end[0], line.end[1]);
     for (const [colour, width] of /** @type {[string, number][]} */ ([["rgba(0,0,0,.7)", 4], [line.colour, 1.5]])) {
@@ -95,5 +101,5 @@ export class FramePainter {
   }
 }
 
-/** @param {Electrode} electrode */
+/** @param {Mark} electrode */
 export const keyOf = (electrode) => `${electrode.catheter ?? ""}/${electrode.electrode}`;

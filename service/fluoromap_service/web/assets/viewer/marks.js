@@ -29,16 +29,6 @@ export class Marks extends EventTarget {
     return this.frames.get(frame) ?? [];
   }
 
-  /** @param {number} frame */
-  isManual(frame) {
-    return this.of(frame).some((each) => each.source === "manual");
-  }
-
-  /** Frames with electrodes set by hand. */
-  get manualFrames() {
-    return [...this.frames.keys()].filter((frame) => this.isManual(frame)).sort((a, b) => a - b);
-  }
-
   /**
    * Replace one catheter's electrodes in a frame. The other catheters stay as they are, so that a wrong name that nobody looked
    * at is not taken for a person's word.

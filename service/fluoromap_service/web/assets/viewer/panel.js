@@ -1,7 +1,7 @@
 /** The second step: both views of a site side by side, and the tools that correct electrodes. */
 import { get } from "../shared/api.js";
+import { catheterColour } from "../shared/catheter-colours.js";
 import { attempt, button, element, field, select } from "../shared/elements.js";
-import { catheterColour } from "./catheter-colours.js";
 import { control, KEYS } from "./controls.js";
 import { View } from "./view.js";
 
@@ -9,6 +9,7 @@ import { View } from "./view.js";
 
 /** @param {StudyState} state @param {() => void} compute */
 export function viewerPanel(state, compute) {
+  const names = () => state.study.catheters.map((each) => each.name);
   const pen = { catheter: state.study.mapping, tool: "edit", next: 1 };
   /** @type {View[]} */
   let views = [];
@@ -56,7 +57,7 @@ export function viewerPanel(state, compute) {
       const query = `other=${other.run.sop_instance_uid}&u_px=${electrode.u_px.toFixed(2)}&v_px=${electrode.v_px.toFixed(2)}`;
       const line = await get(`${state.path}/instances/${from.run.sop_instance_uid}/epipolar-line?${query}`);
       if (from.chosen !== wanted) return;
-      other.line = { start: line.start_px, end: line.end_px, colour: catheterColour(state.study, electrode.catheter) };
+      other.line = { start: line.start_px, end: line.end_px, colour: catheterColour(names(), electrode.catheter) };
       other.draw();
     } catch {
       // Without geometry there is no line; the first step says what is missing.
@@ -86,11 +87,11 @@ export function viewerPanel(state, compute) {
   };
 
   const fill = () => {
-    const names = state.study.catheters.map((each) => /** @type {[string, string]} */ ([each.name, `${each.name} (${each.electrodes})`]));
-    catheter.replaceChildren(...select(names, pen.catheter).children);
+    const choicesOfPen = state.study.catheters.map((each) => /** @type {[string, string]} */ ([each.name, `${each.name} (${each.electrodes})`]));
+    catheter.replaceChildren(...select(choicesOfPen, pen.catheter).children);
     legend.replaceChildren(...state.study.catheters.map((each) => {
       const swatch = element("span", { class: "swatch" });
-      swatch.style.background = catheterColour(state.study, each.name);
+      swatch.style.background = catheterColour(names(), each.name);
       return element("span", {}, swatch, each.name);
     }));
     const bound = new Set(state.sites.flatMap((each) => [each.view_a, each.view_b]));

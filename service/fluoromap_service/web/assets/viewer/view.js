@@ -5,6 +5,7 @@ import { Cine } from "./cine.js";
 import { FramePainter, keyOf } from "./frame-painter.js";
 import { Marks } from "./marks.js";
 import { Placement } from "./placement.js";
+import { FRAME_MS, Playback } from "./playback.js";
 
 /** @typedef {import("../shared/types.js").Electrode} Electrode */
 
@@ -24,7 +25,7 @@ export class View extends EventTarget {
     this.run = run;
     this.pen = pen;
     this.frame = 1;
-    this.playing = false;
+    this.playback = new Playback(run.frame_time_ms ?? FRAME_MS, (frames) => this.show(this.frame + frames));
     /** @type {string|null} */
     this.chosen = null;
     /** @type {{start: number[], end: number[], colour: string}|null} */
@@ -42,7 +43,7 @@ export class View extends EventTarget {
     this.playButton = button("Play", () => this.play(!this.playing), { "aria-label": `Play view ${letter}` });
     this.status = element("span", { class: "status", "aria-live": "polite" });
     this.element = element("div", { class: "view", "data-view": letter },
-      element("div", { class: "caption" }, element("strong", {}, `View ${letter}`), direction(run.gantry), element("span", { class: "grow" }), this.status),
+      element("div", { class: "caption" }, element("strong", {}, `View ${letter}`), `${direction(run.gantry)}${run.simulated ? ", simulated data" : ""}`, element("span", { class: "grow" }), this.status),
       this.canvas, element("div", { class: "caption" }, this.playButton, this.slider, this.count));
     this.marks.addEventListener("changed", () => this.draw());
     this.marks.addEventListener("stored", () => (this.status.textContent = "stored"));
@@ -70,25 +71,15 @@ export class View extends EventTarget {
     this.draw();
   }
 
+  get playing() {
+    return this.playback.playing;
+  }
+
   /** @param {boolean} playing */
   play(playing) {
-    if (playing === this.playing) return;
-    this.playing = playing;
+    this.playback.play(playing);
     this.playButton.textContent = playing ? "Pause" : "Play";
     this.playButton.setAttribute("aria-label", `${this.playButton.textContent} view ${this.letter}`);
-    const every = this.run.frame_time_ms ?? 66;
-    let last = performance.now();
-    /** @param {number} now */
-    const step = (now) => {
-      if (!this.playing) return;
-      const frames = Math.floor((now - last) / every);
-      if (frames > 0) {
-        last += frames * every;
-        this.show(this.frame + frames);
-      }
-      requestAnimationFrame(step);
-    };
-    if (playing) requestAnimationFrame(step);
   }
 
   get electrodes() {
@@ -102,7 +93,9 @@ export class View extends EventTarget {
       this.shownFrames += 1;
       this.element.dataset.frames = String(this.shownFrames);
     }
-    this.painter.paint(this.canvas, this.placement, this.state.study, this.electrodes, { chosen: this.chosen, line: this.line });
+    this.painter.paintFrame(this.canvas, this.placement);
+    if (this.line) this.painter.paintLine(this.canvas, this.placement, this.line);
+    this.painter.paintElectrodes(this.canvas, this.placement, this.state.study, this.electrodes, this.chosen);
     this.element.dataset.electrodes = String(this.electrodes.length);
   }
 

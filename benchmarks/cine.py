@@ -1,0 +1,130 @@
+"""Playing a run in the browser: ``python benchmarks/cine.py [frames] [seconds]``.
+
+The benchmark computes a simulated study of 5 sites (120 frames of 512x512 pixels, 60 frames a second) with the real service and
+opens its pages in Chromium. It lets each view play once, so that its frames are loaded, and then counts the frames that the
+page paints. It prints for one view, for both views of a site, and for both views with the map over them:
+
+- painted frames a second and view; the run itself has 60,
+- the processor time for each painted frame, ms: of the page itself, and of all of Chromium,
+- the frames that the page holds in memory, MiB, and their limit.
+
+Without a graphics card Chromium draws on the processor, which takes most of the time of all of Chromium; the page itself needs the
+same everywhere.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+from playwright.sync_api import CDPSession, Page, sync_playwright
+from rich.console import Console
+
+from fluoromap.phantom import StudySpec
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.progress import progress_bars
+from fluoromap_service.cli.submission import find_files, run_job, upload
+from fluoromap_service.cli.supervisor import private_service
+from fluoromap_service.dicom.simulation import simulate
+
+RATE_HZ = 60.0
+ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+PATIENCE_MS = 240_000
+COUNT = """([views, seconds]) => new Promise(done => {
+  const painted = () => views.map(view => Number(view.dataset.frames));
+  const [start, before] = [performance.now(), painted()];
+  const look = now => now - start < 1000 * seconds ? requestAnimationFrame(look)
+    : done(painted().map((each, k) => 1000 * (each - before[k]) / (now - start)));
+  requestAnimationFrame(look);
+})"""
+STORED = """async () => {
+  const store = await import("/assets/viewer/frame-store.js");
+  return [store.storedBytes(), store.MOST_BYTES];
+}"""
+LOADED = """([view, frames]) => new Promise(done => {
+  const before = Number(view.dataset.frames);
+  const look = () => Number(view.dataset.frames) - before > frames ? done() : requestAnimationFrame(look);
+  look();
+})"""
+
+
+def main(frames: int, seconds: float) -> None:
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        sys.exit("There is no Chromium to open the pages in; install it (on Debian: apt-get install chromium).")
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
+        simulate(Path(folder) / "study", StudySpec(seed=7, sites=5, frames=frames, frame_rate_hz=RATE_HZ))
+        with private_service(Path(folder) / "service") as url:
+            with Client(url) as client, progress_bars(Console(stderr=True)) as progress:
+                study = upload(client, find_files(Path(folder) / "study"), "cine", progress).study
+                run_job(client, study, progress)
+            opened = driver.chromium.launch(executable_path=browser, args=ARGUMENTS)
+            page = opened.new_page(viewport={"width": 1280, "height": 900}, base_url=url)
+            page.set_default_timeout(PATIENCE_MS)
+            page.goto(f"/studies/{study}#electrodes")
+            page.locator(".view[data-frames]").nth(1).wait_for()
+            for letters in ("a", "ab"):
+                for letter in letters:
+                    page.get_by_role("button", name=f"Play view {letter}").click()
+                report(
+                    page,
+                    f"{len(letters)} view",
+                    [f"#panel-electrodes .view[data-view={each}]" for each in letters],
+                    frames,
+                    seconds,
+                )
+                for letter in letters:
+                    page.get_by_role("button", name=f"Pause view {letter}").click()
+            page.get_by_role("tab", name="4 Map and results").click()
+            page.locator(".fused[data-frames]").nth(1).wait_for()
+            page.get_by_role("button", name="Play the map over fluoroscopy").click()
+            report(page, "2 views with the map", [f".fused[data-view={each}]" for each in "ab"], frames, seconds)
+            opened.close()
+
+
+def report(page: Page, title: str, selectors: list[str], frames: int, seconds: float) -> None:
+    """Print the rate of views that play, once all their frames are loaded."""
+    views: list[Any] = [page.locator(each).element_handle() for each in selectors]
+    for view in views:
+        page.evaluate(LOADED, [view, frames])
+    session = page.context.new_cdp_session(page)
+    session.send("Performance.setTimeDomain", {"timeDomain": "threadTicks"})
+    session.send("Performance.enable")
+    before, page_before, start = _processor_seconds(), _page_seconds(session), time.perf_counter()
+    rates = page.evaluate(COUNT, [views, seconds])
+    painted = sum(rates) * (time.perf_counter() - start)
+    spent_ms = 1000 * (_processor_seconds() - before) / max(painted, 1)
+    page_ms = 1000 * (_page_seconds(session) - page_before) / max(painted, 1)
+    session.detach()
+    stored, most = (value / 2**20 for value in page.evaluate(STORED))
+    shown = " and ".join(f"{rate:.0f}" for rate in rates)
+    print(f"{title}: {shown} frames/s; a frame takes {page_ms:.1f} ms, all of Chromium {spent_ms:.0f} ms")
+    print(f"  {stored:.0f} of at most {most:.0f} MiB of frames")
+
+
+def _page_seconds(session: CDPSession) -> float:
+    """Return the processor time of the page's main thread."""
+    metrics = {each["name"]: each["value"] for each in session.send("Performance.getMetrics")["metrics"]}
+    return float(metrics["TaskDuration"])
+
+
+def _processor_seconds() -> float:
+    """Return the processor time of all processes of Chromium that this program started."""
+    total = 0.0
+    for process in psutil.Process().children(recursive=True):
+        if "chrom" in process.name():
+            times = process.cpu_times()
+            total += times.user + times.system
+    return total
+
+
+if __name__ == "__main__":
+    main(
+        int(sys.argv[1]) if len(sys.argv) > 1 else 120,
+        float(sys.argv[2]) if len(sys.argv) > 2 else 5.0,
+    )

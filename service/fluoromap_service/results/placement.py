@@ -1,0 +1,172 @@
+"""The place of the map in the frames of one run: the run's camera, and the shift of the map in each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from fluoromap.contracts import (
+    Array,
+    LocatedSite,
+    MatchedSite,
+    Matching,
+    NamedChain,
+    Triangulation,
+    View,
+)
+from fluoromap.drawing.map_placement import map_shift_mm, tip_pixel
+from fluoromap.geometry import Camera
+from fluoromap.monoplane.track_samples import FrameOrigins, reference_origins
+from fluoromap_service.jobs.stage_results import SiteTracks, load, stage_of
+from fluoromap_service.problem import not_found
+from fluoromap_service.results.finished import done_stage, snapshot_of
+from fluoromap_service.results.maps import FinishedMap, map_of
+from fluoromap_service.store.models import Job, StageState
+from fluoromap_service.study.snapshot import Snapshot
+
+VIEWS: tuple[View, ...] = ("a", "b")
+
+
+@dataclass(frozen=True, slots=True)
+class LocatedView:
+    """One view of a located site; ``frame`` is the diastolic frame, counted from 0."""
+
+    site: str
+    view: View
+    uid: str
+    frame: int
+
+
+@dataclass(frozen=True, eq=False)
+class MapPlacement:
+    """The map in one view of a located site.
+
+    site : of the view, in 3D. chains : frame, counted from 0 -> catheter -> the electrodes that the frame shows. origins : of
+    the reference catheter in each frame by the track of this view; None where the view has no track.
+    """
+
+    view: LocatedView
+    finished: FinishedMap
+    triangulation: Triangulation
+    snapshot: Snapshot
+    site: LocatedSite
+    chains: Mapping[int, Mapping[str, NamedChain]]
+    origins: FrameOrigins | None
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the view, for stored pixels."""
+        return self.site.camera(self.view.view)
+
+    def shift_mm(self, frame: int) -> Array:
+        """Return the shift (3,) of the map in a frame.
+
+        World = map + shift. The frame counts from 0.
+        """
+        mean_mm = np.zeros(3) if self.finished.reference_mm is None else self.finished.reference_mm
+        shown = self.chains.get(frame, {}).get(self.snapshot.reference)
+        return map_shift_mm(self.site, self.camera, shown, self._tracked_mm(frame), mean_mm)
+
+    def tip_uv(self, frame: int) -> Array | None:
+        """Return the pixel (2,) of the mapping tip in a frame from 0 on."""
+        mapping = self.snapshot.mapping
+        shown = self.chains.get(frame, {}).get(mapping)
+        return tip_pixel(self.site, self.camera, mapping, shown, self.shift_mm(frame))
+
+    def electrodes_uv(self, frame: int) -> dict[str, Array]:
+        """Return the pixels (k, 2) of each catheter's electrodes.
+
+        They begin at the tip. The frame counts from 0. A catheter that it does not show has none.
+        """
+        shown = self.chains.get(frame, {})
+        return {
+            catheter.name: shown[catheter.name].pixels_uv[np.argsort(shown[catheter.name].electrodes)]
+            if catheter.name in shown
+            else np.zeros((0, 2))
+            for catheter in self.snapshot.catheters
+        }
+
+    def _tracked_mm(self, frame: int) -> Array | None:
+        """Return the reference catheter's position (3,) by the track.
+
+        None at diastole, which located the site, and in frames that do not show the catheter.
+        """
+        origins = self.origins
+        if frame == self.view.frame or origins is None or frame >= len(origins.same_frame):
+            return None
+        if not origins.same_frame[frame]:
+            return None
+        position: Array = origins.positions_mm[frame]
+        return position
+
+
+def located_views(session: Session, job: Job) -> list[LocatedView]:
+    """Return both views of each located site.
+
+    Raises
+    ------
+    Problem
+        409 while there is no map.
+    """
+    map_of(session, job)
+    return _views(load(Triangulation, done_stage(session, job, "triangulate")), snapshot_of(job))
+
+
+def placement_of(session: Session, job: Job, uid: str) -> MapPlacement:
+    """Return the place of the map in the frames of a run.
+
+    Raises
+    ------
+    Problem
+        404 for a run that is not a view of a located site, 409 without a map.
+    """
+    finished = map_of(session, job)
+    snapshot = snapshot_of(job)
+    triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
+    view = next((each for each in _views(triangulation, snapshot) if each.uid == uid), None)
+    if view is None:
+        raise not_found("overlay: the run is no view of a located site")
+    site = next(each for each in triangulation.sites if each.site == view.site)
+    matching = load(Matching, done_stage(session, job, "match"))
+    matched = next((each for each in matching.sites if each.site == view.site), None)
+    return MapPlacement(
+        view=view,
+        finished=finished,
+        triangulation=triangulation,
+        snapshot=snapshot,
+        site=site,
+        chains={} if matched is None else _chains(matched, view.view),
+        origins=_origins(session, job, site, view.view, snapshot.reference),
+    )
+
+
+def _views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView]:
+    return [
+        LocatedView(site.site, view, snapshot.site(site.site).run(view), site.diastolic_frame(view))
+        for site in triangulation.sites
+        for view in VIEWS
+    ]
+
+
+def _chains(site: MatchedSite, view: View) -> dict[int, dict[str, NamedChain]]:
+    """Return the catheters that each frame shows, by name.
+
+    At diastole those of the pair that located the site count.
+    """
+    diastole, track = (site.diastole.a, site.track_a) if view == "a" else (site.diastole.b, site.track_b)
+    chains: dict[int, dict[str, NamedChain]] = {}
+    for observation in (diastole, *track):
+        for chain in observation.chains:
+            chains.setdefault(observation.frame, {}).setdefault(chain.catheter, chain)
+    return chains
+
+
+def _origins(session: Session, job: Job, site: LocatedSite, view: View, reference: str) -> FrameOrigins | None:
+    stage = stage_of(session, job.id, "monoplane", site.site)
+    if stage is None or stage.state != StageState.DONE:
+        return None
+    track = next((each.track for each in load(SiteTracks, stage).views if each.view == view), None)
+    return None if track is None else reference_origins(track, site, reference, None)
