@@ -92,7 +92,10 @@ def main() -> None:
 
 
 def _simulated(spec: StudySpec, folder: Path | None) -> Path:
-    """Return the folder with the files of the study; simulate it where it is not complete."""
+    """Return the folder with the files of the study.
+
+    The study is simulated where the folder is not complete.
+    """
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fluoromap"
     folder = folder or cache / f"study-{spec.seed}-{spec.sites}x{spec.frames}-{spec.frame_rate_hz:g}"
     if not (folder / "truth.json").exists():
@@ -275,7 +278,10 @@ def _start(http: httpx.Client, study: str, segmenter: str) -> str:
 
 
 def _stage_ends(http: httpx.Client, job: str, start: float) -> dict[str, float]:
-    """Follow a job to its end; return the seconds from ``start`` to the last end of each kind of stage."""
+    """Return when the last stage of each kind ended.
+
+    The times are seconds from ``start``.
+    """
     ends: dict[str, float] = {}
     with http.stream("GET", f"/v1/jobs/{job}/events", timeout=PATIENCE_S) as events:
         for line in events.iter_lines():
@@ -289,7 +295,10 @@ def _stage_ends(http: httpx.Client, job: str, start: float) -> dict[str, float]:
 
 
 def _stage_seconds(http: httpx.Client) -> dict[str, float]:
-    """Return the sum of the durations of the stages of each kind, from claim to stored result."""
+    """Return the seconds of all stages of each kind.
+
+    They count from the claim to the stored result.
+    """
     found = re.findall(r'^fluoromap_stage_seconds_sum{stage="(\w+)"} (\S+)$', http.get("/metrics").text, re.MULTILINE)
     return {name: float(seconds) for name, seconds in found}
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Context, Refusal
 from fluoromap.reasons import Reason
@@ -46,7 +47,7 @@ def stage(data_dir: Path) -> int:
 
 
 def _run(stage: int, monkeypatch: pytest.MonkeyPatch, compute: Callable[[Context], Any]) -> StageRow:
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, _Answer, compute, str))
+    monkeypatch.setattr(runner, "_prepare", lambda session, held: Work("0" * 64, _Answer, compute, str))
     runner.run(stage, "test")
     with reading() as session:
         return session.get_one(StageRow, stage)
@@ -68,7 +69,7 @@ def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.Mon
         assert session.get_one(Job, "j").state == JobState.SUCCEEDED
 
 
-def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_takes_stages_until_none_is_ready(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     with writing() as session:
         session.add(Job(id="other", study_id="s", state=JobState.QUEUED, snapshot={}))
         session.flush()
@@ -84,13 +85,21 @@ def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monk
                 state=state,
             )
             session.add(row)
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, _Answer, lambda context: _Answer(), str))
-    # Nobody else hears of what got ready.
+    prepared = []
+
+    def work(session: Session, held: Claim) -> Work:
+        prepared.append((held.job_id, held.name))
+        return Work("0" * 64, _Answer, lambda context: _Answer(), str)
+
+    monkeypatch.setattr(runner, "_prepare", work)
+    # No other message comes.
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
     tasks.run_stage(stage)
     with reading() as session:
         states = {job.id: job.state for job in session.scalars(select(Job))}
-    assert states == {"j": JobState.SUCCEEDED, "other": JobState.QUEUED}
+    assert states == {"j": JobState.SUCCEEDED, "other": JobState.SUCCEEDED}
+    # A match of any job comes before the segments.
+    assert prepared == [("other", "match"), ("j", "segment"), ("j", "match")]
 
 
 def _more_stages(count: int) -> list[int]:
@@ -112,7 +121,7 @@ def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.M
     keys = {stage: "a", known: "a", removed: "b", new: "c"}
     computed = []
 
-    def work(held: Claim) -> Work:
+    def work(session: Session, held: Claim) -> Work:
         def compute(context: Context) -> _Answer:
             computed.append(held.stage_id)
             return _Answer(number=held.stage_id)
@@ -148,7 +157,7 @@ def test_a_stage_that_cannot_be_prepared_does_not_keep_the_worker_from_the_other
 ) -> None:
     (broken,) = _more_stages(1)
 
-    def work(held: Claim) -> Work:
+    def work(session: Session, held: Claim) -> Work:
         if held.stage_id == broken:
             raise ValueError("a stored result is damaged")
         return Work("0" * 64, _Answer, lambda context: _Answer(), str)
@@ -203,7 +212,9 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
 
 def test_a_reused_result_is_not_copied(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     (again,) = _more_stages(1)
-    monkeypatch.setattr(runner, "_prepare", lambda claim: Work("0" * 64, _Answer, lambda context: _Answer("", 1), str))
+    monkeypatch.setattr(
+        runner, "_prepare", lambda session, claim: Work("0" * 64, _Answer, lambda context: _Answer("", 1), str)
+    )
     runner.run(stage, "test")
     with reading() as session:
         path = files.path_of(str(session.get_one(StageRow, stage).result))
@@ -226,7 +237,7 @@ def test_a_refusal_is_a_result_like_any_other(stage: int, monkeypatch: pytest.Mo
         raise Refusal(Reason.NO_ELECTRODES, "Nothing to see.")
 
     work = Work("0" * 64, _Answer, refuse, lambda refusal: _Answer(f"{refusal.reason}: {refusal}"))
-    monkeypatch.setattr(runner, "_prepare", lambda claim: work)
+    monkeypatch.setattr(runner, "_prepare", lambda session, claim: work)
     runner.run(stage, "test")
     with reading() as session:
         row = session.get_one(StageRow, stage)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, delete, func, or_, select, update
+from sqlalchemy import Row, case, delete, func, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
@@ -64,6 +64,16 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
+class ReadyStage:
+    """A stage that a worker may claim; ``begun`` counts the stages that workers have begun for its job."""
+
+    stage_id: int
+    job_id: str
+    name: str
+    begun: int
+
+
+@dataclass(frozen=True, slots=True)
 class StoredResult:
     """A stage's result in the store: the hash of its file, and the rows that belong to it."""
 
@@ -101,10 +111,11 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
     return job
 
 
-def take_due(session: Session, limit: int = 200) -> list[int]:
+def take_due(session: Session, limit: int = 32) -> list[int]:
     """Return the ready stages that need an announcement, and note that they are announced.
 
-    These are stages that were never announced, and stages whose announcement is so old that it may be lost.
+    These are stages that were never announced, and stages whose announcement is so old that it may be lost. A worker that hears
+    of one takes stages until none is ready, so few announcements at once are enough.
     """
     wait = settings().republish_seconds
     # Each repetition waits longer, so that a long queue is not announced over and over.
@@ -126,6 +137,30 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
     return ids
 
 
+def most_urgent(session: Session) -> ReadyStage | None:
+    """Return the stage that a worker should take next.
+
+    None when no stage is ready. The order:
+
+    1. Stages about a whole study come first: they are short, and the map waits for them.
+    2. Then comes the job for which workers have begun the fewest stages, and of equal ones the oldest. So a small job or a
+       correction does not wait for a large study, and the large study takes turns with it.
+    3. The stages of one job come in the order of the pipeline.
+    """
+    whole_study = [stage.name for stage in PIPELINE if stage.subject == "study"]
+    query = (
+        select(StageRow.id, StageRow.job_id, StageRow.name, Job.stages_begun)
+        .join(Job, Job.id == StageRow.job_id)
+        .where(StageRow.state == StageState.READY)
+        .order_by(
+            case((StageRow.name.in_(whole_study), 0), else_=1), Job.stages_begun, Job.created, Job.id, StageRow.id
+        )
+        .limit(1)
+    )
+    found = session.execute(query).first()
+    return None if found is None else ReadyStage(*found)
+
+
 def ready(session: Session, job_id: str) -> list[Claim]:
     """Return the claims that a job's ready stages would give."""
     columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
@@ -136,18 +171,21 @@ def ready(session: Session, job_id: str) -> list[Claim]:
 def finish_ready(session: Session, job_id: str, results: Sequence[tuple[Claim, StoredResult]]) -> None:
     """End ready stages whose results are stored already."""
     job = _lock(session, job_id)
-    for claimable, result in results:
-        ended = session.execute(
-            update(StageRow)
-            .where(StageRow.id == claimable.stage_id, StageRow.state == StageState.READY)
-            .values(
-                state=StageState.DONE, attempt=StageRow.attempt + 1, result=result.sha256, reused=True, progress=1.0
-            )
-            .returning(*_REPORTED)
-        ).first()
-        if ended is not None:
-            session.add_all(result.rows)
-            _report_stage(session, job_id, ended)
+    # The lock of the job keeps the states until the end of this transaction.
+    still_ready = {claim.stage_id for claim in ready(session, job_id)}
+    ended = [(claim, result) for claim, result in results if claim.stage_id in still_ready]
+    if not ended:
+        return
+    changes = [
+        {"id": claim.stage_id, "attempt": claim.attempt, "result": result.sha256, "state": StageState.DONE,
+         "reused": True, "progress": 1.0}
+        for claim, result in ended
+    ]  # fmt: skip
+    session.execute(update(StageRow), changes)
+    for claim, result in ended:
+        session.add_all(result.rows)
+        data = {"name": claim.name, "subject": claim.subject, "state": StageState.DONE, "attempt": claim.attempt}
+        session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": 1.0, "reused": True}))
     _settle(session, job)
 
 
@@ -172,6 +210,7 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
     ).first()
     if row is None:
         return None
+    job.stages_begun += 1
     if job.state == JobState.QUEUED:
         job.state = JobState.RUNNING
         job.started = session.scalar(select(db_now()))
@@ -207,6 +246,9 @@ def finish(session: Session, held: Claim, result: StoredResult, *, reused: bool)
     job = _lock(session, held.job_id)
     if not _end(session, held, StageState.DONE, result=result.sha256, reused=reused, progress=1.0):
         return False
+    if reused:
+        # Nothing was computed, so it does not count against the job.
+        job.stages_begun -= 1
     session.add_all(result.rows)
     _settle(session, job)
     return True
@@ -426,6 +468,9 @@ def _settle(session: Session, job: Job) -> None:
 
     The caller holds the lock of the job's row.
     """
+    session.flush()
+    if not _may_settle(session, job.id):
+        return
     rows = _stages(session, job.id)
     broken = _broken(rows)
     if broken:
@@ -448,6 +493,27 @@ def _settle(session: Session, job: Job) -> None:
         job.finished = now
         tally.add(session, {f"jobs|{job.state}": 1.0})
         _report_job(session, job)
+
+
+def _may_settle(session: Session, job_id: str) -> bool:
+    """Return whether the states allow a change.
+
+    Stages may become ready, or the job may fail or end. The function reads which states each kind of stage has, so
+    that the end of one of a thousand stages does not read the others.
+    """
+    query = select(StageRow.name, StageRow.state).where(StageRow.job_id == job_id).distinct()
+    states: dict[str, set[str]] = {}
+    for name, state in session.execute(query):
+        states.setdefault(name, set()).add(state)
+    ended = {name for name, found in states.items() if found <= ENDED_STAGE}
+    return (
+        len(ended) == len(states)
+        or any(StageState.FAILED in found for found in states.values())
+        or any(
+            StageState.PENDING in found and ended.issuperset(set(STAGES[name].depends_on) & states.keys())
+            for name, found in states.items()
+        )
+    )
 
 
 def _broken(rows: Sequence[StageRow]) -> list[StageRow]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import event as sql_event
 from sqlalchemy import select, update
 
 from fluoromap_service.jobs import job_life, stall
@@ -367,3 +368,75 @@ def test_ready_stages_that_nobody_runs_are_a_stall(job: str) -> None:
     assert [look(), look()] == [False, False]
     watch.reset()
     assert [look(), look()] == [False, True]
+
+
+def _take() -> tuple[str, str] | None:
+    """Claim and end the most urgent stage; return its job and name."""
+    with writing() as session:
+        urgent = job_life.most_urgent(session)
+        if urgent is None:
+            return None
+        held = job_life.claim(session, urgent.stage_id, "w")
+    assert held is not None
+    assert _finish(held)
+    return held.job_id, held.name
+
+
+def test_a_small_job_does_not_wait_for_a_large_one_and_the_map_comes_first(job: str) -> None:
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=10)).id
+        # The job of the fixture takes no part.
+        assert job_life.cancel(session, job)
+    order = [_take() for _ in range(3)]
+    assert order == [(large, "segment")] * 3
+    with writing() as session:
+        small = job_life.create(session, "s", _snapshot("s", sites=1)).id
+    while taken := _take():
+        order.append(taken)
+    # The newcomer has had no turn: its map is there before the large study gets another one.
+    assert order[3:8] == [(small, name) for name in ("segment", "segment", "match", "triangulate", "fuse")]
+    # Then both jobs have had about as much, and the one track of the small job waits for its turn only.
+    last_of_small = max(place for place, (owner, _) in enumerate(order) if owner == small)
+    assert order[last_of_small] == (small, "monoplane")
+    assert last_of_small <= 12
+    # No monoplane stage is taken while the map of any job can be made.
+    names = [name for owner, name in order if owner == large]
+    assert names == ["segment"] * 20 + ["match", "triangulate", "fuse"] + ["monoplane"] * 10
+
+
+def test_large_jobs_take_turns(job: str) -> None:
+    with writing() as session:
+        other = job_life.create(session, "s", _snapshot("s")).id
+    taken = [_take() for _ in range(7)]
+    assert taken == [(job, "segment"), (other, "segment")] * 3 + [(job, "segment")]
+
+
+def test_a_stage_whose_result_is_known_costs_its_job_no_turn(job: str) -> None:
+    first, second = _stage_ids(job, "segment")[:2]
+    with writing() as session:
+        held = job_life.claim(session, first, "w")
+        assert held is not None
+        sha256 = files.keep_bytes(session, b"{}")
+        assert job_life.finish(session, held, job_life.StoredResult(sha256), reused=True)
+        assert session.get_one(Job, job).stages_begun == 0
+        assert job_life.claim(session, second, "w")
+        assert session.get_one(Job, job).stages_begun == 1
+
+
+def test_the_end_of_a_stage_does_not_read_the_others(job: str) -> None:
+    """The states of a job's stages are counted; only a change of kind reads the rows."""
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=40)).id
+    held = _claim(_stage_ids(large, "segment")[0])
+    assert held is not None
+    loaded: list[StageRow] = []
+
+    def note(row: StageRow, context: object) -> None:
+        loaded.append(row)
+
+    sql_event.listen(StageRow, "load", note)
+    try:
+        assert _finish(held)
+    finally:
+        sql_event.remove(StageRow, "load", note)
+    assert loaded == []
