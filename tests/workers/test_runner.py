@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import delete, event, select, update
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Context, Refusal
@@ -16,9 +16,9 @@ from fluoromap.reasons import Reason
 from fluoromap_service.jobs import queue
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import decode
-from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Event, Job, JobState, StageRow, StageState, Study
+from fluoromap_service.store.codec import decode, encode
+from fluoromap_service.store.engine import engine, reading, writing
+from fluoromap_service.store.models import Event, Job, JobState, StageResult, StageRow, StageState, Study
 from fluoromap_workers import runner, tasks
 from fluoromap_workers.stage_inputs import PluginChanged, Work
 
@@ -150,6 +150,50 @@ def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.M
     assert told == [("1.2.10", "done")]
     assert rows[removed].state == StageState.READY
     assert rows[new].state == StageState.READY
+
+
+def _statements_to_end(count: int, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
+    """Return the SQL statements and the parsed snapshots of ending ``count`` known stages."""
+    stages = _more_stages(count)
+    parsed, statements = [], []
+
+    def parse(snapshot: object) -> object:
+        parsed.append(snapshot)
+        return snapshot
+
+    def note(*arguments: object) -> None:
+        statements.append(arguments[2])
+
+    monkeypatch.setattr(runner.Snapshot, "model_validate", parse)
+    monkeypatch.setattr(runner, "prepare", lambda session, claim, snapshot: Work("d" * 64, _Answer, _never, str))
+    runner._snapshot.cache_clear()
+    with writing() as session:
+        sha256 = files.keep_bytes(session, encode(_Answer()))
+        session.merge(StageResult(key="d" * 64, sha256=sha256))
+    event.listen(engine(), "before_cursor_execute", note)
+    try:
+        runner.finish_known("j")
+    finally:
+        event.remove(engine(), "before_cursor_execute", note)
+        runner._snapshot.cache_clear()
+    with reading() as session:
+        assert {session.get_one(StageRow, number).state for number in stages} == {StageState.DONE}
+    return len(statements), len(parsed)
+
+
+def _never(context: Context) -> Any:
+    raise AssertionError("computed again")
+
+
+@pytest.mark.usefixtures("stage")
+def test_ending_known_stages_costs_the_same_statements_for_few_and_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    few, parsed_for_few = _statements_to_end(4, monkeypatch)
+    with writing() as session:
+        session.execute(update(Job).values(state=JobState.RUNNING))
+        session.execute(delete(StageRow))
+    many, parsed_for_many = _statements_to_end(300, monkeypatch)
+    assert few == many
+    assert parsed_for_few == parsed_for_many == 1
 
 
 def test_a_stage_that_cannot_be_prepared_does_not_keep_the_worker_from_the_others(

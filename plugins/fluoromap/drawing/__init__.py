@@ -2,5 +2,5 @@
 
 from typing import Final
 
-VERSION: Final = "3"
+VERSION: Final = "4"
 """Version of the drawing code: kept pictures depend on it. Raise it with every change of a drawn pixel."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, case, delete, func, or_, select, update
+from sqlalchemy import Row, case, delete, func, insert, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
@@ -41,6 +41,9 @@ _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
 """Columns of a stage that its events report."""
+
+_REUSED = {"state": StageState.DONE, "progress": 1.0, "reused": True}
+"""Columns of a stage that ended with a stored result, as its row and its event have them."""
 
 SECONDS_BUCKETS = (0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 1800.0)
 """Upper limits of the histogram of stage durations, in seconds."""
@@ -176,16 +179,27 @@ def finish_ready(session: Session, job_id: str, results: Sequence[tuple[Claim, S
     ended = [(claim, result) for claim, result in results if claim.stage_id in still_ready]
     if not ended:
         return
-    changes = [
-        {"id": claim.stage_id, "attempt": claim.attempt, "result": result.sha256, "state": StageState.DONE,
-         "reused": True, "progress": 1.0}
-        for claim, result in ended
-    ]  # fmt: skip
-    session.execute(update(StageRow), changes)
-    for claim, result in ended:
+    # One statement for all rows: after a correction nearly every run of a study ends here.
+    session.execute(
+        update(StageRow),
+        [
+            {"id": claim.stage_id, "attempt": claim.attempt, "result": result.sha256, **_REUSED}
+            for claim, result in ended
+        ],
+    )
+    session.execute(
+        insert(Event),
+        [
+            {
+                "job_id": job_id,
+                "kind": "stage",
+                "data": {"name": claim.name, "subject": claim.subject, "attempt": claim.attempt, **_REUSED},
+            }
+            for claim, _ in ended
+        ],
+    )
+    for _, result in ended:
         session.add_all(result.rows)
-        data = {"name": claim.name, "subject": claim.subject, "state": StageState.DONE, "attempt": claim.attempt}
-        session.add(Event(job_id=job_id, kind="stage", data={**data, "progress": 1.0, "reused": True}))
     _settle(session, job)
 
 
