@@ -1,14 +1,15 @@
 """A study of clinical size on the real service: ``python benchmarks/clinical_study.py [sites] [frames] [options]``.
 
 The benchmark simulates a study of 20 sites, 2 views, 120 frames at 30 a second, and keeps its files for the next run. It runs the
-study through three things, one after the other:
+study through four things, one after the other:
 
 1. the functions of the stages in this process, one after the other: the yardstick;
 2. the service with one worker process: a whole job;
 3. the service with a worker process for each processor: a whole job, then pictures, report, archive, tracks and frames of that
-   job, then corrections.
+   job, then corrections;
+4. the same service with a queue: several jobs of the study, and behind them a job of two of its sites.
 
-It prints wall-clock seconds, and processor seconds where other programs use the machine too. ``--parts`` chooses some of the three.
+It prints wall-clock seconds, and processor seconds where other programs use the machine too. ``--parts`` chooses some of the four.
 Give other sizes to see how each figure grows: ``clinical_study.py 5``, ``clinical_study.py 80``.
 """
 
@@ -51,7 +52,7 @@ from fluoromap_service.store.codec import encode
 PATIENCE_S = 3600.0
 POLL_SECONDS = 0.02
 CINE_FRAMES = 120
-PARTS = ("pure", "one", "all")
+PARTS = ("pure", "one", "all", "turns")
 VIEWS: tuple[View, View] = ("a", "b")
 
 
@@ -79,6 +80,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=30.0, help="frames a second")
     parser.add_argument("--segmenter", default=DEFAULTS["segmenter"])
     parser.add_argument("--corrections", type=int, default=12)
+    parser.add_argument("--queued", type=int, default=4, help="jobs of the study before the job of two sites")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--folder", type=Path, help="folder that keeps the simulated study")
     given = parser.parse_args()
@@ -89,6 +91,8 @@ def main() -> None:
     one = _one_worker(folder, given.segmenter, pure) if "one" in given.parts else None
     if "all" in given.parts:
         _all_workers(folder, given.segmenter, given.corrections, one)
+    if "turns" in given.parts:
+        _turns(folder, given.segmenter, given.queued)
 
 
 def _simulated(spec: StudySpec, folder: Path | None) -> Path:
@@ -227,6 +231,39 @@ def _all_workers(folder: Path, segmenter: str, corrections: int, one: JobTimes |
         )
 
 
+def _turns(folder: Path, segmenter: str, queued: int) -> None:
+    """Measure a job of two sites alone, and behind jobs of the whole study."""
+    with _service(None) as (http, _):
+        large, _ = _upload(http, folder)
+        small, _ = _upload(http, folder, sites=2)
+
+        def submit(study: str, number: int) -> str:
+            """Start a job that reuses no result of another number, because its catheters differ."""
+            catheters = http.get(f"/v1/studies/{study}").json()["catheters"]
+            named = [
+                {name: each[name] for name in ("name", "electrodes", "spacing_mm", "tip_mm", "ring_mm")}
+                for each in catheters
+            ]
+            named[0]["tip_mm"] += 0.001 * number
+            http.patch(f"/v1/studies/{study}", json={"catheters": named}).raise_for_status()
+            return _start(http, study, segmenter)
+
+        start = time.perf_counter()
+        _stage_ends(http, submit(small, 0), start)
+        alone = time.perf_counter() - start
+        start = time.perf_counter()
+        before = [submit(large, number) for number in range(1, queued + 1)]
+        behind = time.perf_counter()
+        _stage_ends(http, submit(small, queued + 1), behind)
+        waited = time.perf_counter() - behind
+        for job in before:
+            _stage_ends(http, job, start)
+        print(
+            f"a job of two sites: alone {alone:.1f} s, behind {queued} jobs of the study {waited:.1f} s; these ended after "
+            f"{time.perf_counter() - start:.1f} s"
+        )
+
+
 def _show_job(title: str, times: JobTimes) -> None:
     print(
         f"job with {title}: segmented {times.segmented:.2f} s, map {times.map:.2f} s, end {times.end:.2f} s; processor "
@@ -237,15 +274,17 @@ def _show_job(title: str, times: JobTimes) -> None:
     )
 
 
-def _upload(http: httpx.Client, folder: Path) -> tuple[str, list[float]]:
-    """Return the study and the seconds of each upload."""
+def _upload(http: httpx.Client, folder: Path, sites: int | None = None) -> tuple[str, list[float]]:
+    """Return the study and the seconds of each upload; ``sites`` takes only the first ones."""
     study: str = http.post("/v1/studies", json={"label": "clinical study"}).raise_for_status().json()["id"]
     seconds = []
-    for path in sorted((folder / "dicom").glob("*.dcm")):
+    runs = None if sites is None else 2 * sites
+    for path in sorted((folder / "dicom").glob("*.dcm"))[:runs]:
         with path.open("rb") as stream:
             part = {"file": (path.name, stream, "application/dicom")}
             seconds.append(_seconds(http, "POST", f"/v1/studies/{study}/instances", files=part))
-    table = (folder / "activation_times.csv").read_bytes()
+    lines = (folder / "activation_times.csv").read_bytes().splitlines(keepends=True)
+    table = b"".join(lines if sites is None else lines[: 1 + sites])
     http.put(
         f"/v1/studies/{study}/activation-times", content=table, headers={"Content-Type": "text/csv"}
     ).raise_for_status()

@@ -69,7 +69,6 @@ def _place() -> Iterator[Place]:
 
 def _run_stages(place: Place) -> None:
     worker = f"{socket.gethostname()}:{os.getpid()}"
-    opened: set[str] = set()
     compared: set[tuple[str, str]] = set()
     while place.is_ready():
         with reading() as session:
@@ -77,11 +76,8 @@ def _run_stages(place: Place) -> None:
         if urgent is None:
             return
         kind = urgent.job_id, urgent.name
-        if urgent.begun == 0 and urgent.job_id not in opened:
-            # After a correction this is the run that changed: another worker ends the others meanwhile.
-            opened.add(urgent.job_id)
-            run(urgent.stage_id, worker, place)
-        elif STAGES[urgent.name].subject != "study" and kind not in compared:
+        if STAGES[urgent.name].subject != "study" and kind not in compared:
+            # After a correction nearly all results of this kind are known.
             compared.add(kind)
             place.finish_known(urgent.job_id)
         else:

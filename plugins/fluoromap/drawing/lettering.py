@@ -43,9 +43,10 @@ def halo_text(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, in
 
 @functools.lru_cache(maxsize=4096)
 def _masks(text: str, size: int) -> tuple[Image.Image, Image.Image]:
-    """Return the masks of a text without and with a rim, its middle at the masks' middle.
+    """Return the masks of a text, without and with a rim.
 
-    The pictures of a job show the same texts, and drawing letters takes longer than pasting them.
+    Its middle is the middle of the masks. The pictures of a job show the same texts, and drawing letters takes longer than
+    pasting them.
     """
     stroke = max(1, size // 9)
     width, height = text_size(text, size)

@@ -33,6 +33,8 @@ from fluoromap_service.store.models import (
 from fluoromap_service.study.snapshot import Snapshot
 
 LONGEST_REPUBLISH_SECONDS = 60.0
+AGE_OF_A_STAGE_SECONDS = 5.0
+"""Age of a job that counts as one stage less when workers choose the next stage."""
 WORKER_SECONDS = 30.0
 """A worker that is silent for longer counts as dead."""
 CLOCK_TOLERANCE_SECONDS = 1.0
@@ -68,12 +70,11 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class ReadyStage:
-    """A stage that a worker may claim; ``begun`` counts the stages that workers have begun for its job."""
+    """A stage that a worker may claim."""
 
     stage_id: int
     job_id: str
     name: str
-    begun: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,17 +147,30 @@ def most_urgent(session: Session) -> ReadyStage | None:
     None when no stage is ready. The order:
 
     1. Stages about a whole study come first: they are short, and the map waits for them.
-    2. Then comes the job for which workers have begun the fewest stages, and of equal ones the oldest. So a small job or a
-       correction does not wait for a large study, and the large study takes turns with it.
-    3. The stages of one job come in the order of the pipeline.
+    2. Then come jobs of which no stage has begun, the oldest first: a worker must see how much of them is known.
+    3. Then comes the job with the fewest stages left. So a small job or a correction does not wait for a large study. Each
+       ``AGE_OF_A_STAGE_SECONDS`` of age count as one stage less, so that no job waits for ever.
+    4. The stages of one job come in the order of the pipeline.
     """
     whole_study = [stage.name for stage in PIPELINE if stage.subject == "study"]
+    open_states = [state for state in StageState if state not in ENDED_STAGE]
+    left = (
+        select(StageRow.job_id, func.count().label("stages"))
+        .where(StageRow.state.in_(open_states))
+        .group_by(StageRow.job_id)
+        .subquery()
+    )
+    is_new = Job.state == JobState.QUEUED
     query = (
-        select(StageRow.id, StageRow.job_id, StageRow.name, Job.stages_begun)
+        select(StageRow.id, StageRow.job_id, StageRow.name)
         .join(Job, Job.id == StageRow.job_id)
+        .join(left, left.c.job_id == StageRow.job_id)
         .where(StageRow.state == StageState.READY)
         .order_by(
-            case((StageRow.name.in_(whole_study), 0), else_=1), Job.stages_begun, Job.created, Job.id, StageRow.id
+            case((StageRow.name.in_(whole_study), 0), (is_new, 1), else_=2),
+            case((is_new, 0.0), else_=left.c.stages) + Job.created / AGE_OF_A_STAGE_SECONDS,
+            Job.id,
+            StageRow.id,
         )
         .limit(1)
     )
@@ -224,7 +238,6 @@ def claim(session: Session, stage_id: int, worker: str) -> Claim | None:
     ).first()
     if row is None:
         return None
-    job.stages_begun += 1
     if job.state == JobState.QUEUED:
         job.state = JobState.RUNNING
         job.started = session.scalar(select(db_now()))
@@ -260,9 +273,6 @@ def finish(session: Session, held: Claim, result: StoredResult, *, reused: bool)
     job = _lock(session, held.job_id)
     if not _end(session, held, StageState.DONE, result=result.sha256, reused=reused, progress=1.0):
         return False
-    if reused:
-        # Nothing was computed, so it does not count against the job.
-        job.stages_begun -= 1
     session.add_all(result.rows)
     _settle(session, job)
     return True

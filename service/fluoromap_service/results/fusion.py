@@ -135,7 +135,10 @@ def draw_fusion(path: Path, fusion: Fusion, look: Look, moving: bool) -> bytes:
 
 
 def draw_fusion_jpeg(path: Path, fusion: Fusion, look: Look) -> bytes:
-    """Return an overlay as JPEG, which is smaller than PNG and not exact, from the run's file."""
+    """Return an overlay as JPEG, from the run's file.
+
+    It is smaller than a PNG, and not exact.
+    """
     stream = io.BytesIO()
     Image.fromarray(draw_overlay(*_parts(path, fusion), look)).save(stream, format="JPEG", quality=JPEG_QUALITY)
     return stream.getvalue()

@@ -184,7 +184,6 @@ class Job(Base):
     state: Mapped[str] = mapped_column(String(10), index=True)
     version: Mapped[int] = mapped_column(default=0)  # every change raises it: ETag, and row lock at the end of a stage
     snapshot: Mapped[Json]
-    stages_begun: Mapped[int] = mapped_column(default=0)  # by workers, to compute them; orders the jobs that wait
     cancel_requested: Mapped[bool] = mapped_column(Boolean, default=False)
     error: Mapped[Json | None]
     created: Mapped[float] = mapped_column(default=db_now())

@@ -393,34 +393,54 @@ def test_a_small_job_does_not_wait_for_a_large_one_and_the_map_comes_first(job: 
         small = job_life.create(session, "s", _snapshot("s", sites=1)).id
     while taken := _take():
         order.append(taken)
-    # The newcomer has had no turn: its map is there before the large study gets another one.
-    assert order[3:8] == [(small, name) for name in ("segment", "segment", "match", "triangulate", "fuse")]
-    # Then both jobs have had about as much, and the one track of the small job waits for its turn only.
-    last_of_small = max(place for place, (owner, _) in enumerate(order) if owner == small)
-    assert order[last_of_small] == (small, "monoplane")
-    assert last_of_small <= 12
+    # The newcomer has fewer stages left: all of it is done before the large study goes on.
+    assert order[3:9] == [(small, name) for name in ("segment", "segment", "match", "triangulate", "fuse", "monoplane")]
     # No monoplane stage is taken while the map of any job can be made.
     names = [name for owner, name in order if owner == large]
     assert names == ["segment"] * 20 + ["match", "triangulate", "fuse"] + ["monoplane"] * 10
 
 
-def test_large_jobs_take_turns(job: str) -> None:
+def test_a_map_of_another_job_comes_before_the_tracks(job: str) -> None:
+    """``fuse`` waits for no stage about a site, however few stages the job of that site has left."""
     with writing() as session:
-        other = job_life.create(session, "s", _snapshot("s")).id
-    taken = [_take() for _ in range(7)]
-    assert taken == [(job, "segment"), (other, "segment")] * 3 + [(job, "segment")]
+        large = job_life.create(session, "s", _snapshot("s", sites=10)).id
+    _work(large, only="segment")
+    for name in ("match", "triangulate"):
+        assert _take() == (large, name)
+    _work(job, only="segment")
+    for name in ("match", "triangulate"):
+        _work(job, only=name)
+    assert {_take(), _take()} == {(large, "fuse"), (job, "fuse")}
+    assert [_take() for _ in range(2)] == [(job, "monoplane")] * 2
 
 
-def test_a_stage_whose_result_is_known_costs_its_job_no_turn(job: str) -> None:
-    first, second = _stage_ids(job, "segment")[:2]
+def test_a_correction_counts_only_the_stages_that_are_not_known(job: str) -> None:
+    """A new job is opened first; when its known stages have ended, it has few left."""
+    _work(job, only="segment")
     with writing() as session:
-        held = job_life.claim(session, first, "w")
-        assert held is not None
+        other = job_life.create(session, "s", _snapshot("s", sites=3)).id
+        corrected = job_life.create(session, "s", _snapshot("s", sites=10)).id
         sha256 = files.keep_bytes(session, b"{}")
-        assert job_life.finish(session, held, job_life.StoredResult(sha256), reused=True)
-        assert session.get_one(Job, job).stages_begun == 0
-        assert job_life.claim(session, second, "w")
-        assert session.get_one(Job, job).stages_begun == 1
+        known = job_life.ready(session, corrected)[1:]
+        job_life.finish_ready(session, corrected, [(claim, job_life.StoredResult(sha256)) for claim in known])
+    assert [_take() for _ in range(3)] == [(job, name) for name in ("match", "triangulate", "fuse")]
+    # Two new jobs: each begins, the older one first.
+    assert [_take() for _ in range(2)] == [(other, "segment"), (corrected, "segment")]
+    assert _take() == (corrected, "match")
+
+
+def test_no_job_waits_for_ever(job: str) -> None:
+    """Age counts as stages that are done."""
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=10)).id
+        assert job_life.cancel(session, job)
+    assert _take() == (large, "segment")
+    with writing() as session:
+        age = 100 * job_life.AGE_OF_A_STAGE_SECONDS
+        session.execute(update(Job).where(Job.id == large).values(created=Job.created - age))
+        small = job_life.create(session, "s", _snapshot("s", sites=1)).id
+    assert _take() == (small, "segment")
+    assert _take() == (large, "segment")
 
 
 def test_the_end_of_a_stage_does_not_read_the_others(job: str) -> None:

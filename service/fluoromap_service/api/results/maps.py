@@ -188,7 +188,10 @@ def get_map(
 
 
 def map_picture_of(job_id: str, finished: FinishedMap) -> KeptFile:
-    """Return the kept PNG of a map from six sides; draw it when there is none."""
+    """Return the kept PNG of a map from six sides.
+
+    It is drawn when there is none.
+    """
     return kept_rendering(
         job_id,
         map_picture_dependencies(finished.sha256),

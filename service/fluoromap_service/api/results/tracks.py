@@ -212,9 +212,9 @@ def _read(job_id: str, origin: Origin, site: str | None, view: View | None) -> T
 
 
 def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
-    """Return the kept table of an ended job's tracks; make it when there is none.
+    """Return the kept table of an ended job's tracks.
 
-    Its coordinates count from the reference catheter.
+    It is made when there is none. Its coordinates count from the reference catheter.
     """
 
     def make() -> bytes:
