@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Array, ChamberMap, Triangulation
@@ -82,12 +86,36 @@ def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion
     )
 
 
+JPEG_QUALITY = 88
+"""Fluoroscopy is noise: with JPEG a page of 40 overlays has a few MB."""
+
+
 def draw_fusion(path: Path, fusion: Fusion, look: Look, moving: bool) -> bytes:
     """Return an overlay as PNG, or its propagation as GIF, from the run's file."""
-    frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
-    parts = (frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv)
-    look = replace(look, simulated=fusion.facts.simulated)
+    parts = _parts(path, fusion)
+    look = _labelled(look, fusion)
     return draw_propagation(*parts, look) if moving else encode_png(draw_overlay(*parts, look))
+
+
+def draw_fusion_jpeg(path: Path, fusion: Fusion, look: Look) -> bytes:
+    """Return an overlay as JPEG, from the run's file.
+
+    It is smaller than a PNG, and not exact.
+    """
+    picture = draw_overlay(*_parts(path, fusion), _labelled(look, fusion))
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, format="JPEG", quality=JPEG_QUALITY)
+    return stream.getvalue()
+
+
+def _parts(path: Path, fusion: Fusion) -> tuple[NDArray[np.uint8], Camera, ChamberMap, Array, str, Array | None]:
+    frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
+    return frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv
+
+
+def _labelled(look: Look, fusion: Fusion) -> Look:
+    """Return the look that says whether the run is simulated."""
+    return replace(look, simulated=fusion.facts.simulated)
 
 
 def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]:

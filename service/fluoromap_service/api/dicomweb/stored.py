@@ -20,7 +20,7 @@ from fluoromap_service.dicom import InstanceFacts
 from fluoromap_service.dicom.frames import frame_bytes
 from fluoromap_service.dicom.json_model import header_json
 from fluoromap_service.problem import Problem, not_found
-from fluoromap_service.results.dependencies import RESULT_OBJECTS
+from fluoromap_service.results.dependencies import result_object_dependencies
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Instance, Job, JobState, StudyInstance
@@ -230,7 +230,7 @@ def _results(study_uid: str | None) -> Iterator[StoredResult]:
     with reading() as session:
         jobs = list(session.scalars(query))
     for job_id in jobs:
-        kept = find_rendering(job_id, RESULT_OBJECTS) if study_uid is None else _made(job_id)
+        kept = find_rendering(job_id, result_object_dependencies(job_id)) if study_uid is None else _made(job_id)
         if kept is None:
             continue
         with zipfile.ZipFile(kept.path) as archive:

@@ -17,7 +17,7 @@ from fluoromap_service.api.results.overlays import picture_of
 from fluoromap_service.dicom.objects.job_results import JobResults, job_objects
 from fluoromap_service.dicom.objects.report_site import ReportSite
 from fluoromap_service.problem import Problem
-from fluoromap_service.results.dependencies import RESULT_OBJECTS
+from fluoromap_service.results.dependencies import result_object_dependencies
 from fluoromap_service.results.finished import ended_job_of, snapshot_of
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.results.maps import map_of
@@ -44,7 +44,7 @@ def objects_zip(job_id: str) -> KeptFile:
     """
     with reading() as session:
         ended_job_of(session, job_id, "DICOM zip")
-    return kept_rendering(job_id, RESULT_OBJECTS, lambda: _zip(job_id))
+    return kept_rendering(job_id, result_object_dependencies(job_id), lambda: _zip(job_id))
 
 
 def _zip(job_id: str) -> bytes:
