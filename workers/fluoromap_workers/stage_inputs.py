@@ -35,13 +35,13 @@ from fluoromap.contracts import (
     View,
 )
 from fluoromap.fuser.mapped_sites import map_origin, mapped_sites
-from fluoromap.matching import SiteComparisons, SiteRuns, match_study
+from fluoromap.matching import SiteRuns, match_study
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
 from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_version, plugin_of
-from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, stage_of, stages_of
+from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, load_later, stage_of, stages_of
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode, form_of
 from fluoromap_service.store.models import Base, StageRow
@@ -51,9 +51,6 @@ from fluoromap_workers.point_rows import point_rows
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 Result = TypeVar("Result")
-
-# A process matches the same study after every correction: sites that did not change are compared once.
-_SITE_COMPARISONS = SiteComparisons()
 
 
 class PluginChanged(Exception):
@@ -68,6 +65,8 @@ class Work:
     ----------
     key : str
         Hash of everything that the result depends on.
+    plugin : str
+        Hash of the plugin with its version and parameters: of everything that all partial results depend on.
     kind : type
         The dataclass of the result.
     compute : callable
@@ -79,6 +78,7 @@ class Work:
     """
 
     key: str
+    plugin: str
     kind: type[Any]
     compute: Callable[[Context], Any]
     refused: Callable[[Refusal], Any]
@@ -167,7 +167,7 @@ def _segment(job: StoredJob, uid: str) -> Work:
         job, "segment", run.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames, px_per_mm,
         asdict(catalogue), run.model_dump(include={"corrections"}),
     )  # fmt: skip
-    return Work(key, Segmentation, compute, refused)
+    return Work(key, _key(job, "segment"), Segmentation, compute, refused)
 
 
 def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
@@ -195,15 +195,15 @@ def _match(job: StoredJob, study: str) -> Work:
     views = [(site.site, uid) for site in snapshot.sites for uid in (site.view_a, site.view_b)]
 
     def compute(context: Context) -> Matching:
-        found = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
+        # Only sites whose comparison is not stored read their segmentations.
+        found = {uid: load_later(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
             SiteRuns(
                 site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b],
-                content=tuple((segments[uid].result, encode(cameras[uid])) for uid in (site.view_a, site.view_b)),
             )
             for site in snapshot.sites
         )  # fmt: skip
-        return match_study(sites, catalogue, context, _SITE_COMPARISONS)
+        return match_study(sites, catalogue, context)
 
     def refused(refusal: Refusal) -> Matching:
         return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
@@ -211,7 +211,7 @@ def _match(job: StoredJob, study: str) -> Work:
     # A result's hash says whether it changed: the result itself is not read for the key.
     results = ((site, encode(cameras[uid]), segments[uid].result) for site, uid in views)
     key = _key(job, "match", asdict(catalogue), *(part for view in results for part in view))
-    return Work(key, Matching, compute, refused)
+    return Work(key, _key(job, "match"), Matching, compute, refused)
 
 
 def _triangulate(job: StoredJob, study: str) -> Work:
@@ -222,10 +222,7 @@ def _triangulate(job: StoredJob, study: str) -> Work:
         matching = load(Matching, match)
         located = build_triangulator(plugin.name, plugin.params).triangulate(matching.sites, catalogue, context)
         located = _returned(located, Triangulation, plugin.name)
-        sites = tuple(
-            replace(site, reasons=tuple(dict.fromkeys((*site.reasons, *doubts.get(site.site, ())))))
-            for site in located.sites
-        )
+        sites = tuple(_with_doubts(site, doubts.get(site.site, ())) for site in located.sites)
         return replace(located, sites=sites, rejected=(*matching.rejected, *located.rejected))
 
     def refused(refusal: Refusal) -> Triangulation:
@@ -237,7 +234,13 @@ def _triangulate(job: StoredJob, study: str) -> Work:
         return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
     key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
-    return Work(key, Triangulation, compute, refused, rows)
+    return Work(key, _key(job, "triangulate"), Triangulation, compute, refused, rows)
+
+
+def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:
+    """Return the site with more reasons for doubt; a site without new ones is returned unchanged."""
+    reasons = tuple(dict.fromkeys((*site.reasons, *doubts)))
+    return site if reasons == site.reasons else replace(site, reasons=reasons)
 
 
 def _fuse(job: StoredJob, study: str) -> Work:
@@ -254,7 +257,7 @@ def _fuse(job: StoredJob, study: str) -> Work:
         return MapResult(None, refusal.reason, str(refusal), origin)
 
     key = _key(job, "fuse", list(origin or ()), *(encode(site) for site in sites))
-    return Work(key, MapResult, compute, refused)
+    return Work(key, _key(job, "fuse"), MapResult, compute, refused)
 
 
 def _monoplane(job: StoredJob, name: str) -> Work:
@@ -284,7 +287,7 @@ def _monoplane(job: StoredJob, name: str) -> Work:
         return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
 
     key = _key(job, "monoplane", name, *(encode(view) for view in rejected), *(encode(view) for view in views))
-    return Work(key, SiteTracks, compute, refused)
+    return Work(key, _key(job, "monoplane"), SiteTracks, compute, refused)
 
 
 def _monoplane_view(
