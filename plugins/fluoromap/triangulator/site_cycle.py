@@ -15,8 +15,9 @@ from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixel
 from fluoromap.triangulator.uncertainty import (
     Motion,
     UncertaintyParams,
-    error_sources,
-    pixel_noise_px2,
+    bend_covariances_px2,
+    common_sources,
+    jacobians,
     visible_breathing,
 )
 
@@ -107,14 +108,13 @@ def locate_cycle(
     """
     start, pixels = moments.positions_mm, moments.pixels
     motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
-    sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
+    sources = common_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
     if jump is not None:
         sources = (*sources, jump_source(cameras, start, jump))
-    noise = pixel_noise_px2(pixels.covariances)
-    errors = noise + sum(source.pixels_px2() for source in sources)
-    seen = visible_breathing(cameras, start, params)
-    found = method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
-    covariances = np.einsum("piaib->piab", found.covariance_mm2(errors))
+    bends = bend_covariances_px2(jacobians(cameras, start), params)
+    noise = (pixels.covariances[0] + bends[0], pixels.covariances[1] + bends[1])
+    found = method.estimate_moments(cameras, pixels, start, visible_breathing(cameras, start, params))
+    covariances = found.covariances_mm2(noise, sources)
     return SiteCycle(moments.phases, moments.labels, found.points_mm, covariances)
 
 

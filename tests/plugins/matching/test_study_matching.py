@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
+from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import FrameChains, MatchedSite, Segmentation, Silent
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.matching import SiteRuns, match_study, study_matching
@@ -336,5 +336,3 @@ def test_a_corrected_site_alone_is_compared_and_matched_again(heart, monkeypatch
     assert gathered == ["S01"]
     assert context.computed == ["SiteComparison", "MatchedSite"]
     assert repr(again) == repr(match_study(sites, DEFAULT_CATALOGUE, Silent()))
-
-
