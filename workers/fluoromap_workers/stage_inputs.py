@@ -65,8 +65,6 @@ class Work:
     ----------
     key : str
         Hash of everything that the result depends on.
-    plugin : str
-        Hash of the plugin with its version and parameters: of everything that all partial results depend on.
     kind : type
         The dataclass of the result.
     compute : callable
@@ -75,14 +73,16 @@ class Work:
         Makes the result that says why the plugin refused.
     rows : callable, optional
         Makes the database rows that belong to a result.
+    plugin : str
+        Hash of the plugin with its version and parameters: of everything that all partial results depend on.
     """
 
     key: str
-    plugin: str
     kind: type[Any]
     compute: Callable[[Context], Any]
     refused: Callable[[Refusal], Any]
     rows: Callable[[Any], Iterable[Base]] | None = None
+    plugin: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +110,14 @@ def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
     The stage compares the plugin's version before it computes. A stored result needs no plugin.
     """
     stage = STAGES[claim.name]
-    work = _PREPARE[stage.name](StoredJob(session, claim.job_id, snapshot), claim.subject)
+    job = StoredJob(session, claim.job_id, snapshot)
+    work = _PREPARE[stage.name](job, claim.subject)
 
     def compute(context: Context) -> Any:
         _require_version(stage, snapshot)
         return work.compute(context)
 
-    return replace(work, compute=compute)
+    return replace(work, compute=compute, plugin=_key(job, stage.name))
 
 
 def _require_version(stage: Stage, snapshot: Snapshot) -> None:
@@ -167,7 +168,7 @@ def _segment(job: StoredJob, uid: str) -> Work:
         job, "segment", run.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames, px_per_mm,
         asdict(catalogue), run.model_dump(include={"corrections"}),
     )  # fmt: skip
-    return Work(key, _key(job, "segment"), Segmentation, compute, refused)
+    return Work(key, Segmentation, compute, refused)
 
 
 def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
@@ -211,7 +212,7 @@ def _match(job: StoredJob, study: str) -> Work:
     # A result's hash says whether it changed: the result itself is not read for the key.
     results = ((site, encode(cameras[uid]), segments[uid].result) for site, uid in views)
     key = _key(job, "match", asdict(catalogue), *(part for view in results for part in view))
-    return Work(key, _key(job, "match"), Matching, compute, refused)
+    return Work(key, Matching, compute, refused)
 
 
 def _triangulate(job: StoredJob, study: str) -> Work:
@@ -234,7 +235,7 @@ def _triangulate(job: StoredJob, study: str) -> Work:
         return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
     key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
-    return Work(key, _key(job, "triangulate"), Triangulation, compute, refused, rows)
+    return Work(key, Triangulation, compute, refused, rows)
 
 
 def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:
@@ -257,7 +258,7 @@ def _fuse(job: StoredJob, study: str) -> Work:
         return MapResult(None, refusal.reason, str(refusal), origin)
 
     key = _key(job, "fuse", list(origin or ()), *(encode(site) for site in sites))
-    return Work(key, _key(job, "fuse"), MapResult, compute, refused)
+    return Work(key, MapResult, compute, refused)
 
 
 def _monoplane(job: StoredJob, name: str) -> Work:
@@ -287,7 +288,7 @@ def _monoplane(job: StoredJob, name: str) -> Work:
         return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
 
     key = _key(job, "monoplane", name, *(encode(view) for view in rejected), *(encode(view) for view in views))
-    return Work(key, _key(job, "monoplane"), SiteTracks, compute, refused)
+    return Work(key, SiteTracks, compute, refused)
 
 
 def _monoplane_view(
