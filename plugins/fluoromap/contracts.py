@@ -214,7 +214,8 @@ class Run:
     """One cine as a segmenter gets it.
 
     frames : decoded one at a time. frame_times_ms : (n,), from the first frame on.
-    px_per_mm : at the isocentre. r_wave_frames : frames with R waves, where the file has them.
+    px_per_mm : at the isocentre. r_wave_frames : frames with R waves, where the file has them. content : hash of the file with
+    the frames; None where there is no file.
     """
 
     frames: FrameSource
@@ -222,6 +223,7 @@ class Run:
     px_per_mm: float
     pixels: PixelFacts
     r_wave_frames: tuple[int, ...] = ()
+    content: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (len(self.frames),), "frame_times_ms"))

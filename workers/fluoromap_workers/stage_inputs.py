@@ -152,7 +152,9 @@ def _segment(job: StoredJob, uid: str) -> Work:
 
     def compute(context: Context) -> Segmentation:
         frames = open_frames(files.checked_path(run.sha256), facts)
-        shown = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
+        shown = Run(
+            frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames, run.sha256,
+        )  # fmt: skip
         found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
         found = _returned(found, Segmentation, plugin.name)
         if len(found.frames) != facts.frames:

@@ -62,7 +62,7 @@ def _of_unit_errors(source: ErrorSource) -> Array:
 def separate_moments(cameras: Cameras, points_mm: Array) -> MomentEstimates:
     """Return points (p, N, 3) with the gain of unweighted least squares, each electrode separately."""
     p, n, _ = points_mm.shape
-    own = np.linalg.pinv(jacobians(cameras, points_mm).reshape(p, n, 4, 3))
+    own: Array = np.asarray(np.linalg.pinv(jacobians(cameras, points_mm).reshape(p, n, 4, 3)), dtype=np.float64)
     return MomentEstimates(points_mm, own, np.zeros((p, n, 3)), np.zeros((p, n, 4)))
 
 

@@ -146,7 +146,7 @@ def site_equations(
     def combined(sources: Sequence[ErrorSource]) -> Array:
         effects = [combine @ source.effect_px for source in sources]
         each = [effect @ source.covariance @ effect.T for source, effect in zip(sources, effects, strict=True)]
-        return np.sum(each, axis=0)
+        return np.asarray(np.sum(each, axis=0), dtype=np.float64)
 
     noise = pixel_noise_px2(pixels.covariances)
     # An electrode's own bend is no beat. Where pixels are known well, it would hide how far whole catheters move.
