@@ -163,21 +163,8 @@ def triangulate_maximum_likelihood(
     ndarray, shape (N, 3)
         World, mm.
     """
-    points = triangulate_linear(camera_a, camera_b, pixels_a, pixels_b)
-    views = (
-        (camera_a, pixels_a, np.linalg.inv(covariances_a_px2)),
-        (camera_b, pixels_b, np.linalg.inv(covariances_b_px2)),
-    )
-    for _ in range(STEPS):
-        normal = np.zeros((len(points), 3, 3))
-        gradient = np.zeros((len(points), 3))
-        for camera, pixels, weight in views:
-            jacobian = camera.jacobian(points)
-            weighted = np.einsum("nki,nkl->nil", jacobian, weight)
-            normal += weighted @ jacobian
-            gradient += np.einsum("nil,nl->ni", weighted, pixels - camera.project(points))
-        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
-        points = points + step
-        if len(step) == 0 or np.abs(step).max() < SETTLED_MM:
-            break
-    return points
+    pixels = TwoViewPixels((), (pixels_a[None], pixels_b[None]), (covariances_a_px2[None], covariances_b_px2[None]))
+    start = triangulate_linear(camera_a, camera_b, pixels_a, pixels_b)[None]
+    still = ErrorSource(np.zeros((1, 4 * len(pixels_a), 1)), np.zeros((1, 1)), ("breathing",))
+    found: Array = joint_moments((camera_a, camera_b), pixels, start, still).points_mm[0]
+    return found

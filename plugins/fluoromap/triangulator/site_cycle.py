@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -62,14 +63,14 @@ def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) 
     """Return the moments of a site's cycle; None where too few show its electrodes."""
     moments = [(pair.phase, pixels_in_both_views(pair)) for pair in pairs if pair.phase is not None]
     counts: dict[tuple[str, int], int] = {}
-    for _, pixels in moments:
-        for label in pixels.labels:
-            counts[label] = counts.get(label, 0) + 1
+    for shown, times in Counter(pixels.labels for _, pixels in moments).items():
+        for label in shown:
+            counts[label] = counts.get(label, 0) + times
     labels = tuple(label for label, count in counts.items() if count >= IN_MOST_PAIRS * len(moments))
     whole: dict[float, TwoViewPixels] = {}
     for phase, pixels in moments:
         # Beats timed by R waves repeat phase 0; one moment of each phase is enough.
-        if phase not in whole and set(labels) <= set(pixels.labels):
+        if phase not in whole and (pixels.labels == labels or set(labels) <= set(pixels.labels)):
             whole[phase] = pixels.only(labels)
     if not labels or len(whole) < FEWEST_MOMENTS:
         return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -62,7 +64,13 @@ def pixels_in_both_views(pair: PhasePair) -> TwoViewPixels:
 
 
 def _labels(chains: Sequence[NamedChain]) -> tuple[tuple[str, int], ...]:
-    return tuple((chain.catheter, electrode) for chain in chains for electrode in chain.electrodes)
+    return tuple(itertools.chain.from_iterable(_labels_of(chain.catheter, chain.electrodes) for chain in chains))
+
+
+@functools.lru_cache(maxsize=256)
+def _labels_of(catheter: str, electrodes: tuple[int, ...]) -> tuple[tuple[str, int], ...]:
+    """Return the labels of a chain; hundreds of frames show the same electrodes."""
+    return tuple((catheter, electrode) for electrode in electrodes)
 
 
 def _stacked(chains: Sequence[NamedChain]) -> tuple[Array, ...]:
