@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import delete, update
+from sqlalchemy import delete, select
 
-from fluoromap.contracts import Array, Silent
+from fluoromap.contracts import RejectedSite, Silent
 from fluoromap.matching import study_matching
+from fluoromap.reasons import Reason
 from fluoromap.segmenter import run_segmentation
 from fluoromap.triangulator import study_triangulation
 from fluoromap.triangulator.site_locator import SiteLocator
 from fluoromap_service.jobs import job_life
 from fluoromap_service.store import files
-from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Job, StageResult, StageRow
+from fluoromap_service.store.engine import writing
+from fluoromap_service.store.models import StageResult, StageRow
 from fluoromap_workers.partial_results import StageContext
 
 COUNTED: tuple[tuple[Any, str], ...] = (
@@ -44,7 +45,10 @@ print("\\n" + json.dumps([counts, job["id"], job["state"]]))
 
 
 def count(replace_by: Any) -> dict[str, int]:
-    """Count the calls of the functions that compute the parts; ``replace_by`` is ``setattr``, or one that undoes itself."""
+    """Count the calls of the functions that compute the parts.
+
+    ``replace_by`` is ``setattr``, or a function that can undo it.
+    """
     counts: dict[str, int] = {}
     for owner, name in COUNTED:
         counts[name] = 0
@@ -74,79 +78,73 @@ def _job(service: TestClient, study_path: str) -> dict[str, Any]:
 
 
 def _correct(service: TestClient, study_path: str, job: dict[str, Any], moved_px: float) -> None:
-    """Move the tip of the mapping catheter in a frame of the third site that is far from its diastole."""
+    """Move the mapping catheter's tip in one frame.
+
+    The frame belongs to the third site and is far from its diastole.
+    """
     site = service.get(f"{study_path}/sites").json()["items"][2]
     points = service.get(f"/v1/jobs/{job['id']}/points").json()["points"]
     diastole = next(point["views"]["a"]["frame"] for point in points if point["site"] == site["site"])
     for frame in sorted(range(1, 25), key=lambda frame: -abs(frame - diastole)):
         path = f"{study_path}/instances/{site['view_a']}/frames/{frame}/electrodes"
-        shown = service.get(path).json()
-        if any(electrode["catheter"] == "mapping" for electrode in shown):
+        shown = [each for each in service.get(path).json() if each["catheter"] == "mapping"]
+        if shown:
             break
     keys = ("catheter", "electrode", "u_px", "v_px", "sd_px")
     electrodes = [{key: electrode[key] for key in keys} for electrode in shown]
-    next(each for each in electrodes if each["catheter"] == "mapping")["u_px"] += moved_px
+    electrodes[0]["u_px"] += moved_px
     assert service.put(path, json=electrodes).status_code == 200
 
 
-@pytest.fixture
-def corrected(service: TestClient, study_path: str, simulated_study: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A study after its first job, with a correction in one frame of one run."""
-    counts = count(monkeypatch.setattr)
-    _send(service, study_path, simulated_study)
-    job = _job(service, study_path)
-    assert counts == {"_detect": 10, "compare_views": 5, "_matched": 5, "_check_study": 1, "locate": 5}
-    monkeypatch.undo()
-    _correct(service, study_path, job, 2.0)
-    return study_path
-
-
-def test_a_corrected_frame_computes_its_own_site_again_in_another_process(service: TestClient, corrected: str) -> None:
-    ended = subprocess.run(
-        [sys.executable, "-c", _ANOTHER_PROCESS, __file__, corrected], capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 0, ended.stderr
-    counts, job, state = json.loads(ended.stdout.splitlines()[-1])
-    assert state == "succeeded"
-    assert counts == {"_detect": 0, "compare_views": 1, "_matched": 1, "_check_study": 0, "locate": 1}
-    # A job without partial results of earlier jobs comes to the same points.
-    found = service.get(f"/v1/jobs/{job}/points").json()["points"]
-    _forget_results()
-    again = _job(service, corrected)
-    assert service.get(f"/v1/jobs/{again['id']}/points").json()["points"] == found
-
-
-def _forget_results() -> None:
-    """Make the next job compute everything."""
+def _damage_results() -> None:
+    """Overwrite all stored results, so that the next job computes everything."""
     with writing() as session:
         session.execute(delete(StageResult))
-        session.execute(update(StageRow).values(result=None))
+        for sha256 in session.scalars(select(StageRow.result).where(StageRow.result.is_not(None))):
+            assert sha256 is not None
+            files.path_of(sha256).write_bytes(b"damaged")
 
 
-def test_a_damaged_earlier_result_is_computed_again(service: TestClient, corrected: str) -> None:
-    with reading() as session:
-        for row in session.query(StageRow).filter(StageRow.name.in_(("match", "triangulate"))):
-            assert row.result is not None
-            files.path_of(row.result).write_bytes(b"damaged")
-    assert _job(service, corrected)["state"] == "succeeded"
+def test_a_corrected_frame_computes_its_own_site_again_in_another_process(
+    service: TestClient, study_path: str, simulated_study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        counts = count(patched.setattr)
+        _send(service, study_path, simulated_study)
+        job = _job(service, study_path)
+    assert counts == {"_detect": 10, "compare_views": 5, "_matched": 5, "_check_study": 1, "locate": 5}
+    _correct(service, study_path, job, 2.0)
+    ended = subprocess.run(
+        [sys.executable, "-c", _ANOTHER_PROCESS, __file__, study_path], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    counts, again, state = json.loads(ended.stdout.splitlines()[-1])
+    assert state == "succeeded"
+    assert counts == {"_detect": 0, "compare_views": 1, "_matched": 1, "_check_study": 0, "locate": 1}
+
+    _damage_results()
+    whole = _job(service, study_path)
+    assert whole["state"] == "succeeded"
+    points = [service.get(f"/v1/jobs/{of}/points").json()["points"] for of in (again, whole["id"])]
+    assert points[0] == points[1]
 
 
-def test_a_partial_result_is_used_for_equal_inputs_only(service: TestClient, corrected: str) -> None:
-    with reading() as session:
-        job = session.query(Job).order_by(Job.created.desc()).first()
-        assert job is not None
-        row = session.query(StageRow).filter_by(job_id=job.id, name="match").one()
-        held = job_life.Claim(row.id, job.id, 1, "match", row.subject)
-    computed: list[Array] = []
+def test_a_partial_result_is_used_for_equal_inputs_only(data_dir: Path) -> None:
+    held = job_life.Claim(1, "no such job", 1, "match", "study")
+    computed: list[object] = []
 
-    def recall(plugin: str, *inputs: object) -> None:
-        context = StageContext(Silent(), held, plugin)
-        for _ in range(2):
-            context.recall(job_life.Claim, inputs, lambda: computed.append(np.zeros(1)) or held)
+    def recall(context: StageContext, *inputs: object) -> RejectedSite:
+        def compute() -> RejectedSite:
+            computed.append(inputs)
+            return RejectedSite("S01", (Reason.NO_ELECTRODES,))
 
-    recall("a", "S01", np.arange(3.0))
-    assert len(computed) == 1, "the same stage recalls its own partial results"
-    recall("a", "S01", np.arange(3))
-    recall("a", "S02", np.arange(3.0))
-    recall("b", "S01", np.arange(3.0))
+        return context.recall(RejectedSite, inputs, compute)
+
+    context = StageContext(Silent(), held, "a")
+    first = recall(context, "S01", np.arange(3.0), None)
+    assert recall(context, "S01", np.arange(3.0), None) == first
+    assert len(computed) == 1
+    recall(context, "S01", np.arange(3), None)
+    recall(context, "S02", np.arange(3.0), None)
+    recall(StageContext(Silent(), held, "b"), "S01", np.arange(3.0), None)
     assert len(computed) == 4

@@ -104,7 +104,10 @@ class StageContext:
 
 
 def _earlier_results(held: Claim) -> Iterator[Mapping[str, Block]]:
-    """Return the partial results of the study's newest results of this stage, each read when it is needed."""
+    """Return the partial results of the stage's newest results in the study.
+
+    Each file is read when it is needed.
+    """
     with reading() as session:
         study = select(Job.study_id).where(Job.id == held.job_id).scalar_subquery()
         jobs = session.scalars(

@@ -241,7 +241,10 @@ def _triangulate(job: StoredJob, study: str) -> Work:
 
 
 def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:
-    """Return the site with more reasons for doubt; a site without new ones is returned unchanged."""
+    """Return the site with more reasons for doubt.
+
+    A site without new ones is returned unchanged.
+    """
     reasons = tuple(dict.fromkeys((*site.reasons, *doubts)))
     return site if reasons == site.reasons else replace(site, reasons=reasons)
 

@@ -70,8 +70,8 @@ class _NamedSite:
         runs = self.compared.runs
         # The order of the names is part of the result.
         pairs = tuple(self.pairs.items())
-        alternative = None if self.alternative is None else tuple(self.alternative.items())
-        return runs.site, *runs.content, catalogue, pairs, alternative, self.probability, self.notes
+        alternative = None if self.alternative is None else (tuple(self.alternative.items()), self.probability)
+        return runs.site, *runs.content, catalogue, pairs, alternative, self.notes
 
 
 class _Views:

@@ -195,7 +195,7 @@ def _detect(
     field: FieldMask,
     context: Context,
 ) -> RunDetections:
-    """Find the chains of every frame, and of the mean of the quiet frames round diastole."""
+    """Find the chains of every frame, and of their diastolic mean."""
     count = len(run.frames)
     meter = MotionMeter((log_image(index) for index in evenly_spaced_frames(count)), field.inside)
     motion = np.zeros(count)

@@ -11,7 +11,9 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def step(matrices, points, pixels, weights, common, variance, own, shared, row):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Make one Gauss-Newton step of all points, in place, and return its largest coordinate.
+    """Move all points by one Gauss-Newton step, in place.
+
+    The result is the largest coordinate of the step.
 
     Parameters
     ----------

@@ -187,7 +187,10 @@ def information(rows: Sequence[SiteEquations], linearised_at: Array) -> list[Inf
 
 
 def log_evidences(hearts: Sequence[Information], prior: Array) -> Array:
-    """Return the log evidence (h,) of each heart, up to a constant, of unknowns drawn from ``prior`` (u, u)."""
+    """Return the log evidence (h,) of each heart, up to a constant.
+
+    The unknowns are drawn from ``prior`` (u, u).
+    """
     matrices, vectors = np.array([heart.matrix for heart in hearts]), np.array([heart.vector for heart in hearts])
     each = np.eye(len(prior)) + matrices @ prior
     means = (prior @ np.linalg.solve(each, vectors[..., None]))[..., 0]

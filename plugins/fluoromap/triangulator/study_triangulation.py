@@ -189,7 +189,10 @@ def _usable_sites(
 
 
 def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyParams) -> SiteLook:
-    """Locate a site for the checks of the study, or say why it cannot be located."""
+    """Locate a site for the checks of the study.
+
+    The result says why a site cannot be located.
+    """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
     nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)))
     angle = ray_angle_deg(*cameras)

@@ -272,7 +272,10 @@ def common_sources(
     gantry_covariance: Array,
     motion: Motion | None,
 ) -> tuple[ErrorSource, ...]:
-    """Return the sources of :func:`error_sources` that displace several electrodes alike: all but their own bends."""
+    """Return the error sources that displace several electrodes alike.
+
+    These are the sources of :func:`error_sources` without the electrodes' own bends.
+    """
     jacobian = jacobians(cameras, points_world_mm)
     gantry: tuple[Share, ...] = (*(*("angles",) * 3, *("source_distances",) * 3) * 2, *("source_distances",) * 2)
     sources = [

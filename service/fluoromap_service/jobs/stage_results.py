@@ -89,9 +89,9 @@ def load(kind: type[T], stage: StageRow) -> T:
 
 
 def load_later(kind: type[T], stage: StageRow) -> T:
-    """Return the result of a stage that is done; its file is read when the first field is read.
+    """Return the result of a stage that is done, without reading it.
 
-    That may raise the errors of :func:`load`. ``kind`` is a dataclass without slots.
+    Its file is read when the first field is read. That may raise the errors of :func:`load`. ``kind`` is a dataclass without slots.
     """
     sha256 = stage.result
     if sha256 is None:

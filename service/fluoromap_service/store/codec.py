@@ -6,7 +6,7 @@ number. Arrays of one type and shape lie together too, each different one once. 
 its own, and thousands of small arrays cost little.
 
 Blocks follow the arrays. A block is the stored form of one value by itself: a dataclass that asks for it (``stored_apart``), or
-a partial result that a later job may use again. A block is copied into another stored result as it is. Its fields are decoded
+a partial result that a later job may use again. A block is copied into another stored result unchanged. Its fields are decoded
 when they are first read.
 """
 
@@ -128,7 +128,10 @@ def deferred(kind: type[T], sha256: str, read: Callable[[], bytes]) -> T:
 
 
 def block_of(value: Any, *, finite: bool = True) -> Block:
-    """Return the stored form of one value; it is made only once for a value that is stored apart."""
+    """Return the stored form of one value.
+
+    The form of a value that is stored apart is made only once.
+    """
     source = _source_of(value)
     if source is not None:
         return Block(source.sha256, source.content)
@@ -219,7 +222,10 @@ def _digested(value: Any) -> bytes:
 
 
 def block_hash(value: Any) -> str:
-    """Return the hash of a value's stored form, which is read only where it must be made."""
+    """Return the hash of a value's stored form.
+
+    A value that was read from the store knows it.
+    """
     source = _source_of(value)
     return source.sha256 if source is not None else block_of(value).sha256
 
@@ -436,7 +442,7 @@ def _deferred_kind(kind: Any) -> Any:
 
 
 def _plain_kind(kind: Any) -> Any:
-    """Return the dataclass itself for one whose fields are decoded when they are read."""
+    """Return the dataclass behind one with deferred fields."""
     return kind.__dict__.get("_decoded", kind)
 
 
