@@ -16,9 +16,9 @@ from starlette.middleware.cors import CORSMiddleware
 
 from fluoromap_service.api.dicomweb import retrieve, search, store
 from fluoromap_service.api.http import file_pool, problems
-from fluoromap_service.api.http.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
 from fluoromap_service.api.http.middleware.audit_trail import FLUSH_SECONDS, Acts, AuditTrail
+from fluoromap_service.api.http.middleware.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.disk_space import DiskSpace
 from fluoromap_service.api.http.middleware.request_body import RequestBody
 from fluoromap_service.api.http.middleware.security_headers import SecurityHeaders

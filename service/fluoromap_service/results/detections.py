@@ -9,6 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Chain, Matching, NamedChain, Segmentation
+from fluoromap.matching.likely_names import likely_names
 from fluoromap_service.jobs.stage_results import load, stage_of
 from fluoromap_service.store.models import Job, StageRow, StageState
 from fluoromap_service.study.snapshot import Snapshot
@@ -65,29 +66,14 @@ def _newest_segmentation(session: Session, study_id: str, uid: str) -> StageRow 
 def _electrodes(all_chains: tuple[Chain, ...], named: tuple[NamedChain, ...]) -> list[DetectedElectrode]:
     # A person may have deleted the correction after the job: a chain set by hand is no detection.
     chains = tuple(chain for chain in all_chains if not chain.manual)
+    of_track = {chain.track: chain.catheter for chain in named}
+    matched = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
     found: list[DetectedElectrode] = []
-    for chain, name in zip(chains, _names(chains, named), strict=True):
+    for chain, name in zip(chains, likely_names(chains, matched), strict=True):
         for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
             sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
             found.append(DetectedElectrode(name, electrode, float(u), float(v), sd))
     return found
-
-
-def _names(chains: tuple[Chain, ...], named: tuple[NamedChain, ...]) -> list[str | None]:
-    """Return a catheter for each chain, none twice.
-
-    It is the catheter that the job's matching chose, else the most probable kind.
-    """
-    of_track = {chain.track: chain.catheter for chain in named}
-    names = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
-    likely = sorted(
-        ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
-        key=lambda item: (-item[0], item[1]),
-    )
-    for _, index, name in likely:
-        if names[index] is None and name not in names:
-            names[index] = name
-    return names
 
 
 def _named_chains(session: Session, job_id: str, uid: str) -> dict[int, tuple[NamedChain, ...]]:

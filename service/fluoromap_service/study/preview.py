@@ -12,7 +12,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Chain, Run
+from fluoromap.contracts import Run
+from fluoromap.matching.likely_names import likely_names
 from fluoromap_service.dicom import InstanceFacts, frame_to_8bit, open_frames
 from fluoromap_service.dicom.facts import Pair
 
@@ -81,7 +82,7 @@ def preview_electrodes(
         scale = ScaleSource.FOUND
     electrodes = tuple(
         PreviewElectrode(name, number, float(u), float(v), math.sqrt(max(float(covariance.trace()) / 2, 0.0)))
-        for chain, name in zip(seen.chains, _names(seen.chains), strict=True)
+        for chain, name in zip(seen.chains, likely_names(seen.chains), strict=True)
         for number, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True)
     )
     return FramePreview(seen.px_per_mm, scale, seen.inverted, electrodes)
@@ -105,16 +106,3 @@ def preview_png(
     stored = io.BytesIO()
     picture.save(stored, "PNG")
     return stored.getvalue()
-
-
-def _names(chains: tuple[Chain, ...]) -> list[str | None]:
-    """Return the most probable catheter of each chain, none twice."""
-    names: list[str | None] = [None] * len(chains)
-    likely = sorted(
-        ((probability, index, name) for index, chain in enumerate(chains) for name, probability in chain.kinds),
-        key=lambda item: (-item[0], item[1]),
-    )
-    for _, index, name in likely:
-        if names[index] is None and name not in names:
-            names[index] = name
-    return names

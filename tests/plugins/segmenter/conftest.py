@@ -1,27 +1,11 @@
 import numpy as np
 import pytest
+from frame_sources import Frames
 
 from fluoromap.contracts import PixelFacts, Run
 from fluoromap.phantom import StudySpec, simulate_study
 
 PX_PER_MM = 512 / 178 * 2
-
-
-class Frames:
-    """Frames in an array, as a frame source."""
-
-    def __init__(self, frames):
-        self._frames = np.asarray(frames)
-        self.shape = self._frames.shape[1:]
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-    def __iter__(self):
-        return iter(self._frames)
 
 
 @pytest.fixture

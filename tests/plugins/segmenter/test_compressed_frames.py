@@ -1,10 +1,8 @@
 """Stated places hold in compressed pictures: compression hides noise from its measurement and moves electrodes all the same."""
 
-import io
-
 import numpy as np
 import pytest
-from PIL import Image
+from frame_sources import Frames, displayed
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
@@ -19,34 +17,9 @@ PX_PER_MM = 4.1
 FRAMES, SEEDS = 4, (9711, 9713)
 
 
-class Frames:
-    def __init__(self, frames):
-        self._frames = frames
-        self.shape = frames[0].shape
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-    def __iter__(self):
-        return iter(self._frames)
-
-
 def gantry(primary_deg):
     spacing = 2.0 / PX_PER_MM
     return Gantry(primary_deg, 0.0, 1000.0, 500.0, (spacing, spacing), 512, 512)
-
-
-def displayed(frame, quality):
-    """Return the frame as a lab shows and stores it: logarithm, 8 bits, JPEG."""
-    level = np.log(frame.astype(np.float64) + 1.0)
-    low, high = np.percentile(level, [0.5, 99.5])
-    stored = io.BytesIO()
-    eight = (np.clip((level - low) / (high - low), 0.0, 1.0) * 255).astype(np.uint8)
-    Image.fromarray(eight).save(stored, "JPEG", quality=quality)
-    return np.asarray(Image.open(stored))
 
 
 @pytest.fixture(scope="module")

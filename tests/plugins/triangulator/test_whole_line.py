@@ -1,10 +1,8 @@
 """From pictures as a laboratory stores them to the mapping tip: decapolar reference, hexapolar and ablation catheter."""
 
-import io
-
 import numpy as np
 import pytest
-from PIL import Image
+from frame_sources import Frames, displayed
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import CHI2_95_3D, PixelFacts, Run, Silent
@@ -28,33 +26,8 @@ FRAMES = 16
 SPACING = 292.0 / 512
 
 
-class Frames:
-    def __init__(self, frames):
-        self._frames = frames
-        self.shape = frames[0].shape
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-    def __iter__(self):
-        return iter(self._frames)
-
-
-def displayed(frame):
-    """Return the frame as a lab shows and stores it: logarithm, 8 bits, JPEG."""
-    level = np.log(frame.astype(np.float64) + 1.0)
-    low, high = np.percentile(level, [0.5, 99.5])
-    stored = io.BytesIO()
-    eight = (np.clip((level - low) / (high - low), 0.0, 1.0) * 255).astype(np.uint8)
-    Image.fromarray(eight).save(stored, "JPEG", quality=85)
-    return np.asarray(Image.open(stored))
-
-
 def segmented(run):
-    frames = Frames([displayed(run.frames[k]) for k in range(FRAMES)])
+    frames = Frames([displayed(run.frames[k], quality=85) for k in range(FRAMES)])
     shown = Run(frames, run.frame_times_ms, camera_from_gantry(run.gantry).px_per_mm, PixelFacts(True, 8, False))
     return LearnedChain().segment(shown, CATALOGUE, {}, Silent())
 

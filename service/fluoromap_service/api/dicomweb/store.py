@@ -7,22 +7,14 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import parse_options_header
 from starlette.requests import ClientDisconnect
 
 from fluoromap_service.api.dicomweb.addresses import instance_url, study_url
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.multipart import MultipartBody, malformed
 from fluoromap_service.api.http.security import Writer
-from fluoromap_service.api.study.uploads import (
-    MOST_PARTS,
-    ArrivingPart,
-    Part,
-    arriving_file,
-    in_upload_thread,
-    malformed,
-    write_all,
-)
+from fluoromap_service.api.study.uploads import ArrivingPart, Part, arriving_file, in_upload_thread, write_all
 from fluoromap_service.dicom import InstanceFacts, read_instance
 from fluoromap_service.dicom.store_statuses import status_of
 from fluoromap_service.problem import Problem
@@ -37,56 +29,17 @@ DICOM_JSON = "application/dicom+json"
 Json = dict[str, Any]
 
 
-class _RelatedParts:
-    """The callbacks of a multipart parser: each part is one DICOM file."""
+class _RelatedParts(MultipartBody):
+    """A body of DICOM files, one in each part."""
 
     def __init__(self, boundary: bytes, stack: ExitStack) -> None:
+        super().__init__(boundary)
         self._stack = stack
-        self._header = (b"", b"")
-        self._content_type = b""
         self._arriving: ArrivingPart | None = None
         self.parts: list[Part] = []
-        self.ended = False
-        self._parser = MultipartParser(
-            boundary,
-            {
-                "on_part_begin": self._on_part_begin,
-                "on_header_field": self._on_header_field,
-                "on_header_value": self._on_header_value,
-                "on_header_end": self._on_header_end,
-                "on_headers_finished": self._on_headers_finished,
-                "on_part_data": self._on_part_data,
-                "on_part_end": self._on_part_end,
-                "on_end": self._on_end,
-            },
-        )
 
-    def write(self, data: bytes) -> None:
-        try:
-            self._parser.write(data)
-        except FormParserError:
-            raise malformed() from None
-
-    def _on_part_begin(self) -> None:
-        if len(self.parts) >= MOST_PARTS:
-            raise Problem(
-                413, "too_many_parts", f"A request may have {MOST_PARTS} parts; send the rest in another request."
-            )
-        self._header, self._content_type = (b"", b""), b""
-
-    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
-        self._header = (self._header[0] + data[start:end], self._header[1])
-
-    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
-        self._header = (self._header[0], self._header[1] + data[start:end])
-
-    def _on_header_end(self) -> None:
-        if self._header[0].lower() == b"content-type":
-            self._content_type = parse_options_header(self._header[1])[0]
-        self._header = (b"", b"")
-
-    def _on_headers_finished(self) -> None:
-        if self._content_type != b"application/dicom":
+    def begin_part(self, headers: dict[bytes, bytes]) -> None:
+        if parse_options_header(headers.get(b"content-type"))[0] != b"application/dicom":
             raise Problem(
                 415,
                 "unsupported_media_type",
@@ -94,17 +47,14 @@ class _RelatedParts:
             )
         self._arriving = arriving_file(self._stack, None)
 
-    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+    def add(self, data: bytes) -> None:
         if self._arriving is not None:
-            self._arriving.write(data[start:end])
+            self._arriving.write(data)
 
-    def _on_part_end(self) -> None:
+    def end_part(self) -> None:
         if self._arriving is not None:
             self.parts.append(self._arriving.finish())
         self._arriving = None
-
-    def _on_end(self) -> None:
-        self.ended = True
 
 
 @router.post("/studies")

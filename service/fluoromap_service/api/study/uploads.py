@@ -13,14 +13,13 @@ from typing import Any, BinaryIO, TypeVar
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import parse_options_header
 from starlette.requests import ClientDisconnect
 
+from fluoromap_service.api.http.multipart import MultipartBody, malformed
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import disk, files
 
-MOST_PARTS = 2000
 PART_BYTES = 1 << 20
 """Bytes of a body that are written at once."""
 
@@ -60,60 +59,19 @@ class ArrivingPart:
         return Part(self.path, self.digest.hexdigest(), self.file_name)
 
 
-class _Form:
-    """The callbacks of a multipart parser: parts named ``file`` go to disk, the field ``site`` to memory."""
+class _Form(MultipartBody):
+    """A form: its parts named ``file`` go to disk, its field ``site`` to memory."""
 
     def __init__(self, boundary: bytes, stack: ExitStack) -> None:
+        super().__init__(boundary)
         self._stack = stack
-        self._header = (b"", b"")
-        self._disposition = b""
         self._arriving: ArrivingPart | None = None
         self._text: bytearray | None = None
-        self._parts = 0
         self.files: list[Part] = []
         self.site: str | None = None
-        self.ended = False
-        self._parser = MultipartParser(
-            boundary,
-            {
-                "on_part_begin": self._on_part_begin,
-                "on_header_field": self._on_header_field,
-                "on_header_value": self._on_header_value,
-                "on_header_end": self._on_header_end,
-                "on_headers_finished": self._on_headers_finished,
-                "on_part_data": self._on_part_data,
-                "on_part_end": self._on_part_end,
-                "on_end": self._on_end,
-            },
-        )
 
-    def write(self, data: bytes) -> None:
-        try:
-            self._parser.write(data)
-        except FormParserError:
-            raise malformed() from None
-
-    def _on_part_begin(self) -> None:
-        self._parts += 1
-        if self._parts > MOST_PARTS:
-            raise Problem(
-                413, "too_many_parts", f"A request may have {MOST_PARTS} parts; send the rest in another request."
-            )
-        self._header, self._disposition = (b"", b""), b""
-
-    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
-        self._header = (self._header[0] + data[start:end], self._header[1])
-
-    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
-        self._header = (self._header[0], self._header[1] + data[start:end])
-
-    def _on_header_end(self) -> None:
-        if self._header[0].lower() == b"content-disposition":
-            self._disposition = self._header[1]
-        self._header = (b"", b"")
-
-    def _on_headers_finished(self) -> None:
-        _, options = parse_options_header(self._disposition)
+    def begin_part(self, headers: dict[bytes, bytes]) -> None:
+        _, options = parse_options_header(headers.get(b"content-disposition"))
         name = options.get(b"name", b"").decode("utf-8", "replace")
         if name == "file":
             sent_name = options.get(b"filename")
@@ -127,11 +85,11 @@ class _Form:
                 [("multipart/form-data", "a part with another name, or without one")],
             )  # fmt: skip
 
-    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+    def add(self, data: bytes) -> None:
         if self._arriving is not None:
-            self._arriving.write(data[start:end])
+            self._arriving.write(data)
         elif self._text is not None:
-            self._text += data[start:end]
+            self._text += data
             if len(self._text) > _LONGEST_FIELD:
                 raise Problem(
                     422,
@@ -140,7 +98,7 @@ class _Form:
                     [("site", "too long")],
                 )
 
-    def _on_part_end(self) -> None:
+    def end_part(self) -> None:
         if self._arriving is not None:
             self.files.append(self._arriving.finish())
         elif self._text is not None:
@@ -152,9 +110,6 @@ class _Form:
                 ) from None
         self._arriving = self._text = None
 
-    def _on_end(self) -> None:
-        self.ended = True
-
 
 def arriving_file(stack: ExitStack, file_name: str | None) -> ArrivingPart:
     """Return a new file of the store.
@@ -163,11 +118,6 @@ def arriving_file(stack: ExitStack, file_name: str | None) -> ArrivingPart:
     """
     path = stack.enter_context(files.incoming())
     return ArrivingPart(path, file_name and file_name[:1000], stack.enter_context(path.open("wb")))
-
-
-def malformed() -> Problem:
-    """Return the problem of a broken multipart body."""
-    return Problem(400, "malformed", "The multipart body is malformed or ends too early; send the request again.")
 
 
 async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str | None]:

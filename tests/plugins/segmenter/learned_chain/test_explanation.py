@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frame_sources import Frames
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
@@ -13,21 +14,6 @@ from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 PX_PER_MM = 512 / 178 * 2
 HIGHEST = 4095
-
-
-class Frames:
-    def __init__(self, frames):
-        self._frames = [np.asarray(frame) for frame in frames]
-        self.shape = self._frames[0].shape
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-    def __iter__(self):
-        return iter(self._frames)
 
 
 def run_of(frames):
