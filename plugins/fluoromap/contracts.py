@@ -8,10 +8,10 @@ of the top-left pixel. World points are millimetres along DICOM patient axes (LP
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 View = Literal["a", "b"]
+T = TypeVar("T")
 
 CHI2_95_3D = 7.814727903251179
 """95th percentile of the chi-squared distribution with 3 degrees of freedom: a 95 % ellipsoid's squared radius."""
@@ -60,15 +61,34 @@ class Context(Protocol):
     def check(self) -> None:
         """Raise :class:`StageStopped` when the work is no longer wanted."""
 
+    def recall(self, kind: type[T], inputs: tuple[object, ...], compute: Callable[[], T]) -> T:
+        """Return a partial result from an earlier job of the study, or compute it.
+
+        A correction changes one run. With this method a stage computes again only the parts that depend on that run.
+
+        Parameters
+        ----------
+        kind : type
+            Dataclass of the partial result: numbers, strings, enums, arrays, tuples and dataclasses of them.
+        inputs : tuple
+            Everything that the partial result depends on, besides the plugin, its version and its parameters. A dataclass counts
+            with all its fields.
+        compute : callable
+            Computes the partial result.
+        """
+
 
 class Silent:
-    """A :class:`Context` for notebooks and tests: it reports nothing and never stops."""
+    """A :class:`Context` for notebooks and tests: it reports nothing, never stops and remembers nothing."""
 
     def progress(self, fraction: float) -> None:
         pass
 
     def check(self) -> None:
         pass
+
+    def recall(self, kind: type[T], inputs: tuple[object, ...], compute: Callable[[], T]) -> T:
+        return compute()
 
 
 class Grade(StrEnum):
@@ -194,7 +214,8 @@ class Run:
     """One cine as a segmenter gets it.
 
     frames : decoded one at a time. frame_times_ms : (n,), from the first frame on.
-    px_per_mm : at the isocentre. r_wave_frames : frames with R waves, where the file has them.
+    px_per_mm : at the isocentre. r_wave_frames : frames with R waves, where the file has them. content : hash of the file with
+    the frames; None where there is no file.
     """
 
     frames: FrameSource
@@ -202,6 +223,7 @@ class Run:
     px_per_mm: float
     pixels: PixelFacts
     r_wave_frames: tuple[int, ...] = ()
+    content: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (len(self.frames),), "frame_times_ms"))
@@ -355,6 +377,9 @@ class MatchedSite:
     alternative : the next best pairing of the catheters across the views, unless it can be ruled out.
     """
 
+    stored_apart: ClassVar[bool] = True
+    """Each site is stored by itself: a job stores an unchanged site again without decoding it."""
+
     site: str
     camera_a: Camera
     camera_b: Camera
@@ -467,6 +492,9 @@ class LocatedSite:
     variation : of the study that contains the site. a_priori : the points with the covariances of any gantry and any heart;
     cycle has these too. A correction at another site changes neither, so that no track has to be computed again.
     """
+
+    stored_apart: ClassVar[bool] = True
+    """Each site is stored by itself, like :class:`MatchedSite`."""
 
     site: str
     camera_a: Camera

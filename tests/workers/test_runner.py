@@ -232,7 +232,7 @@ def test_a_plugin_of_another_version_is_not_run(stage: int, monkeypatch: pytest.
 
 
 def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*arguments: Any) -> str:
+    def full(*arguments: Any, **named: Any) -> str:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files, "keep", full)
@@ -243,7 +243,7 @@ def test_a_full_disk_leaves_the_stage_to_another_attempt(stage: int, monkeypatch
 
 
 def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*arguments: Any) -> str:
+    def broken(*arguments: Any, **named: Any) -> str:
         raise RuntimeError("a name that must stay secret")
 
     monkeypatch.setattr(files, "keep", broken)

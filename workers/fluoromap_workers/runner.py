@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -13,7 +14,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 from structlog.typing import FilteringBoundLogger as BoundLogger
 
-from fluoromap.contracts import Context, Refusal, StageStopped
+from fluoromap.contracts import Refusal, StageStopped
 from fluoromap_service.jobs import job_life
 from fluoromap_service.jobs.job_life import Claim, StoredResult
 from fluoromap_service.jobs.stage_results import load_file, remember
@@ -24,6 +25,7 @@ from fluoromap_service.store.files import BrokenFile
 from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
 from fluoromap_workers.heartbeat import Heartbeat
+from fluoromap_workers.partial_results import Connection, StageContext
 from fluoromap_workers.stage_inputs import PluginChanged, Work, prepare
 
 LONGEST_MESSAGE = 500
@@ -87,7 +89,7 @@ def run(stage_id: int, worker: str, place: Place = THIS_PROCESS) -> None:
         place.run(held)
 
 
-def work(held: Claim, context: Context) -> None:
+def work(held: Claim, connection: Connection) -> None:
     """Run a claimed stage and store its end.
 
     A stage that stops because nobody wants it stays claimed.
@@ -95,7 +97,7 @@ def work(held: Claim, context: Context) -> None:
     bound = log.bind(job=held.job_id, stage=held.name, attempt=held.attempt)
     bound.info("stage_started")
     try:
-        _run(held, context, bound)
+        _run(held, connection, bound)
     except StageStopped:
         bound.info("stage_stopped")
     except (OperationalError, InterfaceError, PoolTimeout, OSError) as error:
@@ -146,7 +148,7 @@ def finish_known(job_id: str) -> None:
         log.warning("nothing_finished_at_once", job=job_id, error=type(error).__name__)
 
 
-def _run(held: Claim, context: Context, bound: BoundLogger) -> None:
+def _run(held: Claim, connection: Connection, bound: BoundLogger) -> None:
     with reading() as session:
         work = _prepare(session, held)
         stored = _stored(session, work)
@@ -157,26 +159,28 @@ def _run(held: Claim, context: Context, bound: BoundLogger) -> None:
         if taken:
             bound.info("stage_done", reused=True)
             return
-    result, content = _computed(held, work, context)
+    result, content = _computed(held, work, StageContext(connection, held, work.plugin))
     rows = tuple(work.rows(result)) if work.rows else ()
-    context.check()
-    with files.incoming() as path, writing() as session:
+    connection.check()
+    sha256 = hashlib.sha256(content).hexdigest()
+    with files.incoming() as path:
         path.write_bytes(content)
-        sha256 = files.keep(session, path)
-        session.merge(StageResult(key=work.key, sha256=sha256))
-        if not job_life.finish(session, held, StoredResult(sha256, rows), reused=False):
-            raise StageStopped("the claim was lost while the result was stored")
+        with writing() as session:
+            files.keep(session, path, sha256=sha256)
+            session.merge(StageResult(key=work.key, sha256=sha256))
+            if not job_life.finish(session, held, StoredResult(sha256, rows), reused=False):
+                raise StageStopped("the claim was lost while the result was stored")
     remember(sha256, result, len(content))
     bound.info("stage_done", reused=False)
 
 
-def _computed(held: Claim, work: Work, context: Context) -> tuple[Any, bytes]:
+def _computed(held: Claim, work: Work, context: StageContext) -> tuple[Any, bytes]:
     try:
         try:
             result = work.compute(context)
         except Refusal as refusal:
             result = work.refused(refusal)
-        return result, encode(result)
+        return result, encode(result, context.partial)
     except (StageStopped, BrokenFile):
         raise
     except PluginChanged as error:

@@ -35,13 +35,13 @@ from fluoromap.contracts import (
     View,
 )
 from fluoromap.fuser.mapped_sites import map_origin, mapped_sites
-from fluoromap.matching import SiteComparisons, SiteRuns, match_study
+from fluoromap.matching import SiteRuns, match_study
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
 from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_version, plugin_of
-from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, stage_of, stages_of
+from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, load_later, stage_of, stages_of
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode, form_of
 from fluoromap_service.store.models import Base, StageRow
@@ -51,9 +51,6 @@ from fluoromap_workers.point_rows import point_rows
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 Result = TypeVar("Result")
-
-# A process matches the same study after every correction: sites that did not change are compared once.
-_SITE_COMPARISONS = SiteComparisons()
 
 
 class PluginChanged(Exception):
@@ -76,6 +73,8 @@ class Work:
         Makes the result that says why the plugin refused.
     rows : callable, optional
         Makes the database rows that belong to a result.
+    plugin : str
+        Hash of the plugin with its version and parameters: of everything that all partial results depend on.
     """
 
     key: str
@@ -83,6 +82,7 @@ class Work:
     compute: Callable[[Context], Any]
     refused: Callable[[Refusal], Any]
     rows: Callable[[Any], Iterable[Base]] | None = None
+    plugin: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +110,14 @@ def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
     The stage compares the plugin's version before it computes. A stored result needs no plugin.
     """
     stage = STAGES[claim.name]
-    work = _PREPARE[stage.name](StoredJob(session, claim.job_id, snapshot), claim.subject)
+    job = StoredJob(session, claim.job_id, snapshot)
+    work = _PREPARE[stage.name](job, claim.subject)
 
     def compute(context: Context) -> Any:
         _require_version(stage, snapshot)
         return work.compute(context)
 
-    return replace(work, compute=compute)
+    return replace(work, compute=compute, plugin=_key(job, stage.name))
 
 
 def _require_version(stage: Stage, snapshot: Snapshot) -> None:
@@ -151,7 +152,9 @@ def _segment(job: StoredJob, uid: str) -> Work:
 
     def compute(context: Context) -> Segmentation:
         frames = open_frames(files.checked_path(run.sha256), facts)
-        shown = Run(frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames)
+        shown = Run(
+            frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames, run.sha256,
+        )  # fmt: skip
         found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
         found = _returned(found, Segmentation, plugin.name)
         if len(found.frames) != facts.frames:
@@ -195,15 +198,15 @@ def _match(job: StoredJob, study: str) -> Work:
     views = [(site.site, uid) for site in snapshot.sites for uid in (site.view_a, site.view_b)]
 
     def compute(context: Context) -> Matching:
-        found = {uid: load(Segmentation, row) if row.result else None for uid, row in segments.items()}
+        # Only sites whose comparison is not stored read their segmentations.
+        found = {uid: load_later(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
             SiteRuns(
                 site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b],
-                content=tuple((segments[uid].result, encode(cameras[uid])) for uid in (site.view_a, site.view_b)),
             )
             for site in snapshot.sites
         )  # fmt: skip
-        return match_study(sites, catalogue, context, _SITE_COMPARISONS)
+        return match_study(sites, catalogue, context)
 
     def refused(refusal: Refusal) -> Matching:
         return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
@@ -222,10 +225,7 @@ def _triangulate(job: StoredJob, study: str) -> Work:
         matching = load(Matching, match)
         located = build_triangulator(plugin.name, plugin.params).triangulate(matching.sites, catalogue, context)
         located = _returned(located, Triangulation, plugin.name)
-        sites = tuple(
-            replace(site, reasons=tuple(dict.fromkeys((*site.reasons, *doubts.get(site.site, ())))))
-            for site in located.sites
-        )
+        sites = tuple(_with_doubts(site, doubts.get(site.site, ())) for site in located.sites)
         return replace(located, sites=sites, rejected=(*matching.rejected, *located.rejected))
 
     def refused(refusal: Refusal) -> Triangulation:
@@ -238,6 +238,15 @@ def _triangulate(job: StoredJob, study: str) -> Work:
 
     key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
     return Work(key, Triangulation, compute, refused, rows)
+
+
+def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:
+    """Return the site with more reasons for doubt.
+
+    A site without new ones is returned unchanged.
+    """
+    reasons = tuple(dict.fromkeys((*site.reasons, *doubts)))
+    return site if reasons == site.reasons else replace(site, reasons=reasons)
 
 
 def _fuse(job: StoredJob, study: str) -> Work:

@@ -12,7 +12,7 @@ from fluoromap.contracts import IntArray
 from fluoromap.geometry import Camera
 from fluoromap.matching.hypotheses import MISSING_COST, PRIOR_TURN, SHIFT_SD_MM, Hypotheses
 from fluoromap.matching.pairs import PairTable
-from fluoromap.matching.run_catheters import RunCatheter
+from fluoromap.matching.run_catheters import CatheterFacts
 
 MIRRORED_SITE, MIRRORED_STUDY = 10.0, 15.0
 """A mirrored view must fit this much better (nats), at a site or over the study, to be accepted."""
@@ -96,8 +96,8 @@ def groups_with_extra(
     table: PairTable,
     pairs: IntArray,
     slots: Sequence[int],
-    catheters_a: Sequence[RunCatheter],
-    catheters_b: Sequence[RunCatheter],
+    catheters_a: Sequence[CatheterFacts],
+    catheters_b: Sequence[CatheterFacts],
 ) -> list[int]:
     """Return the groups of look-alikes of which the site shows one too many.
 
@@ -108,13 +108,13 @@ def groups_with_extra(
     if not len(filled):
         return []
     shift = float(np.median(table.distance_px[filled[:, 0], filled[:, 1]]))
-    longest = [max(len(one.chains) for one in view) for view in (catheters_a, catheters_b)]
+    longest = [max(one.frames for one in view) for view in (catheters_a, catheters_b)]
     found = []
     for i, first in enumerate(catheters_a):
         for j, second in enumerate(catheters_b):
             if i in filled[:, 0] or j in filled[:, 1] or not table.possible[i, j]:
                 continue
-            if min(len(first.chains) / max(longest[0], 1), len(second.chains) / max(longest[1], 1)) < _EXTRA_SEEN:
+            if min(first.frames / max(longest[0], 1), second.frames / max(longest[1], 1)) < _EXTRA_SEEN:
                 continue
             turn = table.turn_px[i, j]
             spread = np.sqrt(table.variance_px2[i, j] + turn @ PRIOR_TURN[1] @ turn)

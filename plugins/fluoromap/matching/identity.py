@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array
-from fluoromap.matching.run_catheters import RunCatheter
+from fluoromap.matching.run_catheters import CatheterFacts
 from fluoromap.reasons import Reason
 
 CLEARLY_STILLER = 5.0
@@ -32,8 +32,8 @@ class PairedCatheter:
     place : index within its group, the same over all sites of the study.
     """
 
-    a: RunCatheter
-    b: RunCatheter
+    a: CatheterFacts
+    b: CatheterFacts
     position_mm: Array
     place: int
 

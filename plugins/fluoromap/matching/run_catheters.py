@@ -23,6 +23,19 @@ CONSTANT_SHARE = 0.7
 _NEVER = 1e6
 
 
+@dataclass(frozen=True, slots=True)
+class CatheterFacts:
+    """What the matching of a study needs to know about a catheter of one run.
+
+    frames : number of frames that show it. manual_name : the name set by hand, else None. motion_px : RMS distance of the
+    centroid from its mean place through the run.
+    """
+
+    frames: int
+    manual_name: str | None
+    motion_px: float
+
+
 @dataclass(frozen=True, eq=False)
 class RunCatheter:
     """One catheter through one run.
@@ -68,6 +81,11 @@ class RunCatheter:
         """RMS distance of the centroid from its mean place through the run."""
         _, centroids = self.centroids_uv
         return float(np.sqrt(centroids.var(axis=0).sum())) if len(centroids) else np.inf
+
+    @property
+    def facts(self) -> CatheterFacts:
+        """The few facts that name the catheter over the study."""
+        return CatheterFacts(len(self.chains), self.manual_name, self.motion_px)
 
     def vote(self, names: Sequence[str]) -> float:
         """Return the probability of these names, averaged over the frames.

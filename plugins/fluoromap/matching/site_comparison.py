@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Hashable
 from dataclasses import dataclass
 
 from fluoromap.catheters import Catalogue
@@ -16,7 +13,7 @@ from fluoromap.matching.identity import look_alike_groups
 from fluoromap.matching.pairs import PairTable, pair_table
 from fluoromap.matching.phase import cardiac_phases
 from fluoromap.matching.phase_matching import FoldedRun, fold, motion_misfit
-from fluoromap.matching.run_catheters import RunCatheter, gather
+from fluoromap.matching.run_catheters import CatheterFacts, RunCatheter, gather
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 
@@ -26,8 +23,6 @@ class SiteRuns:
     """The segmented runs of one site.
 
     A segmentation is None where the segmenter failed.
-    content : names the segmentations and cameras, for example by the hashes of their stored form: equal only where
-    these are equal. None where the caller does not know.
     """
 
     site: str
@@ -35,7 +30,11 @@ class SiteRuns:
     camera_b: Camera
     segmentation_a: Segmentation | None
     segmentation_b: Segmentation | None
-    content: Hashable | None = None
+
+    @property
+    def content(self) -> tuple[object, ...]:
+        """Everything that a comparison of the two views depends on."""
+        return self.camera_a, self.camera_b, self.segmentation_a, self.segmentation_b
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,57 +52,37 @@ class RunInView:
 
 
 @dataclass(frozen=True, eq=False)
-class ComparedSite:
-    """A site whose chains are compared across its views but not yet paired.
+class SiteViews:
+    """The two runs of a site; ``folded`` is their motion over one cycle, None without phases."""
 
-    mirrored_gain : see :func:`~fluoromap.matching.doubts.mirrored_gain`. doubtful : one of its views might be mirrored.
-    """
-
-    runs: SiteRuns
     a: RunInView
     b: RunInView
     folded: tuple[FoldedRun, FoldedRun] | None
-    table: PairTable
-    hypotheses: Hypotheses
-    mirrored_gain: float
-    doubtful: bool = False
 
 
-class SiteComparisons:
-    """Earlier comparisons of sites, by their content.
+@dataclass(frozen=True, eq=False)
+class SiteComparison:
+    """All that the study needs to know about a site's chains, compared across its views but not yet paired.
 
-    The caller of :func:`~fluoromap.matching.match_study` owns this object. With it only new or changed sites are
-    compared, for example after a correction. Sites without ``content`` are not stored.
+    reasons : why the views cannot be compared; then the other fields are empty. catheters_a, catheters_b : of each view.
+    mirrored_gain : see :func:`~fluoromap.matching.doubts.mirrored_gain`.
     """
 
-    def __init__(self, most: int = 64) -> None:
-        self._most = most
-        self._stored: OrderedDict[Hashable, ComparedSite | tuple[Reason, ...]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def compare(self, runs: SiteRuns, catalogue: Catalogue) -> ComparedSite | tuple[Reason, ...]:
-        """Return the stored comparison of a site, or compare its views."""
-        if runs.content is None:
-            return compare_views(runs, catalogue)
-        key = (runs.site, runs.content, catalogue)
-        with self._lock:
-            comparison = self._stored.get(key)
-        if comparison is None:
-            comparison = compare_views(runs, catalogue)
-        with self._lock:
-            self._stored[key] = comparison
-            self._stored.move_to_end(key)
-            while len(self._stored) > self._most:
-                self._stored.popitem(last=False)
-        return comparison
+    reasons: tuple[Reason, ...] = ()
+    catheters_a: tuple[CatheterFacts, ...] = ()
+    catheters_b: tuple[CatheterFacts, ...] = ()
+    irregular: bool = False
+    table: PairTable | None = None
+    hypotheses: Hypotheses | None = None
+    mirrored_gain: float = 0.0
 
 
-def compare_views(runs: SiteRuns, catalogue: Catalogue) -> ComparedSite | tuple[Reason, ...]:
-    """Compare the chains of a site's two views.
+def views_of(runs: SiteRuns) -> SiteViews | tuple[Reason, ...]:
+    """Gather the catheters of a site's two runs, with the phases of the frames.
 
     Returns
     -------
-    ComparedSite or tuple of Reason
+    SiteViews or tuple of Reason
         The reasons why the views cannot be compared.
     """
     if runs.segmentation_a is None or runs.segmentation_b is None:
@@ -121,19 +100,31 @@ def compare_views(runs: SiteRuns, catalogue: Catalogue) -> ComparedSite | tuple[
             fold(a.catheters, a.phases, a.phase_uncertainty),
             fold(b.catheters, b.phases, b.phase_uncertainty),
         )
+    return SiteViews(a, b, folded)
 
+
+def compare_views(views: SiteViews, cameras: tuple[Camera, Camera], catalogue: Catalogue) -> SiteComparison:
+    """Compare the chains of a site's two views."""
+    a, b = views.a, views.b
     # The motion cost is computed once: a mirror hardly changes how catheters move across the epipolar lines.
-    motion_cost = motion_misfit((runs.camera_a, runs.camera_b), folded, len(a.catheters), len(b.catheters))
+    motion_cost = motion_misfit(cameras, views.folded, len(a.catheters), len(b.catheters))
     groups = look_alike_groups(catalogue)
     slots = [k for k, group in enumerate(groups) for _ in group]
 
     def compare(camera_a: Camera, camera_b: Camera) -> tuple[PairTable, Hypotheses]:
         table = pair_table((camera_a, camera_b), a.catheters, b.catheters, motion_cost, catalogue, groups)
-        return table, enumerate_pairings(table, slots, runs.camera_b.px_per_mm)
+        return table, enumerate_pairings(table, slots, cameras[1].px_per_mm)
 
-    table, hypotheses = compare(runs.camera_a, runs.camera_b)
-    mirrored = [compare(mirror(runs.camera_a), runs.camera_b)[1], compare(runs.camera_a, mirror(runs.camera_b))[1]]
-    return ComparedSite(runs, a, b, folded, table, hypotheses, mirrored_gain(hypotheses, mirrored))
+    table, hypotheses = compare(*cameras)
+    mirrored = [compare(mirror(cameras[0]), cameras[1])[1], compare(cameras[0], mirror(cameras[1]))[1]]
+    return SiteComparison(
+        catheters_a=tuple(one.facts for one in a.catheters),
+        catheters_b=tuple(one.facts for one in b.catheters),
+        irregular=a.irregular or b.irregular,
+        table=table,
+        hypotheses=hypotheses,
+        mirrored_gain=mirrored_gain(hypotheses, mirrored),
+    )
 
 
 def _segmenter_reasons(segmentation: Segmentation) -> list[Reason]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
@@ -26,15 +27,28 @@ from fluoromap.matching.doubts import (
     groups_with_extra,
     mirrored_sites,
 )
+from fluoromap.matching.hypotheses import Hypotheses
 from fluoromap.matching.identity import PairedCatheter, look_alike_groups, name_look_alikes
 from fluoromap.matching.joint_choice import SiteChoice, choose_pairings
+from fluoromap.matching.pairs import PairTable
 from fluoromap.matching.phase_matching import pair_by_phase, phase_shift
 from fluoromap.matching.run_catheters import RunCatheter
-from fluoromap.matching.site_comparison import ComparedSite, SiteComparisons, SiteRuns
+from fluoromap.matching.site_comparison import SiteComparison, SiteRuns, SiteViews, compare_views, views_of
 from fluoromap.reasons import Reason
 
 LEAST_PROBABILITY = 0.02
 """Another pairing with a lower probability counts as ruled out."""
+
+
+@dataclass(frozen=True, eq=False)
+class _ComparedSite:
+    """A site whose views can be compared. doubtful : one of them might be mirrored."""
+
+    runs: SiteRuns
+    comparison: SiteComparison
+    table: PairTable
+    hypotheses: Hypotheses
+    doubtful: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +59,41 @@ class _NamedSite:
     doubt).
     """
 
-    compared: ComparedSite
+    compared: _ComparedSite
     pairs: dict[str, tuple[int, int]]
     alternative: dict[str, tuple[int, int]] | None
     probability: float
     notes: tuple[tuple[str, Reason], ...]
 
+    def content(self, catalogue: Catalogue) -> tuple[object, ...]:
+        """Return everything that the matched site depends on."""
+        runs = self.compared.runs
+        # The order of the names is part of the result.
+        pairs = tuple(self.pairs.items())
+        alternative = None if self.alternative is None else (tuple(self.alternative.items()), self.probability)
+        return runs.site, *runs.content, catalogue, pairs, alternative, self.notes
 
-def match_study(
-    sites: Sequence[SiteRuns], catalogue: Catalogue, context: Context, comparisons: SiteComparisons | None = None
-) -> Matching:
+
+class _Views:
+    """The views of sites by their names, gathered where they are needed: unchanged sites are compared already."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, SiteViews | tuple[Reason, ...]] = {}
+
+    def of(self, runs: SiteRuns) -> SiteViews | tuple[Reason, ...]:
+        if runs.site not in self._known:
+            self._known[runs.site] = views_of(runs)
+        return self._known[runs.site]
+
+    def compare(self, runs: SiteRuns, catalogue: Catalogue) -> SiteComparison:
+        """Compare the views of a site, or return the reasons why they cannot be compared."""
+        views = self.of(runs)
+        if not isinstance(views, SiteViews):
+            return SiteComparison(views)
+        return compare_views(views, (runs.camera_a, runs.camera_b), catalogue)
+
+
+def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Context) -> Matching:
     """Name the catheters of all sites, pair them across views and match the phases.
 
     The mapping catheter is identified by its tip, look-alikes by hand or by their motion over the whole study. A site
@@ -68,9 +107,7 @@ def match_study(
     catalogue : Catalogue
         Of the study.
     context : Context
-        For progress and cancellation.
-    comparisons : SiteComparisons, optional
-        Earlier comparisons, to compare only new or changed sites. The results are the same with and without it.
+        For progress and cancellation. It recalls the comparisons and matched sites that did not change.
 
     Returns
     -------
@@ -78,29 +115,34 @@ def match_study(
         Every site is either in ``sites`` or, with its reasons, in ``rejected``.
     """
     groups = look_alike_groups(catalogue)
-    comparisons = comparisons or SiteComparisons()
-    compared: list[ComparedSite] = []
+    views = _Views()
+    compared: list[tuple[SiteRuns, SiteComparison]] = []
     rejected: list[RejectedSite] = []
     for index, runs in enumerate(sites):
         context.check()
-        comparison = comparisons.compare(runs, catalogue)
-        if isinstance(comparison, ComparedSite):
-            compared.append(comparison)
+        inputs = (*runs.content, catalogue)
+        comparison = context.recall(SiteComparison, inputs, partial(views.compare, runs, catalogue))
+        if comparison.reasons:
+            rejected.append(RejectedSite(runs.site, comparison.reasons))
         else:
-            rejected.append(RejectedSite(runs.site, comparison))
+            compared.append((runs, comparison))
         context.progress(0.7 * (index + 1) / len(sites))
-    mirrored, maybe = mirrored_sites([site.mirrored_gain for site in compared])
+    mirrored, maybe = mirrored_sites([comparison.mirrored_gain for _, comparison in compared])
     sound = []
-    for site, is_mirrored, is_doubtful in zip(compared, mirrored, maybe, strict=True):
+    for (runs, comparison), is_mirrored, is_doubtful in zip(compared, mirrored, maybe, strict=True):
         if is_mirrored:
-            rejected.append(RejectedSite(site.runs.site, (Reason.VIEW_MIRRORED,)))
+            rejected.append(RejectedSite(runs.site, (Reason.VIEW_MIRRORED,)))
         else:
-            sound.append(replace(site, doubtful=is_doubtful))
+            assert comparison.table is not None, "the views were compared"
+            assert comparison.hypotheses is not None, "the views were compared"
+            sound.append(_ComparedSite(runs, comparison, comparison.table, comparison.hypotheses, is_doubtful))
     matched = []
     for index, named in enumerate(_name_all(sound, groups, catalogue)):
         context.check()
         if catalogue.mapping in named.pairs:
-            matched.append(_matched(named, catalogue))
+            matched.append(
+                context.recall(MatchedSite, named.content(catalogue), partial(_matched, named, catalogue, views))
+            )
         else:
             reason = Reason.CATHETER_NOT_FOUND if named.pairs else Reason.PAIRING_FAILED
             rejected.append(RejectedSite(named.compared.runs.site, (reason,)))
@@ -109,7 +151,7 @@ def match_study(
 
 
 def _name_all(
-    sites: Sequence[ComparedSite], groups: tuple[tuple[str, ...], ...], catalogue: Catalogue
+    sites: Sequence[_ComparedSite], groups: tuple[tuple[str, ...], ...], catalogue: Catalogue
 ) -> list[_NamedSite]:
     """Pair and name the catheters of all sites."""
     slots = [k for k, group in enumerate(groups) for _ in group]
@@ -142,13 +184,15 @@ def _name_all(
     ]
 
 
-def _paired(site: ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
+def _paired(site: _ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
     i, j = int(pair[0]), int(pair[1])
-    return PairedCatheter(site.a.catheters[i], site.b.catheters[j], site.table.position_mm[i, j], place)
+    return PairedCatheter(
+        site.comparison.catheters_a[i], site.comparison.catheters_b[j], site.table.position_mm[i, j], place
+    )  # fmt: skip
 
 
 def _named_site(
-    site: ComparedSite,
+    site: _ComparedSite,
     choice: SiteChoice,
     names: Sequence[str],
     doubts: dict[str, Reason],
@@ -163,12 +207,13 @@ def _named_site(
         return {name: found[name] for name in order if name in found}
 
     pairs = by_name(choice.pairs)
+    in_a, in_b = site.comparison.catheters_a, site.comparison.catheters_b
     notes = []
     for name, (i, j) in pairs.items():
-        by_hand = site.a.catheters[i].manual_name or site.b.catheters[j].manual_name
+        by_hand = in_a[i].manual_name or in_b[j].manual_name
         if name in doubts and by_hand is None:
             notes.append((name, doubts[name]))
-    for catheters, used in zip((site.a.catheters, site.b.catheters), zip(*pairs.values(), strict=True), strict=False):
+    for catheters, used in zip((in_a, in_b), zip(*pairs.values(), strict=True), strict=False):
         unused = [one.manual_name for index, one in enumerate(catheters) if index not in used]
         notes.extend((name, Reason.MARK_NOT_USED) for name in unused if name is not None)
     alternative = None
@@ -177,20 +222,22 @@ def _named_site(
         notes.extend((name, Reason.IDENTITY_UNCERTAIN) for name, pair in pairs.items() if alternative.get(name) != pair)
     if site.doubtful or geometry_is_doubtful(site.table, choice.pairs, site.runs.camera_b.px_per_mm):
         notes.extend((name, Reason.GEOMETRY_DOUBTFUL) for name in pairs)
-    for number in groups_with_extra(site.table, choice.pairs, slots, site.a.catheters, site.b.catheters):
+    for number in groups_with_extra(site.table, choice.pairs, slots, in_a, in_b):
         notes.extend((name, Reason.EXTRA_CATHETER) for name in groups[number] if name in pairs)
-    if site.a.irregular or site.b.irregular:
+    if site.comparison.irregular:
         notes.extend((name, Reason.IRREGULAR_RHYTHM) for name in pairs)
     return _NamedSite(site, pairs, alternative, choice.probability, tuple(dict.fromkeys(notes)))
 
 
-def _matched(named: _NamedSite, catalogue: Catalogue) -> MatchedSite:
-    site = named.compared
-    runs, a, b = site.runs, site.a, site.b
+def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) -> MatchedSite:
+    runs = named.compared.runs
+    views = views_of_sites.of(runs)
+    assert isinstance(views, SiteViews), "the views were compared"
+    a, b = views.a, views.b
     cameras = (runs.camera_a, runs.camera_b)
     phases_b = b.phases
-    if site.folded is not None and phases_b is not None:
-        phases_b = (phases_b + phase_shift(cameras, site.folded, list(named.pairs.values()))) % 1.0
+    if views.folded is not None and phases_b is not None:
+        phases_b = (phases_b + phase_shift(cameras, views.folded, list(named.pairs.values()))) % 1.0
     in_a = {name: a.catheters[i] for name, (i, _) in named.pairs.items()}
     in_b = {name: b.catheters[j] for name, (_, j) in named.pairs.items()}
     track_a, track_b = _track(in_a, a.segmentation, a.phases), _track(in_b, b.segmentation, phases_b)
@@ -205,7 +252,7 @@ def _matched(named: _NamedSite, catalogue: Catalogue) -> MatchedSite:
         camera_a=runs.camera_a,
         camera_b=runs.camera_b,
         diastole=_at_diastole(catalogue, in_a, in_b, a.phases, phases_b),
-        cycle=() if site.folded is None else pair_by_phase(track_a, track_b),
+        cycle=() if views.folded is None else pair_by_phase(track_a, track_b),
         track_a=track_a,
         track_b=track_b,
         frame_times_a_ms=a.segmentation.frame_times_ms,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -69,6 +69,20 @@ class Detector(Protocol):
         """Return whether the log image clearly shows a catheter besides these chains."""
 
 
+@dataclass(frozen=True, eq=False)
+class RunDetections:
+    """The chains of a run's images, each found by itself and without any marks.
+
+    frames : one entry a frame. motion : (n,), see :class:`~fluoromap.contracts.Segmentation`. mean : chains of the mean of the
+    frames ``averaged`` round diastole.
+    """
+
+    frames: tuple[FrameChains, ...]
+    motion: Array
+    averaged: tuple[int, ...]
+    mean: FrameChains
+
+
 def segment_run(
     run: Run,
     catalogue: Catalogue,
@@ -105,41 +119,44 @@ def segment_run(
     context.check()
     field = find_field(run.frames, run.pixels)
     transform = LogTransform.of_run(run.pixels, field.mean_level)
-    detector = detector_of(field)
     count = len(run.frames)
 
     def log_image(frame: int) -> Image:
         return field.fill(transform(run.frames[frame]))
 
-    meter = MotionMeter((log_image(index) for index in evenly_spaced_frames(count)), field.inside)
-    motion = np.zeros(count)
-    found: list[FrameChains] = []
-    automatic: dict[int, tuple[Chain, ...]] = {}
-    images: deque[tuple[int, Image]] = deque(maxlen=3)
-    for index in range(count):
-        context.check()
-        images += [
-            (after, log_image(after)) for after in range(images[-1][0] + 1 if images else 0, min(index + 2, count))
-        ]
-        (x,) = (image for number, image in images if number == index)
-        motion[index] = meter(x)
-        entry = detector.find_chains(x, index, _beside(index, images, run.frame_times_ms))
-        if index in marks:
-            automatic[index] = entry.chains if entry.manual_needed is None else ()
-            entry = FrameChains(index, tuple(replace(chain, manual=True) for chain in marks[index]))
-        found.append(entry)
-        context.progress(0.8 * (index + 1) / count)
-    if count > 1:
-        motion[0] = motion[1]
+    def mean_image(averaged: Sequence[int]) -> Image:
+        total = np.zeros(run.frames.shape, np.float64)
+        for index in averaged:
+            total += run.frames[index].astype(np.float64)
+        return field.fill(transform(total / len(averaged)))
+
+    def detect() -> RunDetections:
+        return _detect(run, detector_of(field), log_image, mean_image, field, context)
+
+    if run.content is None:
+        detections = detect()
+    else:
+        # Marks change the tracks, but not what the images show.
+        shown = (run.content, run.frame_times_ms, run.px_per_mm, run.pixels, run.r_wave_frames, catalogue)
+        detections = context.recall(RunDetections, shown, detect)
+    motion, averaged = detections.motion, detections.averaged
+    automatic = {
+        index: entry.chains if entry.manual_needed is None else ()
+        for index, entry in enumerate(detections.frames)
+        if index in marks
+    }
+    found = [
+        FrameChains(entry.frame, tuple(replace(chain, manual=True) for chain in marks[entry.frame]))
+        if entry.frame in marks
+        else entry
+        for entry in detections.frames
+    ]
+    context.progress(0.9)
     context.check()
-    averaged = diastolic_frames(motion, run.frame_times_ms, run.r_wave_frames)
-    middle = averaged[len(averaged) // 2]
-    total = np.zeros(run.frames.shape, np.float64)
-    for index in averaged:
-        total += run.frames[index].astype(np.float64)
-    mean_image = field.fill(transform(total / len(averaged)))
-    mean = detector.find_chains(mean_image, middle)
-    mean = mean if mean.manual_needed is None else FrameChains(middle, ())
+    mean = detections.mean
+    # A detector remembers the images before. A new one gives the same answers for recalled detections.
+    detector = detector_of(field)
+    mean_x = mean_image(averaged)
     catheters = len(catalogue.catheters)
     search = _chain_search(detector, log_image, context) if search_again else None
     seed = mean if len(averaged) > 1 else None
@@ -149,14 +166,14 @@ def segment_run(
     context.progress(0.95)
     chains = mean.chains
     if search_again:
-        chains = _add_missing_catheters(mean_image, chains, detector, averaged, entries, catheters)
+        chains = _add_missing_catheters(mean_x, chains, detector, averaged, entries, catheters)
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
     if shows_catheter is not None and count > 1:
         tracks = {chain.track for entry in entries for chain in entry.chains}
         chains = tuple(chain for chain in chains if chain.manual or chain.track in tracks)
     reason = None if chains else Reason.MANUAL_NEEDED
-    if chains and detector.shows_extra_catheter(mean_image, chains):
+    if chains and detector.shows_extra_catheter(mean_x, chains):
         reason = Reason.EXTRA_CATHETER
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
@@ -167,6 +184,40 @@ def segment_run(
         motion=motion,
         frame_times_ms=run.frame_times_ms,
         r_wave_frames=run.r_wave_frames,
+    )
+
+
+def _detect(
+    run: Run,
+    detector: Detector,
+    log_image: Callable[[int], Image],
+    mean_image: Callable[[Sequence[int]], Image],
+    field: FieldMask,
+    context: Context,
+) -> RunDetections:
+    """Find the chains of every frame, and of their diastolic mean."""
+    count = len(run.frames)
+    meter = MotionMeter((log_image(index) for index in evenly_spaced_frames(count)), field.inside)
+    motion = np.zeros(count)
+    found: list[FrameChains] = []
+    images: deque[tuple[int, Image]] = deque(maxlen=3)
+    for index in range(count):
+        context.check()
+        images += [
+            (after, log_image(after)) for after in range(images[-1][0] + 1 if images else 0, min(index + 2, count))
+        ]
+        (x,) = (image for number, image in images if number == index)
+        motion[index] = meter(x)
+        found.append(detector.find_chains(x, index, _beside(index, images, run.frame_times_ms)))
+        context.progress(0.8 * (index + 1) / count)
+    if count > 1:
+        motion[0] = motion[1]
+    context.check()
+    averaged = diastolic_frames(motion, run.frame_times_ms, run.r_wave_frames)
+    middle = averaged[len(averaged) // 2]
+    mean = detector.find_chains(mean_image(averaged), middle)
+    return RunDetections(
+        tuple(found), motion, averaged, mean if mean.manual_needed is None else FrameChains(middle, ())
     )
 
 

@@ -10,12 +10,9 @@ import numpy as np
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 from fluoromap.matching.two_view import triangulate_linear
+from fluoromap.triangulator.moments import SETTLED_MM, STEPS, MomentEstimates, joint_moments, separate_moments
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import jacobians
-
-_STEPS = 8
-_SETTLED_MM = 1e-6
-"""Iteration ends below this step: the next step would be much smaller still."""
+from fluoromap.triangulator.uncertainty import ErrorSource, jacobians
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,15 @@ class Method(Protocol):
         """Return points (N, 3) in the world, mm, each electrode located separately."""
 
     def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
-        """Estimate points with the covariance (..., 4 N, 4 N) that weights the pixels."""
+        """Estimate points with the covariance (4 N, 4 N) that weights the pixels."""
+
+    def estimate_moments(
+        self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, breathing: ErrorSource
+    ) -> MomentEstimates:
+        """Estimate points at many moments.
+
+        Their own noise and the displacement of the whole heart between the runs weight the pixels.
+        """
 
 
 class SeparateLeastSquares:
@@ -61,6 +66,11 @@ class SeparateLeastSquares:
 
     def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
         return Estimate(start_mm, separate_gain(cameras, start_mm))
+
+    def estimate_moments(
+        self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, breathing: ErrorSource
+    ) -> MomentEstimates:
+        return separate_moments(cameras, start_mm)
 
 
 class JointLeastSquares:
@@ -78,15 +88,20 @@ class JointLeastSquares:
     def estimate(self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, errors_px2: Array) -> Estimate:
         weight = np.linalg.inv(errors_px2)
         points = start_mm
-        for _ in range(_STEPS):
+        for _ in range(STEPS):
             design = _design(cameras, points)
             weighted = _transposed(design) @ weight
             gain: Array = np.asarray(np.linalg.solve(weighted @ design, weighted), dtype=np.float64)
             step = (gain @ pixels.residuals_px(cameras, points)[..., None]).reshape(points.shape)
             points = points + step
-            if np.abs(step).max() < _SETTLED_MM:
+            if np.abs(step).max() < SETTLED_MM:
                 break
         return Estimate(points, gain)
+
+    def estimate_moments(
+        self, cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, breathing: ErrorSource
+    ) -> MomentEstimates:
+        return joint_moments(cameras, pixels, start_mm, breathing)
 
 
 def triangulate_unweighted(cameras: Cameras, pixels: TwoViewPixels) -> Array:
@@ -148,21 +163,8 @@ def triangulate_maximum_likelihood(
     ndarray, shape (N, 3)
         World, mm.
     """
-    points = triangulate_linear(camera_a, camera_b, pixels_a, pixels_b)
-    views = (
-        (camera_a, pixels_a, np.linalg.inv(covariances_a_px2)),
-        (camera_b, pixels_b, np.linalg.inv(covariances_b_px2)),
-    )
-    for _ in range(_STEPS):
-        normal = np.zeros((len(points), 3, 3))
-        gradient = np.zeros((len(points), 3))
-        for camera, pixels, weight in views:
-            jacobian = camera.jacobian(points)
-            weighted = np.einsum("nki,nkl->nil", jacobian, weight)
-            normal += weighted @ jacobian
-            gradient += np.einsum("nil,nl->ni", weighted, pixels - camera.project(points))
-        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
-        points = points + step
-        if len(step) == 0 or np.abs(step).max() < _SETTLED_MM:
-            break
-    return points
+    pixels = TwoViewPixels((), (pixels_a[None], pixels_b[None]), (covariances_a_px2[None], covariances_b_px2[None]))
+    start = triangulate_linear(camera_a, camera_b, pixels_a, pixels_b)[None]
+    still = ErrorSource(np.zeros((1, 4 * len(pixels_a), 1)), np.zeros((1, 1)), ("breathing",))
+    found: Array = joint_moments((camera_a, camera_b), pixels, start, still).points_mm[0]
+    return found

@@ -26,6 +26,7 @@ from fluoromap.triangulator.study_equations import (
     SiteEquations,
     gap_labels,
     information,
+    log_evidences,
     site_equations,
 )
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
@@ -88,6 +89,13 @@ class StudyBelief:
 def header_belief(params: UncertaintyParams) -> StudyBelief:
     """Return the belief where no electrode shows the gantry's error or the heart's variation."""
     return _belief(GantryBelief(np.eye(4), params.header_covariance()), HeartScale(), params)
+
+
+def study_belief(
+    gantry: GantryBelief, variation: StudyVariation, params: UncertaintyParams, doubt: Reason | None
+) -> StudyBelief:
+    """Return the belief about a study whose variation is known."""
+    return StudyBelief(gantry, params.scaled(variation.breathing, variation.beats), variation, doubt)
 
 
 def calibrate(
@@ -170,7 +178,7 @@ def _belief(
     shares = np.diagonal(gantry.covariance)[:12].reshape(2, 2, 3) / np.maximum(usual, 1e-12)
     angle, offset = np.sqrt(shares.mean(axis=(0, 2)))
     variation = StudyVariation(scale.breathing, scale.beats, float(angle), float(offset))
-    return StudyBelief(gantry, params.scaled(scale.breathing, scale.beats), variation, doubt)
+    return study_belief(gantry, variation, params, doubt)
 
 
 def _displacement(six: Array) -> Array:
@@ -224,18 +232,19 @@ def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
     No electrode shows an error that both views share, so each kind of gantry keeps its own prior there.
     """
     widest = _prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE), usual, gaps)
-    best = max(heart.log_evidence(widest) for heart in hearts)
-    plausible = [heart for heart in hearts if heart.log_evidence(widest) > best - _NEGLIGIBLE]
+    at_widest = log_evidences(hearts, widest)
+    likely_hearts = at_widest > at_widest.max() - _NEGLIGIBLE
+    plausible = [heart for heart, is_likely in zip(hearts, likely_hearts, strict=True) if is_likely]
     kinds = [
-        (heart, of_gantry, float(np.log(kind.share)) + heart.log_evidence(of_gantry))
+        (heart, of_gantry, float(np.log(kind.share)) + float(evidence))
         for kind in GANTRY_KINDS
         for of_gantry in [_prior(kind.multiples, usual, gaps)]
-        for heart in plausible
+        for heart, evidence in zip(plausible, log_evidences(plausible, of_gantry), strict=True)
     ]
     evidence = np.array([one for *_, one in kinds])
     weights = np.exp(evidence - logsumexp(evidence))
     no_error = _prior(np.zeros(GANTRY_UNKNOWNS), usual, gaps)
-    exact = logsumexp([heart.log_evidence(no_error) for heart in hearts])
+    exact = logsumexp(log_evidences(hearts, no_error))
     likely = [(kind, weight) for kind, weight in zip(kinds, weights, strict=True) if weight > 1e-4]
     total = sum(weight for _, weight in likely)
     answers = [(heart.posterior(of_gantry), weight / total) for (heart, of_gantry, _), weight in likely]

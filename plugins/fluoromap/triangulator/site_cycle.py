@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,8 +16,9 @@ from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixel
 from fluoromap.triangulator.uncertainty import (
     Motion,
     UncertaintyParams,
-    error_sources,
-    pixel_noise_px2,
+    bend_covariances_px2,
+    common_sources,
+    jacobians,
     visible_breathing,
 )
 
@@ -61,14 +63,14 @@ def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) 
     """Return the moments of a site's cycle; None where too few show its electrodes."""
     moments = [(pair.phase, pixels_in_both_views(pair)) for pair in pairs if pair.phase is not None]
     counts: dict[tuple[str, int], int] = {}
-    for _, pixels in moments:
-        for label in pixels.labels:
-            counts[label] = counts.get(label, 0) + 1
+    for shown, times in Counter(pixels.labels for _, pixels in moments).items():
+        for label in shown:
+            counts[label] = counts.get(label, 0) + times
     labels = tuple(label for label, count in counts.items() if count >= IN_MOST_PAIRS * len(moments))
     whole: dict[float, TwoViewPixels] = {}
     for phase, pixels in moments:
         # Beats timed by R waves repeat phase 0; one moment of each phase is enough.
-        if phase not in whole and set(labels) <= set(pixels.labels):
+        if phase not in whole and (pixels.labels == labels or set(labels) <= set(pixels.labels)):
             whole[phase] = pixels.only(labels)
     if not labels or len(whole) < FEWEST_MOMENTS:
         return None
@@ -107,14 +109,13 @@ def locate_cycle(
     """
     start, pixels = moments.positions_mm, moments.pixels
     motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
-    sources = error_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
+    sources = common_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
     if jump is not None:
         sources = (*sources, jump_source(cameras, start, jump))
-    noise = pixel_noise_px2(pixels.covariances)
-    errors = noise + sum(source.pixels_px2() for source in sources)
-    seen = visible_breathing(cameras, start, params)
-    found = method.estimate(cameras, pixels, start, noise + seen.pixels_px2())
-    covariances = np.einsum("piaib->piab", found.covariance_mm2(errors))
+    bends = bend_covariances_px2(jacobians(cameras, start), params)
+    noise = (pixels.covariances[0] + bends[0], pixels.covariances[1] + bends[1])
+    found = method.estimate_moments(cameras, pixels, start, visible_breathing(cameras, start, params))
+    covariances = found.covariances_mm2(noise, sources)
     return SiteCycle(moments.phases, moments.labels, found.points_mm, covariances)
 
 

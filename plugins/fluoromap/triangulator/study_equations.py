@@ -18,10 +18,12 @@ from fluoromap.triangulator.spacing import neighbours
 from fluoromap.triangulator.stray_electrodes import epipolar_rows
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
 from fluoromap.triangulator.uncertainty import (
-    Share,
+    ErrorSource,
     UncertaintyParams,
+    beat_sources,
+    bend_covariances_px2,
     breathing_effect_px,
-    error_sources,
+    breathing_sources,
     gantry_effect_px,
     jacobians,
     pixel_noise_px2,
@@ -32,7 +34,6 @@ GAP_SD_MM = 0.3
 """Error of a catalogue's gap, the same at all sites: bent shafts, tip centres, wrong descriptions."""
 _SPACING_SD_MM = 0.1
 """Difference of a gap between sites."""
-_SCALED: tuple[Share, ...] = ("breathing", "phase_mismatch")
 _BREATHING_LOG_SD, _BEATS_LOG_SD = 1.1, 0.7
 
 
@@ -96,13 +97,6 @@ class Information:
     vector: Array
     constant: float
 
-    def log_evidence(self, prior: Array) -> float:
-        """Return the log evidence, up to a constant, of unknowns drawn from ``prior`` (u, u)."""
-        u = len(self.vector)
-        mean = prior @ np.linalg.solve(np.eye(u) + self.matrix @ prior, self.vector)
-        volume = np.linalg.slogdet(np.eye(u) + prior @ self.matrix)[1]
-        return self.constant + self.scale.log_prior + 0.5 * float(self.vector @ mean) - 0.5 * float(volume)
-
     def posterior(self, prior: Array) -> tuple[Array, Array]:
         """Return covariance (u, u) and mean (u,) of the unknowns."""
         # prior (1 + matrix prior)^-1 needs no inverse of a prior that may be 0.
@@ -147,28 +141,23 @@ def site_equations(
         combine = np.concatenate([combine, lengths])
         residual = np.concatenate([residual, length - [gap for _, _, gap, _ in known]])
         errors[n + np.arange(len(known)), [row[3] for row in known]] = 1.0
-    none = np.zeros((GANTRY_UNKNOWNS, GANTRY_UNKNOWNS))
-    # An electrode's own bend is no beat. Where pixels are known well, it would hide how far whole catheters move.
-    of_beats, of_bend = (
-        error_sources(cameras, points, pixels.labels, catalogue, params.model_copy(update={other: 0.0}), none, None)
-        for other in ("bend_sd_mm", "beat_sd_mm")
-    )
-    noise = pixel_noise_px2(pixels.covariances)
-    fixed = combine @ noise @ combine.T
-    fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
-    parts = {share: np.zeros_like(fixed) for share in _SCALED}
-    for source in of_bend:
-        if "phase_mismatch" in source.shares:
-            effect = combine @ source.effect_px
-            fixed += effect @ source.covariance @ effect.T
-    for source in of_beats:
-        for share in parts.keys() & source.shares:
-            effect = combine @ source.effect_px
-            parts[share] += effect @ source.covariance @ effect.T
     jacobian = jacobians(cameras, points)
+
+    def combined(sources: Sequence[ErrorSource]) -> Array:
+        effects = [combine @ source.effect_px for source in sources]
+        each = [effect @ source.covariance @ effect.T for source, effect in zip(sources, effects, strict=True)]
+        return np.asarray(np.sum(each, axis=0), dtype=np.float64)
+
+    noise = pixel_noise_px2(pixels.covariances)
+    # An electrode's own bend is no beat. Where pixels are known well, it would hide how far whole catheters move.
+    bend = pixel_noise_px2(bend_covariances_px2(jacobian, params))
+    fixed = combine @ (noise + bend) @ combine.T
+    fixed[range(n, len(residual)), range(n, len(residual))] += _SPACING_SD_MM**2
+    breathing = combined(breathing_sources(jacobian, params))
+    beats = combined(beat_sources(jacobian, points, pixels.labels, catalogue, params))
     slope = np.concatenate([combine @ gantry_effect_px(cameras, jacobian, points), errors], axis=1)
     return SiteEquations(
-        residual, slope, fixed, parts["breathing"], parts["phase_mismatch"], combine @ breathing_effect_px(jacobian), n,
+        residual, slope, fixed, breathing, beats, combine @ breathing_effect_px(jacobian), n,
         np.diagonal(combine @ noise @ combine.T)[:n],
     )  # fmt: skip
 
@@ -179,16 +168,33 @@ def information(rows: Sequence[SiteEquations], linearised_at: Array) -> list[Inf
     The equations were linearised at the unknowns ``linearised_at`` (u,).
     """
     u = len(linearised_at)
-    residuals = [one.residual + one.slope @ linearised_at for one in rows]
-    found = []
-    for scale in HEART_SCALES:
-        matrix, vector, constant = np.zeros((u, u)), np.zeros(u), 0.0
-        for one, residual in zip(rows, residuals, strict=True):
-            factor = np.linalg.cholesky(one.covariance(scale))
-            both = np.linalg.solve(factor, np.column_stack([one.slope, residual]))
-            slope, rest = both[:, :-1], both[:, -1]
-            matrix += slope.T @ slope
-            vector += slope.T @ rest
-            constant -= 0.5 * float(rest @ rest) + float(np.log(np.diagonal(factor)).sum())
-        found.append(Information(scale, matrix, vector, constant))
-    return found
+    matrices, vectors = np.zeros((len(HEART_SCALES), u, u)), np.zeros((len(HEART_SCALES), u))
+    constants = np.zeros(len(HEART_SCALES))
+    breathing, beats = (np.array([getattr(scale, of) ** 2 for scale in HEART_SCALES]) for of in ("breathing", "beats"))
+    for one in rows:
+        residual = one.residual + one.slope @ linearised_at
+        covariance = one.fixed + breathing[:, None, None] * one.breathing + beats[:, None, None] * one.beats
+        factor = np.linalg.cholesky(covariance)
+        both = np.linalg.solve(factor, np.column_stack([one.slope, residual]))
+        products = np.swapaxes(both, -1, -2) @ both
+        matrices += products[:, :-1, :-1]
+        vectors += products[:, :-1, -1]
+        constants -= 0.5 * products[:, -1, -1] + np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
+    return [
+        Information(scale, matrix, vector, float(constant))
+        for scale, matrix, vector, constant in zip(HEART_SCALES, matrices, vectors, constants, strict=True)
+    ]
+
+
+def log_evidences(hearts: Sequence[Information], prior: Array) -> Array:
+    """Return the log evidence (h,) of each heart, up to a constant.
+
+    The unknowns are drawn from ``prior`` (u, u).
+    """
+    matrices, vectors = np.array([heart.matrix for heart in hearts]), np.array([heart.vector for heart in hearts])
+    each = np.eye(len(prior)) + matrices @ prior
+    means = (prior @ np.linalg.solve(each, vectors[..., None]))[..., 0]
+    own = np.array([heart.constant + heart.scale.log_prior for heart in hearts])
+    # det(1 + prior matrix) = det(1 + matrix prior)
+    evidences: Array = own + 0.5 * (vectors * means).sum(axis=1) - 0.5 * np.linalg.slogdet(each)[1]
+    return evidences

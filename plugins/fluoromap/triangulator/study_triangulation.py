@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -17,6 +19,7 @@ from fluoromap.contracts import (
     LocatedSite,
     MatchedSite,
     RejectedSite,
+    StudyVariation,
     Triangulation,
 )
 from fluoromap.geometry import Camera, ray_angle_deg
@@ -24,7 +27,7 @@ from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
 from fluoromap.triangulator.reference_origin import common_origin, deviates
-from fluoromap.triangulator.self_calibration import calibrate, header_belief
+from fluoromap.triangulator.self_calibration import GantryBelief, calibrate, header_belief, study_belief
 from fluoromap.triangulator.site_locator import Moment, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
@@ -41,6 +44,60 @@ from fluoromap.triangulator.uncertainty import (
 _SAME_GANTRY_DEG = 3.0
 
 
+@dataclass(frozen=True, eq=False)
+class SiteLook:
+    """The part of a site that the checks of the whole study need.
+
+    points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. reasons : why the site
+    cannot be located; then there are no points. note : a sentence about these reasons, or none.
+    """
+
+    site: str
+    camera_a: Camera
+    camera_b: Camera
+    pixels: TwoViewPixels
+    points_mm: Array
+    covariance_mm2: Array
+    reasons: tuple[Reason, ...] = ()
+    note: str | None = None
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.camera_a, self.camera_b
+
+
+@dataclass(frozen=True, eq=False)
+class StudyChecks:
+    """All that the sites of a study show together.
+
+    jumps : one entry a site. wrong, contradicted : catheters whose spacings differ from the catalogue's much, or a little.
+    same_gantry : indices of the sites that share the gantry's errors. belief : of the gantry and the heart, for these.
+    """
+
+    jumps: tuple[Jump | None, ...]
+    wrong: tuple[tuple[str, tuple[WrongGap, ...]], ...]
+    contradicted: tuple[tuple[str, tuple[WrongGap, ...]], ...]
+    same_gantry: tuple[int, ...] = ()
+    calibration: Calibration | None = None
+    gantry: GantryBelief | None = None
+    variation: StudyVariation | None = None
+    doubt: Reason | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SiteErrors:
+    """What the report of the study needs to know about a site's location.
+
+    located : whether a plausible position agrees with both views. electrodes : number of located electrodes. squares_mm2 : sum
+    of their variances from each source of error, in the order of :class:`~fluoromap.contracts.ErrorBudget`.
+    """
+
+    located: bool
+    electrodes: int
+    squares_mm2: tuple[float, ...]
+    notes: tuple[str, ...]
+
+
 def locate_study(
     sites: Sequence[MatchedSite], catalogue: Catalogue, context: Context, params: UncertaintyParams, method: Method
 ) -> Triangulation:
@@ -48,10 +105,11 @@ def locate_study(
 
     Sites whose views are too close together or whose mapping catheter is missing are rejected.
     """
-    usable, rejected, notes = _usable_sites(sites, catalogue)
+    looks = _looks(sites, catalogue, context, params)
+    usable, rejected, notes = _usable_sites(sites, looks)
     header = header_belief(params)
     locator = SiteLocator(method, catalogue, header, header, params.spacing_limit_mm)
-    return _locate_sites([(site, None, locator) for site in usable], catalogue, context, rejected, notes, None)
+    return _locate_sites([(site, None, locator) for site, _ in usable], catalogue, context, rejected, notes, None)
 
 
 def calibrate_and_locate(
@@ -61,59 +119,102 @@ def calibrate_and_locate(
 
     The checks are for moved tables, wrong spacings and a wrong gantry.
     """
-    usable, rejected, notes = _usable_sites(sites, catalogue)
-    first = [_first_look(site, catalogue, params) for site in usable]
-    resting = frozenset(catalogue.names) - {catalogue.mapping}
-    jumps = table_jumps([(cameras, pixels, points) for cameras, pixels, points, _ in first], resting, params)
-    notes += table_notes([site.site for site in usable], jumps)
-    spacings = [(pixels, points, joint) for _, pixels, points, joint in first]
-    wrong = wrong_spacings(spacings, catalogue, STUDY_LIMIT_MM)
-    contradicted = {
-        name: gaps for name, gaps in wrong_spacings(spacings, catalogue, DOUBT_LIMIT_MM).items() if name not in wrong
-    }
+    usable, rejected, notes = _usable_sites(sites, _looks(sites, catalogue, context, params))
+    looks = tuple(look for _, look in usable)
+    found = context.recall(StudyChecks, (looks, catalogue), partial(_check_study, looks, catalogue, params))
+    wrong, contradicted = dict(found.wrong), dict(found.contradicted)
+    notes += table_notes([look.site for look in looks], found.jumps)
     notes += _spacing_notes(wrong, catalogue) + _contradiction_notes(contradicted)
     if set(wrong) == set(catalogue.names):
         # Catheter names and scale both come from the spacings, so no located position can be trusted.
         reasons = (Reason.SPACING_MISMATCH, Reason.GEOMETRY_DOUBTFUL)
-        rejected += [RejectedSite(site.site, reasons) for site in usable]
+        rejected += [RejectedSite(look.site, reasons) for look in looks]
         return Triangulation((), tuple(rejected), tuple(notes))
-    same_gantry = _same_gantry(usable)
-    is_certain = [jump is not None and jump.is_certain for jump in jumps]
-    unmoved = [first[i][:2] for i in same_gantry if not is_certain[i]]
-    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
-    if calibration is not None and calibration.applied:
-        notes.append(_calibration_note(calibration))
-    if belief.doubt is not None:
-        notes.append(_doubt_note(belief.doubt))
+    if found.calibration is not None and found.calibration.applied:
+        notes.append(_calibration_note(found.calibration))
+    if found.doubt is not None:
+        notes.append(_doubt_note(found.doubt))
     header = header_belief(params)
+    assert found.gantry is not None, "the study was calibrated"
+    assert found.variation is not None, "the study was calibrated"
+    belief = study_belief(found.gantry, found.variation, params, found.doubt)
     gap_doubts = dict.fromkeys(contradicted, Reason.CATALOGUE_CONTRADICTED) | dict.fromkeys(
         wrong, Reason.SPACING_MISMATCH
     )
-    work = []
-    for i, (site, jump) in enumerate(zip(usable, jumps, strict=True)):
-        own = belief if i in same_gantry else header
-        work.append((site, jump, SiteLocator(method, catalogue, own, header, params.spacing_limit_mm, gap_doubts)))
-    return _locate_sites(work, catalogue, context, rejected, notes, calibration)
+    as_calibrated, as_header = (
+        SiteLocator(method, catalogue, own, header, params.spacing_limit_mm, gap_doubts) for own in (belief, header)
+    )
+    work = [
+        (site, jump, as_calibrated if i in found.same_gantry else as_header)
+        for i, ((site, _), jump) in enumerate(zip(usable, found.jumps, strict=True))
+    ]
+    return _locate_sites(work, catalogue, context, rejected, notes, found.calibration)
+
+
+def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: UncertaintyParams) -> StudyChecks:
+    """Check the study for moved tables and wrong spacings, and calibrate its gantry."""
+    resting = frozenset(catalogue.names) - {catalogue.mapping}
+    jumps = tuple(table_jumps([(look.cameras, look.pixels, look.points_mm) for look in looks], resting, params))
+    spacings = [(look.pixels, look.points_mm, look.covariance_mm2) for look in looks]
+    wrong = wrong_spacings(spacings, catalogue, STUDY_LIMIT_MM)
+    contradicted = {
+        name: gaps for name, gaps in wrong_spacings(spacings, catalogue, DOUBT_LIMIT_MM).items() if name not in wrong
+    }
+    gaps = [tuple((name, tuple(of)) for name, of in each.items()) for each in (wrong, contradicted)]
+    if set(wrong) == set(catalogue.names):
+        return StudyChecks(jumps, gaps[0], gaps[1])
+    same_gantry = _same_gantry(looks)
+    is_certain = [jump is not None and jump.is_certain for jump in jumps]
+    unmoved = [(looks[i].cameras, looks[i].pixels) for i in same_gantry if not is_certain[i]]
+    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
+    return StudyChecks(
+        jumps, gaps[0], gaps[1], tuple(same_gantry), calibration, belief.gantry, belief.variation, belief.doubt
+    )
+
+
+def _looks(
+    sites: Sequence[MatchedSite], catalogue: Catalogue, context: Context, params: UncertaintyParams
+) -> list[SiteLook]:
+    return [
+        context.recall(SiteLook, (site, catalogue), partial(_first_look, site, catalogue, params)) for site in sites
+    ]
 
 
 def _usable_sites(
-    sites: Sequence[MatchedSite], catalogue: Catalogue
-) -> tuple[list[MatchedSite], list[RejectedSite], list[str]]:
-    usable, rejected, notes = [], [], []
-    for site in sites:
-        angle = ray_angle_deg(site.camera_a, site.camera_b)
-        if angle < PARALLEL_BELOW_DEG:
-            rejected.append(RejectedSite(site.site, (Reason.VIEWS_PARALLEL,)))
-            notes.append(f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed.")
-        elif catalogue.mapping not in pixels_in_both_views(site.diastole).catheters:
-            rejected.append(RejectedSite(site.site, (Reason.CATHETER_NOT_FOUND,)))
-        else:
-            usable.append(site)
-    return usable, rejected, notes
+    sites: Sequence[MatchedSite], looks: Sequence[SiteLook]
+) -> tuple[list[tuple[MatchedSite, SiteLook]], list[RejectedSite], list[str]]:
+    usable = [(site, look) for site, look in zip(sites, looks, strict=True) if not look.reasons]
+    rejected = [RejectedSite(look.site, look.reasons) for look in looks if look.reasons]
+    return usable, rejected, [look.note for look in looks if look.note is not None]
+
+
+def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyParams) -> SiteLook:
+    """Locate a site for the checks of the study.
+
+    The result says why a site cannot be located.
+    """
+    cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
+    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)))
+    angle = ray_angle_deg(*cameras)
+    if angle < PARALLEL_BELOW_DEG:
+        note = f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed."
+        return replace(nothing, reasons=(Reason.VIEWS_PARALLEL,), note=note)
+    if catalogue.mapping not in pixels.catheters:
+        return replace(nothing, reasons=(Reason.CATHETER_NOT_FOUND,))
+    points = triangulate_unweighted(cameras, pixels)
+    widest = LARGEST_MULTIPLE**2 * params.gantry_covariance()
+    sources = error_sources(cameras, points, pixels.labels, catalogue, params, widest, None)
+    pixels = widen_strays(cameras, pixels, points, sources)
+    alone = Estimate(points, separate_gain(cameras, points))
+    covariance = alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
+    return replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance)
+
+
+_Work = tuple[MatchedSite, Jump | None, SiteLocator]
 
 
 def _locate_sites(
-    work: Sequence[tuple[MatchedSite, Jump | None, SiteLocator]],
+    work: Sequence[_Work],
     catalogue: Catalogue,
     context: Context,
     rejected: list[RejectedSite],
@@ -121,27 +222,44 @@ def _locate_sites(
     calibration: Calibration | None,
 ) -> Triangulation:
     located: list[LocatedSite] = []
-    moments: list[Moment] = []
-    used: list[tuple[MatchedSite, Jump | None, SiteLocator]] = []
-    for index, (site, jump, locator) in enumerate(work):
+    errors: list[SiteErrors] = []
+    used: list[_Work] = []
+    for index, one in enumerate(work):
         context.check()
-        answer = locator.locate(site, jump)
-        if answer is None:
-            rejected.append(RejectedSite(site.site, (Reason.PAIRING_FAILED,)))
+        location = _Location(*one)
+        of_site = context.recall(SiteErrors, location.inputs, partial(_errors, location))
+        if of_site.located:
+            located.append(context.recall(LocatedSite, location.inputs, location.located_site))
+            used.append(one)
+            errors.append(of_site)
+            notes += of_site.notes
         else:
-            located.append(answer[0])
-            used.append((site, jump, locator))
-            moments.append(answer[1])
-            notes += answer[2]
+            rejected.append(RejectedSite(one[0].site, (Reason.PAIRING_FAILED,)))
         context.progress((index + 1) / len(work))
-    located = _from_one_origin(located, used, catalogue)
-    return Triangulation(tuple(located), tuple(rejected), tuple(notes), calibration, _budget(moments))
+    located = _from_one_origin(located, used, catalogue, context)
+    return Triangulation(tuple(located), tuple(rejected), tuple(notes), calibration, _budget(errors))
+
+
+class _Location:
+    """The location of one site, computed when it is first needed."""
+
+    def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator) -> None:
+        self.inputs = (site, jump, locator.catalogue, locator.belief, locator.gap_doubts, locator.origin)
+        self._work = site, jump, locator
+
+    @functools.cached_property
+    def answer(self) -> tuple[LocatedSite, Moment, list[str]] | None:
+        site, jump, locator = self._work
+        return locator.locate(site, jump)
+
+    def located_site(self) -> LocatedSite:
+        """Return the site in 3D."""
+        assert self.answer is not None, "the site was located before"
+        return self.answer[0]
 
 
 def _from_one_origin(
-    located: Sequence[LocatedSite],
-    work: Sequence[tuple[MatchedSite, Jump | None, SiteLocator]],
-    catalogue: Catalogue,
+    located: Sequence[LocatedSite], work: Sequence[_Work], catalogue: Catalogue, context: Context
 ) -> list[LocatedSite]:
     """Give all sites the same origin.
 
@@ -151,30 +269,13 @@ def _from_one_origin(
     same: list[LocatedSite] = []
     for first, (site, jump, locator) in zip(located, work, strict=True):
         if origin is not None and deviates(first, catalogue.reference, origin):
-            again = replace(locator, origin=origin).locate(site, jump)
-            assert again is not None, "the site was located before"
-            first = again[0]
+            again = _Location(site, jump, replace(locator, origin=origin))
+            first = context.recall(LocatedSite, again.inputs, again.located_site)
         same.append(first)
     return same
 
 
-def _first_look(
-    site: MatchedSite, catalogue: Catalogue, params: UncertaintyParams
-) -> tuple[Cameras, TwoViewPixels, Array, Array]:
-    """Return a site's nominal cameras, pixels and first points.
-
-    Points (N, 3) in mm, and their covariance (N, 3, N, 3) from pixel noise.
-    """
-    cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    points = triangulate_unweighted(cameras, pixels)
-    widest = LARGEST_MULTIPLE**2 * params.gantry_covariance()
-    sources = error_sources(cameras, points, pixels.labels, catalogue, params, widest, None)
-    pixels = widen_strays(cameras, pixels, points, sources)
-    alone = Estimate(points, separate_gain(cameras, points))
-    return cameras, pixels, points, alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
-
-
-def _same_gantry(sites: Sequence[MatchedSite]) -> list[int]:
+def _same_gantry(sites: Sequence[SiteLook]) -> list[int]:
     """Return the indices of the most sites with the same two gantry positions.
 
     Only such sites share the gantry's errors.
@@ -242,21 +343,32 @@ def _calibration_note(calibration: Calibration) -> str:
     )
 
 
-def _budget(moments: Sequence[Moment]) -> ErrorBudget | None:
+_BUDGET = get_args(Share)
+
+
+def _errors(location: _Location) -> SiteErrors:
+    """Return the share of a site in the report of the study."""
+    if location.answer is None:
+        return SiteErrors(False, 0, (), ())
+    _, moment, notes = location.answer
+    gain = moment.found.gain
+    squares = dict.fromkeys(_BUDGET, 0.0)
+    squares["pixels"] += float(np.trace(gain @ moment.noise_px2 @ gain.T))
+    for source in moment.sources:
+        for share in set(source.shares):
+            of = [k for k, own in enumerate(source.shares) if own == share]
+            effect = gain @ source.effect_px[:, of]
+            squares[share] += float(np.trace(effect @ source.covariance[np.ix_(of, of)] @ effect.T))
+    return SiteErrors(True, len(moment.found.points_mm), tuple(squares.values()), tuple(notes))
+
+
+def _budget(sites: Sequence[SiteErrors]) -> ErrorBudget | None:
     """Return the RMS of each source of error over all located electrodes.
 
     The result is None where no electrode was located.
     """
-    count = sum(len(moment.found.points_mm) for moment in moments)
+    count = sum(site.electrodes for site in sites)
     if not count:
         return None
-    squares = dict.fromkeys(("pixels", *get_args(Share)), 0.0)
-    for moment in moments:
-        gain = moment.found.gain
-        squares["pixels"] += float(np.trace(gain @ moment.noise_px2 @ gain.T))
-        for source in moment.sources:
-            for share in set(source.shares):
-                of = [k for k, own in enumerate(source.shares) if own == share]
-                effect = gain @ source.effect_px[:, of]
-                squares[share] += float(np.trace(effect @ source.covariance[np.ix_(of, of)] @ effect.T))
-    return ErrorBudget(**{f"{name}_mm": float(np.sqrt(square / count)) for name, square in squares.items()})
+    totals = np.sum([site.squares_mm2 for site in sites], axis=0)
+    return ErrorBudget(**{f"{name}_mm": float(np.sqrt(of / count)) for name, of in zip(_BUDGET, totals, strict=True)})

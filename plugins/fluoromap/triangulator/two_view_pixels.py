@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,6 +33,8 @@ class TwoViewPixels:
 
     def only(self, labels: Sequence[tuple[str, int]]) -> TwoViewPixels:
         """Return the same moment with these electrodes only, in this order."""
+        if tuple(labels) == self.labels:
+            return self
         rows = [self.labels.index(label) for label in labels]
         (pa, pb), (ca, cb) = self.pixels, self.covariances
         return TwoViewPixels(tuple(labels), (pa[rows], pb[rows]), (ca[rows], cb[rows]))
@@ -47,22 +51,32 @@ class TwoViewPixels:
 
 def pixels_in_both_views(pair: PhasePair) -> TwoViewPixels:
     """Return the electrodes that both views of a pair show."""
-    first, second = _by_label(pair.a.chains), _by_label(pair.b.chains)
-    labels = tuple(label for label in first if label in second)
+    first, second = _labels(pair.a.chains), _labels(pair.b.chains)
+    in_a, in_b = _stacked(pair.a.chains), _stacked(pair.b.chains)
+    if first != second or len(set(first)) != len(first):
+        # Of an electrode that a view shows twice the last place counts.
+        at_a, at_b = ({label: row for row, label in enumerate(labels)} for labels in (first, second))
+        first = tuple(label for label in at_a if label in at_b)
+        in_a, in_b = (
+            tuple(part[[at[label] for label in first]] for part in of) for at, of in ((at_a, in_a), (at_b, in_b))
+        )
+    return TwoViewPixels(first, (in_a[0], in_b[0]), (in_a[1], in_b[1]))
 
-    def stack(of: dict[tuple[str, int], tuple[Array, Array]], part: int, shape: tuple[int, ...]) -> Array:
-        return np.array([of[label][part] for label in labels]).reshape(len(labels), *shape)
 
-    return TwoViewPixels(
-        labels,
-        (stack(first, 0, (2,)), stack(second, 0, (2,))),
-        (stack(first, 1, (2, 2)), stack(second, 1, (2, 2))),
+def _labels(chains: Sequence[NamedChain]) -> tuple[tuple[str, int], ...]:
+    return tuple(itertools.chain.from_iterable(_labels_of(chain.catheter, chain.electrodes) for chain in chains))
+
+
+@functools.lru_cache(maxsize=256)
+def _labels_of(catheter: str, electrodes: tuple[int, ...]) -> tuple[tuple[str, int], ...]:
+    """Return the labels of a chain; hundreds of frames show the same electrodes."""
+    return tuple((catheter, electrode) for electrode in electrodes)
+
+
+def _stacked(chains: Sequence[NamedChain]) -> tuple[Array, ...]:
+    """Return the pixels (N, 2) and their covariances (N, 2, 2) of all chains."""
+    if not chains:
+        return np.zeros((0, 2)), np.zeros((0, 2, 2))
+    return np.concatenate([chain.pixels_uv for chain in chains]), np.concatenate(
+        [chain.covariance_px2 for chain in chains]
     )
-
-
-def _by_label(chains: Sequence[NamedChain]) -> dict[tuple[str, int], tuple[Array, Array]]:
-    return {
-        (chain.catheter, electrode): (pixel, covariance)
-        for chain in chains
-        for electrode, pixel, covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True)
-    }

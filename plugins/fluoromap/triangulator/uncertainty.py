@@ -257,26 +257,38 @@ def error_sources(
     motion : Motion or None
         None where the heart rests.
     """
-    n = len(labels)
+    return (
+        *common_sources(cameras, points_world_mm, labels, catalogue, params, gantry_covariance, motion),
+        bend_source(jacobians(cameras, points_world_mm), params),
+    )
+
+
+def common_sources(
+    cameras: Cameras,
+    points_world_mm: Array,
+    labels: Sequence[tuple[str, int]],
+    catalogue: Catalogue,
+    params: UncertaintyParams,
+    gantry_covariance: Array,
+    motion: Motion | None,
+) -> tuple[ErrorSource, ...]:
+    """Return the error sources that displace several electrodes alike.
+
+    These are the sources of :func:`error_sources` without the electrodes' own bends.
+    """
     jacobian = jacobians(cameras, points_world_mm)
     gantry: tuple[Share, ...] = (*(*("angles",) * 3, *("source_distances",) * 3) * 2, *("source_distances",) * 2)
-    head_feet = np.array([[0.0], [0.0], [1.0]])
     sources = [
         ErrorSource(gantry_effect_px(cameras, jacobian, points_world_mm), gantry_covariance, gantry),
-        ErrorSource(breathing_effect_px(jacobian), params.respiration_covariance_mm2() / 2, ("breathing",) * 3),
-        _both_views(jacobian, head_feet, head_feet, params.respiration_drift_sd_mm, "breathing"),
+        *breathing_sources(jacobian, params),
+        *beat_sources(jacobian, points_world_mm, labels, catalogue, params),
     ]
-    follows = follows_tip(points_world_mm, labels, catalogue)
     for name in sorted({catheter for catheter, _ in labels}):
-        own = follows * np.array([catheter == name for catheter, _ in labels])[:, None, None]
-        sources.append(_both_views(jacobian, own, own, params.beat_sd_mm, "phase_mismatch"))
         tip = _tip_along_shaft(points_world_mm, labels, name)
         if tip is not None:
             # Both views show the same centre, so that no epipolar distance reveals it.
             effect = effect_px(jacobian, tip, tip)
             sources.append(ErrorSource(effect, np.array([[params.tip_centre_sd_mm**2]]), ("pixels",)))
-    each = np.eye(3 * n).reshape(n, 3, 3 * n)
-    sources.append(_both_views(jacobian, each, each, params.bend_sd_mm, "phase_mismatch"))
     if motion is not None:
         displaced, velocity = motion.displaced_mm[..., None], motion.velocity_mm[..., None]
         sources.append(_both_views(jacobian, displaced, displaced, params.beat_amplitude_sd, "phase_mismatch"))
@@ -288,6 +300,44 @@ def error_sources(
         )  # fmt: skip
         sources.append(ErrorSource(late, timing, ("phase_mismatch",) * 2))
     return tuple(sources)
+
+
+def breathing_sources(jacobian: Array, params: UncertaintyParams) -> tuple[ErrorSource, ErrorSource]:
+    """Return breathing between the two runs and within each run."""
+    head_feet = np.array([[0.0], [0.0], [1.0]])
+    return (
+        ErrorSource(breathing_effect_px(jacobian), params.respiration_covariance_mm2() / 2, ("breathing",) * 3),
+        _both_views(jacobian, head_feet, head_feet, params.respiration_drift_sd_mm, "breathing"),
+    )
+
+
+def beat_sources(
+    jacobian: Array,
+    points_world_mm: Array,
+    labels: Sequence[tuple[str, int]],
+    catalogue: Catalogue,
+    params: UncertaintyParams,
+) -> list[ErrorSource]:
+    """Return the variation of each catheter's place from beat to beat."""
+    follows = follows_tip(points_world_mm, labels, catalogue)
+    return [
+        _both_views(jacobian, own, own, params.beat_sd_mm, "phase_mismatch")
+        for name in sorted({catheter for catheter, _ in labels})
+        for own in [follows * np.array([catheter == name for catheter, _ in labels])[:, None, None]]
+    ]
+
+
+def bend_source(jacobian: Array, params: UncertaintyParams) -> ErrorSource:
+    """Return the displacement of each electrode beyond the share that follows its catheter's tip."""
+    n = jacobian.shape[-4]
+    each = np.eye(3 * n).reshape(n, 3, 3 * n)
+    return _both_views(jacobian, each, each, params.bend_sd_mm, "phase_mismatch")
+
+
+def bend_covariances_px2(jacobian: Array, params: UncertaintyParams) -> tuple[Array, Array]:
+    """Return the pixels' covariances (..., N, 2, 2) in view a and b from :func:`bend_source`."""
+    of_view = params.bend_sd_mm**2 * (jacobian @ np.swapaxes(jacobian, -1, -2))
+    return of_view[..., 0, :, :], of_view[..., 1, :, :]
 
 
 def _tip_along_shaft(points_world_mm: Array, labels: Sequence[tuple[str, int]], catheter: str) -> Array | None:

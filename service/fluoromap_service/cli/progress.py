@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from fluoromap.contracts import Silent
+
 
 @contextmanager
 def progress_bars(console: Console) -> Iterator[Progress]:
@@ -22,7 +24,7 @@ def progress_bars(console: Console) -> Iterator[Progress]:
         yield progress
 
 
-class BarContext:
+class BarContext(Silent):
     """A :class:`~fluoromap.contracts.Context` that moves a progress bar and never stops the work.
 
     Parameters
@@ -37,9 +39,6 @@ class BarContext:
     def progress(self, fraction: float) -> None:
         """Move the bar to a fraction from 0 to 1."""
         self._move(fraction)
-
-    def check(self) -> None:
-        """Let the work continue."""
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from fluoromap.contracts import ChamberMap, Track, View
 from fluoromap.reasons import Reason
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import StoredOtherwise, decode
+from fluoromap_service.store.codec import StoredOtherwise, decode, deferred
 from fluoromap_service.store.models import StageRow
 
 T = TypeVar("T")
@@ -86,6 +86,17 @@ def load(kind: type[T], stage: StageRow) -> T:
     if stage.result is None:
         raise ValueError(f"stage {stage.id} has no result")
     return load_file(kind, stage.result)
+
+
+def load_later(kind: type[T], stage: StageRow) -> T:
+    """Return the result of a stage that is done, without reading it.
+
+    Its file is read when the first field is read. That may raise the errors of :func:`load`. ``kind`` is a dataclass without slots.
+    """
+    sha256 = stage.result
+    if sha256 is None:
+        raise ValueError(f"stage {stage.id} has no result")
+    return deferred(kind, sha256, lambda: files.read(sha256))
 
 
 def load_file(kind: type[T], sha256: str) -> T:

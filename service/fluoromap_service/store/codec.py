@@ -1,9 +1,13 @@
 """Stage results as bytes and back, exactly: equal values give equal bytes.
 
-A stored result has three parts: eight bytes with the length of the second part, a MessagePack tree, and the numbers of all
+A stored result begins with three parts: eight bytes with the length of the second part, a MessagePack tree, and the numbers of all
 arrays. The tree holds columns: all values of one field of all dataclasses of one kind lie together, and an array is its
 number. Arrays of one type and shape lie together too, each different one once. So reading a value costs no Python call of
 its own, and thousands of small arrays cost little.
+
+Blocks follow the arrays. A block is the stored form of one value by itself: a dataclass that asks for it (``stored_apart``), or
+a partial result that a later job may use again. A block is copied into another stored result unchanged. Its fields are decoded
+when they are first read.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ import math
 import types
 import typing
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from operator import attrgetter
@@ -26,23 +30,46 @@ from typing import Any, NoReturn, Protocol, cast
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 T = typing.TypeVar("T")
 
-LAYOUT = 2
+LAYOUT = 3
 """The number of the layout of stored bytes. It is part of every form, so that results of another one are computed again."""
 
 _ALIGNMENT = 8
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
+_SOURCE = "_stored_form"
 _pack, _unpack = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder()
+_Described = list[tuple[str, tuple[int, ...], list[int]]]
+# form, arrays, blocks (hash, length), partial results (key, number of the block), one value with its fields as columns
+_unpack_head = msgspec.msgpack.Decoder(
+    tuple[str, _Described, list[tuple[str, int]], dict[str, int], tuple[int, list[msgspec.Raw]]]
+)
 
 
 class StoredOtherwise(ValueError):
     """The bytes are no stored result of this kind, or another version of the contracts stored them."""
 
 
-def encode(value: Any) -> bytes:
+@dataclasses.dataclass(frozen=True, slots=True)
+class Block:
+    """The stored form of one value, and its hash."""
+
+    sha256: str
+    content: bytes
+
+
+def encode(value: Any, partial: Mapping[str, Block] = types.MappingProxyType({}), *, finite: bool = True) -> bytes:
     """Encode a dataclass of arrays, numbers, strings, enums, tuples and dataclasses.
+
+    Parameters
+    ----------
+    value : dataclass
+    partial : mapping of str to Block
+        Partial results to store with it, by their keys; see :func:`partial_results`.
+    finite : bool
+        Whether to refuse numbers that are not finite.
 
     Raises
     ------
@@ -54,34 +81,91 @@ def encode(value: Any) -> bytes:
     kind = type(value)
     if not dataclasses.is_dataclass(kind):
         _refuse(kind)
-    arrays = _Arrays()
+    arrays = _Arrays(finite)
     with _without_collector():
-        tree = _column(cast(Hashable, kind)).encode([value], arrays)
-        head = _pack.encode((form_of(kind), arrays.described(), tree))
-    return len(head).to_bytes(_ALIGNMENT, "little") + _padded(head) + arrays.numbers()
+        tree = _fields_column(_plain_kind(kind)).encode([value], arrays)
+        numbers = {key: arrays.add_block(block) for key, block in sorted(partial.items())}
+        blocks = [(block.sha256, len(block.content)) for block in arrays.blocks]
+        head = _pack.encode((form_of(_plain_kind(kind)), arrays.described(), blocks, numbers, tree))
+    parts = [len(head).to_bytes(_ALIGNMENT, "little"), _padded(head), arrays.numbers()]
+    return b"".join([*parts, *(_padded(block.content) for block in arrays.blocks)])
 
 
 def decode(kind: type[T], content: bytes) -> T:
     """Decode the bytes that :func:`encode` made of a ``kind``.
 
-    The dataclasses do not check themselves again, because they did so before they were stored. Arrays are read-only.
+    The dataclasses do not check themselves again, because they did so before they were stored. Arrays are read-only. The
+    fields of a value that is stored apart are decoded when they are first read.
 
     Raises
     ------
     StoredOtherwise
         When the bytes are no stored ``kind`` of these contracts.
     """
-    try:
-        end = _ALIGNMENT + int.from_bytes(content[:_ALIGNMENT], "little")
-        with _without_collector():
-            form, described, tree = _unpack.decode(content[_ALIGNMENT:end])
-            if form != form_of(kind):
-                raise StoredOtherwise(f"another version of the contracts stored this {kind}")
-            arrays = _stored_arrays(described, content, _whole(end))
-            (decoded,) = _column(cast(Hashable, kind)).decode(tree, arrays)
-    except (msgspec.DecodeError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise StoredOtherwise(f"these bytes are no stored {kind}") from error
-    return cast(T, decoded)
+    stored = _Content(kind, content)
+    made = object.__new__(kind)
+    with _without_collector(), _stored_otherwise(kind):
+        for name in stored.columns:
+            object.__setattr__(made, name, stored.field(name))
+    return made
+
+
+def deferred(kind: type[T], sha256: str, read: Callable[[], bytes]) -> T:
+    """Return a dataclass whose fields are decoded when they are first read.
+
+    Parameters
+    ----------
+    kind : type
+        A dataclass without slots.
+    sha256 : str
+        Hash of the stored form.
+    read : callable
+        Returns the stored form; called once, for the first field.
+    """
+    made: T = object.__new__(_deferred_kind(cast(Hashable, kind)))
+    made.__dict__[_SOURCE] = _Source(kind, sha256, read)
+    return made
+
+
+def block_of(value: Any, *, finite: bool = True) -> Block:
+    """Return the stored form of one value.
+
+    The form of a value that is stored apart is made only once.
+    """
+    source = _source_of(value)
+    if source is not None:
+        return Block(source.sha256, source.content)
+    content = encode(value, finite=finite)
+    block = Block(hashlib.sha256(content).hexdigest(), content)
+    if _is_apart(type(value)):
+        value.__dict__[_SOURCE] = _Source(type(value), block.sha256, lambda: content)
+    return block
+
+
+def partial_results(content: bytes) -> Mapping[str, Block]:
+    """Return the partial results that were stored with a result, by their keys.
+
+    Raises
+    ------
+    StoredOtherwise
+        When the bytes are no stored result of this layout.
+    """
+    with _stored_otherwise(object):
+        return _Content(None, content).partial_results()
+
+
+def digest(*inputs: Any) -> str:
+    """Return a hash of values: equal for equal values of the same types.
+
+    They may be numbers, strings, enums, arrays, tuples, mappings, dataclasses and pydantic models. A value that was read from
+    the store counts with the hash of its stored form, without being decoded.
+    """
+    found = hashlib.sha256()
+    for value in inputs:
+        content = _digested(value)
+        found.update(len(content).to_bytes(_ALIGNMENT, "little"))
+        found.update(content)
+    return found.hexdigest()
 
 
 def form_of(kind: type[Any]) -> str:
@@ -110,6 +194,42 @@ def _form_of(kind: Any) -> str:
     return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
 
 
+def _digested(value: Any) -> bytes:
+    """Return bytes that are equal for equal values."""
+    kind = type(value)
+    if isinstance(value, Enum):
+        return f"{kind.__qualname__}.{value.name}".encode()
+    if kind in _PLAIN:
+        return f"{kind.__name__}:{value!r}".encode()
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype.str}{value.shape}".encode() + value.tobytes()
+    if isinstance(value, np.generic):
+        return _digested(value.item())
+    if isinstance(value, Mapping):
+        return f"mapping:{digest(*itertools.chain.from_iterable(sorted(value.items())))}".encode()
+    if isinstance(value, (tuple, list)):
+        return f"sequence:{digest(*value)}".encode()
+    if isinstance(value, frozenset):
+        return f"set:{digest(*sorted(value))}".encode()
+    if isinstance(value, BaseModel):
+        return f"{kind.__qualname__}:{value.model_dump_json()}".encode()
+    if not dataclasses.is_dataclass(value):
+        _refuse(kind)
+    if _source_of(value) is not None or _is_apart(kind):
+        return f"stored:{block_hash(value)}".encode()
+    fields = digest(*(getattr(value, field.name) for field in dataclasses.fields(value)))
+    return f"{kind.__qualname__}:{fields}".encode()
+
+
+def block_hash(value: Any) -> str:
+    """Return the hash of a value's stored form.
+
+    A value that was read from the store knows it.
+    """
+    source = _source_of(value)
+    return source.sha256 if source is not None else block_of(value).sha256
+
+
 def _whole(length: int) -> int:
     return -(-length // _ALIGNMENT) * _ALIGNMENT
 
@@ -133,6 +253,17 @@ def _without_collector() -> Iterator[None]:
             gc.enable()
 
 
+@contextmanager
+def _stored_otherwise(kind: type) -> Iterator[None]:
+    """Turn the errors of bytes of another form into :class:`StoredOtherwise`."""
+    try:
+        yield
+    except StoredOtherwise:
+        raise
+    except (msgspec.DecodeError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise StoredOtherwise(f"these bytes are no stored {kind}") from error
+
+
 def _refuse(kind: type) -> NoReturn:
     raise TypeError(f"a result holds a {kind.__name__}, which is never stored")
 
@@ -152,14 +283,25 @@ def _check_finite(numbers: Iterable[float]) -> None:
 
 
 class _Arrays:
-    """The different arrays of one value, numbered as they come and gathered by type and shape."""
+    """The different arrays and blocks of one value, numbered as they come. Arrays are gathered by type and shape."""
 
-    def __init__(self) -> None:
+    def __init__(self, finite: bool) -> None:
+        self.finite = finite
         self._numbers: dict[tuple[np.dtype[Any], tuple[int, ...], bytes], int] = {}
+        self._blocks: dict[str, tuple[int, Block]] = {}
 
     def add(self, array: NDArray[Any]) -> int:
         """Add an array and return its number."""
         return self._numbers.setdefault((array.dtype, array.shape, array.tobytes()), len(self._numbers))
+
+    def add_block(self, block: Block) -> int:
+        """Add a block and return its number."""
+        return self._blocks.setdefault(block.sha256, (len(self._blocks), block))[0]
+
+    @property
+    def blocks(self) -> list[Block]:
+        """All blocks by their numbers."""
+        return [block for _, block in self._blocks.values()]
 
     @functools.cached_property
     def _pools(self) -> dict[tuple[np.dtype[Any], tuple[int, ...]], tuple[list[int], list[bytes]]]:
@@ -194,20 +336,122 @@ class _Arrays:
         parts = []
         for (dtype, _), (_, contents) in self._pools.items():
             content = b"".join(contents)
-            if dtype.kind == "f" and not np.isfinite(np.frombuffer(content, dtype)).all():
+            if self.finite and dtype.kind == "f" and not np.isfinite(np.frombuffer(content, dtype)).all():
                 raise ValueError("the result holds a number that is not finite")
             parts.append(_padded(content))
         return b"".join(parts)
 
 
-def _stored_arrays(described: Any, content: bytes, start: int) -> list[NDArray[Any]]:
-    """Return all arrays by their numbers; their values start at byte ``start``."""
-    by_number: dict[int, NDArray[Any]] = {}
-    for dtype, shape, numbers in described:
-        pool = np.frombuffer(content, dtype, len(numbers) * math.prod(shape), start)
-        by_number.update(zip(numbers, pool.reshape(len(numbers), *shape), strict=True))
-        start += _whole(pool.nbytes)
-    return [by_number[number] for number in range(len(by_number))]
+class _Content:
+    """The stored form of one value, taken apart. Its arrays are read when the first one is needed."""
+
+    def __init__(self, kind: type | None, content: bytes) -> None:
+        with _stored_otherwise(kind or object):
+            self._kind, self._content = kind, content
+            end = _ALIGNMENT + int.from_bytes(content[:_ALIGNMENT], "little")
+            form, self._described, self._blocks, self._partial, (count, columns) = _unpack_head.decode(
+                content[_ALIGNMENT:end]
+            )
+            self._start = _whole(end)
+            if kind is None:
+                return
+            if form != form_of(kind) or count != 1:
+                raise StoredOtherwise(f"another version of the contracts stored this {kind}")
+            names = [name for name, _ in _fields_column(kind).fields]
+            self.columns = dict(zip(names, columns, strict=True))
+
+    def field(self, name: str) -> Any:
+        """Decode one field."""
+        assert self._kind is not None, "partial results have no fields of their own"
+        column = dict(_fields_column(self._kind).fields)[name]
+        (value,) = column.decode(_unpack.decode(self.columns[name]), self)
+        return value
+
+    def __getitem__(self, number: int) -> NDArray[Any]:
+        """Return an array by its number."""
+        return self._arrays[number]
+
+    @functools.cached_property
+    def _arrays(self) -> list[NDArray[Any]]:
+        by_number: dict[int, NDArray[Any]] = {}
+        start = self._start
+        for dtype, shape, numbers in self._described:
+            pool = np.frombuffer(self._content, dtype, len(numbers) * math.prod(shape), start)
+            by_number.update(zip(numbers, pool.reshape(len(numbers), *shape), strict=True))
+            start += _whole(pool.nbytes)
+        return [by_number[number] for number in range(len(by_number))]
+
+    @functools.cached_property
+    def _starts_of_blocks(self) -> list[int]:
+        start = self._start
+        for dtype, shape, numbers in self._described:
+            start += _whole(np.dtype(dtype).itemsize * math.prod(shape) * len(numbers))
+        return [start, *itertools.accumulate((_whole(length) for _, length in self._blocks), initial=start)][1:]
+
+    def block(self, number: int) -> Block:
+        """Return a block by its number."""
+        sha256, length = self._blocks[number]
+        start = self._starts_of_blocks[number]
+        return Block(sha256, self._content[start : start + length])
+
+    def partial_results(self) -> dict[str, Block]:
+        """Return the partial results by their keys."""
+        return {key: self.block(number) for key, number in self._partial.items()}
+
+
+# --- values that are decoded when they are read ------------------------------------------------------------------------
+
+
+class _Source:
+    """The stored form of a value, read when it is first needed."""
+
+    def __init__(self, kind: type, sha256: str, read: Callable[[], bytes]) -> None:
+        self.kind, self.sha256, self._read = kind, sha256, read
+
+    @functools.cached_property
+    def content(self) -> bytes:
+        return self._read()
+
+    @functools.cached_property
+    def _taken_apart(self) -> _Content:
+        return _Content(self.kind, self.content)
+
+    def field(self, name: str) -> Any:
+        """Decode one field."""
+        with _without_collector(), _stored_otherwise(self.kind):
+            return self._taken_apart.field(name)
+
+
+class _DeferredField:
+    """A field that is decoded when it is first read; then the object itself holds it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, owner: Any, kind: type) -> Any:
+        if owner is None:
+            return self
+        value = owner.__dict__[self._name] = owner.__dict__[_SOURCE].field(self._name)
+        return value
+
+
+@functools.cache
+def _deferred_kind(kind: Any) -> Any:
+    fields = {field.name: _DeferredField(field.name) for field in dataclasses.fields(kind)}
+    return type(kind.__name__, (kind,), {**fields, "__module__": kind.__module__, "_decoded": kind})
+
+
+def _plain_kind(kind: Any) -> Any:
+    """Return the dataclass behind one with deferred fields."""
+    return kind.__dict__.get("_decoded", kind)
+
+
+def _source_of(value: Any) -> _Source | None:
+    return cast("_Source | None", getattr(value, "__dict__", {}).get(_SOURCE))
+
+
+def _is_apart(kind: Any) -> bool:
+    return bool(getattr(kind, "stored_apart", False))
 
 
 # --- columns -----------------------------------------------------------------------------------------------------------
@@ -218,7 +462,7 @@ class _Column(Protocol):
 
     def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any: ...
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]: ...
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]: ...
 
 
 @functools.cache
@@ -234,10 +478,15 @@ def _column(kind: Any) -> _Column:
             return _SequenceColumn(_column(arguments[0]))
         return _TupleColumn([_column(argument) for argument in arguments])
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        return _DataclassColumn(kind)
+        return _ApartColumn(kind) if _is_apart(kind) else _fields_column(cast(Hashable, kind))
     if isinstance(kind, type) and issubclass(kind, Enum):
         return _EnumColumn(kind)
     return _PlainColumn()
+
+
+@functools.cache
+def _fields_column(kind: Any) -> _DataclassColumn:
+    return _DataclassColumn(kind)
 
 
 class _PlainColumn:
@@ -250,11 +499,11 @@ class _PlainColumn:
                 _refuse(kind)
             values = [value.item() if isinstance(value, np.generic) else value for value in values]
             return self.encode(values, arrays)
-        if float in kinds:
+        if arrays.finite and float in kinds:
             _check_finite(values if len(kinds) == 1 else [value for value in values if type(value) is float])
         return values
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         return cast(list[Any], stored)
 
 
@@ -269,7 +518,7 @@ class _EnumColumn:
         _check_types(values, self._kind)
         return [value.value for value in values]
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         return [self._members[value] for value in stored]
 
 
@@ -280,7 +529,7 @@ class _ArrayColumn:
         _check_types(values, np.ndarray)
         return list(map(arrays.add, values))
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         return [arrays[number] for number in stored]
 
 
@@ -294,7 +543,7 @@ class _OptionalColumn:
         there = [value is not None for value in values]
         return there, self._present.encode([value for value in values if value is not None], arrays)
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         there, present = stored
         following = iter(self._present.decode(present, arrays))
         return [next(following) if is_there else None for is_there in there]
@@ -310,7 +559,7 @@ class _SequenceColumn:
         _check_types(values, tuple, list)
         return list(map(len, values)), self._member.encode(list(itertools.chain.from_iterable(values)), arrays)
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         lengths, members = stored
         following = iter(self._member.decode(members, arrays))
         return [tuple(itertools.islice(following, length)) for length in lengths]
@@ -327,7 +576,7 @@ class _TupleColumn:
         columns = list(zip(*values, strict=True)) or [()] * len(self._places)
         return [place.encode(column, arrays) for place, column in zip(self._places, columns, strict=True)]
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         columns = [place.decode(column, arrays) for place, column in zip(self._places, stored, strict=True)]
         return list(zip(*columns, strict=True))
 
@@ -339,7 +588,7 @@ class _DataclassColumn:
         self._kind = kind
 
     @functools.cached_property
-    def _fields(self) -> list[tuple[str, _Column]]:
+    def fields(self) -> list[tuple[str, _Column]]:
         # A dataclass may hold others of its own kind, so its fields are looked up at the first value.
         hints = typing.get_type_hints(self._kind)
         return [(field.name, _column(hints[field.name])) for field in dataclasses.fields(cast(Any, self._kind))]
@@ -347,19 +596,37 @@ class _DataclassColumn:
     def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
         if not values:
             return 0, []
-        for kind in set(map(type, values)) - {self._kind}:
-            _refuse(kind)
-        return len(values), [
-            column.encode(list(map(attrgetter(name), values)), arrays) for name, column in self._fields
-        ]
+        for kind in set(map(type, values)):
+            if _plain_kind(kind) is not self._kind:
+                _refuse(kind)
+        return len(values), [column.encode(list(map(attrgetter(name), values)), arrays) for name, column in self.fields]
 
-    def decode(self, stored: Any, arrays: list[NDArray[Any]]) -> list[Any]:
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
         count, columns = stored
         made = list(map(object.__new__, itertools.repeat(cast(Any, self._kind), count)))
         if made:
-            for (name, column), items in zip(self._fields, columns, strict=True):
+            for (name, column), items in zip(self.fields, columns, strict=True):
                 _set_all(made, name, column.decode(items, arrays))
         return made
+
+
+class _ApartColumn:
+    """Dataclasses that are stored by themselves: the numbers of their blocks."""
+
+    def __init__(self, kind: type) -> None:
+        self._kind = kind
+
+    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+        _check_types(values, self._kind)
+        return [arrays.add_block(block_of(value, finite=arrays.finite)) for value in values]
+
+    def decode(self, stored: Any, arrays: _Content) -> list[Any]:
+        blocks = [arrays.block(number) for number in stored]
+        return [deferred(self._kind, block.sha256, functools.partial(_content_of, block)) for block in blocks]
+
+
+def _content_of(block: Block) -> bytes:
+    return block.content
 
 
 def _set_all(objects: Sequence[Any], name: str, values: Sequence[Any]) -> None:

@@ -1,14 +1,15 @@
 """A whole study matched: names, pairs, phases, and the reasons where they fail."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
+from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import FrameChains, MatchedSite, Segmentation, Silent
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
-from fluoromap.matching import SiteComparisons, SiteRuns, match_study, site_comparison
+from fluoromap.matching import SiteRuns, match_study, study_matching
 from fluoromap.matching.two_view import triangulate_linear
 from fluoromap.reasons import Reason
 
@@ -298,23 +299,40 @@ def test_named_chains_carry_the_track_of_the_segmenter(heart) -> None:  # type: 
                 np.testing.assert_array_equal(chain.pixels_uv, by_track[chain.track].pixels_uv)
 
 
-def test_stored_comparisons_change_nothing_but_the_work(heart, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+class _Remembering(Silent):
+    """A context with a memory: ``computed`` are the kinds of the partial results that it had to compute."""
+
+    def __init__(self) -> None:
+        self.computed: list[str] = []
+        self._known: dict[str, Any] = {}
+
+    def recall(self, kind, inputs, compute):  # type: ignore[no-untyped-def]
+        key = repr((kind, inputs))
+        if key not in self._known:
+            self.computed.append(kind.__name__)
+            self._known[key] = compute()
+        return self._known[key]
+
+
+def test_a_corrected_site_alone_is_compared_and_matched_again(heart, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=4)
-    sites = [replace(study.site(f"S{i:02d}"), content=i) for i in range(3)]
-    comparisons, compared = SiteComparisons(most=3), []
+    sites = [study.site(f"S{i:02d}") for i in range(3)]
+    gathered, views_of = [], study_matching.views_of
+    monkeypatch.setattr(study_matching, "views_of", lambda runs: gathered.append(runs.site) or views_of(runs))
+    context = _Remembering()
+    match_study(sites, DEFAULT_CATALOGUE, context)
+    assert gathered == ["S00", "S01", "S02"]
+    assert context.computed == ["SiteComparison"] * 3 + ["MatchedSite"] * 3
 
-    def counting(runs: SiteRuns, catalogue: Catalogue) -> object:
-        compared.append(runs.site)
-        return compare_views(runs, catalogue)
-
-    compare_views = site_comparison.compare_views
-    monkeypatch.setattr(site_comparison, "compare_views", counting)
-    first = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent(), comparisons)
-    sites[1] = replace(sites[1], content="corrected")
-    again = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent(), comparisons)
-    assert compared == ["S00", "S01", "S02", "S01"]
-    unstored = match_study(
-        tuple(replace(site, content=None) for site in sites), DEFAULT_CATALOGUE, Silent(), comparisons
-    )
-    assert len(compared) == 7
-    assert repr(first) == repr(again) == repr(unstored)
+    gathered.clear()
+    context.computed.clear()
+    segmentation = sites[1].segmentation_a
+    assert segmentation is not None
+    frame = segmentation.frames[5]
+    moved = replace(frame.chains[0], pixels_uv=frame.chains[0].pixels_uv + 0.1)
+    frames = [FrameChains(5, (moved, *frame.chains[1:])) if one.frame == 5 else one for one in segmentation.frames]
+    sites[1] = replace(sites[1], segmentation_a=replace(segmentation, frames=tuple(frames)))
+    again = match_study(sites, DEFAULT_CATALOGUE, context)
+    assert gathered == ["S01"]
+    assert context.computed == ["SiteComparison", "MatchedSite"]
+    assert repr(again) == repr(match_study(sites, DEFAULT_CATALOGUE, Silent()))

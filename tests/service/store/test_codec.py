@@ -3,7 +3,7 @@
 import dataclasses
 import datetime
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
-from fluoromap_service.store.codec import StoredOtherwise, decode, encode
+from fluoromap_service.store import codec
+from fluoromap_service.store.codec import StoredOtherwise, block_of, decode, deferred, digest, encode, partial_results
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +38,20 @@ class _Tree:
     label: str | None
     branches: "tuple[_Tree, ...]" = ()
     pairs: tuple[tuple[str, Array | None], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Apart:
+    stored_apart: ClassVar[bool] = True
+
+    name: str
+    numbers: Array
+    note: str | None = "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Whole:
+    parts: tuple[_Apart, ...]
 
 
 def _segmentation() -> Segmentation:
@@ -135,3 +150,66 @@ def test_bytes_that_are_cut_off_are_no_stored_result(cut: int) -> None:
 def test_numbers_come_back_bit_for_bit(numbers: list[float]) -> None:
     before = np.array(numbers)
     assert decode(_Numbers, encode(_Numbers(before))).numbers.tobytes() == before.tobytes()
+
+
+def _whole() -> _Whole:
+    return _Whole((_Apart("a", np.arange(4.0)), _Apart("b", np.arange(2), None), _Apart("a", np.arange(4.0))))
+
+
+def test_a_value_that_is_stored_apart_comes_back_field_by_field() -> None:
+    after = decode(_Whole, encode(_whole()))
+    assert [part.name for part in after.parts] == ["a", "b", "a"]
+    assert [part.note for part in after.parts] == ["none", None, "none"]
+    np.testing.assert_array_equal(after.parts[0].numbers, np.arange(4.0))
+    assert all(isinstance(part, _Apart) for part in after.parts)
+    changed = dataclasses.replace(after.parts[0], name="c")
+    assert (changed.name, changed.note) == ("c", "none")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        after.parts[0].name = "d"  # type: ignore[misc]
+
+
+def test_an_unchanged_part_is_stored_again_without_being_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = encode(_whole())
+    after = decode(_Whole, before)
+    monkeypatch.setattr(codec._Content, "field", None)
+    assert encode(after) == before
+
+
+def test_equal_parts_are_stored_once() -> None:
+    one, three = (encode(_Whole((_Apart("a", np.arange(1000.0)),) * count)) for count in (1, 3))
+    assert len(three) < len(one) + 100
+
+
+def test_partial_results_lie_in_the_file_of_a_result() -> None:
+    part = block_of(_Number(np.inf), finite=False)
+    content = encode(_whole(), {"key": part})
+    assert partial_results(content) == {"key": part}
+    assert decode(_Number, part.content).number == np.inf
+    assert encode(decode(_Whole, content)) == encode(_whole())
+
+
+def test_a_deferred_value_is_read_when_a_field_is_read() -> None:
+    content, reads = encode(_segmentation()), []
+    value = deferred(Segmentation, "hash", lambda: reads.append(1) or content)
+    assert digest(value) == digest(deferred(Segmentation, "hash", lambda: content))
+    assert reads == []
+    assert value.r_wave_frames == (1,)
+    assert len(value.frames) == 2
+    assert reads == [1]
+
+
+def test_a_deferred_value_of_another_form_says_so() -> None:
+    value = deferred(Segmentation, "hash", lambda: encode(_whole()))
+    with pytest.raises(StoredOtherwise):
+        _ = value.frames
+
+
+def test_a_digest_distinguishes_types_and_places() -> None:
+    values = [
+        (1,), (1.0,), ("1",), (True,), (None,), ((1,),), (1, 2), ((1, 2),), (np.arange(2),), (np.arange(2.0),),
+        ({"a": 1},), ({"a": 2},), (Reason.NO_ELECTRODES,), ("NO_ELECTRODES",), (_whole().parts[0],), (_whole().parts[1],),
+    ]  # fmt: skip
+    assert len({digest(*value) for value in values}) == len(values)
+    assert digest(_whole()) == digest(decode(_Whole, encode(_whole())))
+    with pytest.raises(TypeError, match="never stored"):
+        digest(object())
