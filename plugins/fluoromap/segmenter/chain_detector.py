@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
+from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, IntArray
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_fitting import fit_chains, widen_covariance
 from fluoromap.segmenter.field_mask import FieldMask
@@ -25,6 +25,7 @@ from fluoromap.segmenter.linking import (
     link_candidates,
 )
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
 from fluoromap.segmenter.refinement import refine
@@ -39,6 +40,7 @@ _HIDING_MM, _LEAST_FREE = 1.2, 2
 _WORST_FIT = 2.0
 _BENDING = 0.12
 _BESIDE_MM = 2.0
+_WEAKER = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,8 @@ class Acceptance:
     least_seen : at least this share of a chain's electrodes has this score. unseen_evidence : an electrode that was not
     proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
     not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
+    row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``least_score`` and ``least_seen`` where its
+    chain's score and the median of its scores are at least these: anatomy rarely has so long a row with the right spacings.
     trust : see :class:`~fluoromap.segmenter.linking.Trust`.
     """
 
@@ -63,11 +67,26 @@ class Acceptance:
     least_seen: float = 0.0
     unseen_evidence: float = 0.0
     strict: bool = False
+    row_chain_score: float = np.inf
+    row_score: float = np.inf
     trust: Trust = ONE_BY_ONE
 
-    def accepts(self, scores: Array) -> bool:
-        """Return whether a chain's scores (electrodes,) are enough."""
-        return bool(np.median(scores) >= self.least_score and np.mean(scores >= self.seen_score) >= self.least_seen)
+    def accepts(self, scores: Array, chain_scores: Array) -> BoolArray:
+        """Return whether chains are clear enough, (...).
+
+        Parameters
+        ----------
+        scores : (..., electrodes)
+            Of the electrodes, in the proposer's measure.
+        chain_scores : (...)
+            Of the chains, see :func:`~fluoromap.segmenter.linking.link_candidates`.
+        """
+        middle = np.median(scores, axis=-1)
+        share_seen = np.mean(scores >= self.seen_score, axis=-1)
+        accepted: BoolArray = (middle >= self.least_score) & (share_seen >= self.least_seen)
+        if scores.shape[-1] >= MANY_ELECTRODES:
+            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score)
+        return accepted
 
 
 @dataclass(slots=True, eq=False)
@@ -112,7 +131,15 @@ class ChainDetector:
         shaft_image = self._shafts(seen)
         points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
         sure_candidates = len(points)
-        linked = link_candidates(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
+        linked = link_candidates(
+            points,
+            weights,
+            variance,
+            shaft_image,
+            families,
+            slack=_COMPANION_SLACK,
+            accepted=self._accepted_rows(seen.scores_at(points)),
+        )
         if not self._is_complete(linked, weights):
 
             def dark(places: Array) -> Array:
@@ -132,6 +159,7 @@ class ChainDetector:
                 len(points),
                 _COMPANION_SLACK,
                 completed.rows,
+                self._accepted_rows(seen.scores_at(completed.points_uv)),
             )
             points = completed.points_uv
         if not linked:
@@ -154,26 +182,39 @@ class ChainDetector:
             )
             for chain in found
         )
-        chains = tuple(chain for chain in chains if self.acceptance.accepts(chain.scores))
+        chains = tuple(
+            chain for chain, one in zip(chains, found, strict=True) if self.acceptance.accepts(chain.scores, one.scores[0])
+        )
         if self.acceptance.strict:
-            chains = self._of_catalogue(chains, proposed)
+            chains = self._of_catalogue(chains, seen, proposed)
         return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
 
-    def _of_catalogue(self, chains: tuple[Chain, ...], proposed: Proposals) -> tuple[Chain, ...]:
+    def _of_catalogue(
+        self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals
+    ) -> tuple[Chain, ...]:
         """Return the chains that can be catheters of the catalogue.
 
-        A chain that is part of a catheter with more electrodes than the catalogue has is dropped.
+        A chain that is part of a catheter with more electrodes than the catalogue has is dropped. The electrodes of one
+        catheter look alike, so proposals that are less probable than the chain's weaker electrodes do not count.
         """
-        sure = proposed.points_uv[proposed.probability >= SURE]
-        free = not_on(sure, chains, self.px_per_mm)
+        free = not_on(proposed.points_uv, chains, self.px_per_mm)
+        probability_of_free = seen.probability_at(free)
         kept = []
         for chain in chains:
             family = self._family(chain)
-            if family is None or unexplained_between(chain, free, family.catheter, self.px_per_mm):
+            if family is None:
                 continue
-            if not continues(chain, sure, family.catheter, self.px_per_mm):
+            alike = np.quantile(seen.probability_at(chain.pixels_uv), _WEAKER, method="lower")
+            least = max(SURE, float(alike))
+            if unexplained_between(chain, free[probability_of_free >= least], family.catheter, self.px_per_mm):
+                continue
+            if not continues(chain, proposed.points_uv[proposed.probability >= least], family.catheter, self.px_per_mm):
                 kept.append(chain)
         return tuple(kept)
+
+    def _accepted_rows(self, scores: Array) -> Callable[[IntArray, Array], BoolArray]:
+        """Return the function that says which rows (n, electrodes) of candidates with these scores are accepted."""
+        return lambda rows, chain_scores: self.acceptance.accepts(scores[rows], chain_scores)
 
     def _is_complete(self, linked: Sequence[CandidateChain], weights: Array) -> bool:
         """Return whether each catheter has a well-fitting chain.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array, IntArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
@@ -128,6 +128,7 @@ def link_candidates(
     sure: int | None = None,
     slack: float = 0.0,
     completed: Sequence[IntArray] = (),
+    accepted: Callable[[IntArray, Array], BoolArray] | None = None,
 ) -> tuple[CandidateChain, ...]:
     """Return the best set of chains, each ordered from the tip.
 
@@ -161,6 +162,9 @@ def link_candidates(
         How far a chain's score may lie below its family's floor.
     completed : sequence of (n, electrodes) int
         More chains of each family, as indices from the tip on. Then the search itself uses only the sure candidates.
+    accepted : callable, optional
+        (n, electrodes) indices of candidates, (n,) scores of the chains -> (n,) whether these would be accepted. Other chains do not compete: they
+        would take the place of a catheter and be dropped afterwards.
 
     Returns
     -------
@@ -182,6 +186,9 @@ def link_candidates(
             paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm, shaft_image.px_per_mm,
             shaft_image.smooth, shaft_image.reduction, shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, family.floor - slack,
         )  # fmt: skip
+        if accepted is not None:
+            possible = np.flatnonzero(np.isfinite(scores))
+            scores[possible[~accepted(paths[possible], scores[possible])]] = -np.inf
         best = np.argsort(-scores)[:_BEST]
         found += [
             CandidateChain(tuple(paths[row].tolist()), index, float(scores[row]))
