@@ -58,8 +58,8 @@ class Acceptance:
     proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
     not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
     row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``least_score`` and ``least_seen``
-    where its chain's score and the median of its scores are at least these: anatomy rarely has so long a row with the right
-    spacings.
+    where its chain's score and the median of its scores are at least these and both its ends are seen: anatomy rarely has so
+    long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
     trust : see :class:`~fluoromap.segmenter.linking.Trust`.
     """
 
@@ -90,7 +90,8 @@ class Acceptance:
         share_seen = np.mean(scores >= self.seen_score, axis=-1)
         accepted: BoolArray = (middle >= self.least_score) & (share_seen >= self.least_seen)
         if scores.shape[-1] >= MANY_ELECTRODES:
-            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score)
+            ends_seen = (scores[..., [0, -1]] >= self.seen_score).all(axis=-1)
+            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & ends_seen
         return accepted
 
 
@@ -266,7 +267,8 @@ class ChainDetector:
         """Return which chains can be catheters of the catalogue, (n,).
 
         Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
-        alike, so proposals that are less probable than the chain's weaker electrodes do not count.
+        alike: in a long chain, proposals in less than half of the gaps may be parts of the shaft, if they are less probable
+        than the chain's weaker electrodes.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         probability_of_free = seen.probability_at(free)
@@ -275,11 +277,18 @@ class ChainDetector:
             family = self._family(chain)
             if family is None:
                 continue
-            alike = np.quantile(seen.probability_at(chain.pixels_uv), _WEAKER, method="lower")
-            least = max(SURE, float(alike))
-            sure = proposed.points_uv[proposed.probability >= least]
-            between = unexplained_between(chain, free[probability_of_free >= least], family.catheter, self.px_per_mm)
-            listed[index] = not between and not continues(chain, sure, family.catheter, self.px_per_mm)
+            least, most = SURE, 0
+            if len(chain.electrodes) >= MANY_ELECTRODES:
+                least = max(SURE, float(np.quantile(seen.probability_at(chain.pixels_uv), _WEAKER, method="lower")))
+                most = (len(chain.electrodes) - 1) // 2
+            sure, alike = (
+                unexplained_between(chain, free[probability_of_free >= limit], family.catheter, self.px_per_mm)
+                for limit in (SURE, least)
+            )
+            onwards = proposed.points_uv[proposed.probability >= least]
+            listed[index] = (
+                sure <= most and not alike and not continues(chain, onwards, family.catheter, self.px_per_mm)
+            )
         return listed
 
     def _is_complete(self, linked: Sequence[CandidateChain], weights: Array) -> bool:
