@@ -58,8 +58,8 @@ class Acceptance:
     proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
     not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
     row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``least_score`` and ``least_seen``
-    where its chain's score and the median of its scores are at least these and both its ends are seen: anatomy rarely has so
-    long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
+    where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
+    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
     trust : see :class:`~fluoromap.segmenter.linking.Trust`.
     """
 
@@ -90,8 +90,8 @@ class Acceptance:
         share_seen = np.mean(scores >= self.seen_score, axis=-1)
         accepted: BoolArray = (middle >= self.least_score) & (share_seen >= self.least_seen)
         if scores.shape[-1] >= MANY_ELECTRODES:
-            ends_seen = (scores[..., [0, -1]] >= self.seen_score).all(axis=-1)
-            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & ends_seen
+            ends = np.minimum(scores[..., :2].max(axis=-1), scores[..., -2:].max(axis=-1))
+            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & (ends >= self.seen_score)
         return accepted
 
 
