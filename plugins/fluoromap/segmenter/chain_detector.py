@@ -17,14 +17,18 @@ from fluoromap.segmenter.linking import (
     ONE_BY_ONE,
     CandidateChain,
     CatheterFamily,
+    PossibleChains,
     ShaftImage,
     Trust,
+    best_chains,
     catheter_families,
     chain_score,
     evidence,
     link_candidates,
+    possible_chains,
 )
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
 from fluoromap.segmenter.refinement import refine
@@ -39,6 +43,8 @@ _HIDING_MM, _LEAST_FREE = 1.2, 2
 _WORST_FIT = 2.0
 _BENDING = 0.12
 _BESIDE_MM = 2.0
+_WEAKER = 0.25
+_GOOD_ALONE = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +57,9 @@ class Acceptance:
     least_seen : at least this share of a chain's electrodes has this score. unseen_evidence : an electrode that was not
     proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
     not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
+    row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``least_score`` and ``least_seen``
+    where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
+    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
     trust : see :class:`~fluoromap.segmenter.linking.Trust`.
     """
 
@@ -63,11 +72,54 @@ class Acceptance:
     least_seen: float = 0.0
     unseen_evidence: float = 0.0
     strict: bool = False
+    row_chain_score: float = np.inf
+    row_score: float = np.inf
     trust: Trust = ONE_BY_ONE
 
-    def accepts(self, scores: Array) -> bool:
-        """Return whether a chain's scores (electrodes,) are enough."""
-        return bool(np.median(scores) >= self.least_score and np.mean(scores >= self.seen_score) >= self.least_seen)
+    def accepts(self, scores: Array, chain_scores: Array) -> BoolArray:
+        """Return whether chains are clear enough, (...).
+
+        Parameters
+        ----------
+        scores : (..., electrodes)
+            Of the electrodes, in the proposer's measure.
+        chain_scores : (...)
+            Of the chains, see :func:`~fluoromap.segmenter.linking.possible_chains`.
+        """
+        middle = np.median(scores, axis=-1)
+        share_seen = np.mean(scores >= self.seen_score, axis=-1)
+        accepted: BoolArray = (middle >= self.least_score) & (share_seen >= self.least_seen)
+        if scores.shape[-1] >= MANY_ELECTRODES:
+            ends = np.minimum(scores[..., :2].max(axis=-1), scores[..., -2:].max(axis=-1))
+            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & (ends >= self.seen_score)
+        return accepted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linking:
+    """Chains of one image's candidates.
+
+    points_uv : the candidates, (n, 2) pixels; the first ``proposed`` of them were proposed. chains : the best set of the possible.
+    """
+
+    points_uv: Array
+    proposed: int
+    possible: PossibleChains
+    chains: tuple[CandidateChain, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FittedSet:
+    """Accepted chains of one image.
+
+    candidates : of each chain. unlisted : chains that are part of a catheter with more electrodes. sure : whether one fitted
+    chain is clear enough.
+    """
+
+    chains: tuple[Chain, ...]
+    candidates: tuple[CandidateChain, ...]
+    unlisted: tuple[CandidateChain, ...]
+    sure: bool
 
 
 @dataclass(slots=True, eq=False)
@@ -109,71 +161,135 @@ class ChainDetector:
         electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
         proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
         families = catheter_families(self.catalogue)
+        linking = self._link(seen, proposed, families)
+        if not linking.chains:
+            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        result = self._fit(x, seen, proposed, linking, families)
+        if self.acceptance.strict and len(result.candidates) < len(linking.chains):
+            again = self._link_without_rejected(seen, linking, result, families)
+            if not set(again.chains) <= set(result.candidates):
+                other = self._fit(x, seen, proposed, again, families)
+                result = other if len(other.chains) > len(result.chains) else result
+        return FrameChains(frame, result.chains, None if result.sure and result.chains else Reason.MANUAL_NEEDED)
+
+    def _link(self, seen: ImageEvidence, proposed: Proposals, families: tuple[CatheterFamily, ...]) -> _Linking:
+        """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
         shaft_image = self._shafts(seen)
         points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
-        sure_candidates = len(points)
-        linked = link_candidates(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
-        if not self._is_complete(linked, weights):
+        possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
+        linked = best_chains(possible, points, families, self.px_per_mm)
+        if self._is_complete(linked, weights):
+            return _Linking(points, len(points), possible, linked)
 
-            def dark(places: Array) -> Array:
-                probability = seen.unseen_probability_at(places)
-                possible = self._in_field(places) & (probability > 0)
-                return np.where(possible, self._evidence(probability), -np.inf)
+        def dark(places: Array) -> Array:
+            probability = seen.unseen_probability_at(places)
+            allowed = self._in_field(places) & (probability > 0)
+            return np.where(allowed, self._evidence(probability), -np.inf)
 
-            completed = complete_chains(
-                points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm
-            )
-            linked = link_candidates(
-                completed.points_uv,
-                completed.weights,
-                completed.variance_px2,
-                shaft_image,
-                families,
-                len(points),
-                _COMPANION_SLACK,
-                completed.rows,
-            )
-            points = completed.points_uv
-        if not linked:
-            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
-        fitted = [
-            one
-            for one in fit_chains(x, points, linked, shaft_image, families, seen.position_noise, sure_candidates)
+        completed = complete_chains(
+            points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm
+        )
+        possible = possible_chains(
+            completed.points_uv,
+            completed.weights,
+            completed.variance_px2,
+            shaft_image,
+            families,
+            len(points),
+            _COMPANION_SLACK,
+            completed.rows,
+        )
+        linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
+        return _Linking(completed.points_uv, len(points), possible, linked)
+
+    def _fit(
+        self,
+        x: Image,
+        seen: ImageEvidence,
+        proposed: Proposals,
+        linking: _Linking,
+        families: tuple[CatheterFamily, ...],
+    ) -> _FittedSet:
+        """Fit linked chains to the image, and drop those that are not accepted."""
+        fitted = fit_chains(
+            x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed
+        )
+        clear = [
+            (candidates, one)
+            for candidates, one in zip(linking.chains, fitted, strict=True)
             if one.clearness >= self.acceptance.least_clearness
         ]
         floor = min(family.floor for family in families)
-        sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for one in fitted)
-        found = [one.chain for one in fitted]
-        chains = tuple(
-            replace(
-                chain,
-                covariance_px2=widen_covariance(
-                    chain, [other for other in found if other is not chain], self.px_per_mm
-                ),
-                scores=seen.scores_at(chain.pixels_uv),
-            )
-            for chain in found
-        )
-        chains = tuple(chain for chain in chains if self.acceptance.accepts(chain.scores))
+        sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
+        found = [one.chain for _, one in clear]
+        accepted = []
+        for candidates, chain in zip((candidates for candidates, _ in clear), found, strict=True):
+            others = [other for other in found if other is not chain]
+            scores = seen.scores_at(chain.pixels_uv)
+            if self.acceptance.accepts(scores, chain.scores[0]):
+                covariance = widen_covariance(chain, others, self.px_per_mm)
+                accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
+        chains = tuple(chain for _, chain in accepted)
+        listed = np.ones(len(chains), np.bool_)
         if self.acceptance.strict:
-            chains = self._of_catalogue(chains, proposed)
-        return FrameChains(frame, chains, None if sure and chains else Reason.MANUAL_NEEDED)
+            listed = self._are_of_catalogue(chains, seen, proposed)
+        return _FittedSet(
+            tuple(chain for chain, kept in zip(chains, listed, strict=True) if kept),
+            tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if kept),
+            tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if not kept),
+            sure,
+        )
 
-    def _of_catalogue(self, chains: tuple[Chain, ...], proposed: Proposals) -> tuple[Chain, ...]:
-        """Return the chains that can be catheters of the catalogue.
+    def _link_without_rejected(
+        self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
+    ) -> _Linking:
+        """Link again without chains that would be rejected: they took the places of catheters.
 
-        A chain that is part of a catheter with more electrodes than the catalogue has is dropped.
+        A chain that only now gets its place must be good for itself, and it has no electrode of an unlisted catheter.
         """
-        sure = proposed.points_uv[proposed.probability >= SURE]
-        free = not_on(sure, chains, self.px_per_mm)
-        kept = []
-        for chain in chains:
+        scores = seen.scores_at(linking.points_uv)
+        unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
+        allowed = []
+        for index, (family, rows, chain_scores) in enumerate(
+            zip(families, linking.possible.rows, linking.possible.scores, strict=True)
+        ):
+            good = (chain_scores >= family.floor + _GOOD_ALONE) & self.acceptance.accepts(scores[rows], chain_scores)
+            good &= ~np.isin(rows, unlisted).any(axis=1)
+            for chain in linking.chains:
+                if chain.family == index:
+                    good[(rows == np.array(chain.candidates)).all(axis=1)] = chain in result.candidates
+            allowed.append(good)
+        possible = linking.possible.where(allowed)
+        chains = best_chains(possible, linking.points_uv, families, self.px_per_mm)
+        return replace(linking, possible=possible, chains=chains)
+
+    def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
+        """Return which chains can be catheters of the catalogue, (n,).
+
+        Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
+        alike: in a long chain, proposals in less than half of the gaps may be parts of the shaft, if they are less probable
+        than the chain's weaker electrodes.
+        """
+        free = not_on(proposed.points_uv, chains, self.px_per_mm)
+        probability_of_free = seen.probability_at(free)
+        listed = np.zeros(len(chains), np.bool_)
+        for index, chain in enumerate(chains):
             family = self._family(chain)
-            if family is None or unexplained_between(chain, free, family.catheter, self.px_per_mm):
+            if family is None:
                 continue
-            if not continues(chain, sure, family.catheter, self.px_per_mm):
-                kept.append(chain)
-        return tuple(kept)
+            least, most = SURE, 0
+            if len(chain.electrodes) >= MANY_ELECTRODES:
+                least = max(SURE, float(np.quantile(seen.probability_at(chain.pixels_uv), _WEAKER, method="lower")))
+                most = (len(chain.electrodes) - 1) // 2
+            sure, alike = (
+                unexplained_between(chain, free[probability_of_free >= limit], family.catheter, self.px_per_mm)
+                for limit in (SURE, least)
+            )
+            onwards = proposed.points_uv[proposed.probability >= least]
+            listed[index] = (
+                sure <= most and not alike and not continues(chain, onwards, family.catheter, self.px_per_mm)
+            )
+        return listed
 
     def _is_complete(self, linked: Sequence[CandidateChain], weights: Array) -> bool:
         """Return whether each catheter has a well-fitting chain.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array, IntArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
@@ -83,6 +83,25 @@ class CandidateChain:
     score: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PossibleChains:
+    """All chains of candidates that the search found, and their scores.
+
+    rows : for each family, the indices of the candidates from the tip on, (n, electrodes). scores : for each family, (n,); -inf
+    where the chain is too unlikely.
+    """
+
+    rows: tuple[IntArray, ...]
+    scores: tuple[Array, ...]
+
+    def where(self, allowed: Sequence[BoolArray]) -> PossibleChains:
+        """Return the chains for which ``allowed`` has True: one (n,) for each family."""
+        return PossibleChains(
+            tuple(rows[kept] for rows, kept in zip(self.rows, allowed, strict=True)),
+            tuple(scores[kept] for scores, kept in zip(self.scores, allowed, strict=True)),
+        )
+
+
 def catheter_families(catalogue: Catalogue) -> tuple[CatheterFamily, ...]:
     """Group the catalogue's catheters by :meth:`~fluoromap.catheters.Catheter.looks_like`."""
     groups: list[list[Catheter]] = []
@@ -131,6 +150,24 @@ def link_candidates(
 ) -> tuple[CandidateChain, ...]:
     """Return the best set of chains, each ordered from the tip.
 
+    See :func:`possible_chains` for the parameters and :func:`best_chains` for the set.
+    """
+    possible = possible_chains(points_uv, weights, variance_px2, shaft_image, families, sure, slack, completed)
+    return best_chains(possible, points_uv, families, shaft_image.px_per_mm)
+
+
+def possible_chains(
+    points_uv: Array,
+    weights: Array,
+    variance_px2: Array,
+    shaft_image: ShaftImage,
+    families: Sequence[CatheterFamily],
+    sure: int | None = None,
+    slack: float = 0.0,
+    completed: Sequence[IntArray] = (),
+) -> PossibleChains:
+    """Return all chains that catheters can show.
+
     A chain's score is the sum of its candidates' weights. Penalties are subtracted for:
 
     - spacings whose foreshortening differs more than a bend in depth explains (0.06 SD),
@@ -139,10 +176,6 @@ def link_candidates(
     - rings of unlike weight.
 
     A dark shaft between the electrodes and behind the last one raises the score; a dark shaft before the tip lowers it.
-    The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
-    weaker catheter is not dropped, nor a part of a long one preferred. Crossing catheters may share one candidate at a
-    price, but two chains must not lie at the same place. A set has at most as many chains of a family as the catalogue
-    has catheters.
 
     Parameters
     ----------
@@ -161,27 +194,41 @@ def link_candidates(
         How far a chain's score may lie below its family's floor.
     completed : sequence of (n, electrodes) int
         More chains of each family, as indices from the tip on. Then the search itself uses only the sure candidates.
-
-    Returns
-    -------
-    tuple of CandidateChain
-        Best first.
     """
     sure = len(points_uv) if sure is None else sure
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
-    found: list[CandidateChain] = []
+    all_rows, all_scores = [], []
     for index, family in enumerate(families):
-        if len(points) < family.catheter.electrodes:
-            continue
-        spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
-        searched = sure if completed else len(points)
-        paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px)
-        if completed:
-            paths = np.concatenate([paths, completed[index]])
-        scores = chain_scores.score_paths(
-            paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm, shaft_image.px_per_mm,
-            shaft_image.smooth, shaft_image.reduction, shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, family.floor - slack,
-        )  # fmt: skip
+        paths, scores = np.zeros((0, family.catheter.electrodes), np.int64), np.zeros(0)
+        if len(points) >= family.catheter.electrodes:
+            spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
+            searched = sure if completed else len(points)
+            paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px)
+            if completed:
+                paths = np.concatenate([paths, completed[index]])
+            scores = chain_scores.score_paths(
+                paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm,
+                shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction, shaft_image.clear, shaft_image.side_px,
+                _SHAFT_WEIGHT, family.floor - slack,
+            )  # fmt: skip
+        all_rows.append(paths)
+        all_scores.append(scores)
+    return PossibleChains(tuple(all_rows), tuple(all_scores))
+
+
+def best_chains(
+    possible: PossibleChains, points_uv: Array, families: Sequence[CatheterFamily], px_per_mm: float
+) -> tuple[CandidateChain, ...]:
+    """Return the best set of these chains, best first.
+
+    The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
+    weaker catheter is not dropped, nor a part of a long one preferred. Crossing catheters may share one candidate at a
+    price, but two chains must not lie at the same place. A set has at most as many chains of a family as the catalogue
+    has catheters.
+    """
+    points = np.ascontiguousarray(points_uv, dtype=np.float64)
+    found: list[CandidateChain] = []
+    for index, (paths, scores) in enumerate(zip(possible.rows, possible.scores, strict=True)):
         best = np.argsort(-scores)[:_BEST]
         found += [
             CandidateChain(tuple(paths[row].tolist()), index, float(scores[row]))
@@ -197,7 +244,7 @@ def link_candidates(
         within[row, : len(chain.candidates)] = chain.candidates
     chosen = chain_search.best_set(
         np.array([values[id(chain)] for chain in found]),
-        chain_search.count_shared(within, points, _SAME_PLACE_MM * shaft_image.px_per_mm, _SAME_PLACES),
+        chain_search.count_shared(within, points, _SAME_PLACE_MM * px_per_mm, _SAME_PLACES),
         np.array([chain.family for chain in found]),
         np.array([len(family.names) for family in families]),
         _SHARED,
@@ -208,7 +255,7 @@ def link_candidates(
 def chain_score(
     points_uv: Array, weights: Array, variance_px2: Array, shaft_image: ShaftImage, family: CatheterFamily
 ) -> float:
-    """Return the score of the points in this order, as in :func:`link_candidates`."""
+    """Return the score of the points in this order, as in :func:`possible_chains`."""
     return float(
         chain_scores.score_paths(
             np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,

@@ -28,6 +28,8 @@ _IN_A_RUN = Acceptance(
     least_seen=0.85,
     unseen_evidence=-0.9,
     strict=True,
+    row_chain_score=2.0,
+    row_score=0.2,
     trust=_TRUST,
 )
 _ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)

@@ -1,5 +1,6 @@
 """Tracks judged by pictures averaged along them, in noise and where nothing is."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,3 +74,17 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
     track = chains(noisy.truth.pixels_uv["reference"])
     track[2] = next(iter(chains(noisy.truth.pixels_uv["reference"][2:3, :3]).values()))
     assert judge(track, lambda frame: images[frame])
+
+
+@pytest.mark.parametrize(
+    ("electrodes", "odds", "accepted"),
+    [(4, -0.5, False), (6, -0.5, True), (6, -1.5, False), (10, -1.5, True), (10, -2.5, False)],
+)
+def test_a_long_catheter_needs_less_from_the_network(monkeypatch, electrodes, odds, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    monkeypatch.setattr(TrackEvidence, "log_odds_along", lambda self, frames, path, image: np.full(path.shape[1], odds))
+    row = np.stack([np.linspace(100.0, 300.0, electrodes), np.full(electrodes, 200.0)], axis=1)
+    doubted = np.full(electrodes, 0.3)
+    known = chains(np.repeat(row[None], FRAMES, axis=0))
+    track = {frame: replace(chain, scores=doubted) for frame, chain in known.items()}
+    assert judge(track, lambda frame: None) == accepted

@@ -1,0 +1,150 @@
+"""Chains of one image: which of them compete, and which are accepted."""
+
+import numpy as np
+import pytest
+
+from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
+from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.linking import Trust
+from fluoromap.segmenter.proposals import Likeness, Proposals
+
+PX = 4.0
+SIZE = 360
+CATALOGUE = Catalogue(
+    (catheter_type("decapolar-2-5-2", "cs"), catheter_type("ablation-4", "ablation")), "cs", "ablation"
+)
+ACCEPTANCE = Acceptance(
+    least_clearness=0.1,
+    again_clearness=0.1,
+    sure_clearness=0.1,
+    extra_clearness=0.3,
+    least_score=0.4,
+    seen_score=0.15,
+    least_seen=0.85,
+    unseen_evidence=-0.9,
+    strict=True,
+    row_chain_score=2.0,
+    row_score=0.2,
+    trust=Trust(share=0.25, chain=0.7),
+)
+
+
+class Evidence:
+    """Image evidence with a probability and a score for each of some points, and nothing elsewhere."""
+
+    reduction = 1
+    pixel_noise = position_noise = 0.02
+
+    def __init__(self, image, points, probability, scores):
+        self.smooth, self.points = image, points
+        self.probability, self.scores = np.asarray(probability), np.asarray(scores)
+
+    @property
+    def likeness(self):
+        return Likeness(np.zeros_like(self.smooth), 1.0, 0.0)
+
+    def proposals(self, allowed, expected):
+        order = np.argsort(-self.probability, kind="stable")
+        covariance = np.tile(0.5 * np.eye(2), (len(order), 1, 1))
+        return Proposals(self.points[order], self.probability[order], covariance)
+
+    def _nearest(self, values, points_uv, otherwise):
+        away = np.linalg.norm(points_uv[:, None] - self.points[None], axis=2)
+        return np.where(away.min(axis=1) < 4.0, values[away.argmin(axis=1)], otherwise)
+
+    def probability_at(self, points_uv):
+        return self._nearest(self.probability, points_uv, 0.01)
+
+    def unseen_probability_at(self, points_uv):
+        return np.zeros(len(points_uv))
+
+    def variance_at(self, points_uv):
+        return np.full(len(points_uv), 0.5)
+
+    def scores_at(self, points_uv):
+        return self._nearest(self.scores, points_uv, 0.01)
+
+
+def row_of(name, tip, angle):
+    return np.asarray(tip) + np.outer(CATALOGUE[name].arc_lengths_mm * PX * 0.9, [np.cos(angle), np.sin(angle)])
+
+
+def drawn(rows):
+    """Draw a log image with a dark spot at each electrode and a faint shaft along and behind each row."""
+    v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    image = np.random.default_rng(3).normal(6.0, 0.02, (SIZE, SIZE))
+    for row in rows:
+        along = (row[-1] - row[0]) / np.linalg.norm(row[-1] - row[0])
+        t = (u - row[0][0]) * along[0] + (v - row[0][1]) * along[1]
+        across = (v - row[0][1]) * along[0] - (u - row[0][0]) * along[1]
+        length = np.linalg.norm(row[-1] - row[0])
+        image -= 0.12 * ((np.abs(across) < 3.0) & (t > 0) & (t < length + 40.0))
+        for point in row:
+            image -= 0.8 * (np.hypot(u - point[0], v - point[1]) < 3.0)
+    return image.astype(np.float32)
+
+
+def chains_found(image, points, probability, scores):
+    everywhere = np.ones(image.shape, np.bool_)
+    field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
+    evidence = Evidence(image, points, probability, scores)
+    detector = ChainDetector(CATALOGUE, field, PX, lambda x: evidence, ACCEPTANCE)
+    return detector.find_chains(image, 0).chains
+
+
+def lies_on(chain, row):
+    return len(chain.pixels_uv) == len(row) and np.linalg.norm(chain.pixels_uv - row, axis=1).max() < 5.0
+
+
+def test_a_chain_that_would_be_rejected_does_not_take_a_catheter_s_place():
+    catheter, vessel = row_of("ablation", (60, 60), 0.3), row_of("ablation", (60, 250), -0.2)
+    points = np.concatenate([catheter, vessel])
+    probability, scores = [0.8] * 4 + [0.99] * 4, [0.9] * 4 + [0.05] * 4
+    found = chains_found(drawn([catheter, vessel]), points, probability, scores)
+    assert len(found) == 1
+    assert lies_on(found[0], catheter)
+
+
+@pytest.mark.parametrize(("between", "listed"), [(0.8, True), (0.995, False)])
+def test_a_long_chain_is_unlisted_only_where_what_lies_between_is_like_its_electrodes(between, listed):
+    catheter = row_of("cs", (60, 60), 0.4)
+    extra = 0.5 * (catheter[3] + catheter[4])
+    points = np.concatenate([catheter, extra[None]])
+    found = chains_found(drawn([catheter]), points, [0.99] * 10 + [between], [0.9] * 10 + [0.9])
+    assert any(lies_on(chain, catheter) for chain in found) == listed
+
+
+def test_less_likely_points_between_half_of_the_electrodes_make_a_long_chain_unlisted():
+    catheter = row_of("cs", (60, 60), 0.4)
+    gaps = 0.5 * (catheter[:-1] + catheter[1:])[[1, 3, 5, 7]]
+    wide = np.concatenate([gaps - 0.6 * PX, gaps + 0.6 * PX])
+    points = np.concatenate([catheter, wide])
+    found = chains_found(drawn([catheter]), points, [0.99] * 10 + [0.8] * 8, [0.9] * 10 + [0.9] * 8)
+    assert not any(lies_on(chain, catheter) for chain in found)
+
+
+def test_a_short_chain_with_a_sure_point_between_its_electrodes_is_unlisted():
+    catheter = row_of("ablation", (60, 60), 0.3)
+    points = np.concatenate([catheter, 0.5 * (catheter[1:2] + catheter[2:3])])
+    assert chains_found(drawn([catheter]), points, [0.99] * 4 + [0.8], [0.9] * 5) == ()
+
+
+def test_a_long_row_is_accepted_with_less_from_each_electrode():
+    doubted = np.full(10, 0.3)
+    assert ACCEPTANCE.accepts(doubted, 2.5)
+    assert not ACCEPTANCE.accepts(doubted, 1.5)
+    assert not ACCEPTANCE.accepts(doubted[:4], 2.5)
+    assert not ACCEPTANCE.accepts(np.full(10, 0.1), 8.0)
+
+
+def test_a_row_displaced_by_a_pair_is_not_accepted():
+    displaced = np.array([0.9] * 8 + [0.01] * 2)
+    assert not ACCEPTANCE.accepts(displaced, 5.0)
+    assert not ACCEPTANCE.accepts(displaced[::-1], 5.0)
+    assert ACCEPTANCE.accepts(np.array([0.9] * 6 + [0.01] * 2 + [0.9] * 2), 5.0)
+
+
+def test_chains_are_accepted_one_by_one():
+    scores = np.stack([np.full(4, 0.9), np.full(4, 0.1)])
+    assert ACCEPTANCE.accepts(scores, np.array([5.0, 5.0])).tolist() == [True, False]
