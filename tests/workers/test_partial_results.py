@@ -80,9 +80,9 @@ def _job(service: TestClient, study_path: str) -> dict[str, Any]:
 def _correct(service: TestClient, study_path: str, job: dict[str, Any], moved_px: float) -> None:
     """Move the mapping catheter's tip in one frame.
 
-    The frame belongs to the third site and is far from its diastole.
+    The frame belongs to the fourth site and is far from its diastole, which stays the same.
     """
-    site = service.get(f"{study_path}/sites").json()["items"][2]
+    site = service.get(f"{study_path}/sites").json()["items"][3]
     points = service.get(f"/v1/jobs/{job['id']}/points").json()["points"]
     diastole = next(point["views"]["a"]["frame"] for point in points if point["site"] == site["site"])
     for frame in sorted(range(1, 25), key=lambda frame: -abs(frame - diastole)):
