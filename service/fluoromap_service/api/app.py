@@ -37,6 +37,7 @@ from fluoromap_service.api.results import (
     placements,
     points,
     report,
+    report_page,
     tracks,
 )
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
@@ -198,6 +199,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 async def _warm_up() -> None:
     await run_in_threadpool(file_pool.start)
+    await run_in_threadpool(report_page.prepare)
 
 
 async def _repeat(failure: str, act: Callable[[], object], seconds: float) -> None:
