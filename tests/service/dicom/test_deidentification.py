@@ -140,7 +140,7 @@ def test_the_subject_is_always_the_same() -> None:
     assert pseudonyms(secret=b"other").name != pseudonyms().name
     dataset = Dataset()
     deidentify(dataset, pseudonyms(subject="S-001"))
-    assert (dataset.PatientName, dataset.PatientID) == ("S-001", "S-001")
+    assert (dataset.PatientName, dataset.PatientID) == ("S-001^", "S-001")
 
 
 def _same_but_for_uids(found: InstanceFacts, expected: InstanceFacts) -> bool:

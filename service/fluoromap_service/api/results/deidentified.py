@@ -228,7 +228,8 @@ def _working_folder() -> Iterator[Path]:
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes | Path) -> None:
     entry = zipfile.ZipInfo(name, _DATE)
-    entry.compress_type = zipfile.ZIP_DEFLATED
+    # Noise makes runs hardly smaller, and deflating them takes minutes.
+    entry.compress_type = zipfile.ZIP_DEFLATED if isinstance(content, bytes) else zipfile.ZIP_STORED
     entry.external_attr = 0o644 << 16
     with archive.open(entry, "w", force_zip64=True) as member:
         if isinstance(content, bytes):

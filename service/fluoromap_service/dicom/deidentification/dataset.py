@@ -46,7 +46,8 @@ def deidentify(dataset: Dataset, pseudonyms: Pseudonyms) -> dict[str, str]:
     """
     uids: dict[str, str] = {}
     _clean(dataset, pseudonyms, uids)
-    dataset.PatientName = dataset.PatientID = pseudonyms.name
+    # The caret marks a family name, without which readers warn (PS3.5 section 6.2.1).
+    dataset.PatientName, dataset.PatientID = f"{pseudonyms.name}^", pseudonyms.name
     dataset.PatientIdentityRemoved = "YES"
     dataset.DeidentificationMethod = METHOD
     dataset.DeidentificationMethodCodeSequence = [_code("113100", "Basic Application Confidentiality Profile")]

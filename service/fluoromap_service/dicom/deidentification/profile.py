@@ -1,4 +1,4 @@
-"""The actions of the Basic Application Level Confidentiality Profile (PS3.15 table E.1-1)."""
+"""The actions of the Basic Application Level Confidentiality Profile (PS3.15 table E.1-1, edition 2026c)."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_no_identifier_is_in_the_export(client: TestClient, study: FinishedStudy
     for item in (*objects(found, "runs").values(), *objects(found, "results").values()):
         assert item.PatientIdentityRemoved == "YES"
         assert item.DeidentificationMethodCodeSequence[0].CodeValue == "113100"
-        assert item.PatientName == item.PatientID
+        assert item.PatientName == f"{item.PatientID}^"
         assert str(item.PatientName).startswith("SUBJECT-")
     assert "burned" in found["README.txt"].decode()
 
