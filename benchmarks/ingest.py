@@ -153,7 +153,10 @@ def uid(name: str) -> str:
 
 
 def make_round(folder: Path, template: bytes, name: str) -> list[Path]:
-    """Write the files of a round: the same pixels under new UIDs, in a study of their own."""
+    """Write the files of a round.
+
+    They have the same pixels under new UIDs, in a study of their own.
+    """
     files = []
     for number in range(FILES):
         content = template.replace(uid("template").encode(), uid(f"{name}-{number}").encode())

@@ -85,6 +85,7 @@ def plan(session: Session, target: str, job_ends: Iterable[str]) -> int:
 
     Each job that ended since the target was registered needs one.
     """
+    _lock_target(session, target)
     jobs = session.scalars(_unplanned(target, job_ends)).all()
     for job_id in jobs:
         _add(session, target, job_id)
@@ -96,6 +97,11 @@ def plan(session: Session, target: str, job_ends: Iterable[str]) -> int:
         .values(since=seen_until)
     )
     return len(jobs)
+
+
+def _lock_target(session: Session, target: str) -> None:
+    """Let no other transaction add deliveries to a target until this one ends."""
+    session.execute(select(DeliveryTarget.name).where(DeliveryTarget.name == target).with_for_update())
 
 
 def _unplanned(target: str, job_ends: Iterable[str]) -> Any:
@@ -332,6 +338,7 @@ def request(session: Session, job_id: str, target: str) -> Delivery:
         As :func:`target_kind`.
     """
     target_kind(session, job_id, target)
+    _lock_target(session, target)
     known = session.scalar(select(Delivery.id).where(Delivery.job_id == job_id, Delivery.target == target))
     return _add(session, target, job_id) if known is None else retry(session, known)
 

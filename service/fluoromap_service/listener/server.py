@@ -85,7 +85,10 @@ def start(
 
 
 def _prepare_connection(event: evt.Event) -> None:
-    """Do the TLS handshake of a connection, and limit its silence and the length of its PDUs."""
+    """Prepare a new connection.
+
+    Do its TLS handshake, and limit its silence and the length of its PDUs.
+    """
     association = cast(Any, event.assoc)
     connection, stream = association.dul.socket, association.dul.socket.socket
     if isinstance(stream, ssl.SSLSocket):

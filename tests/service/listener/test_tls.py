@@ -28,7 +28,10 @@ pytestmark = pytest.mark.skipif(
 
 
 def make_certificate(folder: Path, name: str) -> tuple[str, str]:
-    """Make a self-signed certificate for this machine and return the files of certificate and key."""
+    """Return the files of a new self-signed certificate and of its key.
+
+    The certificate is for this machine.
+    """
     certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", f"/CN={name}", "-addext",

@@ -61,6 +61,20 @@ def test_of_two_senders_one_has_a_delivery(job: FinishedStudy) -> None:
         assert not outbox.needs_work(session, "pacs", ["succeeded"])
 
 
+def test_requests_and_senders_at_once_make_one_delivery(job: FinishedStudy) -> None:
+    def ask(number: int) -> None:
+        with writing() as session:
+            if number % 2:
+                outbox.request(session, job.job_id, "pacs")
+            else:
+                outbox.plan(session, "pacs", ["succeeded"])
+
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(ask, range(16)))
+    with reading() as session:
+        assert len(session.scalars(select(Delivery.id)).all()) == 1
+
+
 def test_many_senders_at_once_claim_each_delivery_once(job: FinishedStudy) -> None:
     def look(number: int) -> str | None:
         with writing() as session:

@@ -21,8 +21,8 @@ from fluoromap_service.api.http.multipart import MultipartBody, malformed
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import disk, files
 
-PART_BYTES = 1 << 20
-"""Bytes of a body that are written at once."""
+PART_BYTES = 2 << 20
+"""Bytes of a body that a thread writes at once: each change of threads costs time."""
 
 UPLOAD_THREADS = 32
 _LONGEST_FIELD = 1024
@@ -156,17 +156,19 @@ async def _receive_raw(request: Request, stack: ExitStack) -> Part:
 
 
 async def write_all(request: Request, write: Callable[[bytes], None]) -> None:
-    """Write a body in large parts; the next part arrives while a thread writes the one before."""
-    waiting = bytearray()
+    """Write a body; further chunks arrive while a thread writes those before."""
+    waiting: list[bytes] = []
+    waiting_bytes = 0
     writing: asyncio.Task[None] | None = None
     try:
         async for chunk in request.stream():
-            waiting += chunk
-            if len(waiting) >= PART_BYTES:
+            waiting.append(chunk)
+            waiting_bytes += len(chunk)
+            if waiting_bytes >= PART_BYTES:
                 if writing is not None:
                     await writing
-                writing = asyncio.create_task(in_upload_thread(_write_part, write, bytes(waiting)))
-                waiting.clear()
+                writing = asyncio.create_task(in_upload_thread(_write_chunks, write, waiting, waiting_bytes))
+                waiting, waiting_bytes = [], 0
     finally:
         # Nobody may close the file under the thread that writes it.
         if writing is not None:
@@ -174,12 +176,13 @@ async def write_all(request: Request, write: Callable[[bytes], None]) -> None:
     if writing is not None:
         writing.result()
     if waiting:
-        await in_upload_thread(_write_part, write, bytes(waiting))
+        await in_upload_thread(_write_chunks, write, waiting, waiting_bytes)
 
 
-def _write_part(write: Callable[[bytes], None], part: bytes) -> None:
-    disk.check_room(len(part))
-    write(part)
+def _write_chunks(write: Callable[[bytes], None], chunks: list[bytes], size: int) -> None:
+    disk.check_room(size)
+    for chunk in chunks:
+        write(chunk)
 
 
 async def in_upload_thread(function: Callable[..., Answer], *arguments: Any) -> Answer:
