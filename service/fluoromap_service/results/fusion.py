@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy.orm import Session
@@ -86,7 +86,6 @@ def draw_fusion(path: Path, fusion: Fusion, look: Look, moving: bool) -> bytes:
     """Return an overlay as PNG, or its propagation as GIF, from the run's file."""
     frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
     parts = (frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv)
-    look = replace(look, simulated=fusion.facts.simulated)
     return draw_propagation(*parts, look) if moving else encode_png(draw_overlay(*parts, look))
 
 

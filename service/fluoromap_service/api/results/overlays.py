@@ -63,8 +63,9 @@ class Overlays(BaseModel):
 def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> KeptFile:
     """Return the kept PNG or GIF of an overlay.
 
-    The GIF shows the propagation. The picture is drawn when none is kept.
+    The GIF shows the propagation. The picture is drawn when none is kept. It says when the run is simulated.
     """
+    look = replace(look, simulated=fusion.facts.simulated)
 
     def make() -> bytes:
         path = files.path_of(fusion.sha256)
