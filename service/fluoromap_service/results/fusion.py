@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +93,6 @@ JPEG_QUALITY = 88
 def draw_fusion(path: Path, fusion: Fusion, look: Look, moving: bool) -> bytes:
     """Return an overlay as PNG, or its propagation as GIF, from the run's file."""
     parts = _parts(path, fusion)
-    look = _labelled(look, fusion)
     return draw_propagation(*parts, look) if moving else encode_png(draw_overlay(*parts, look))
 
 
@@ -102,20 +101,14 @@ def draw_fusion_jpeg(path: Path, fusion: Fusion, look: Look) -> bytes:
 
     It is smaller than a PNG, and not exact.
     """
-    picture = draw_overlay(*_parts(path, fusion), _labelled(look, fusion))
     stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, format="JPEG", quality=JPEG_QUALITY)
+    Image.fromarray(draw_overlay(*_parts(path, fusion), look)).save(stream, format="JPEG", quality=JPEG_QUALITY)
     return stream.getvalue()
 
 
 def _parts(path: Path, fusion: Fusion) -> tuple[NDArray[np.uint8], Camera, ChamberMap, Array, str, Array | None]:
     frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
     return frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv
-
-
-def _labelled(look: Look, fusion: Fusion) -> Look:
-    """Return the look that says whether the run is simulated."""
-    return replace(look, simulated=fusion.facts.simulated)
 
 
 def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]:

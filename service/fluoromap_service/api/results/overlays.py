@@ -64,8 +64,9 @@ class Overlays(BaseModel):
 def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False) -> KeptFile:
     """Return the kept PNG or GIF of an overlay.
 
-    The GIF shows the propagation. The picture is drawn when none is kept.
+    The GIF shows the propagation. The picture is drawn when none is kept. It says when the run is simulated.
     """
+    look = _marked(fusion, look)
 
     def make() -> bytes:
         return run_in_pool(Task.DRAW_PICTURE, draw_fusion, _run_path(fusion), fusion, look, moving)
@@ -75,7 +76,12 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
 
 def jpeg_of(fusion: Fusion, look: Look) -> bytes:
     """Return a new JPEG of an overlay, which nothing keeps."""
-    return run_in_pool(Task.DRAW_PICTURE, draw_fusion_jpeg, _run_path(fusion), fusion, look)
+    return run_in_pool(Task.DRAW_PICTURE, draw_fusion_jpeg, _run_path(fusion), fusion, _marked(fusion, look))
+
+
+def _marked(fusion: Fusion, look: Look) -> Look:
+    """Return the look that says when the run is simulated."""
+    return replace(look, simulated=fusion.facts.simulated)
 
 
 def _run_path(fusion: Fusion) -> Path:
