@@ -15,8 +15,11 @@ from fluoromap.reasons import Reason
 
 CLEARLY_STILLER = 5.0
 """The reference is identified by motion when the log likelihood ratio for it against any look-alike exceeds this."""
-_OWN_MM2 = np.geomspace(0.05, 25.0, 12)
-"""Variances tried for a catheter's own motion between sites, an axis; the least is from detection and beats alone."""
+_OWN_MM2 = np.geomspace(0.25, 25.0, 12)
+"""Variances tried for a catheter's own motion between sites, an axis.
+
+The least one is from detection and beats alone: irregular beats move a catheter at rest by half a millimetre.
+"""
 _COMMON_MM2 = np.concatenate([[0.0], np.geomspace(0.1, 1000.0, 13)])
 """Variances tried for the motion of all catheters between sites, an axis: breathing and a moved table."""
 

@@ -28,3 +28,16 @@ def test_a_moved_table_hides_the_stiller_catheter_but_never_exchanges_it() -> No
         still, moving = places(0.2, table, rng), places(0.8, table, rng)
         wrong += stiller(moving, still) > CLEARLY_STILLER
     assert wrong == 0
+
+
+def test_irregular_beats_alone_make_no_catheter_the_stiller_one() -> None:
+    # Simulated study 90141 of benchmarks/silent_wrongs.py: the beats move the reference at rest by 1 mm at three sites.
+    pacing = np.array([
+        [0.09, -2.81, 1.87], [-0.17, -1.58, -0.98], [-0.14, 0.79, -1.33],
+        [-0.22, -0.42, -2.81], [0.29, 3.68, 3.38], [0.16, 0.34, -0.12],
+    ])  # fmt: skip
+    reference = np.array([
+        [-0.92, -2.66, 2.32], [-0.40, -3.64, -0.40], [1.84, 1.09, -0.59],
+        [0.35, 1.15, -5.54], [-1.02, 2.56, 3.71], [0.13, 1.49, 0.50],
+    ])  # fmt: skip
+    assert abs(stiller(pacing, reference)) < CLEARLY_STILLER
