@@ -25,16 +25,12 @@ _AVERAGED = 8
 _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
-_USUAL_ELECTRODES = 4
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.2, -2.0
 """Log-odds of the middle electrode in each mean; less where half of the single frames show the catheter; of the worst electrode."""
 _LOW_QUANTILE = 0.1
-_LEAST_FALLS, _LEAST_LONG = 0.6, -2.2
-"""How far the middle electrode's limit falls for each electrode beyond four, as the floor of linking does, and where it ends.
-
-A long row with the right spacings in half of the frames is rare in anatomy.
-"""
+_LEAST_LONG = 0.0
+"""Of the middle electrode of six or more. Clutter often hides one or two of them, so the worst electrodes do not count."""
 _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
@@ -65,12 +61,10 @@ class TrackEvidence:
         )
         clear = sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames
         middle = np.median(odds, axis=1)
-        least = _LEAST_WHERE_CLEAR if clear else _LEAST_MEDIAN
         if len(usual) >= MANY_ELECTRODES:
-            long = max(_LEAST_MEDIAN - _LEAST_FALLS * (len(usual) - _USUAL_ELECTRODES), _LEAST_LONG)
-            return bool((middle >= min(least, long)).all())
+            return bool((middle >= (_LEAST_WHERE_CLEAR if clear else _LEAST_LONG)).all())
         low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
-        return bool((middle >= least).all() and low >= _LEAST_LOW)
+        return bool((middle >= (_LEAST_WHERE_CLEAR if clear else _LEAST_MEDIAN)).all() and low >= _LEAST_LOW)
 
     def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""

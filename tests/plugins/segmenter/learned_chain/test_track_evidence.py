@@ -77,13 +77,17 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
 
 
 @pytest.mark.parametrize(
-    ("electrodes", "odds", "accepted"),
-    [(4, -0.5, False), (6, -0.5, True), (6, -1.5, False), (10, -1.5, True), (10, -2.5, False)],
+    ("electrodes", "odds", "hidden", "accepted"),
+    [(4, 0.5, 0, True), (4, 0.5, 1, False), (6, 0.5, 1, True), (10, 0.1, 2, True), (10, -0.5, 0, False)],
 )
-def test_a_long_catheter_needs_less_from_the_network(monkeypatch, electrodes, odds, accepted):
+def test_clutter_may_hide_some_electrodes_of_a_long_catheter(monkeypatch, electrodes, odds, hidden, accepted):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
-    monkeypatch.setattr(TrackEvidence, "log_odds_along", lambda self, frames, path, image: np.full(path.shape[1], odds))
-    row = np.stack([np.linspace(100.0, 300.0, electrodes), np.full(electrodes, 200.0)], axis=1)
+
+    def along(self, frames, path_uv, log_image):
+        return np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -4.0)
+
+    monkeypatch.setattr(TrackEvidence, "log_odds_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     doubted = np.full(electrodes, 0.3)
     known = chains(np.repeat(row[None], FRAMES, axis=0))
     track = {frame: replace(chain, scores=doubted) for frame, chain in known.items()}
