@@ -46,7 +46,7 @@ def main(corrections: int) -> None:
             seconds = []
             for number in range(corrections):
                 site = sites[number % len(sites)]
-                path, electrodes = _electrodes_to_put(http, study, site["view_a"], frame=1 + number)
+                path, electrodes = electrodes_to_put(http, study, site["view_a"], frame=1 + number)
                 start = time.perf_counter()
                 http.put(path, json=electrodes).raise_for_status()
                 _, job = _until_map(http, study)
@@ -66,7 +66,7 @@ def main(corrections: int) -> None:
                 )
 
 
-def _electrodes_to_put(http: httpx.Client, study: str, uid: str, frame: int) -> tuple[str, list[dict[str, Any]]]:
+def electrodes_to_put(http: httpx.Client, study: str, uid: str, frame: int) -> tuple[str, list[dict[str, Any]]]:
     """Return the path of a frame's electrodes, and the mapping catheter's electrodes with the first displaced."""
     path = f"/v1/studies/{study}/instances/{uid}/frames/{frame}/electrodes"
     found = http.get(path).json()

@@ -107,6 +107,7 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("FLUOROMAP_DATA_DIR", str(folder))
     monkeypatch.delenv("FLUOROMAP_DATABASE_URL", raising=False)
     from fluoromap_service.jobs import stage_results
+    from fluoromap_service.results import finished
     from fluoromap_service.settings import settings
     from fluoromap_service.store.engine import engine
     from fluoromap_service.store.models import Base
@@ -114,6 +115,7 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     settings.cache_clear()
     # Results of equal content have the same address in the folders of all tests.
     monkeypatch.setattr(stage_results, "_remembered", OrderedDict())
+    monkeypatch.setattr(finished, "_snapshots", OrderedDict())
     Base.metadata.create_all(engine())
     yield folder
     engine().dispose()

@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import delete, event, select, update
+from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Context, Refusal
 from fluoromap.reasons import Reason
 from fluoromap_service.jobs import queue
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.store import files
-from fluoromap_service.store.codec import decode
-from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Event, Job, JobState, StageRow, StageState, Study
+from fluoromap_service.store.codec import decode, encode
+from fluoromap_service.store.engine import engine, reading, writing
+from fluoromap_service.store.models import Event, Job, JobState, StageResult, StageRow, StageState, Study
 from fluoromap_workers import runner, tasks
 from fluoromap_workers.stage_inputs import PluginChanged, Work
 
@@ -46,7 +47,7 @@ def stage(data_dir: Path) -> int:
 
 
 def _run(stage: int, monkeypatch: pytest.MonkeyPatch, compute: Callable[[Context], Any]) -> StageRow:
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, _Answer, compute, str))
+    monkeypatch.setattr(runner, "_prepare", lambda session, held: Work("0" * 64, _Answer, compute, str))
     runner.run(stage, "test")
     with reading() as session:
         return session.get_one(StageRow, stage)
@@ -68,7 +69,7 @@ def test_a_result_is_stored_and_the_job_ends(stage: int, monkeypatch: pytest.Mon
         assert session.get_one(Job, "j").state == JobState.SUCCEEDED
 
 
-def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_takes_stages_until_none_is_ready(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     with writing() as session:
         session.add(Job(id="other", study_id="s", state=JobState.QUEUED, snapshot={}))
         session.flush()
@@ -84,13 +85,21 @@ def test_a_worker_stays_with_a_job_until_nothing_of_it_is_ready(stage: int, monk
                 state=state,
             )
             session.add(row)
-    monkeypatch.setattr(runner, "_prepare", lambda held: Work("0" * 64, _Answer, lambda context: _Answer(), str))
-    # Nobody else hears of what got ready.
+    prepared = []
+
+    def work(session: Session, held: Claim) -> Work:
+        prepared.append((held.job_id, held.name))
+        return Work("0" * 64, _Answer, lambda context: _Answer(), str)
+
+    monkeypatch.setattr(runner, "_prepare", work)
+    # No other message comes.
     monkeypatch.setattr(queue, "publish", lambda stage_ids: None)
     tasks.run_stage(stage)
     with reading() as session:
         states = {job.id: job.state for job in session.scalars(select(Job))}
-    assert states == {"j": JobState.SUCCEEDED, "other": JobState.QUEUED}
+    assert states == {"j": JobState.SUCCEEDED, "other": JobState.SUCCEEDED}
+    # A match of any job comes before the segments.
+    assert prepared == [("other", "match"), ("j", "segment"), ("j", "match")]
 
 
 def _more_stages(count: int) -> list[int]:
@@ -112,7 +121,7 @@ def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.M
     keys = {stage: "a", known: "a", removed: "b", new: "c"}
     computed = []
 
-    def work(held: Claim) -> Work:
+    def work(session: Session, held: Claim) -> Work:
         def compute(context: Context) -> _Answer:
             computed.append(held.stage_id)
             return _Answer(number=held.stage_id)
@@ -143,12 +152,56 @@ def test_what_was_computed_before_ends_at_once(stage: int, monkeypatch: pytest.M
     assert rows[new].state == StageState.READY
 
 
+def _statements_to_end(count: int, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
+    """Return the SQL statements and the parsed snapshots of ending ``count`` known stages."""
+    stages = _more_stages(count)
+    parsed, statements = [], []
+
+    def parse(snapshot: object) -> object:
+        parsed.append(snapshot)
+        return snapshot
+
+    def note(*arguments: object) -> None:
+        statements.append(arguments[2])
+
+    monkeypatch.setattr(runner.Snapshot, "model_validate", parse)
+    monkeypatch.setattr(runner, "prepare", lambda session, claim, snapshot: Work("d" * 64, _Answer, _never, str))
+    runner._snapshot.cache_clear()
+    with writing() as session:
+        sha256 = files.keep_bytes(session, encode(_Answer()))
+        session.merge(StageResult(key="d" * 64, sha256=sha256))
+    event.listen(engine(), "before_cursor_execute", note)
+    try:
+        runner.finish_known("j")
+    finally:
+        event.remove(engine(), "before_cursor_execute", note)
+        runner._snapshot.cache_clear()
+    with reading() as session:
+        assert {session.get_one(StageRow, number).state for number in stages} == {StageState.DONE}
+    return len(statements), len(parsed)
+
+
+def _never(context: Context) -> Any:
+    raise AssertionError("computed again")
+
+
+@pytest.mark.usefixtures("stage")
+def test_ending_known_stages_costs_the_same_statements_for_few_and_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    few, parsed_for_few = _statements_to_end(4, monkeypatch)
+    with writing() as session:
+        session.execute(update(Job).values(state=JobState.RUNNING))
+        session.execute(delete(StageRow))
+    many, parsed_for_many = _statements_to_end(300, monkeypatch)
+    assert few == many
+    assert parsed_for_few == parsed_for_many == 1
+
+
 def test_a_stage_that_cannot_be_prepared_does_not_keep_the_worker_from_the_others(
     stage: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (broken,) = _more_stages(1)
 
-    def work(held: Claim) -> Work:
+    def work(session: Session, held: Claim) -> Work:
         if held.stage_id == broken:
             raise ValueError("a stored result is damaged")
         return Work("0" * 64, _Answer, lambda context: _Answer(), str)
@@ -203,7 +256,9 @@ def test_a_fault_of_the_service_is_not_blamed_on_the_plugin(stage: int, monkeypa
 
 def test_a_reused_result_is_not_copied(stage: int, monkeypatch: pytest.MonkeyPatch) -> None:
     (again,) = _more_stages(1)
-    monkeypatch.setattr(runner, "_prepare", lambda claim: Work("0" * 64, _Answer, lambda context: _Answer("", 1), str))
+    monkeypatch.setattr(
+        runner, "_prepare", lambda session, claim: Work("0" * 64, _Answer, lambda context: _Answer("", 1), str)
+    )
     runner.run(stage, "test")
     with reading() as session:
         path = files.path_of(str(session.get_one(StageRow, stage).result))
@@ -226,7 +281,7 @@ def test_a_refusal_is_a_result_like_any_other(stage: int, monkeypatch: pytest.Mo
         raise Refusal(Reason.NO_ELECTRODES, "Nothing to see.")
 
     work = Work("0" * 64, _Answer, refuse, lambda refusal: _Answer(f"{refusal.reason}: {refusal}"))
-    monkeypatch.setattr(runner, "_prepare", lambda claim: work)
+    monkeypatch.setattr(runner, "_prepare", lambda session, claim: work)
     runner.run(stage, "test")
     with reading() as session:
         row = session.get_one(StageRow, stage)

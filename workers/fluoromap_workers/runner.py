@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import structlog
+from sqlalchemy import select
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
@@ -74,20 +76,15 @@ class ThisProcess:
 THIS_PROCESS = ThisProcess()
 
 
-def run(stage_id: int, worker: str, place: Place = THIS_PROCESS) -> str | None:
+def run(stage_id: int, worker: str, place: Place = THIS_PROCESS) -> None:
     """Claim a stage for a worker, run its plugin and store the result.
 
-    Returns
-    -------
-    str or None
-        The stage's job; None when the stage could not be claimed.
+    Do nothing when another worker was faster.
     """
     with writing() as session:
         held = job_life.claim(session, stage_id, worker)
-    if held is None:
-        return None
-    place.run(held)
-    return held.job_id
+    if held is not None:
+        place.run(held)
 
 
 def work(held: Claim, context: Context) -> None:
@@ -133,23 +130,30 @@ def finish_known(job_id: str) -> None:
     """
     try:
         with reading() as session:
-            ready = job_life.ready(session, job_id)
-        stored = [(claim, _stored(_prepare(claim))) for claim in ready]
-        known = [(claim, result) for claim, result in stored if result is not None]
+            works = [(claim, _prepare(session, claim)) for claim in job_life.ready(session, job_id)]
+            stored = _addresses(session, [work.key for _, work in works])
+        known = [
+            (claim, _with_rows(work, stored[work.key]))
+            for claim, work in works
+            if work.key in stored and files.is_whole(stored[work.key])
+        ]
         if known:
             with writing() as session:
-                job_life.finish_ready(session, job_id, [entry for entry in known if _holds(session, entry[1])])
+                held = _held_files(session, [result.sha256 for _, result in known])
+                job_life.finish_ready(session, job_id, [entry for entry in known if entry[1].sha256 in held])
     except Exception as error:
         # A stage that cannot be prepared fails with its own reason when its turn comes.
         log.warning("nothing_finished_at_once", job=job_id, error=type(error).__name__)
 
 
 def _run(held: Claim, context: Context, bound: BoundLogger) -> None:
-    work = _prepare(held)
-    stored = _stored(work)
+    with reading() as session:
+        work = _prepare(session, held)
+        stored = _stored(session, work)
     if stored is not None:
         with writing() as session:
-            taken = _holds(session, stored) and job_life.finish(session, held, stored, reused=True)
+            kept = _held_files(session, [stored.sha256])
+            taken = bool(kept) and job_life.finish(session, held, stored, reused=True)
         if taken:
             bound.info("stage_done", reused=True)
             return
@@ -183,34 +187,40 @@ def _computed(held: Claim, work: Work, context: Context) -> tuple[Any, bytes]:
         raise PluginFailed({"code": "plugin_failed", "detail": sentence[:LONGEST_MESSAGE]}) from error
 
 
-def _prepare(claim: Claim) -> Work:
-    with reading() as session:
-        return prepare(session, claim, _snapshot(claim.job_id))
+def _prepare(session: Session, claim: Claim) -> Work:
+    return prepare(session, claim, _snapshot(claim.job_id))
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=8)
 def _snapshot(job_id: str) -> Snapshot:
     """Return a job's snapshot, parsed once.
 
-    It never changes, and a worker takes many stages of one job in a row.
+    It never changes, and a worker takes many stages of the same few jobs.
     """
     with reading() as session:
         return Snapshot.model_validate(session.get_one(Job, job_id).snapshot)
 
 
-def _stored(work: Work) -> StoredResult | None:
+def _stored(session: Session, work: Work) -> StoredResult | None:
     """Return the result that an earlier job stored for the same work."""
-    with reading() as session:
-        row = session.get(StageResult, work.key)
-    if row is None or not files.is_whole(row.sha256):
-        return None
-    return StoredResult(row.sha256, tuple(work.rows(load_file(work.kind, row.sha256))) if work.rows else ())
+    sha256 = _addresses(session, [work.key]).get(work.key)
+    return None if sha256 is None or not files.is_whole(sha256) else _with_rows(work, sha256)
 
 
-def _holds(session: Session, stored: StoredResult) -> bool:
-    """Return whether the store still holds a result.
+def _addresses(session: Session, keys: Sequence[str]) -> dict[str, str]:
+    """Return the addresses of the results that are stored under these keys."""
+    query = select(StageResult.key, StageResult.sha256).where(StageResult.key.in_(keys))
+    return {row.key: row.sha256 for row in session.execute(query)}
 
-    Nobody can remove it until this transaction ends.
+
+def _with_rows(work: Work, sha256: str) -> StoredResult:
+    return StoredResult(sha256, tuple(work.rows(load_file(work.kind, sha256))) if work.rows else ())
+
+
+def _held_files(session: Session, addresses: Sequence[str]) -> set[str]:
+    """Return those of the results that the store still holds.
+
+    Nobody can remove them until this transaction ends.
     """
     files.lock(session)
-    return session.get(File, stored.sha256) is not None
+    return set(session.scalars(select(File.sha256).where(File.sha256.in_(addresses))))

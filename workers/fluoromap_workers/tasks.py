@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import queue as waiting_line
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,6 +15,7 @@ from celery.signals import celeryd_init, worker_shutting_down
 from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.jobs.stall import StallWatch
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import reading, writing
@@ -36,14 +36,14 @@ _free_processes: waiting_line.LifoQueue[StageProcess] = waiting_line.LifoQueue()
 
 @shared_task(name=queue.RUN_STAGE)  # type: ignore[untyped-decorator,unused-ignore]
 def run_stage(stage_id: int) -> None:
-    """Run the stage of that row, then for a while others of its job.
+    """Run stages until none is ready, the most urgent first.
 
-    A stage that cannot be claimed is left alone. After a stage, this worker runs the stages of the same job that are ready, and
-    does not wait for their messages. A message that arrives later finds its stage claimed.
+    The message of a stage only wakes the worker: :func:`job_life.most_urgent` says which stage it takes. A message that arrives
+    later finds its stage claimed.
     """
     try:
         with _place() as place:
-            _run_stages(stage_id, place)
+            _run_stages(place)
     except SQLAlchemyError as error:
         if settings().eager:
             raise
@@ -67,21 +67,21 @@ def _place() -> Iterator[Place]:
         _free_processes.put(process)
 
 
-def _run_stages(stage_id: int, place: Place) -> None:
+def _run_stages(place: Place) -> None:
     worker = f"{socket.gethostname()}:{os.getpid()}"
-    end = time.monotonic() + queue.STAYS_SECONDS
-    if not place.is_ready():
-        return
-    job = run(stage_id, worker, place)
-    if job is None:
-        return
-    place.finish_known(job)
-    queue.publish_due()
-    while time.monotonic() <= end and place.is_ready():
+    compared: set[tuple[str, str]] = set()
+    while place.is_ready():
         with reading() as session:
-            waiting = job_life.ready(session, job)
-        if not waiting or run(waiting[0].stage_id, worker, place) is None:
+            urgent = job_life.most_urgent(session)
+        if urgent is None:
             return
+        kind = urgent.job_id, urgent.name
+        if STAGES[urgent.name].subject != "study" and kind not in compared:
+            # After a correction nearly all results of this kind are known.
+            compared.add(kind)
+            place.finish_known(urgent.job_id)
+        else:
+            run(urgent.stage_id, worker, place)
         queue.publish_due()
 
 

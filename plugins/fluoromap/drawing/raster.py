@@ -63,7 +63,8 @@ class Raster:
         offset = uv - corners[face, 0]
         value = at_corners[face, 0] + slope_u[face] * offset[:, 0] + slope_v[face] * offset[:, 1]
         # A pixel on the rim of a face that is nearly edge-on must not get a value extrapolated far beyond the face.
-        clipped: Array = np.clip(value, at_corners.min(axis=1)[face], at_corners.max(axis=1)[face])
+        low, high = (of(of(*at_corners.T[:2]), at_corners[:, 2]) for of in (np.minimum, np.maximum))
+        clipped: Array = np.clip(value, low[face], high[face])
         return clipped
 
 
@@ -82,7 +83,10 @@ def rasterise(uv: Array, nearness: Array, faces: IntArray, facing: BoolArray, sh
     """
     rows, columns = shape
     corners = uv[faces]
-    in_field = (corners.max(axis=1) >= 0).all(axis=1) & (corners.min(axis=1) <= [columns - 1, rows - 1]).all(axis=1)
+    # NumPy is slow along an axis of three: each corner is an operand of its own.
+    first, second, third = corners.transpose(1, 2, 0)
+    (left, upper), (right, lower) = (of(of(first, second), third) for of in (np.minimum, np.maximum))
+    in_field = (right >= 0) & (lower >= 0) & (left <= columns - 1) & (upper <= rows - 1)
     front = np.flatnonzero(facing & in_field)
     front = front[np.argsort(nearness[faces[front]].mean(axis=1), kind="stable")]
     # From the top corner down. Both faces of an edge compute the same crossing: no pixel between them is missed or shared.

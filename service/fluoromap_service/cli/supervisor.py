@@ -308,11 +308,18 @@ def _exit(number: int, frame: object) -> None:
 
 
 @contextmanager
-def private_service(data_dir: Path) -> Iterator[str]:
+def private_service(data_dir: Path, *, workers: int | None = None) -> Iterator[str]:
     """Run the whole service on one data folder and yield its address.
 
     It listens on a free port of the loopback address. It ignores the FLUOROMAP_* variables of this user, so that it cannot
     touch the database or broker of another service.
+
+    Parameters
+    ----------
+    data_dir : Path
+        Folder of the files, the database and the broker.
+    workers : int, optional
+        Number of stages that run at the same time; by default one a processor.
 
     Raises
     ------
@@ -320,12 +327,14 @@ def private_service(data_dir: Path) -> Iterator[str]:
         When another service runs on the folder, the database cannot be made or the service is not ready in time.
     """
     with only_one(data_dir):
-        yield from _served(data_dir)
+        yield from _served(data_dir, workers)
 
 
-def _served(data_dir: Path) -> Iterator[str]:
+def _served(data_dir: Path, workers: int | None) -> Iterator[str]:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
     environment["FLUOROMAP_DATA_DIR"] = str(data_dir.resolve())
+    if workers is not None:
+        environment["FLUOROMAP_WORKERS"] = str(workers)
     migration = subprocess.run(
         [program(), "db", "upgrade"], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
     )

@@ -130,15 +130,26 @@ def frame_to_8bit(pixels: Pixels, facts: InstanceFacts, window: Pair | None = No
     """
     chosen = window or facts.window
     if chosen is None:
-        low, high = (float(value) for value in np.percentile(pixels.astype(np.float32), (0.5, 99.5)))
+        low, high = _range(pixels)
     else:
         centre, width = chosen
         low = centre - 0.5 - (width - 1) / 2
         high = low + width - 1
-    scaled = (pixels.astype(np.float32) - low) * (255.0 / max(high - low, 1e-3))
-    shown = np.clip(np.rint(scaled), 0, 255)
-    display: NDArray[np.uint8] = (255 - shown if facts.pixels.monochrome1 else shown).astype(np.uint8)
+    # The grey of each value that occurs, looked up for each pixel, is several times as fast as arithmetic with pixels.
+    values = np.arange(int(pixels.max()) + 1, dtype=np.float32)
+    shown = np.clip(np.rint((values - low) * (255.0 / max(high - low, 1e-3))), 0, 255)
+    greys: NDArray[np.uint8] = (255 - shown if facts.pixels.monochrome1 else shown).astype(np.uint8)
+    display: NDArray[np.uint8] = greys[pixels]
     return display
+
+
+def _range(pixels: Pixels) -> Pair:
+    """Return the 0.5th and the 99.5th percentile of the pixels, between two values linearly."""
+    up_to = np.cumsum(np.bincount(pixels.ravel()))
+    places = np.array([0.005, 0.995]) * (pixels.size - 1)
+    below, above = (np.searchsorted(up_to, side(places), side="right") for side in (np.floor, np.ceil))
+    low, high = (below + (above - below) * (places % 1)).tolist()
+    return low, high
 
 
 def cine_8bit(path: Path, facts: InstanceFacts, first: int, count: int) -> bytes:
@@ -149,7 +160,7 @@ def cine_8bit(path: Path, facts: InstanceFacts, first: int, count: int) -> bytes
     frames = open_frames(path, facts)
     chosen = facts.window
     if chosen is None:
-        low, high = (float(value) for value in np.percentile(frames[0].astype(np.float32), (0.5, 99.5)))
+        low, high = _range(frames[0])
         chosen = ((low + high + 1) / 2, max(high - low, 1.0) + 1)
     return b"".join(frame_to_8bit(frames[first + k], facts, chosen).tobytes() for k in range(count))
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, delete, func, or_, select, update
+from sqlalchemy import Row, case, delete, func, insert, or_, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
@@ -33,6 +33,8 @@ from fluoromap_service.store.models import (
 from fluoromap_service.study.snapshot import Snapshot
 
 LONGEST_REPUBLISH_SECONDS = 60.0
+AGE_OF_A_STAGE_SECONDS = 5.0
+"""Age of a job that counts as one stage less when workers choose the next stage."""
 WORKER_SECONDS = 30.0
 """A worker that is silent for longer counts as dead."""
 CLOCK_TOLERANCE_SECONDS = 1.0
@@ -41,6 +43,9 @@ _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
 """Columns of a stage that its events report."""
+
+_REUSED = {"state": StageState.DONE, "progress": 1.0, "reused": True}
+"""Columns of a stage that ended with a stored result, as its row and its event have them."""
 
 SECONDS_BUCKETS = (0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 1800.0)
 """Upper limits of the histogram of stage durations, in seconds."""
@@ -61,6 +66,15 @@ class Claim:
     attempt: int
     name: str
     subject: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyStage:
+    """A stage that a worker may claim."""
+
+    stage_id: int
+    job_id: str
+    name: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +115,11 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
     return job
 
 
-def take_due(session: Session, limit: int = 200) -> list[int]:
+def take_due(session: Session, limit: int = 32) -> list[int]:
     """Return the ready stages that need an announcement, and note that they are announced.
 
-    These are stages that were never announced, and stages whose announcement is so old that it may be lost.
+    These are stages that were never announced, and stages whose announcement is so old that it may be lost. A worker that hears
+    of one takes stages until none is ready, so few announcements at once are enough.
     """
     wait = settings().republish_seconds
     # Each repetition waits longer, so that a long queue is not announced over and over.
@@ -126,6 +141,43 @@ def take_due(session: Session, limit: int = 200) -> list[int]:
     return ids
 
 
+def most_urgent(session: Session) -> ReadyStage | None:
+    """Return the stage that a worker should take next.
+
+    None when no stage is ready. The order:
+
+    1. Stages about a whole study come first: they are short, and the map waits for them.
+    2. Then come jobs of which no stage has begun, the oldest first: a worker must see how much of them is known.
+    3. Then comes the job with the fewest stages left. So a small job or a correction does not wait for a large study. Each
+       ``AGE_OF_A_STAGE_SECONDS`` of age count as one stage less, so that no job waits for ever.
+    4. The stages of one job come in the order of the pipeline.
+    """
+    whole_study = [stage.name for stage in PIPELINE if stage.subject == "study"]
+    open_states = [state for state in StageState if state not in ENDED_STAGE]
+    left = (
+        select(StageRow.job_id, func.count().label("stages"))
+        .where(StageRow.state.in_(open_states))
+        .group_by(StageRow.job_id)
+        .subquery()
+    )
+    is_new = Job.state == JobState.QUEUED
+    query = (
+        select(StageRow.id, StageRow.job_id, StageRow.name)
+        .join(Job, Job.id == StageRow.job_id)
+        .join(left, left.c.job_id == StageRow.job_id)
+        .where(StageRow.state == StageState.READY)
+        .order_by(
+            case((StageRow.name.in_(whole_study), 0), (is_new, 1), else_=2),
+            case((is_new, 0.0), else_=left.c.stages) + Job.created / AGE_OF_A_STAGE_SECONDS,
+            Job.id,
+            StageRow.id,
+        )
+        .limit(1)
+    )
+    found = session.execute(query).first()
+    return None if found is None else ReadyStage(*found)
+
+
 def ready(session: Session, job_id: str) -> list[Claim]:
     """Return the claims that a job's ready stages would give."""
     columns = StageRow.id, StageRow.job_id, StageRow.attempt + 1, StageRow.name, StageRow.subject
@@ -136,18 +188,32 @@ def ready(session: Session, job_id: str) -> list[Claim]:
 def finish_ready(session: Session, job_id: str, results: Sequence[tuple[Claim, StoredResult]]) -> None:
     """End ready stages whose results are stored already."""
     job = _lock(session, job_id)
-    for claimable, result in results:
-        ended = session.execute(
-            update(StageRow)
-            .where(StageRow.id == claimable.stage_id, StageRow.state == StageState.READY)
-            .values(
-                state=StageState.DONE, attempt=StageRow.attempt + 1, result=result.sha256, reused=True, progress=1.0
-            )
-            .returning(*_REPORTED)
-        ).first()
-        if ended is not None:
-            session.add_all(result.rows)
-            _report_stage(session, job_id, ended)
+    # The lock of the job keeps the states until the end of this transaction.
+    still_ready = {claim.stage_id for claim in ready(session, job_id)}
+    ended = [(claim, result) for claim, result in results if claim.stage_id in still_ready]
+    if not ended:
+        return
+    # One statement for all rows: after a correction nearly every run of a study ends here.
+    session.execute(
+        update(StageRow),
+        [
+            {"id": claim.stage_id, "attempt": claim.attempt, "result": result.sha256, **_REUSED}
+            for claim, result in ended
+        ],
+    )
+    session.execute(
+        insert(Event),
+        [
+            {
+                "job_id": job_id,
+                "kind": "stage",
+                "data": {"name": claim.name, "subject": claim.subject, "attempt": claim.attempt, **_REUSED},
+            }
+            for claim, _ in ended
+        ],
+    )
+    for _, result in ended:
+        session.add_all(result.rows)
     _settle(session, job)
 
 
@@ -426,6 +492,9 @@ def _settle(session: Session, job: Job) -> None:
 
     The caller holds the lock of the job's row.
     """
+    session.flush()
+    if not _may_settle(session, job.id):
+        return
     rows = _stages(session, job.id)
     broken = _broken(rows)
     if broken:
@@ -448,6 +517,27 @@ def _settle(session: Session, job: Job) -> None:
         job.finished = now
         tally.add(session, {f"jobs|{job.state}": 1.0})
         _report_job(session, job)
+
+
+def _may_settle(session: Session, job_id: str) -> bool:
+    """Return whether the states allow a change.
+
+    Stages may become ready, or the job may fail or end. The function reads which states each kind of stage has, so
+    that the end of one of a thousand stages does not read the others.
+    """
+    query = select(StageRow.name, StageRow.state).where(StageRow.job_id == job_id).distinct()
+    states: dict[str, set[str]] = {}
+    for name, state in session.execute(query):
+        states.setdefault(name, set()).add(state)
+    ended = {name for name, found in states.items() if found <= ENDED_STAGE}
+    return (
+        len(ended) == len(states)
+        or any(StageState.FAILED in found for found in states.values())
+        or any(
+            StageState.PENDING in found and ended.issuperset(set(STAGES[name].depends_on) & states.keys())
+            for name, found in states.items()
+        )
+    )
 
 
 def _broken(rows: Sequence[StageRow]) -> list[StageRow]:

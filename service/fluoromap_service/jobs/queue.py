@@ -16,9 +16,6 @@ from fluoromap_service.store.engine import writing
 RUN_STAGE = "fluoromap.run_stage"
 """Name of the registered task that runs a stage by its id."""
 
-STAYS_SECONDS = 10
-"""How long a worker takes stages of one job before it takes those of others."""
-
 DRAIN_SECONDS = 20
 """How long a worker that must end waits for its running stages before it gives them back."""
 

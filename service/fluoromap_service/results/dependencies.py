@@ -61,17 +61,28 @@ def map_picture_dependencies(map_sha256: str, *, simulated: bool) -> Dependencie
 
 
 def report_dependencies(
-    template_sha256: str, job_version: int, label: str | None, guessed_sites: tuple[str, ...]
+    template_sha256: str, job_id: str, job_version: int, label: str | None, guessed_sites: tuple[str, ...]
 ) -> Dependencies:
     """Return the dependencies of a job's report, which prints the version of the package."""
     return {
         "kind": "report",
+        "job_id": job_id,
         "package": version("fluoromap"),
         "drawing": drawing.VERSION,
         "template": template_sha256,
         "job": job_version,
         "label": label,
         "guessed_sites": list(guessed_sites),
+    }
+
+
+def tracks_table_dependencies(job_id: str, job_version: int) -> Dependencies:
+    """Return the dependencies of the table of an ended job's tracks."""
+    return {
+        "kind": "tracks_table",
+        "job_id": job_id,
+        "package": version("fluoromap"),
+        "job": job_version,
     }
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from sqlalchemy.orm import Session
+import threading
+from collections import OrderedDict
+
+from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import StageName
 from fluoromap_service.jobs.stage_results import stage_of
@@ -11,6 +14,9 @@ from fluoromap_service.store.models import ENDED_JOB, Job, StageRow, StageState
 from fluoromap_service.study.snapshot import Snapshot
 
 RETRY_SECONDS = 2
+_REMEMBERED_SNAPSHOTS = 8
+_snapshots: OrderedDict[str, Snapshot] = OrderedDict()
+_lock = threading.Lock()
 
 
 def job_of(session: Session, job_id: str) -> Job:
@@ -21,7 +27,8 @@ def job_of(session: Session, job_id: str) -> Job:
     Problem
         404 when there is none.
     """
-    job = session.get(Job, job_id)
+    # The snapshot is long, and most requests do not read it.
+    job = session.get(Job, job_id, options=[defer(Job.snapshot)])
     if job is None:
         raise not_found("job")
     return job
@@ -49,8 +56,20 @@ def ended_job_of(session: Session, job_id: str, result: str) -> Job:
 
 
 def snapshot_of(job: Job) -> Snapshot:
-    """Return the frozen input of a job."""
-    return Snapshot.model_validate(job.snapshot)
+    """Return the frozen input of a job.
+
+    It never changes, so a process parses those of the last jobs once.
+    """
+    with _lock:
+        known = _snapshots.get(job.id)
+    if known is None:
+        known = Snapshot.model_validate(job.snapshot)
+    with _lock:
+        _snapshots[job.id] = known
+        _snapshots.move_to_end(job.id)
+        while len(_snapshots) > _REMEMBERED_SNAPSHOTS:
+            _snapshots.popitem(last=False)
+    return known
 
 
 def done_stage(session: Session, job: Job, name: StageName, subject: str | None = None) -> StageRow:

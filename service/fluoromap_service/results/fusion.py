@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Array, ChamberMap, Triangulation
@@ -82,11 +86,29 @@ def fusion_of(session: Session, job: Job, uid: str, frame: int | None) -> Fusion
     )
 
 
+JPEG_QUALITY = 88
+"""Fluoroscopy is noise: with JPEG a page of 40 overlays has a few MB."""
+
+
 def draw_fusion(path: Path, fusion: Fusion, look: Look, moving: bool) -> bytes:
     """Return an overlay as PNG, or its propagation as GIF, from the run's file."""
-    frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
-    parts = (frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv)
+    parts = _parts(path, fusion)
     return draw_propagation(*parts, look) if moving else encode_png(draw_overlay(*parts, look))
+
+
+def draw_fusion_jpeg(path: Path, fusion: Fusion, look: Look) -> bytes:
+    """Return an overlay as JPEG, from the run's file.
+
+    It is smaller than a PNG, and not exact.
+    """
+    stream = io.BytesIO()
+    Image.fromarray(draw_overlay(*_parts(path, fusion), look)).save(stream, format="JPEG", quality=JPEG_QUALITY)
+    return stream.getvalue()
+
+
+def _parts(path: Path, fusion: Fusion) -> tuple[NDArray[np.uint8], Camera, ChamberMap, Array, str, Array | None]:
+    frame = frame_to_8bit(open_frames(path, fusion.facts)[fusion.frame], fusion.facts)
+    return frame, fusion.camera, fusion.chamber, fusion.shift_mm, fusion.site, fusion.tip_uv
 
 
 def _covariances(triangulation: Triangulation, mapping: str) -> dict[str, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from fluoromap.reasons import Reason
@@ -11,11 +12,9 @@ from fluoromap_service.study.binding import binding_of
 
 def sites_by_row_order(session: Session, job: Job) -> tuple[str, ...]:
     """Return the job's sites with guessed runs; a confirmation after the job counts too."""
-    guessed = {
-        site["site"]: (site["view_a"], site["view_b"])
-        for site in job.snapshot.get("sites", ())
-        if site.get("bound_by") == "order"
-    }
+    # The database picks the sites: the whole snapshot is long, and this runs with every look at a job.
+    sites = session.scalar(select(Job.snapshot["sites"]).where(Job.id == job.id)) or ()
+    guessed = {site["site"]: (site["view_a"], site["view_b"]) for site in sites if site.get("bound_by") == "order"}
     if not guessed:
         return ()
     confirmed = {

@@ -52,9 +52,16 @@ Found = ElectrodeSamples | RejectedView
 
 
 def tracks_of(
-    session: Session, job: Job, origin: Origin, site: str | None = None, view: View | None = None
+    session: Session,
+    job: Job,
+    origin: Origin,
+    site: str | None = None,
+    view: View | None = None,
+    tip_of: str | None = None,
 ) -> Iterator[Found]:
     """Return the tracks of one site or of all, site by site.
+
+    With ``tip_of``, the name of a catheter, only the tracks of its tip.
 
     Raises
     ------
@@ -70,7 +77,7 @@ def tracks_of(
     origins = _OriginOfTracks(origin, snapshot.reference, map_origin(triangulation))
     for stage in stages_of(session, job.id, "monoplane"):
         if site in (None, stage.subject):
-            yield from _site(job, stage, views, triangulation, origins)
+            yield from _site(job, stage, views, triangulation, origins, tip_of)
     for entry in snapshot.rejected:
         if site in (None, entry.site):
             message = " ".join(reason.sentence for reason in entry.reasons)
@@ -94,8 +101,9 @@ class _OriginOfTracks:
 
 
 def _site(
-    job: Job, stage: StageRow, views: Sequence[View], triangulation: Triangulation, origin: _OriginOfTracks
-) -> Iterator[Found]:
+    job: Job, stage: StageRow, views: Sequence[View], triangulation: Triangulation, origin: _OriginOfTracks,
+    tip_of: str | None,
+) -> Iterator[Found]:  # fmt: skip
     if stage.state == StageState.FAILED:
         message = str((stage.error or {}).get("detail", Reason.PLUGIN_FAILED.sentence))
         yield from (RejectedView(stage.subject, view, (Reason.PLUGIN_FAILED,), message) for view in views)
@@ -115,6 +123,8 @@ def _site(
         track = in_study(result.track, camera, origin.catheter, site.variation)
         frames = origin.frames(track, site)
         for index, (catheter, electrode) in enumerate(track.labels):
+            if tip_of is not None and (catheter, electrode) != (tip_of, 1):
+                continue
             reference = None if origin.origin is Origin.ISOCENTRE else origin.catheter
             samples = track_samples(track, index, camera, frames, site.reasons_of(catheter, electrode, reference))
             yield ElectrodeSamples(stage.subject, result.view, catheter, electrode, stage.plugin, samples)

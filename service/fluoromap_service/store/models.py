@@ -266,12 +266,12 @@ class Event(Base):
 
 
 class Rendering(Base):
-    """A picture, mesh or page of a job's results, made on request and kept."""
+    """A picture, mesh, table or page of a job's results, made on request and kept; deleted with the job it was made for."""
 
     __tablename__ = "rendering"
     id: Mapped[int] = mapped_column(primary_key=True)
     job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
-    key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of the job and of all dependencies
+    key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of the study and of all dependencies
     sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
 
 

@@ -1,4 +1,9 @@
-"""Kept renderings: pictures, meshes and pages that the service makes of a job's results once."""
+"""Kept renderings: pictures, meshes, tables and pages that the service makes of a job's results once.
+
+The jobs of a study share them: a rendering is kept under the hash of the study and of everything that changes it. So a job whose
+map did not change has the pictures of the job before it. A rendering is deleted with the job that it was made for; another job
+that needs it makes it again.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +19,7 @@ from sqlalchemy.exc import IntegrityError
 
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Rendering
+from fluoromap_service.store.models import Job, Rendering
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,17 +31,20 @@ class KeptFile:
 
 
 def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], bytes]) -> KeptFile:
-    """Return the kept rendering of a job; make it when there is none.
+    """Return a kept rendering; make it when there is none.
 
     Parameters
     ----------
     job_id : str
+        The job that needs it.
     depends_on : dict
         JSON values: everything that changes the rendering.
     make : callable
         Makes the content. It is called outside any transaction.
     """
-    key = hashlib.sha256(json.dumps([job_id, depends_on], sort_keys=True).encode()).hexdigest()
+    with reading() as session:
+        study = session.scalar(select(Job.study_id).where(Job.id == job_id))
+    key = hashlib.sha256(json.dumps([study, depends_on], sort_keys=True).encode()).hexdigest()
     kept = _find(key)
     if kept is not None:
         return kept

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -14,7 +15,7 @@ from fluoromap_service.problem import not_found
 from fluoromap_service.store.models import Site, Study
 from fluoromap_service.study import pairing
 from fluoromap_service.study.instances import StudyRun, runs_of
-from fluoromap_service.study.pairing import Pairing, SiteRuns
+from fluoromap_service.study.pairing import SiteRuns
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,26 +94,27 @@ def rows_of(session: Session, study_id: str) -> list[Site]:
     return list(session.scalars(select(Site).where(Site.study_id == study_id).order_by(Site.id)))
 
 
-def binding_of(session: Session, study_id: str, *, also: str | None = None) -> Binding:
+def binding_of(
+    session: Session, study_id: str, *, also: str | None = None, runs: Sequence[StudyRun] | None = None
+) -> Binding:
     """Return which runs belong to which site of a study.
 
-    The rules are those of :mod:`pairing`. A site without runs and facts is left out, unless ``also`` is its name.
+    The rules are those of :mod:`pairing`. A site without runs and facts is left out, unless ``also`` is its name. A caller
+    that has read the runs of the study gives them as ``runs``.
     """
-    runs = runs_of(session, study_id)
+    runs = runs_of(session, study_id) if runs is None else runs
     with_runs = {run.link.site for run in runs} | {also}
     rows = [row for row in rows_of(session, study_id) if row.name in with_runs or not _is_empty(row)]
-    paired, with_geometry = _pairing(rows, runs), _with_geometry(runs)
+    gantries = [run.gantry for run in runs]
+    values = [_run_value(run, gantry) for run, gantry in zip(runs, gantries, strict=True)]
+    paired = pairing.pair_runs([_site_value(row) for row in rows], values)
+    with_geometry = {run.uid for run, gantry in zip(runs, gantries, strict=True) if None not in gantry.values()}
     sites = tuple(_bound(row, paired.sites[row.name], with_geometry) for row in rows)
     pairs = tuple(
         _unnamed(number, pairing.lateral_first(*pair), with_geometry)
         for number, pair in enumerate(paired.unnamed, start=1)
     )
     return Binding(sites, pairs)
-
-
-def _pairing(rows: Sequence[Site], runs: Sequence[StudyRun]) -> Pairing:
-    """Apply the pairing rules to the rows of the store."""
-    return pairing.pair_runs([_site_value(row) for row in rows], [_run_value(run) for run in runs])
 
 
 def _site_value(row: Site) -> pairing.Site:
@@ -128,8 +130,8 @@ def _site_value(row: Site) -> pairing.Site:
     )
 
 
-def _run_value(run: StudyRun) -> pairing.Run:
-    primary, secondary = run.gantry["primary_deg"], run.gantry["secondary_deg"]
+def _run_value(run: StudyRun, gantry: Mapping[str, Any]) -> pairing.Run:
+    primary, secondary = gantry["primary_deg"], gantry["secondary_deg"]
     return pairing.Run(
         uid=run.uid,
         arrival=run.link.id,
@@ -141,10 +143,6 @@ def _run_value(run: StudyRun) -> pairing.Run:
         site=run.link.site,
         site_by=run.link.site_by,
     )
-
-
-def _with_geometry(runs: Sequence[StudyRun]) -> set[str]:
-    return {run.uid for run in runs if run.geometry is not None}
 
 
 def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:

@@ -70,7 +70,8 @@ def freeze(
     """
     plugins = _plugin_snapshots(pipeline)
     study = lock(session, study.id)
-    binding = binding_of(session, study.id)
+    study_runs = runs_of(session, study.id)
+    binding = binding_of(session, study.id, runs=study_runs)
     unmatched = [
         site for site in binding.sites if site.view_a is None and site.view_b is None and site.lat_ms is not None
     ]
@@ -79,7 +80,7 @@ def freeze(
     ready = [site for site in binding.sites if site.ready]
     if not ready:
         raise _no_ready_site((*binding.sites, *binding.pairs))
-    runs = {run.uid: run for run in runs_of(session, study.id)}
+    runs = {run.uid: run for run in study_runs}
     by_hand = corrections.of_study(session, study.id)
     used = sorted({uid for site in ready for uid in (site.view_a, site.view_b) if uid is not None})
     offsets = table_offsets_mm(runs[uid].facts for uid in used)

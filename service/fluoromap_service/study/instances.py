@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, select
-from sqlalchemy.orm import Session
+from sqlalchemy import Select, Text, cast, delete, select
+from sqlalchemy.orm import Session, defer
 
 from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom.facts import InstanceFacts
@@ -76,12 +78,13 @@ class StudyRun:
 
     def gantry_with(self, defaults: dict[str, Any]) -> dict[str, Any]:
         """Return the gantry values with these defaults for the values that the run lacks."""
-        header = {field: getattr(self.facts, field) for field in GANTRY_KEYWORDS}
-        sources = (self.link.gantry, header, defaults)
-        return {
-            field: next((source[field] for source in sources if source.get(field) is not None), None)
-            for field in GANTRY_KEYWORDS
-        }
+        own, values = self.link.gantry, {}
+        for field in GANTRY_KEYWORDS:
+            value = own.get(field)
+            if value is None:
+                value = getattr(self.facts, field)
+            values[field] = defaults.get(field) if value is None else value
+        return values
 
     @property
     def missing(self) -> list[str]:
@@ -108,18 +111,7 @@ def _image_axes(facts: InstanceFacts, values: dict[str, Any]) -> ImageAxes:
 
 def runs_of(session: Session, study_id: str) -> list[StudyRun]:
     """Return all runs of a study in the order of arrival."""
-    query = (
-        select(StudyInstance, Instance, Study.gantry)
-        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
-        .join(Study, Study.id == StudyInstance.study_id)
-        .where(StudyInstance.study_id == study_id)
-        .order_by(StudyInstance.id)
-    )
-    return [_run(*row) for row in session.execute(query)]
-
-
-def _run(link: StudyInstance, instance: Instance, defaults: dict[str, Any]) -> StudyRun:
-    return StudyRun(link, instance, InstanceFacts.from_json(instance.facts), defaults)
+    return [_run(*row) for row in session.execute(_runs_query(study_id).order_by(StudyInstance.id))]
 
 
 def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
@@ -130,15 +122,33 @@ def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
     Problem
         404 when the study has no such run.
     """
-    row = session.execute(
-        select(StudyInstance, Instance, Study.gantry)
-        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
-        .join(Study, Study.id == StudyInstance.study_id)
-        .where(StudyInstance.study_id == study_id, StudyInstance.sop_instance_uid == uid)
-    ).first()
+    row = session.execute(_runs_query(study_id).where(StudyInstance.sop_instance_uid == uid)).first()
     if row is None:
         raise not_found("instance in this study")
     return _run(*row)
+
+
+def _runs_query(study_id: str) -> Select[StudyInstance, Instance, str, dict[str, Any]]:
+    return (
+        select(StudyInstance, Instance, cast(Instance.facts, Text), Study.gantry)
+        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
+        .join(Study, Study.id == StudyInstance.study_id)
+        .where(StudyInstance.study_id == study_id)
+        .options(defer(Instance.facts))
+    )
+
+
+def _run(link: StudyInstance, instance: Instance, facts: str, defaults: dict[str, Any]) -> StudyRun:
+    return StudyRun(link, instance, _facts(facts), defaults)
+
+
+@functools.lru_cache(maxsize=2048)
+def _facts(text: str) -> InstanceFacts:
+    """Return the facts of a run from their stored JSON.
+
+    Every upload reads all runs of its study, so each text is decoded only once.
+    """
+    return InstanceFacts.from_json(json.loads(text))
 
 
 def add(

@@ -12,8 +12,10 @@ A name comes from a person, an upload or a table. No rule invents one.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
@@ -180,10 +182,11 @@ class _Draft:
                     self._take_view(site, view, by_uid.get(uid), "explicit")
 
     def take_table_views(self) -> None:
+        names = RunNames(self._runs)
         for site in self._sites:
             for view, text in (("a", site.csv_a), ("b", site.csv_b)):
                 if text is not None:
-                    self._take_view(site, view, named_run(text, self._runs), "csv")
+                    self._take_view(site, view, names.run(text), "csv")
 
     def _take_view(self, site: Site, view: str, run: Run | None, by: Rule) -> None:
         slots = self.slots[site.name]
@@ -196,8 +199,12 @@ class _Draft:
 
         The runs come in order of arrival; a third run stays free.
         """
+        members_of: dict[str | None, list[Run]] = defaultdict(list)
+        for run in self._runs:
+            if run.uid in self.free and run.site_by == by:
+                members_of[run.site].append(run)
         for name, slots in self.slots.items():
-            members = [run for run in self._runs if run.uid in self.free and run.site == name and run.site_by == by]
+            members = members_of[name]
             while members and len(slots.runs) < 2:
                 present = slots.runs
                 chosen = next((run for run in members if present and _apart(present[0], run)), members[0])
@@ -232,23 +239,31 @@ class _Draft:
         return sorted(rows, key=lambda site: site.csv_row or 0)
 
 
-def named_run(text: str, runs: Sequence[Run]) -> Run | None:
-    """Return the run that a table names.
+class RunNames:
+    """The texts that may name each run of a study in a table.
 
-    The name is a SOP Instance UID, a series number or a file name. None unless it fits just one run.
+    They are the SOP Instance UID, the series number, the file name and its last part; the first that fits any run counts.
     """
-    text = text.strip()
-    tests: tuple[Callable[[Run], bool], ...] = (
-        lambda run: run.uid == text,
-        lambda run: run.series_number is not None and str(run.series_number) == text,
-        lambda run: run.file_name == text,
-        lambda run: run.file_name is not None and _base_name(run.file_name) == _base_name(text),
-    )
-    for test in tests:
-        found = [run for run in runs if test(run)]
-        if found:
-            return found[0] if len(found) == 1 else None
-    return None
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        uids, numbers, names, base_names = (defaultdict[str, list[Run]](list) for _ in range(4))
+        for run in runs:
+            uids[run.uid].append(run)
+            if run.series_number is not None:
+                numbers[str(run.series_number)].append(run)
+            if run.file_name is not None:
+                names[run.file_name].append(run)
+                base_names[_base_name(run.file_name)].append(run)
+        self._tests = ((uids, str), (numbers, str), (names, str), (base_names, _base_name))
+
+    def run(self, text: str) -> Run | None:
+        """Return the run that a text names; None unless it fits just one run."""
+        text = text.strip()
+        for found, form in self._tests:
+            runs = found.get(form(text))
+            if runs:
+                return runs[0] if len(runs) == 1 else None
+        return None
 
 
 def _base_name(path: str) -> str:
@@ -287,6 +302,7 @@ def _moment(run: Run) -> tuple[float, int]:
     return (run.acquired.timestamp() if run.acquired is not None else math.inf, run.arrival)
 
 
+@functools.lru_cache(maxsize=1024)
 def central_ray(primary_deg: float, secondary_deg: float) -> Direction:
     """Return the direction from the isocentre to the detector of a gantry position."""
     x, y, z = view_axes(primary_deg, secondary_deg)[2].tolist()

@@ -446,7 +446,7 @@ def test_only_grey_and_rgb_pictures_become_png(picture):
         encode_png(picture)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (3, 7), (200, 301), (1, 5, 3), (64, 65, 3)])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 7), (200, 301), (1, 5, 3), (64, 65, 3), (840, 841, 3)])
 def test_png_is_the_picture(shape, tmp_path):
     rng = np.random.default_rng(3)
     for picture in (rng.integers(0, 256, shape, dtype=np.uint8), np.full(shape, 250, dtype=np.uint8)):

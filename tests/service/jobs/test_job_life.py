@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import event as sql_event
 from sqlalchemy import select, update
 
 from fluoromap_service.jobs import job_life, stall
@@ -367,3 +368,95 @@ def test_ready_stages_that_nobody_runs_are_a_stall(job: str) -> None:
     assert [look(), look()] == [False, False]
     watch.reset()
     assert [look(), look()] == [False, True]
+
+
+def _take() -> tuple[str, str] | None:
+    """Claim and end the most urgent stage; return its job and name."""
+    with writing() as session:
+        urgent = job_life.most_urgent(session)
+        if urgent is None:
+            return None
+        held = job_life.claim(session, urgent.stage_id, "w")
+    assert held is not None
+    assert _finish(held)
+    return held.job_id, held.name
+
+
+def test_a_small_job_does_not_wait_for_a_large_one_and_the_map_comes_first(job: str) -> None:
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=10)).id
+        # The job of the fixture takes no part.
+        assert job_life.cancel(session, job)
+    order = [_take() for _ in range(3)]
+    assert order == [(large, "segment")] * 3
+    with writing() as session:
+        small = job_life.create(session, "s", _snapshot("s", sites=1)).id
+    while taken := _take():
+        order.append(taken)
+    # The newcomer has fewer stages left: all of it is done before the large study goes on.
+    assert order[3:9] == [(small, name) for name in ("segment", "segment", "match", "triangulate", "fuse", "monoplane")]
+    # No monoplane stage is taken while the map of any job can be made.
+    names = [name for owner, name in order if owner == large]
+    assert names == ["segment"] * 20 + ["match", "triangulate", "fuse"] + ["monoplane"] * 10
+
+
+def test_a_map_of_another_job_comes_before_the_tracks(job: str) -> None:
+    """``fuse`` waits for no stage about a site, however few stages the job of that site has left."""
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=10)).id
+    _work(large, only="segment")
+    for name in ("match", "triangulate"):
+        assert _take() == (large, name)
+    _work(job, only="segment")
+    for name in ("match", "triangulate"):
+        _work(job, only=name)
+    assert {_take(), _take()} == {(large, "fuse"), (job, "fuse")}
+    assert [_take() for _ in range(2)] == [(job, "monoplane")] * 2
+
+
+def test_a_correction_counts_only_the_stages_that_are_not_known(job: str) -> None:
+    """A new job is opened first; when its known stages have ended, it has few left."""
+    _work(job, only="segment")
+    with writing() as session:
+        other = job_life.create(session, "s", _snapshot("s", sites=3)).id
+        corrected = job_life.create(session, "s", _snapshot("s", sites=10)).id
+        sha256 = files.keep_bytes(session, b"{}")
+        known = job_life.ready(session, corrected)[1:]
+        job_life.finish_ready(session, corrected, [(claim, job_life.StoredResult(sha256)) for claim in known])
+    assert [_take() for _ in range(3)] == [(job, name) for name in ("match", "triangulate", "fuse")]
+    # Two new jobs: each begins, the older one first.
+    assert [_take() for _ in range(2)] == [(other, "segment"), (corrected, "segment")]
+    assert _take() == (corrected, "match")
+
+
+def test_no_job_waits_for_ever(job: str) -> None:
+    """Age counts as stages that are done."""
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=10)).id
+        assert job_life.cancel(session, job)
+    assert _take() == (large, "segment")
+    with writing() as session:
+        age = 100 * job_life.AGE_OF_A_STAGE_SECONDS
+        session.execute(update(Job).where(Job.id == large).values(created=Job.created - age))
+        small = job_life.create(session, "s", _snapshot("s", sites=1)).id
+    assert _take() == (small, "segment")
+    assert _take() == (large, "segment")
+
+
+def test_the_end_of_a_stage_does_not_read_the_others(job: str) -> None:
+    """The states of a job's stages are counted; only a change of kind reads the rows."""
+    with writing() as session:
+        large = job_life.create(session, "s", _snapshot("s", sites=40)).id
+    held = _claim(_stage_ids(large, "segment")[0])
+    assert held is not None
+    loaded: list[StageRow] = []
+
+    def note(row: StageRow, context: object) -> None:
+        loaded.append(row)
+
+    sql_event.listen(StageRow, "load", note)
+    try:
+        assert _finish(held)
+    finally:
+        sql_event.remove(StageRow, "load", note)
+    assert loaded == []

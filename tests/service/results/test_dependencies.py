@@ -74,7 +74,7 @@ def test_the_version_of_the_code_that_makes_a_file_changes_its_key(
         return [
             _key(overlay_dependencies(FUSION, Look(), moving=False)),
             _key(mesh_dependencies("a", "ply", Origin.REFERENCE)),
-            _key(report_dependencies("t", 1, "label", ())),
+            _key(report_dependencies("t", "j", 1, "label", ())),
         ]
 
     before = keys()

@@ -14,9 +14,9 @@ from fluoromap_service.dicom.facts import TableOrigin
 from fluoromap_service.study.pairing import (
     Pairing,
     Run,
+    RunNames,
     Site,
     central_ray,
-    named_run,
     pair_runs,
     pairs_by_time,
     tables_comparable,
@@ -217,9 +217,10 @@ def test_a_table_names_runs_by_uid_series_number_or_file_name() -> None:
         run(2, PA, series_number=8, file_name="right.dcm"),
         run(3, PA, series_number=8, file_name="other/right.dcm"),
     ]
+    names = RunNames(runs)
     for text in ("1.2.1", " 7 ", "C:\\export\\left.dcm", "left.dcm", "folder/left.dcm"):
-        assert named_run(text, runs) == runs[0], text
+        assert names.run(text) == runs[0], text
     # The whole name fits one run, although the base name fits two.
-    assert named_run("right.dcm", runs) == runs[1]
+    assert names.run("right.dcm") == runs[1]
     for text in ("8", "elsewhere/right.dcm", "nowhere.dcm", ""):
-        assert named_run(text, runs) is None, text
+        assert names.run(text) is None, text

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import tempfile
+import itertools
 import zipfile
-from collections.abc import Iterator
-from typing import IO
+from collections.abc import Iterable, Iterator
+from typing import IO, cast
 
 from fastapi import APIRouter
 from fastapi.responses import StreamingResponse
-from starlette.background import BackgroundTask
 
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.results.archive_files import archive_files
-from fluoromap_service.settings import settings
-from fluoromap_service.store.files import CHUNK_BYTES
+from fluoromap_service.api.results.archive_files import ArchiveFile, archive_files
 
 router = APIRouter(tags=["results"])
 
 _DATE = (1980, 1, 1, 0, 0, 0)
 """The date of every file in the archive, so that the same results give the same bytes."""
+
+_LEVEL = 1
+"""Compression of the tables: a higher level takes several times as long and saves a fifth."""
 
 
 @router.get(
@@ -41,27 +41,47 @@ def get_archive(job_id: JobId, caller: Reader) -> StreamingResponse:
 
     The answer is 409 until the job has ended. The zip contains `job.json`, `parameters.json`, `points.csv`,
     `tracks.csv`, `report.html`, `map.json`, `map.png`, the mesh in all formats and an overlay of each view of each
-    site, as far as the job has these results. Coordinates count from the reference catheter.
+    site, as far as the job has these results. Coordinates count from the reference catheter. The archive is sent while it is
+    made, so its length is not known at the start.
     """
-    folder = settings().files_dir / "incoming"
-    folder.mkdir(parents=True, exist_ok=True)
-    stream = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - the background task closes it after the answer
-    try:
-        with zipfile.ZipFile(stream, "w") as archive:
-            for file in archive_files(job_id):
-                entry = zipfile.ZipInfo(file.name, _DATE)
-                entry.compress_type = zipfile.ZIP_DEFLATED if file.compress else zipfile.ZIP_STORED
-                entry.external_attr = 0o644 << 16
-                archive.writestr(entry, file.content)
-        size = stream.tell()
-        stream.seek(0)
-    except BaseException:
-        stream.close()
-        raise
-    headers = {"Content-Disposition": f'attachment; filename="fluoromap-{job_id}.zip"', "Content-Length": str(size)}
-    return StreamingResponse(_chunks(stream), 200, headers, "application/zip", BackgroundTask(stream.close))
+    files = archive_files(job_id)
+    # The first file before the status: a job that has not ended is a problem, not an archive.
+    first = next(files)
+    headers = {"Content-Disposition": f'attachment; filename="fluoromap-{job_id}.zip"'}
+    return StreamingResponse(_zipped(itertools.chain([first], files)), 200, headers, "application/zip")
 
 
-def _chunks(stream: IO[bytes]) -> Iterator[bytes]:
-    while chunk := stream.read(CHUNK_BYTES):
-        yield chunk
+class _Outflow:
+    """The end of a stream that the archive is written into; it cannot seek."""
+
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+
+    def write(self, content: bytes) -> int:
+        self._waiting += content
+        return len(content)
+
+    def flush(self) -> None:
+        """Do nothing: the reader takes the bytes when it is ready."""
+
+    def take(self) -> bytes:
+        """Return the bytes that were written since the last call."""
+        content = bytes(self._waiting)
+        self._waiting.clear()
+        return content
+
+
+def _zipped(files: Iterable[ArchiveFile]) -> Iterator[bytes]:
+    """Return a zip of the files, piece by piece.
+
+    An error in the middle ends the connection, so that a client does not take a part for the whole.
+    """
+    outflow = _Outflow()
+    with zipfile.ZipFile(cast(IO[bytes], outflow), "w") as archive:
+        for file in files:
+            entry = zipfile.ZipInfo(file.name, _DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED if file.compress else zipfile.ZIP_STORED
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, file.content, compresslevel=_LEVEL)
+            yield outflow.take()
+    yield outflow.take()

@@ -23,7 +23,7 @@ from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.mesh_files import MESH_MEDIA_TYPES, MeshFormat, mesh_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.renderings import kept_rendering
+from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
 router = APIRouter(tags=["results"])
 
@@ -190,6 +190,18 @@ def get_map(
     return activation_map(finished, origin)
 
 
+def map_picture_of(job_id: str, finished: FinishedMap) -> KeptFile:
+    """Return the kept PNG of a map from six sides.
+
+    It is drawn when there is none.
+    """
+    return kept_rendering(
+        job_id,
+        map_picture_dependencies(finished.sha256, simulated=finished.simulated),
+        lambda: run_in_pool(Task.DRAW_PICTURE, _map_picture, finished.chamber, finished.simulated),
+    )
+
+
 def _map_picture(chamber: ChamberMap, simulated: bool) -> bytes:
     return encode_png(draw_map_views(chamber, simulated=simulated))
 
@@ -214,11 +226,7 @@ def get_map_picture(job_id: JobId, request: Request, caller: Reader) -> Response
     """
     with reading() as session:
         finished = map_of(session, job_of(session, job_id))
-    picture = kept_rendering(
-        job_id,
-        map_picture_dependencies(finished.sha256, simulated=finished.simulated),
-        lambda: run_in_pool(Task.DRAW_PICTURE, _map_picture, finished.chamber, finished.simulated),
-    )
+    picture = map_picture_of(job_id, finished)
     return file_response(request, picture.path, picture.sha256, "image/png", f"map-{job_id}.png", inline=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
@@ -20,7 +21,7 @@ from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import overlay_dependencies
 from fluoromap_service.results.finished import job_of
-from fluoromap_service.results.fusion import Fusion, draw_fusion, fusion_of
+from fluoromap_service.results.fusion import Fusion, draw_fusion, draw_fusion_jpeg, fusion_of
 from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
@@ -65,17 +66,29 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
 
     The GIF shows the propagation. The picture is drawn when none is kept. It says when the run is simulated.
     """
-    look = replace(look, simulated=fusion.facts.simulated)
+    look = _marked(fusion, look)
 
     def make() -> bytes:
-        path = files.path_of(fusion.sha256)
-        if not path.exists():
-            detail = "Somebody deleted this run; upload it again and start a new job to get its overlay."
-            raise Problem(409, "run_deleted", detail)
-        files.checked_path(fusion.sha256)
-        return run_in_pool(Task.DRAW_PICTURE, draw_fusion, path, fusion, look, moving)
+        return run_in_pool(Task.DRAW_PICTURE, draw_fusion, _run_path(fusion), fusion, look, moving)
 
     return kept_rendering(job_id, overlay_dependencies(fusion, look, moving=moving), make)
+
+
+def jpeg_of(fusion: Fusion, look: Look) -> bytes:
+    """Return a new JPEG of an overlay, which nothing keeps."""
+    return run_in_pool(Task.DRAW_PICTURE, draw_fusion_jpeg, _run_path(fusion), fusion, _marked(fusion, look))
+
+
+def _marked(fusion: Fusion, look: Look) -> Look:
+    """Return the look that says when the run is simulated."""
+    return replace(look, simulated=fusion.facts.simulated)
+
+
+def _run_path(fusion: Fusion) -> Path:
+    if not files.path_of(fusion.sha256).exists():
+        detail = "Somebody deleted this run; upload it again and start a new job to get its overlay."
+        raise Problem(409, "run_deleted", detail)
+    return files.checked_path(fusion.sha256)
 
 
 @router.get(

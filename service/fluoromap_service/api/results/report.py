@@ -8,13 +8,7 @@ from fluoromap_service.api.http.etags import file_response
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.api.results.report_page import report_page, template_sha256
-from fluoromap_service.results.dependencies import report_dependencies
-from fluoromap_service.results.finished import ended_job_of
-from fluoromap_service.results.row_order import sites_by_row_order
-from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import Study
-from fluoromap_service.store.renderings import kept_rendering
+from fluoromap_service.api.results.report_page import report_of
 
 router = APIRouter(tags=["results"])
 
@@ -41,12 +35,7 @@ def get_report(job_id: JobId, request: Request, caller: Reader) -> Response:
     The file has no links to other files. The answer is 409 until the job has ended. The page contains pictures, a 3D
     view, tables with grades and reasons, the error budget, parameters, versions and the hashes of the input files.
     """
-    with reading() as session:
-        job = ended_job_of(session, job_id, "report")
-        study = session.get(Study, job.study_id)
-        guessed = sites_by_row_order(session, job)
-        depends_on = report_dependencies(template_sha256(), job.version, study.label if study else None, guessed)
-    page = kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
+    page = report_of(job_id)
     response = file_response(request, page.path, page.sha256, "text/html", f"report-{job_id}.html", inline=True)
     response.headers["Content-Security-Policy"] = POLICY
     return response

@@ -5,27 +5,26 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
-import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
-from PIL import Image
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import ChamberMap, Triangulation
 from fluoromap.drawing.annotations import purpose_text
-from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look
-from fluoromap.drawing.png import encode_png
 from fluoromap.registry import Kind
+from fluoromap_service.api.http.file_pool import PROCESSES
 from fluoromap_service.api.jobs.job_answers import read_job
-from fluoromap_service.api.results.maps import activation_map
-from fluoromap_service.api.results.overlays import picture_of
+from fluoromap_service.api.results.maps import activation_map, map_picture_of
+from fluoromap_service.api.results.overlays import jpeg_of
 from fluoromap_service.api.results.points import Point, points_of
 from fluoromap_service.api.results.report_modules import modules_sha256, packed_modules
 from fluoromap_service.api.results.report_tables import (
@@ -39,14 +38,16 @@ from fluoromap_service.api.results.report_tables import (
 from fluoromap_service.api.results.tracks import read_tracks
 from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
 from fluoromap_service.problem import Problem
-from fluoromap_service.results.finished import job_of, snapshot_of
+from fluoromap_service.results.dependencies import report_dependencies
+from fluoromap_service.results.finished import ended_job_of, job_of, snapshot_of
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.origins import Origin
-from fluoromap_service.results.placement import located_views
+from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
+from fluoromap_service.store.renderings import KeptFile, kept_rendering
 from fluoromap_service.study.snapshot import SiteSnapshot
 
 WEB = Path(__file__).parents[2] / "web"
@@ -58,24 +59,42 @@ BINDINGS = {
     "confirmed": "row order, confirmed by a person after the job",
 }
 """Rule that bound a site's runs -> its words in the report."""
-JPEG_QUALITY = 88
-"""Fluoroscopy is noise: with JPEG a page of 40 overlays has a few MB."""
+
+
+def report_of(job_id: str) -> KeptFile:
+    """Return the kept report of an ended job; make it when there is none.
+
+    Raises
+    ------
+    Problem
+        404 when there is no such job; 409 ``not_ready`` while the job runs.
+    """
+    with reading() as session:
+        job = ended_job_of(session, job_id, "report")
+        study = session.get(Study, job.study_id)
+        guessed = sites_by_row_order(session, job)
+        label = study.label if study else None
+        depends_on = report_dependencies(template_sha256(), job_id, job.version, label, guessed)
+    return kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
 
 
 def report_page(job_id: str) -> str:
     """Return the page of an ended job, with all results that the job has."""
-    values = _values(job_id)
-    chamber, scene = values.pop("map"), values.pop("scene")
-    values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None, "title": None}
-    if chamber is not None:
-        values |= {
-            "chamber": _figures(chamber),
-            "map_png": _inline(encode_png(draw_map_views(chamber, simulated=values["simulated"])), "image/png"),
-            "overlays": _overlays(job_id),
-            "scene": _json(scene),
-            "scripts": _json(packed_modules()),
-            "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
-        }
+    with ThreadPoolExecutor(PROCESSES) as threads:
+        # The pool draws while this thread makes the tables.
+        pictures = _start_pictures(job_id, threads)
+        values = _values(job_id)
+        chamber, scene = values.pop("map"), values.pop("scene")
+        values |= {"chamber": None, "overlays": [], "map_png": None, "scene": None, "scripts": None, "title": None}
+        if chamber is not None and pictures is not None:
+            values |= {
+                "chamber": _figures(chamber),
+                "map_png": _inline(pictures.map.result().path.read_bytes(), "image/png"),
+                "overlays": list(pictures.shown()),
+                "scene": _json(scene),
+                "scripts": _json(packed_modules()),
+                "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
+            }
     return _environment().get_template("report.html.j2").render(values)
 
 
@@ -98,7 +117,7 @@ def _values(job_id: str) -> dict[str, Any]:
         guessed = sites_by_row_order(session, job)
         rows = tips(points, snapshot.mapping, chamber)
         electrode_rows = electrodes(points)
-        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE), snapshot.mapping) if tracked else []
+        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE, tip_of=snapshot.mapping)) if tracked else []
         return {
             "job": read_job(session, job),
             "label": study.label if study else "Mapping study",
@@ -147,20 +166,38 @@ def _figures(chamber: ChamberMap) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _overlays(job_id: str) -> list[dict[str, Any]]:
-    with reading() as session:
-        job = job_of(session, job_id)
-        fusions = [(view, fusion_of(session, job, view.uid, None)) for view in located_views(session, job)]
-    pictures = []
-    for view, fusion in fusions:
-        try:
-            picture = picture_of(job_id, fusion, Look(covariances_mm2=fusion.covariances_mm2))
-        except Problem:
-            # Somebody deleted the run meanwhile: its numbers are still in the tables.
-            continue
-        source = _jpeg(picture.path)
-        pictures.append({"site": view.site, "view": view.view, "frame": view.frame + 1, "src": source})
-    return pictures
+@dataclass(frozen=True, slots=True)
+class _Pictures:
+    """The pictures of a report while the pool draws them."""
+
+    map: Future[KeptFile]
+    overlays: list[tuple[LocatedView, Future[bytes]]]
+
+    def shown(self) -> Iterator[dict[str, Any]]:
+        for view, drawn in self.overlays:
+            try:
+                source = _inline(drawn.result(), "image/jpeg")
+            except Problem:
+                # Somebody deleted the run meanwhile: its numbers are still in the tables.
+                continue
+            yield {"site": view.site, "view": view.view, "frame": view.frame + 1, "src": source}
+
+
+def _start_pictures(job_id: str, threads: ThreadPoolExecutor) -> _Pictures | None:
+    """Let the pool draw the pictures; None without a map."""
+    try:
+        with reading() as session:
+            job = job_of(session, job_id)
+            finished = map_of(session, job)
+            fusions = [(view, fusion_of(session, job, view.uid, None)) for view in located_views(session, job)]
+    except Problem:
+        return None
+    map_picture = threads.submit(map_picture_of, job_id, finished)
+    overlays = [
+        (view, threads.submit(jpeg_of, fusion, Look(covariances_mm2=fusion.covariances_mm2)))
+        for view, fusion in fusions
+    ]
+    return _Pictures(map_picture, overlays)
 
 
 def _scene(finished: FinishedMap, points: Sequence[Point], catheters: list[str]) -> dict[str, Any]:
@@ -180,12 +217,6 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_rounded(item) for item in value]
     return None if value is None else round(value, 2)
-
-
-def _jpeg(path: Path) -> str:
-    stream = io.BytesIO()
-    Image.open(path).save(stream, format="JPEG", quality=JPEG_QUALITY)
-    return _inline(stream.getvalue(), "image/jpeg")
 
 
 def _inline(content: bytes, media_type: str) -> str:

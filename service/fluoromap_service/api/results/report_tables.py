@@ -54,7 +54,7 @@ def electrodes(points: Sequence[Point]) -> list[Row]:
     ]  # fmt: skip
 
 
-def tracks(answer: Row, mapping: str) -> list[Row]:
+def tracks(answer: Row) -> list[Row]:
     """Return a row for every view.
 
     It is the track of its mapping tip, or the reasons why it has none.
@@ -62,14 +62,10 @@ def tracks(answer: Row, mapping: str) -> list[Row]:
     Parameters
     ----------
     answer : dict
-        The answer of ``read_tracks``.
-    mapping : str
-        Name of the mapping catheter.
+        The answer of ``read_tracks`` for the tip of the mapping catheter.
     """
     rows = []
     for track in answer["tracks"]:
-        if track["catheter"] != mapping or track["electrode"] != 1:
-            continue
         located = [sample for sample in track["samples"] if sample["x_mm"] is not None]
         reasons = dict.fromkeys(Reason(reason) for sample in track["samples"] for reason in sample["reasons"])
         rows.append(

@@ -19,11 +19,13 @@ from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position, Six
+from fluoromap_service.results.dependencies import tracks_table_dependencies
 from fluoromap_service.results.finished import job_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.results.tracks import RejectedView, tracks_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
+from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
 router = APIRouter(tags=["results"])
 
@@ -130,9 +132,16 @@ TracksJson = dict[str, Any]
 
 
 def read_tracks(
-    session: Session, job: Job, origin: Origin, site: str | None = None, view: View | None = None
+    session: Session,
+    job: Job,
+    origin: Origin,
+    site: str | None = None,
+    view: View | None = None,
+    tip_of: str | None = None,
 ) -> TracksJson:
     """Return the tracks of one site or of all, in the shape of :class:`Tracks`.
+
+    With ``tip_of``, the name of a catheter, only the tracks of its tip.
 
     Raises
     ------
@@ -140,7 +149,7 @@ def read_tracks(
         404 for a site that the job does not have; 409 ``not_ready`` while the track of one of the sites is not done.
     """
     tracks, rejected = [], []
-    for found in tracks_of(session, job, origin, site, view):
+    for found in tracks_of(session, job, origin, site, view, tip_of):
         if isinstance(found, RejectedView):
             codes = list(dict.fromkeys(str(reason) for reason in found.reasons))
             rejected.append({"site": found.site, "view": found.view, "reasons": codes, "message": found.message})
@@ -200,6 +209,18 @@ def _lines(answer: TracksJson) -> Iterator[list[Any]]:
 def _read(job_id: str, origin: Origin, site: str | None, view: View | None) -> TracksJson:
     with reading() as session:
         return read_tracks(session, job_of(session, job_id), origin, site, view)
+
+
+def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
+    """Return the kept table of an ended job's tracks.
+
+    It is made when there is none. Its coordinates count from the reference catheter.
+    """
+
+    def make() -> bytes:
+        return tracks_csv(_read(job_id, Origin.REFERENCE, None, None)).encode()
+
+    return kept_rendering(job_id, tracks_table_dependencies(job_id, job_version), make)
 
 
 @router.get(

@@ -207,9 +207,10 @@ def _of_part(problem: Problem, number: int) -> Problem:
 
 
 def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, Any]]:
-    views = views_of(binding_of(session, study.id))
-    runs = {run.uid: run for run in instances.runs_of(session, study.id)}
-    return [instance_shape(runs[uid], views).model_dump() for uid in dict.fromkeys(uids)]
+    runs = instances.runs_of(session, study.id)
+    views = views_of(binding_of(session, study.id, runs=runs))
+    by_uid = {run.uid: run for run in runs}
+    return [instance_shape(by_uid[uid], views).model_dump() for uid in dict.fromkeys(uids)]
 
 
 @router.get("", responses=responses(400, 401, 403, 404, 422))
@@ -217,8 +218,8 @@ def list_instances(study_id: StudyId, pages: Pages, caller: Reader) -> Page[Inst
     """List the study's runs in the order of arrival."""
     with reading() as session:
         study = studies.get(session, study_id)
-        views = views_of(binding_of(session, study.id))
         runs = instances.runs_of(session, study_id)
+        views = views_of(binding_of(session, study.id, runs=runs))
         return pages.page_of_all(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
 
 

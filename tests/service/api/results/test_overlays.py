@@ -32,11 +32,13 @@ from sqlalchemy import select
 
 from fluoromap.contracts import NamedChain
 from fluoromap.drawing.animation import PICTURES
+from fluoromap_service.api.results import archive, archive_files, maps, report_page, tracks
 from fluoromap_service.api.results import overlays as overlay_routes
 from fluoromap_service.results.fusion import Fusion, fusion_of
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Job, Rendering, StudyInstance
+from fluoromap_service.store.models import Job, JobState, Rendering, Study, StudyInstance
+from fluoromap_service.store.renderings import kept_rendering
 
 pytestmark = pytest.mark.usefixtures("file_processes")
 
@@ -220,17 +222,17 @@ def test_the_archive_holds_everything(client: TestClient, study: FinishedStudy) 
     path = f"/v1/jobs/{study.job_id}/archive.zip"
     answer = client.get(path)
     assert answer.headers["content-type"] == "application/zip"
-    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
-        assert archive.testzip() is None
-        assert set(archive.namelist()) == {
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as content:
+        assert content.testzip() is None
+        assert set(content.namelist()) == {
             "job.json", "parameters.json", "points.csv", "tracks.csv", "map.json", "map.png", "mesh/chamber.ply",
             "mesh/chamber.stl", "mesh/chamber.glb", "mesh/chamber.vtp", "mesh/chamber.mat", "mesh/chamber.csv", "report.html",
             "overlays/S01-a.png", "overlays/S01-b.png",
         }  # fmt: skip
-        assert json.loads(archive.read("job.json"))["state"] == "succeeded"
-        assert json.loads(archive.read("parameters.json"))["segmenter"]["name"] == "by-hand"
-        assert archive.read("points.csv").decode() == client.get(f"/v1/jobs/{study.job_id}/points.csv").text
-        assert json.loads(archive.read("map.json")) == client.get(f"/v1/jobs/{study.job_id}/map").json()
+        assert json.loads(content.read("job.json"))["state"] == "succeeded"
+        assert json.loads(content.read("parameters.json"))["segmenter"]["name"] == "by-hand"
+        assert content.read("points.csv").decode() == client.get(f"/v1/jobs/{study.job_id}/points.csv").text
+        assert json.loads(content.read("map.json")) == client.get(f"/v1/jobs/{study.job_id}/map").json()
     assert client.get(path).content == answer.content
 
 
@@ -245,3 +247,59 @@ def test_the_archive_waits_for_the_end(client: TestClient, study: FinishedStudy)
     study.mapped()
     answer = client.get(f"/v1/jobs/{study.job_id}/archive.zip")
     assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
+
+
+def test_the_archive_begins_before_its_pictures_exist(
+    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study.finish()
+
+    def never(*_: object) -> object:
+        raise AssertionError("made before the first bytes were sent")
+
+    for name in ("report_of", "tracks_table_of", "picture_of"):
+        monkeypatch.setattr(archive_files, name, never)
+    pieces = archive._zipped(archive_files.archive_files(study.job_id))
+    first = next(pieces)
+    assert first.startswith(b"PK")
+    assert b"job.json" in first
+
+
+def test_a_second_archive_takes_the_files_of_the_first(
+    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study.finish()
+    path = f"/v1/jobs/{study.job_id}/archive.zip"
+    first = client.get(path).content
+
+    def never(*_: object) -> object:
+        raise AssertionError("made again")
+
+    for module, name in (
+        (overlay_routes, "run_in_pool"),
+        (maps, "run_in_pool"),
+        (report_page, "report_page"),
+        (tracks, "tracks_csv"),
+    ):
+        monkeypatch.setattr(module, name, never)
+    assert client.get(path).content == first
+    assert client.get(f"/v1/jobs/{study.job_id}/report.html").status_code == 200
+
+
+def test_the_jobs_of_a_study_share_their_pictures(study: FinishedStudy) -> None:
+    made = []
+
+    def make() -> bytes:
+        made.append(len(made))
+        return b"picture"
+
+    with writing() as session:
+        session.add(Study(id="other", label="x", catheters=[], reference="r", mapping="m"))
+        session.flush()
+        session.add(Job(id="later", study_id=study.study_id, state=JobState.QUEUED, snapshot={}))
+        session.add(Job(id="elsewhere", study_id="other", state=JobState.QUEUED, snapshot={}))
+    for job, times_made in ((study.job_id, 1), ("later", 1), ("elsewhere", 2)):
+        assert kept_rendering(job, {"kind": "test"}, make).path.read_bytes() == b"picture"
+        assert len(made) == times_made
+    assert kept_rendering("later", {"kind": "another"}, make).path.read_bytes() == b"picture"
+    assert len(made) == 3

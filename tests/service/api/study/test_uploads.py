@@ -13,10 +13,12 @@ from fastapi.testclient import TestClient
 from small_runs import COLUMNS, FRAMES, ROWS, edited, run_uid, small_run
 from sqlalchemy import func, select
 
+from fluoromap_service.dicom import InstanceFacts
 from fluoromap_service.settings import settings
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import File, Instance, StudyInstance
+from fluoromap_service.study import instances
 
 Upload = Callable[..., Any]
 
@@ -264,3 +266,19 @@ def test_gantry_values_that_do_not_fit_are_refused(service: TestClient, upload: 
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_gantry")
     assert service.get(path).json()["gantry"]["source_detector_mm"] == 1000
     assert service.patch(path, json={"gantry": {"primary_deg": 500}}).status_code == 422
+
+
+def test_an_upload_decodes_no_facts_of_the_runs_before_it(upload: Upload, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every upload pairs all runs of the study; it must not read each of their headers again."""
+    decoded = []
+    decode = InstanceFacts.from_json
+
+    def count(value: dict[str, Any]) -> InstanceFacts:
+        decoded.append(value["sop_instance_uid"])
+        return decode(value)
+
+    instances._facts.cache_clear()
+    monkeypatch.setattr(InstanceFacts, "from_json", count)
+    for number in range(1, 6):
+        assert upload((number, 90.0 * (number % 2))).status_code == 201
+    assert decoded == [run_uid(number) for number in range(1, 6)]
