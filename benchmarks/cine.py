@@ -83,7 +83,7 @@ def main(frames: int, seconds: float) -> None:
             page.get_by_role("tab", name="4 Map and results").click()
             page.locator(".fused[data-frames]").nth(1).wait_for()
             page.get_by_role("button", name="Play the map over fluoroscopy").click()
-            report(page, "2 views with the map", [f".fused[data-view={each}]" for each in "ab"], frames, seconds)
+            report(page, "2 views with the map", [f".fused[data-fused={each}]" for each in "ab"], frames, seconds)
             opened.close()
 
 

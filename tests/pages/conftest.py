@@ -12,7 +12,9 @@ import pytest
 import servers
 from processes import embedded, environment_of, wait_until_ready
 
+from fluoromap.phantom import StudySpec
 from fluoromap_service.cli.client import Client
+from fluoromap_service.dicom.simulation import simulate
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test opens the pages")
 
@@ -117,13 +119,15 @@ def new_study() -> Callable[[Any, str], str]:
 
 
 @pytest.fixture(scope="session")
-def mapped_study(service_url: str, simulated_study: Path) -> tuple[str, str]:
+def mapped_study(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     """Return the ids of a study with a map and of its job."""
+    # Another heart than that of the fixture `simulated_study`: tests upload changed files of its runs.
+    files = simulate(tmp_path_factory.mktemp("mapped"), StudySpec(8, sites=5, frames=24), processes=1)
     with Client(service_url) as client:
         study = client.make_study("With a map")
-        for path in sorted(simulated_study.rglob("*.dcm")):
+        for path in files.runs:
             client.upload(study, path)
-        client.put_activation_times(study, simulated_study / "activation_times.csv")
+        client.put_activation_times(study, files.activation_times)
         job = client.start_job(study)
         states = [each["state"] for each in client.follow(job)]
         assert states[-1] == "succeeded", states

@@ -41,7 +41,7 @@ def pixel(place: dict[str, Any], point: NDArray[np.float64]) -> NDArray[np.float
 
 def on_canvas(page: Any, view: str) -> NDArray[np.int64]:
     """Return the picture of a fluoroscopy view, (512, 512, 3)."""
-    address = page.locator(f".fused[data-view={view}] .picture canvas").first.evaluate("canvas => canvas.toDataURL()")
+    address = page.locator(f".fused[data-fused={view}] .picture canvas").first.evaluate("canvas => canvas.toDataURL()")
     picture = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")
     return np.asarray(picture.resize((SIDE, SIDE))).astype(np.int64)
 
@@ -77,7 +77,7 @@ def test_a_click_on_a_site_finds_it_in_every_view_and_keeps_the_runs(
         name: min(np.linalg.norm(uv[name] - uv[other]) for other in uv if other != name) for name in uv if name != runs
     }
     name = max(apart, key=lambda each: apart[each])
-    canvas = map_page.locator(".fused[data-view=a] .picture canvas").first
+    canvas = map_page.locator(".fused[data-fused=a] .picture canvas").first
     canvas.scroll_into_view_if_needed()
     box = canvas.bounding_box()
     u, v = (uv[name] + 0.5) / SIDE
@@ -107,7 +107,7 @@ def test_a_choice_in_the_table_shows_the_runs_of_the_site_and_the_way_to_the_ear
 
 
 def test_the_map_follows_the_frames_while_they_play(map_page: Any) -> None:
-    shown = [map_page.locator(f".fused[data-view={view}]") for view in "ab"]
+    shown = [map_page.locator(f".fused[data-fused={view}]") for view in "ab"]
     map_page.get_by_role("button", name="Play the map over fluoroscopy").click()
     for each in shown:
         each.evaluate(

@@ -49,7 +49,7 @@ export class FusedView extends EventTarget {
     this.canvas = element("canvas", { tabIndex: 0, role: "img", "aria-label": `The map over ${name} of site ${place.site}, ${direction(run.gantry)}` });
     this.slider = element("input", { type: "range", min: 1, max: run.frames, value: this.frame, "aria-label": `Frame of the map over ${name}`, oninput: () => this.show(Number(this.slider.value)) });
     this.count = element("span", {});
-    this.element = element("div", { class: "view fused", "data-view": place.view },
+    this.element = element("div", { class: "view fused", "data-fused": place.view },
       element("div", { class: "caption" }, element("strong", {}, `View ${place.view}`), `${direction(run.gantry)} of site ${place.site}`),
       element("div", { class: "picture" }, this.canvas, bar), element("div", { class: "caption" }, this.slider, this.count));
     this.#listen();
