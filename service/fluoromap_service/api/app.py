@@ -27,7 +27,17 @@ from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
 from fluoromap_service.api.openapi import document
-from fluoromap_service.api.results import archive, dicom_files, maps, overlays, placements, points, report, tracks
+from fluoromap_service.api.results import (
+    archive,
+    dicom_files,
+    maps,
+    overlays,
+    placements,
+    points,
+    report,
+    report_page,
+    tracks,
+)
 from fluoromap_service.api.service import health, metrics, pages, plugins, reasons
 from fluoromap_service.api.service.api_page import api_page
 from fluoromap_service.api.study import (
@@ -170,6 +180,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 async def _warm_up() -> None:
     await run_in_threadpool(file_pool.start)
+    await run_in_threadpool(report_page.prepare)
 
 
 async def _repeat(failure: str, act: Callable[[], object], seconds: float) -> None:

@@ -51,6 +51,7 @@ from fluoromap_service.store.renderings import KeptFile, kept_rendering
 from fluoromap_service.study.snapshot import SiteSnapshot
 
 WEB = Path(__file__).parents[2] / "web"
+TEMPLATE = "report.html.j2"
 BINDINGS = {
     "explicit": "set by hand",
     "csv": "named in the table of activation times",
@@ -95,7 +96,13 @@ def report_page(job_id: str) -> str:
                 "scripts": _json(packed_modules()),
                 "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
             }
-    return _environment().get_template("report.html.j2").render(values)
+    return _environment().get_template(TEMPLATE).render(values)
+
+
+def prepare() -> None:
+    """Compile the template and pack the scripts, so that the first report need not wait."""
+    _environment().get_template(TEMPLATE)
+    packed_modules()
 
 
 def _values(job_id: str) -> dict[str, Any]:
@@ -243,7 +250,7 @@ def _environment() -> Environment:
 @functools.cache
 def template_sha256() -> str:
     """Return the hash of the page's template and modules."""
-    return hashlib.sha256((WEB / "report.html.j2").read_bytes() + modules_sha256().encode()).hexdigest()
+    return hashlib.sha256((WEB / TEMPLATE).read_bytes() + modules_sha256().encode()).hexdigest()
 
 
 def _number(value: float | None, digits: int) -> str:
