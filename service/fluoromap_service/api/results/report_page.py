@@ -208,7 +208,10 @@ def _start_pictures(job_id: str, threads: ThreadPoolExecutor) -> _Pictures | Non
 
 
 def _scene(finished: FinishedMap, points: Sequence[Point], catheters: list[str]) -> dict[str, Any]:
-    """Return map, electrodes and catheters' names for the 3D view, coordinates with two decimals."""
+    """Return map, electrodes and names of catheters for the 3D view.
+
+    Coordinates have two decimals.
+    """
     chamber = activation_map(finished, Origin.REFERENCE).model_dump(mode="json")
     for name in ("vertices_mm", "lat_ms", "lat_sd_ms"):
         chamber[name] = _rounded(chamber[name])

@@ -101,7 +101,10 @@ def get_asset(name: str, request: Request) -> Response:
 
 @router.get(SESSION)
 def get_session(caller: Reader) -> dict[str, str | None]:
-    """Return the name of the token that this browser signed in with; null where the service is open."""
+    """Return the name of this browser's token.
+
+    It is null where the service is open.
+    """
     return {"name": None if caller == OPEN.name else caller}
 
 
