@@ -71,7 +71,7 @@ def row_of(name, tip, angle):
 
 
 def drawn(rows):
-    """Draw a log image with a dark spot at each electrode and a faint shaft along and behind each row."""
+    """Draw a dark spot at each electrode and a faint shaft."""
     v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
     image = np.random.default_rng(3).normal(6.0, 0.02, (SIZE, SIZE))
     for row in rows:
