@@ -243,9 +243,10 @@ class ChainDetector:
     def _link_without_rejected(
         self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
     ) -> _Linking:
-        """Link again without chains that would be rejected: they took the places of catheters.
+        """Link again without the chains that would be rejected.
 
-        A chain that only now gets its place must be good for itself, and it has no electrode of an unlisted catheter.
+        They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
+        electrode of an unlisted catheter.
         """
         scores = seen.scores_at(linking.points_uv)
         unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
