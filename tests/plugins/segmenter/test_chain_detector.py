@@ -71,7 +71,10 @@ def row_of(name, tip, angle):
 
 
 def drawn(rows):
-    """Draw a dark spot at each electrode and a faint shaft."""
+    """Draw a log image of catheters.
+
+    Each electrode is a dark spot; a faint shaft follows the row and goes on behind it.
+    """
     v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
     image = np.random.default_rng(3).normal(6.0, 0.02, (SIZE, SIZE))
     for row in rows:
