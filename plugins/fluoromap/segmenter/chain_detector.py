@@ -243,16 +243,10 @@ class ChainDetector:
     def _link_without_rejected(
         self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
     ) -> _Linking:
-<<<<<<< HEAD
-        """Link again without chains that would be rejected.
-
-        They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no electrode of an unlisted catheter.
-=======
         """Link again without the chains that would be rejected.
 
         They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
         electrode of an unlisted catheter.
->>>>>>> learned
         """
         scores = seen.scores_at(linking.points_uv)
         unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
