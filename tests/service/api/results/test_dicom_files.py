@@ -202,7 +202,7 @@ def test_conformance_statement_lists_the_objects(client: TestClient, study: Fini
     study.finish()
     page = (Path(__file__).parents[4] / "docs" / "dicom-conformance.md").read_text()
     listed = re.findall(
-        r"^\| (.+) \| `([\d.]+)` \|$", page.partition("## Objects created")[2].partition("## ")[0], re.M
+        r"^\| (.+) \| `([\d.]+)` \| SCU \|$", page.partition("## Objects created")[2].partition("## ")[0], re.M
     )
     made = dict.fromkeys(item.SOPClassUID for item in objects(content(client, study)).values())
     assert listed == [(uid.name, str(uid)) for uid in made]

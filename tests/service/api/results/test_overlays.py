@@ -37,7 +37,7 @@ from fluoromap_service.api.results import overlays as overlay_routes
 from fluoromap_service.results.fusion import Fusion, fusion_of
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Job, JobState, Rendering, Study, StudyInstance
+from fluoromap_service.store.models import Job, JobState, Rendering, Study
 from fluoromap_service.store.renderings import kept_rendering
 
 pytestmark = pytest.mark.usefixtures("file_processes")
@@ -196,8 +196,6 @@ def test_a_deleted_runs_overlay_stays_when_it_was_drawn(client: TestClient, stud
 def test_a_deleted_run_takes_the_pictures_of_it_along(client: TestClient, study: FinishedStudy) -> None:
     study.finish()
     uid = study.uids["S01", "a"]
-    with writing() as session:
-        session.add(StudyInstance(study_id=study.study_id, sop_instance_uid=uid))
     path = f"/v1/jobs/{study.job_id}/overlays/{uid}.png"
     assert client.get(path).status_code == 200
     assert client.delete(f"/v1/studies/{study.study_id}/instances/{uid}").status_code == 204
