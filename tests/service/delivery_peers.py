@@ -15,7 +15,7 @@ from typing import Any
 
 import pydicom
 from pydicom.dataset import Dataset
-from pynetdicom import AE, AllStoragePresentationContexts, evt
+from pynetdicom import AE, AllStoragePresentationContexts, _config, evt
 from pynetdicom.sop_class import StudyRootQueryRetrieveInformationModelFind
 from python_multipart import MultipartParser
 
@@ -81,6 +81,8 @@ def dicom_node(
     if answers_questions:
         entity.add_supported_context(StudyRootQueryRetrieveInformationModelFind)
     entity.require_called_aet = True
+    # The listener of an earlier test lets pynetdicom write objects to files, for the whole process.
+    chunked, _config.STORE_RECV_CHUNKED_DATASET = _config.STORE_RECV_CHUNKED_DATASET, False
     server = entity.start_server(
         ("127.0.0.1", port), block=False, evt_handlers=[(evt.EVT_C_STORE, store), (evt.EVT_C_FIND, find), *handlers]
     )
@@ -90,6 +92,7 @@ def dicom_node(
         )
     finally:
         server.shutdown()
+        _config.STORE_RECV_CHUNKED_DATASET = chunked
 
 
 @contextmanager

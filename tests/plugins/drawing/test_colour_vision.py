@@ -45,6 +45,6 @@ def test_pages_have_the_same_palettes() -> None:
 
 
 def test_pages_doubt_the_same_sites() -> None:
-    found = re.search(r"^const DOUBTS = (\[.*\]);$", (PAGES / "scene.js").read_text(), re.M)
+    found = re.search(r"^const DOUBTS = (\[.*\]);$", (PAGES / "site-text.js").read_text(), re.M)
     assert found is not None
     assert set(json.loads(found[1])) == {*map(str, AT_BEST_C), str(Reason.LAT_OUTLIER)}

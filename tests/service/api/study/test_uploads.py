@@ -59,6 +59,7 @@ def test_a_run_is_stored_and_described(upload: Upload, data_dir: Path) -> None:
         },
         "missing": [],
         "warnings": run["warnings"],
+        "simulated": True,
     }  # fmt: skip
     assert "unbound" not in run["warnings"]
     assert _stored(data_dir) == (1, 1, 1, 1)
