@@ -15,11 +15,10 @@ from fluoromap.reasons import Reason
 
 CLEARLY_STILLER = 5.0
 """The reference is identified by motion when the log likelihood ratio for it against any look-alike exceeds this."""
-_OWN_MM2 = np.geomspace(0.25, 25.0, 12)
-"""Variances tried for a catheter's own motion between sites, an axis.
-
-The least one is from detection and beats alone: irregular beats move a catheter at rest by half a millimetre.
-"""
+_OWN_MM2 = np.geomspace(0.05, 25.0, 12)
+"""Variances tried for a catheter's own motion between sites, an axis; the least is from detection and beats alone."""
+_OWN_IRREGULAR_MM2 = np.geomspace(0.25, 25.0, 12)
+"""The same where the rhythm is irregular: its beats move a catheter at rest by half a millimetre."""
 _COMMON_MM2 = np.concatenate([[0.0], np.geomspace(0.1, 1000.0, 13)])
 """Variances tried for the motion of all catheters between sites, an axis: breathing and a moved table."""
 
@@ -29,13 +28,14 @@ class PairedCatheter:
     """One catheter in both views of a site.
 
     position_mm : (3,) mean of its electrodes at diastole, from the isocentre.
-    place : index within its group, the same over all sites of the study.
+    place : index within its group, the same over all sites of the study. irregular : whether the site's rhythm is irregular.
     """
 
     a: CatheterFacts
     b: CatheterFacts
     position_mm: Array
     place: int
+    irregular: bool = False
 
     @property
     def manual_name(self) -> str | None:
@@ -152,7 +152,7 @@ def _positions_at(sites: Sequence[Sequence[PairedCatheter]], places: list[list[i
     return {s: site[places[s].index(place)].position_mm for s, site in enumerate(sites) if place in places[s]}
 
 
-def stiller(first_mm: Array, second_mm: Array) -> float:
+def stiller(first_mm: Array, second_mm: Array, *, irregular: bool = False) -> float:
     """Return the log likelihood ratio for the first catheter being stiller.
 
     It compares the motion of each catheter by itself.
@@ -164,17 +164,20 @@ def stiller(first_mm: Array, second_mm: Array) -> float:
     ----------
     first_mm, second_mm : ndarray, shape (s, 3)
         Diastolic places at the same sites.
+    irregular : bool
+        Whether the rhythm is irregular at a site.
     """
+    own_mm2 = _OWN_IRREGULAR_MM2 if irregular else _OWN_MM2
     both = np.stack([first_mm - first_mm.mean(axis=0), second_mm - second_mm.mean(axis=0)])
     scatter = np.einsum("isx,jsx->xij", both, both)[:, :, :, None, None, None]
-    first, second, common = np.meshgrid(_OWN_MM2, _OWN_MM2, _COMMON_MM2, indexing="ij")
+    first, second, common = np.meshgrid(own_mm2, own_mm2, _COMMON_MM2, indexing="ij")
     determinant = common * (first + second) + first * second
     misfit = (
         scatter[:, 0, 0] * (common + second) - 2 * scatter[:, 0, 1] * common + scatter[:, 1, 1] * (common + first)
     ) / determinant
     likelihood = -0.5 * ((len(first_mm) - 1) * np.log(determinant) + misfit)
     best = likelihood.max(axis=-1).sum(axis=0)
-    less = np.triu_indices(len(_OWN_MM2), 1)
+    less = np.triu_indices(len(own_mm2), 1)
     return float(best[less].max() - best.T[less].max())
 
 
@@ -197,11 +200,12 @@ def _stillest(
     together = sorted(set.intersection(*shown))
     if len(free) > 1 and len(together) >= 3:
         positions = np.array([[_positions_at(sites, places, place)[s] for s in together] for place in free])
+        irregular = any(one.irregular for site in sites for one in site)
         for index, place in enumerate(free):
             others = np.delete(positions, index, axis=0)
             if any(_exchanged(positions[index], other) for other in others):
                 continue
-            if all(stiller(positions[index], other) > CLEARLY_STILLER for other in others):
+            if all(stiller(positions[index], other, irregular=irregular) > CLEARLY_STILLER for other in others):
                 return place, Reason.IDENTITY_BY_MOTION
     motion = [
         np.mean([site[places[s].index(place)].motion_px for s, site in enumerate(sites) if place in places[s]])

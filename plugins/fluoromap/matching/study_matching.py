@@ -186,9 +186,10 @@ def _name_all(
 
 def _paired(site: _ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
     i, j = int(pair[0]), int(pair[1])
+    comparison = site.comparison
     return PairedCatheter(
-        site.comparison.catheters_a[i], site.comparison.catheters_b[j], site.table.position_mm[i, j], place
-    )  # fmt: skip
+        comparison.catheters_a[i], comparison.catheters_b[j], site.table.position_mm[i, j], place, comparison.irregular
+    )
 
 
 def _named_site(

@@ -40,4 +40,6 @@ def test_irregular_beats_alone_make_no_catheter_the_stiller_one() -> None:
         [-0.92, -2.66, 2.32], [-0.40, -3.64, -0.40], [1.84, 1.09, -0.59],
         [0.35, 1.15, -5.54], [-1.02, 2.56, 3.71], [0.13, 1.49, 0.50],
     ])  # fmt: skip
-    assert abs(stiller(pacing, reference)) < CLEARLY_STILLER
+    assert abs(stiller(pacing, reference, irregular=True)) < CLEARLY_STILLER
+    # At a regular rhythm the same places would decide.
+    assert stiller(pacing, reference) > CLEARLY_STILLER
