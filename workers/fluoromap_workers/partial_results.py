@@ -14,18 +14,18 @@ from sqlalchemy import select
 
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.store import files
+from fluoromap_service.store.array_pools import Block
 from fluoromap_service.store.codec import (
-    Block,
     StoredOtherwise,
     block_of,
     decode,
     deferred,
-    digest,
     form_of,
     partial_results,
 )
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job, StageRow
+from fluoromap_service.store.value_hash import digest
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from celery import bootsteps, shared_task
 from celery.signals import celeryd_init, worker_shutting_down
 from sqlalchemy.exc import SQLAlchemyError
 
-from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.jobs import living_workers, queue, turns
 from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.jobs.stall import StallWatch
 from fluoromap_service.settings import settings
@@ -38,7 +38,7 @@ _free_processes: waiting_line.LifoQueue[StageProcess] = waiting_line.LifoQueue()
 def run_stage(stage_id: int) -> None:
     """Run stages until none is ready, the most urgent first.
 
-    The message of a stage only wakes the worker: :func:`job_life.most_urgent` says which stage it takes. A message that arrives
+    The message of a stage only wakes the worker: :func:`turns.most_urgent` says which stage it takes. A message that arrives
     later finds its stage claimed.
     """
     try:
@@ -72,7 +72,7 @@ def _run_stages(place: Place) -> None:
     compared: set[tuple[str, str]] = set()
     while place.is_ready():
         with reading() as session:
-            urgent = job_life.most_urgent(session)
+            urgent = turns.most_urgent(session)
         if urgent is None:
             return
         kind = urgent.job_id, urgent.name
@@ -126,7 +126,7 @@ class Sweeper(bootsteps.StartStopStep):  # type: ignore[misc]
         # The worker outlives a database that is away for a moment: the next sweep finds it again.
         try:
             with writing() as session:
-                job_life.worker_seen(session, name)
+                living_workers.worker_seen(session, name)
             queue.sweep()
             with reading() as session:
                 stalled = self._stall.look(session)

@@ -21,7 +21,7 @@ from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.settings import settings
 from fluoromap_service.store import audit, tally
 from fluoromap_service.store.audit import Act
-from fluoromap_service.store.clock import db_now
+from fluoromap_service.store.clock import CLOCK_TOLERANCE_SECONDS, db_now
 from fluoromap_service.store.models import (
     ENDED_JOB,
     Delivery,
@@ -35,8 +35,6 @@ from fluoromap_service.store.models import (
 
 OVERLAP_SECONDS = 600.0
 """A transaction that ends a job commits at most this long after the time that it stores as the job's end."""
-CLOCK_TOLERANCE_SECONDS = 1.0
-"""A lease that ends further ahead than its length comes from before the clock was set back."""
 DAY_SECONDS = 86400.0
 
 

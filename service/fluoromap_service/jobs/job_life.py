@@ -11,13 +11,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, case, delete, func, insert, or_, select, update
+from sqlalchemy import Row, delete, insert, select, update
 from sqlalchemy.orm import Session, defer
 
 from fluoromap_service.jobs.pipeline import PIPELINE, STAGES, StageName, after, plugin_of, subjects_of
 from fluoromap_service.settings import settings
 from fluoromap_service.store import tally
-from fluoromap_service.store.clock import db_now
+from fluoromap_service.store.clock import CLOCK_TOLERANCE_SECONDS, db_now
 from fluoromap_service.store.models import (
     ENDED_JOB,
     ENDED_STAGE,
@@ -28,17 +28,9 @@ from fluoromap_service.store.models import (
     Point,
     StageRow,
     StageState,
-    WorkerSeen,
 )
 from fluoromap_service.study.snapshot import Snapshot
 
-LONGEST_REPUBLISH_SECONDS = 60.0
-AGE_OF_A_STAGE_SECONDS = 5.0
-"""Age of a job that counts as one stage less when workers choose the next stage."""
-WORKER_SECONDS = 30.0
-"""A worker that is silent for longer counts as dead."""
-CLOCK_TOLERANCE_SECONDS = 1.0
-"""A stored time that lies further in the future comes from before the clock was set back."""
 _REPORTED = (
     StageRow.name, StageRow.subject, StageRow.state, StageRow.attempt, StageRow.progress, StageRow.reused,
 )  # fmt: skip
@@ -66,15 +58,6 @@ class Claim:
     attempt: int
     name: str
     subject: str
-
-
-@dataclass(frozen=True, slots=True)
-class ReadyStage:
-    """A stage that a worker may claim."""
-
-    stage_id: int
-    job_id: str
-    name: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,69 +96,6 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
         ids[stage.name] = [row.id for row in rows]
     _report_job(session, job)
     return job
-
-
-def take_due(session: Session, limit: int = 32) -> list[int]:
-    """Return the ready stages that need an announcement, and note that they are announced.
-
-    These are stages that were never announced, and stages whose announcement is so old that it may be lost. A worker that hears
-    of one takes stages until none is ready, so few announcements at once are enough.
-    """
-    wait = settings().republish_seconds
-    # Each repetition waits longer, so that a long queue is not announced over and over.
-    due = or_(
-        StageRow.published.is_(None),
-        StageRow.published < db_now() - StageRow.publications * wait,
-        StageRow.published < db_now() - LONGEST_REPUBLISH_SECONDS,
-        # Somebody has set the clock back.
-        StageRow.published > db_now() + CLOCK_TOLERANCE_SECONDS,
-    )
-    query = select(StageRow.id).where(StageRow.state == StageState.READY, due).order_by(StageRow.id).limit(limit)
-    ids = list(session.scalars(query.with_for_update(skip_locked=True)))
-    if ids:
-        session.execute(
-            update(StageRow)
-            .where(StageRow.id.in_(ids))
-            .values(published=db_now(), publications=StageRow.publications + 1)
-        )
-    return ids
-
-
-def most_urgent(session: Session) -> ReadyStage | None:
-    """Return the stage that a worker should take next.
-
-    None when no stage is ready. The order:
-
-    1. Stages about a whole study come first: they are short, and the map waits for them.
-    2. Then come jobs of which no stage has begun, the oldest first: a worker must see how much of them is known.
-    3. Then comes the job with the fewest stages left. So a small job or a correction does not wait for a large study. Each
-       ``AGE_OF_A_STAGE_SECONDS`` of age count as one stage less, so that no job waits for ever.
-    4. The stages of one job come in the order of the pipeline.
-    """
-    whole_study = [stage.name for stage in PIPELINE if stage.subject == "study"]
-    open_states = [state for state in StageState if state not in ENDED_STAGE]
-    left = (
-        select(StageRow.job_id, func.count().label("stages"))
-        .where(StageRow.state.in_(open_states))
-        .group_by(StageRow.job_id)
-        .subquery()
-    )
-    is_new = Job.state == JobState.QUEUED
-    query = (
-        select(StageRow.id, StageRow.job_id, StageRow.name)
-        .join(Job, Job.id == StageRow.job_id)
-        .join(left, left.c.job_id == StageRow.job_id)
-        .where(StageRow.state == StageState.READY)
-        .order_by(
-            case((StageRow.name.in_(whole_study), 0), (is_new, 1), else_=2),
-            case((is_new, 0.0), else_=left.c.stages) + Job.created / AGE_OF_A_STAGE_SECONDS,
-            Job.id,
-            StageRow.id,
-        )
-        .limit(1)
-    )
-    found = session.execute(query).first()
-    return None if found is None else ReadyStage(*found)
 
 
 def ready(session: Session, job_id: str) -> list[Claim]:
@@ -415,27 +335,6 @@ def _free(session: Session, job: Job, stage: StageRow) -> None:
     stage.published, stage.publications, stage.lease_until, stage.worker = None, 0, None, None
     _report_stage(session, job.id, stage)
     _settle(session, job)
-
-
-def worker_seen(session: Session, name: str) -> None:
-    """Store a worker's sign of life."""
-    row = session.get(WorkerSeen, name)
-    now = session.scalar(select(db_now())) or 0.0
-    if row is None:
-        session.add(WorkerSeen(name=name, seen=now))
-    else:
-        row.seen = now
-
-
-def living_workers(session: Session, name: str | None = None) -> int:
-    """Return how many workers gave a recent sign of life.
-
-    Recent means within ``WORKER_SECONDS``. With ``name`` only the worker of that name counts.
-    """
-    # A time in the future comes from before the clock was set back.
-    alive = WorkerSeen.seen.between(db_now() - WORKER_SECONDS, db_now() + WORKER_SECONDS)
-    query = select(func.count()).select_from(WorkerSeen).where(alive)
-    return session.scalar(query if name is None else query.where(WorkerSeen.name == name)) or 0
 
 
 def _held(held: Claim) -> tuple[Any, ...]:

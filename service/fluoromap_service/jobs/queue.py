@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 import structlog
 from celery import Celery
 
-from fluoromap_service.jobs import job_life
+from fluoromap_service.jobs import job_life, turns
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import writing
 
@@ -90,7 +90,7 @@ def publish_due() -> int:
     Call it after each commit that made stages ready.
     """
     with writing() as session:
-        ids = job_life.take_due(session)
+        ids = turns.take_due(session)
     publish(ids)
     return len(ids)
 

@@ -8,6 +8,9 @@ from sqlalchemy import Float
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.expression import FunctionElement
 
+CLOCK_TOLERANCE_SECONDS = 1.0
+"""A stored time that lies further in the future comes from before the clock was set back."""
+
 
 class db_now(FunctionElement[float]):  # noqa: N801 - reads as the SQL function it is
     """Seconds since 1970-01-01 UTC by the database's clock."""

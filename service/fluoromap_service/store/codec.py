@@ -30,14 +30,14 @@ from typing import Any, NoReturn, Protocol, cast
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
+
+from fluoromap_service.store.array_pools import ALIGNMENT, ArrayPools, Block, padded, whole
 
 T = typing.TypeVar("T")
 
 LAYOUT = 3
 """The number of the layout of stored bytes. It is part of every form, so that results of another one are computed again."""
 
-_ALIGNMENT = 8
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
 _SOURCE = "_stored_form"
 _pack, _unpack = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder()
@@ -50,14 +50,6 @@ _unpack_head = msgspec.msgpack.Decoder(
 
 class StoredOtherwise(ValueError):
     """The bytes are no stored result of this kind, or another version of the contracts stored them."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Block:
-    """The stored form of one value, and its hash."""
-
-    sha256: str
-    content: bytes
 
 
 def encode(value: Any, partial: Mapping[str, Block] = types.MappingProxyType({}), *, finite: bool = True) -> bytes:
@@ -81,14 +73,14 @@ def encode(value: Any, partial: Mapping[str, Block] = types.MappingProxyType({})
     kind = type(value)
     if not dataclasses.is_dataclass(kind):
         _refuse(kind)
-    arrays = _Arrays(finite)
+    arrays = ArrayPools(finite)
     with _without_collector():
         tree = _fields_column(_plain_kind(kind)).encode([value], arrays)
         numbers = {key: arrays.add_block(block) for key, block in sorted(partial.items())}
         blocks = [(block.sha256, len(block.content)) for block in arrays.blocks]
         head = _pack.encode((form_of(_plain_kind(kind)), arrays.described(), blocks, numbers, tree))
-    parts = [len(head).to_bytes(_ALIGNMENT, "little"), _padded(head), arrays.numbers()]
-    return b"".join([*parts, *(_padded(block.content) for block in arrays.blocks)])
+    parts = [len(head).to_bytes(ALIGNMENT, "little"), padded(head), arrays.numbers()]
+    return b"".join([*parts, *(padded(block.content) for block in arrays.blocks)])
 
 
 def decode(kind: type[T], content: bytes) -> T:
@@ -154,20 +146,6 @@ def partial_results(content: bytes) -> Mapping[str, Block]:
         return _Content(None, content).partial_results()
 
 
-def digest(*inputs: Any) -> str:
-    """Return a hash of values: equal for equal values of the same types.
-
-    They may be numbers, strings, enums, arrays, tuples, mappings, dataclasses and pydantic models. A value that was read from
-    the store counts with the hash of its stored form, without being decoded.
-    """
-    found = hashlib.sha256()
-    for value in inputs:
-        content = _digested(value)
-        found.update(len(content).to_bytes(_ALIGNMENT, "little"))
-        found.update(content)
-    return found.hexdigest()
-
-
 def form_of(kind: type[Any]) -> str:
     """Return the hash of a type's form, which changes when a contract or the layout does.
 
@@ -194,48 +172,15 @@ def _form_of(kind: Any) -> str:
     return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
 
 
-def _digested(value: Any) -> bytes:
-    """Return bytes that are equal for equal values."""
-    kind = type(value)
-    if isinstance(value, Enum):
-        return f"{kind.__qualname__}.{value.name}".encode()
-    if kind in _PLAIN:
-        return f"{kind.__name__}:{value!r}".encode()
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype.str}{value.shape}".encode() + value.tobytes()
-    if isinstance(value, np.generic):
-        return _digested(value.item())
-    if isinstance(value, Mapping):
-        return f"mapping:{digest(*itertools.chain.from_iterable(sorted(value.items())))}".encode()
-    if isinstance(value, (tuple, list)):
-        return f"sequence:{digest(*value)}".encode()
-    if isinstance(value, frozenset):
-        return f"set:{digest(*sorted(value))}".encode()
-    if isinstance(value, BaseModel):
-        return f"{kind.__qualname__}:{value.model_dump_json()}".encode()
-    if not dataclasses.is_dataclass(value):
-        _refuse(kind)
-    if _source_of(value) is not None or _is_apart(kind):
-        return f"stored:{block_hash(value)}".encode()
-    fields = digest(*(getattr(value, field.name) for field in dataclasses.fields(value)))
-    return f"{kind.__qualname__}:{fields}".encode()
+def block_hash(value: Any) -> str | None:
+    """Return the hash of the form of a value that is stored apart.
 
-
-def block_hash(value: Any) -> str:
-    """Return the hash of a value's stored form.
-
-    A value that was read from the store knows it.
+    None for another value. A value that was read from the store knows it, and is not decoded.
     """
     source = _source_of(value)
-    return source.sha256 if source is not None else block_of(value).sha256
-
-
-def _whole(length: int) -> int:
-    return -(-length // _ALIGNMENT) * _ALIGNMENT
-
-
-def _padded(content: bytes) -> bytes:
-    return content + bytes(_whole(len(content)) - len(content))
+    if source is not None:
+        return source.sha256
+    return block_of(value).sha256 if _is_apart(type(value)) else None
 
 
 @contextmanager
@@ -279,80 +224,17 @@ def _check_finite(numbers: Iterable[float]) -> None:
         raise ValueError("the result holds a number that is not finite")
 
 
-# --- arrays ------------------------------------------------------------------------------------------------------------
-
-
-class _Arrays:
-    """The different arrays and blocks of one value, numbered as they come. Arrays are gathered by type and shape."""
-
-    def __init__(self, finite: bool) -> None:
-        self.finite = finite
-        self._numbers: dict[tuple[np.dtype[Any], tuple[int, ...], bytes], int] = {}
-        self._blocks: dict[str, tuple[int, Block]] = {}
-
-    def add(self, array: NDArray[Any]) -> int:
-        """Add an array and return its number."""
-        return self._numbers.setdefault((array.dtype, array.shape, array.tobytes()), len(self._numbers))
-
-    def add_block(self, block: Block) -> int:
-        """Add a block and return its number."""
-        return self._blocks.setdefault(block.sha256, (len(self._blocks), block))[0]
-
-    @property
-    def blocks(self) -> list[Block]:
-        """All blocks by their numbers."""
-        return [block for _, block in self._blocks.values()]
-
-    @functools.cached_property
-    def _pools(self) -> dict[tuple[np.dtype[Any], tuple[int, ...]], tuple[list[int], list[bytes]]]:
-        pools: dict[tuple[np.dtype[Any], tuple[int, ...]], tuple[list[int], list[bytes]]] = {}
-        for (dtype, shape, content), number in self._numbers.items():
-            numbers, contents = pools.setdefault((dtype, shape), ([], []))
-            numbers.append(number)
-            contents.append(content)
-        return pools
-
-    def described(self) -> list[tuple[str, tuple[int, ...], list[int]]]:
-        """Return type, shape and the arrays' numbers for each pool.
-
-        Raises
-        ------
-        TypeError
-            When an array holds no real numbers.
-        """
-        for dtype, _ in self._pools:
-            if dtype.kind not in "biuf":
-                raise TypeError(f"a result holds an array of {dtype}, which is never stored")
-        return [(dtype.str, shape, numbers) for (dtype, shape), (numbers, _) in self._pools.items()]
-
-    def numbers(self) -> bytes:
-        """Return the numbers of all pools, each pool padded to whole words.
-
-        Raises
-        ------
-        ValueError
-            When one of them is not finite.
-        """
-        parts = []
-        for (dtype, _), (_, contents) in self._pools.items():
-            content = b"".join(contents)
-            if self.finite and dtype.kind == "f" and not np.isfinite(np.frombuffer(content, dtype)).all():
-                raise ValueError("the result holds a number that is not finite")
-            parts.append(_padded(content))
-        return b"".join(parts)
-
-
 class _Content:
     """The stored form of one value, taken apart. Its arrays are read when the first one is needed."""
 
     def __init__(self, kind: type | None, content: bytes) -> None:
         with _stored_otherwise(kind or object):
             self._kind, self._content = kind, content
-            end = _ALIGNMENT + int.from_bytes(content[:_ALIGNMENT], "little")
+            end = ALIGNMENT + int.from_bytes(content[:ALIGNMENT], "little")
             form, self._described, self._blocks, self._partial, (count, columns) = _unpack_head.decode(
-                content[_ALIGNMENT:end]
+                content[ALIGNMENT:end]
             )
-            self._start = _whole(end)
+            self._start = whole(end)
             if kind is None:
                 return
             if form != form_of(kind) or count != 1:
@@ -378,15 +260,15 @@ class _Content:
         for dtype, shape, numbers in self._described:
             pool = np.frombuffer(self._content, dtype, len(numbers) * math.prod(shape), start)
             by_number.update(zip(numbers, pool.reshape(len(numbers), *shape), strict=True))
-            start += _whole(pool.nbytes)
+            start += whole(pool.nbytes)
         return [by_number[number] for number in range(len(by_number))]
 
     @functools.cached_property
     def _starts_of_blocks(self) -> list[int]:
         start = self._start
         for dtype, shape, numbers in self._described:
-            start += _whole(np.dtype(dtype).itemsize * math.prod(shape) * len(numbers))
-        return [start, *itertools.accumulate((_whole(length) for _, length in self._blocks), initial=start)][1:]
+            start += whole(np.dtype(dtype).itemsize * math.prod(shape) * len(numbers))
+        return [start, *itertools.accumulate((whole(length) for _, length in self._blocks), initial=start)][1:]
 
     def block(self, number: int) -> Block:
         """Return a block by its number."""
@@ -460,7 +342,7 @@ def _is_apart(kind: Any) -> bool:
 class _Column(Protocol):
     """The values of one type as MessagePack, and back."""
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any: ...
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any: ...
 
     def decode(self, stored: Any, arrays: _Content) -> list[Any]: ...
 
@@ -492,7 +374,7 @@ def _fields_column(kind: Any) -> _DataclassColumn:
 class _PlainColumn:
     """Numbers, strings, truth values and None, which MessagePack holds unchanged."""
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         kinds = set(map(type, values))
         for kind in kinds - _PLAIN:
             if not issubclass(kind, np.generic):
@@ -514,7 +396,7 @@ class _EnumColumn:
         self._kind = kind
         self._members = {member.value: member for member in kind}
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         _check_types(values, self._kind)
         return [value.value for value in values]
 
@@ -525,7 +407,7 @@ class _EnumColumn:
 class _ArrayColumn:
     """Arrays, by their numbers."""
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         _check_types(values, np.ndarray)
         return list(map(arrays.add, values))
 
@@ -539,7 +421,7 @@ class _OptionalColumn:
     def __init__(self, present: _Column) -> None:
         self._present = present
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         there = [value is not None for value in values]
         return there, self._present.encode([value for value in values if value is not None], arrays)
 
@@ -555,7 +437,7 @@ class _SequenceColumn:
     def __init__(self, member: _Column) -> None:
         self._member = member
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         _check_types(values, tuple, list)
         return list(map(len, values)), self._member.encode(list(itertools.chain.from_iterable(values)), arrays)
 
@@ -571,7 +453,7 @@ class _TupleColumn:
     def __init__(self, places: Sequence[_Column]) -> None:
         self._places = places
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         _check_types(values, tuple, list)
         columns = list(zip(*values, strict=True)) or [()] * len(self._places)
         return [place.encode(column, arrays) for place, column in zip(self._places, columns, strict=True)]
@@ -593,7 +475,7 @@ class _DataclassColumn:
         hints = typing.get_type_hints(self._kind)
         return [(field.name, _column(hints[field.name])) for field in dataclasses.fields(cast(Any, self._kind))]
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         if not values:
             return 0, []
         for kind in set(map(type, values)):
@@ -616,7 +498,7 @@ class _ApartColumn:
     def __init__(self, kind: type) -> None:
         self._kind = kind
 
-    def encode(self, values: Sequence[Any], arrays: _Arrays) -> Any:
+    def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         _check_types(values, self._kind)
         return [arrays.add_block(block_of(value, finite=arrays.finite)) for value in values]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from program import Program, one_sentence
 
-from fluoromap_service.jobs import job_life
+from fluoromap_service.jobs import living_workers
 from fluoromap_service.store.engine import writing
 
 
@@ -92,5 +92,5 @@ def test_worker_check_fails_without_a_sign_of_life(fluoromap: Program) -> None:
     assert fluoromap("db", "upgrade").returncode == 0
     assert "sign of life" in one_sentence(fluoromap("worker", "--check"))
     with writing() as session:
-        job_life.worker_seen(session, f"fluoromap@{socket.gethostname()}")
+        living_workers.worker_seen(session, f"fluoromap@{socket.gethostname()}")
     assert fluoromap("worker", "--check").returncode == 0

@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import event as sql_event
 from sqlalchemy import select, update
 
-from fluoromap_service.jobs import job_life, stall
+from fluoromap_service.jobs import job_life, living_workers, stall, turns
 from fluoromap_service.settings import settings
 from fluoromap_service.store import files
 from fluoromap_service.store.clock import db_now
@@ -124,12 +124,12 @@ def test_stages_run_in_order_and_the_job_succeeds(job: str) -> None:
 
 def test_a_ready_stage_is_announced_once_and_again_only_after_a_while(job: str) -> None:
     with writing() as session:
-        assert sorted(job_life.take_due(session)) == _stage_ids(job, "segment")
+        assert sorted(turns.take_due(session)) == _stage_ids(job, "segment")
     with writing() as session:
-        assert job_life.take_due(session) == []
+        assert turns.take_due(session) == []
         session.execute(update(StageRow).values(published=db_now() - 100))
     with writing() as session:
-        assert sorted(job_life.take_due(session)) == _stage_ids(job, "segment")
+        assert sorted(turns.take_due(session)) == _stage_ids(job, "segment")
 
 
 def test_a_stage_is_claimed_once(job: str) -> None:
@@ -320,10 +320,10 @@ def test_a_dead_workers_stage_is_freed_although_the_clock_was_set_back(job: str)
 
 def test_a_lost_announcement_is_repeated_although_the_clock_was_set_back(job: str) -> None:
     with writing() as session:
-        assert job_life.take_due(session)
+        assert turns.take_due(session)
     _move_clock_back(3600)
     with writing() as session:
-        assert sorted(job_life.take_due(session)) == _stage_ids(job, "segment")
+        assert sorted(turns.take_due(session)) == _stage_ids(job, "segment")
 
 
 def test_a_stage_that_is_given_back_is_ready_at_once(job: str) -> None:
@@ -342,12 +342,12 @@ def test_a_stage_that_is_given_back_is_ready_at_once(job: str) -> None:
 
 def test_a_worker_lives_while_it_gives_signs_of_life(job: str) -> None:
     with writing() as session:
-        job_life.worker_seen(session, "first")
-        assert (job_life.living_workers(session), job_life.living_workers(session, "second")) == (1, 0)
+        living_workers.worker_seen(session, "first")
+        assert (living_workers.living_workers(session), living_workers.living_workers(session, "second")) == (1, 0)
     for seconds in (-3600, 3600):
         with writing() as session:
             session.execute(update(WorkerSeen).values(seen=db_now() + seconds))
-            assert job_life.living_workers(session) == 0
+            assert living_workers.living_workers(session) == 0
 
 
 def test_ready_stages_that_nobody_runs_are_a_stall(job: str) -> None:
@@ -373,7 +373,7 @@ def test_ready_stages_that_nobody_runs_are_a_stall(job: str) -> None:
 def _take() -> tuple[str, str] | None:
     """Claim and end the most urgent stage; return its job and name."""
     with writing() as session:
-        urgent = job_life.most_urgent(session)
+        urgent = turns.most_urgent(session)
         if urgent is None:
             return None
         held = job_life.claim(session, urgent.stage_id, "w")
@@ -436,7 +436,7 @@ def test_no_job_waits_for_ever(job: str) -> None:
         assert job_life.cancel(session, job)
     assert _take() == (large, "segment")
     with writing() as session:
-        age = 100 * job_life.AGE_OF_A_STAGE_SECONDS
+        age = 100 * turns.AGE_OF_A_STAGE_SECONDS
         session.execute(update(Job).where(Job.id == large).values(created=Job.created - age))
         small = job_life.create(session, "s", _snapshot("s", sites=1)).id
     assert _take() == (small, "segment")

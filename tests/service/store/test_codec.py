@@ -14,7 +14,8 @@ from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap_service.store import codec
-from fluoromap_service.store.codec import StoredOtherwise, block_of, decode, deferred, digest, encode, partial_results
+from fluoromap_service.store.codec import StoredOtherwise, block_of, decode, deferred, encode, partial_results
+from fluoromap_service.store.value_hash import digest
 
 
 @dataclasses.dataclass(frozen=True)

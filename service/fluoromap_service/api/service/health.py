@@ -10,7 +10,7 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import select
 
-from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.jobs import living_workers, queue
 from fluoromap_service.jobs.stall import StallWatch, stall_seconds
 from fluoromap_service.settings import settings
 from fluoromap_service.store import disk, files
@@ -77,7 +77,7 @@ def _worker() -> str:
     if settings().eager:
         return ""
     with reading() as session:
-        alive = job_life.living_workers(session)
+        alive = living_workers.living_workers(session)
     return "" if alive else "No worker gave a sign of life in the last 30 s; start one with 'fluoromap worker'."
 
 

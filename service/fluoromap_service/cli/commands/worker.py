@@ -12,7 +12,7 @@ from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options, end_with_supervisor, keep_compiled_kernels
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir
-from fluoromap_service.jobs import job_life
+from fluoromap_service.jobs import living_workers
 from fluoromap_service.jobs.queue import celery_app
 from fluoromap_service.store import schema
 from fluoromap_service.store.engine import reading
@@ -48,5 +48,5 @@ def _name() -> str:
 
 def _check_life() -> None:
     with reading() as session:
-        if not job_life.living_workers(session, _name()):
+        if not living_workers.living_workers(session, _name()):
             raise CommandFailed(f"The worker {_name()} gave no sign of life in the last 30 s; start it again.")

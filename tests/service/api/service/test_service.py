@@ -12,7 +12,7 @@ from finished_study import FinishedStudy
 
 from fluoromap import registry
 from fluoromap_service.api.service import health
-from fluoromap_service.jobs import job_life, queue
+from fluoromap_service.jobs import living_workers, queue
 from fluoromap_service.jobs.stall import StallWatch
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import writing
@@ -59,7 +59,7 @@ def test_not_ready_without_a_worker(client: TestClient, monkeypatch: pytest.Monk
     settings.cache_clear()
     assert _checks(client) == (503, {"database": True, "broker": True, "files": True, "worker": False, "queue": True})
     with writing() as session:
-        job_life.worker_seen(session, "worker")
+        living_workers.worker_seen(session, "worker")
     assert _checks(client)[0] == 200
     with writing() as session:
         session.get_one(WorkerSeen, "worker").seen -= 60
@@ -75,7 +75,7 @@ def test_not_ready_while_nobody_runs_the_ready_stages(
     clock = itertools.count(0.0, 15.0)
     monkeypatch.setattr(health, "_stall", StallWatch(clock.__next__))
     with writing() as session:
-        job_life.worker_seen(session, "worker")
+        living_workers.worker_seen(session, "worker")
     assert [_checks(client)[0] for _ in range(3)] == [200, 200, 503]
 
 
