@@ -7,7 +7,6 @@ import re
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -109,9 +108,7 @@ def get_deidentified(
     text that is burned into them stays. The list that leads back from the new UIDs stays in the data folder of the
     service.
     """
-    folder = files.incoming_folder()
-    folder.mkdir(parents=True, exist_ok=True)
-    stream = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - the background task closes it after the answer
+    stream = tempfile.TemporaryFile(dir=files.made_incoming_folder())  # noqa: SIM115 - the background task closes it after the answer
     try:
         write_export(job_id, stream, ExportOptions(dates, subject))
         size = stream.tell()
@@ -150,7 +147,7 @@ def write_export(job_id: str, stream: IO[bytes], options: ExportOptions) -> Path
     pseudonyms = Pseudonyms(
         reidentification.secret(), _patient(next(iter(runs.values()))), options.subject, options.dates
     )
-    with _working_folder() as folder, zipfile.ZipFile(stream, "w") as archive:
+    with files.incoming_files() as folder, zipfile.ZipFile(stream, "w") as archive:
         _add(archive, "README.txt", README.format(dates=_SENTENCES[options.dates]).encode())
         replaced: dict[str, str] = {}
         copies: dict[Path, Path] = {}
@@ -225,14 +222,6 @@ def _activation_times(sites: tuple[SiteSnapshot, ...], pseudonyms: Pseudonyms) -
     """Return the table of the sites with their runs, as ``PUT .../activation-times`` takes it."""
     rows = [[site.site, site.lat_ms, pseudonyms.uid(site.view_a), pseudonyms.uid(site.view_b)] for site in sites]
     return csv_text(("site", "lat_ms", "view_a", "view_b"), rows)
-
-
-@contextmanager
-def _working_folder() -> Iterator[Path]:
-    folder = files.incoming_folder()
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as name:
-        yield Path(name)
 
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes | Path) -> None:
