@@ -78,9 +78,9 @@ def _angles_about_isocentre(header: Header) -> Pair | None:
 
 
 def patient_position(header: Header) -> str:
-    """Return how the patient lies, as PatientPosition says it: HFS, HFP, FFS, FFP or another value.
+    """Return how the patient lies, in the terms of PatientPosition.
 
-    Enhanced objects may state it by codes. "" where the header does not state it.
+    These are HFS, HFP, FFS, FFP or another value. Enhanced objects may state it by codes. "" where the header does not state it.
     """
     stated = header.text("PatientPosition")
     if stated:
@@ -91,7 +91,10 @@ def patient_position(header: Header) -> str:
 
 
 def _is_tilted(header: Header) -> bool:
-    """Return whether the table is tilted or turned, so that its axes are not those of the isocentre."""
+    """Return whether the table is tilted or turned.
+
+    Then its axes are not those of the isocentre.
+    """
     return any(abs(header.number(angle) or 0.0) > _STILL_DEG for angle in _TABLE_ANGLES)
 
 

@@ -61,9 +61,9 @@ def map_picture_dependencies(map_sha256: str, *, simulated: bool) -> Dependencie
 
 
 def result_object_dependencies(job_id: str, name: str) -> Dependencies:
-    """Return the dependencies of a DICOM object of a job, or of the zip of all its objects.
+    """Return the dependencies of a DICOM object of a job.
 
-    Only the job counts: a later version of the service may draw other pictures, but an object never changes under its UID.
+    The zip of all objects has a name too. Only the job counts: a later version of the service may draw other pictures, but an object never changes under its UID.
     """
     return {"kind": "dicom", "job_id": job_id, "name": name}
 

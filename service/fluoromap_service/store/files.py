@@ -90,7 +90,7 @@ def incoming_folder() -> Path:
 
 
 def made_incoming_folder() -> Path:
-    """Return the folder of the files that have not arrived whole; make it where there is none."""
+    """Return :func:`incoming_folder`; make it where there is none."""
     folder = incoming_folder()
     make_private_folder(folder.parent)
     folder.mkdir(exist_ok=True)

@@ -255,7 +255,7 @@ def code_item(value: str) -> Dataset:
 def about_isocentre(
     make_xa: MakeXa, angles_deg: list[tuple[float, float]], system: dict[str, float] | None = None, **attributes: Any
 ) -> InstanceFacts:
-    """Return the facts of an Enhanced XA run with angles about the isocentre in each frame."""
+    """Return the facts of a run with angles about the isocentre."""
     per_frame = [
         group(
             IsocenterReferenceSystemSequence={

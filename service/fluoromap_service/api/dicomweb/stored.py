@@ -33,9 +33,32 @@ from fluoromap_service.store.models import Instance, Job, JobState, StudyInstanc
 
 Json = dict[str, Any]
 
-_REMEMBERED_HEADERS = 2000
-_headers: OrderedDict[tuple[str, str], Json] = OrderedDict()
-_lock = threading.Lock()
+
+class _Remembered:
+    """The headers that were read last, by the hash of their file or the id of their job; ``most`` limits their number."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._headers: OrderedDict[str, Json] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: str, read: Callable[[], Json]) -> Json:
+        """Return what is remembered under a key; read it when there is nothing."""
+        with self._lock:
+            if key in self._headers:
+                self._headers.move_to_end(key)
+                return self._headers[key]
+        header = read()
+        with self._lock:
+            self._headers[key] = header
+            while len(self._headers) > self._most:
+                self._headers.popitem(last=False)
+        return header
+
+
+_headers_of_runs = _Remembered(2000)
+_headers_of_jobs = _Remembered(500)
+"""The headers of all results of a job, by the names of the objects."""
 
 
 class StoredInstance(Protocol):
@@ -66,7 +89,10 @@ class StoredInstance(Protocol):
         """Number of frames; 0 for an object without pictures."""
 
     def make_file(self) -> None:
-        """Make the file when it does not exist yet, so that a fault comes before the first byte of an answer."""
+        """Make the file when it does not exist yet.
+
+        A fault then comes before the first byte of an answer.
+        """
 
     def chunks(self) -> Iterator[bytes]:
         """Return the content of the file, piece by piece."""
@@ -98,7 +124,7 @@ class StoredRun:
     def header(self) -> Json:
         """The header in the DICOM JSON model."""
         # A hostile header can take any time, so another process reads it.
-        return _remembered((self.sha256, ""), lambda: run_in_pool(Task.READ_FILE, header_json, self._path))
+        return _headers_of_runs.get(self.sha256, lambda: run_in_pool(Task.READ_FILE, header_json, self._path))
 
     @property
     def transfer_syntax(self) -> str:
@@ -254,13 +280,13 @@ def _results(study_uid: str | None) -> Iterator[StoredResult]:
 
 
 def _headers_of_results(job_id: str) -> dict[str, Json]:
-    """Return the header of each DICOM object of a job by its name, without drawing a picture.
+    """Return the headers of the DICOM objects of a job by name.
 
-    Empty for a job without results, or whose runs are damaged: the other instances of the study are shown nevertheless.
+    It draws no picture. Empty for a job without results, or whose runs are damaged: the other instances of the study are shown nevertheless.
     """
     try:
         planned = plan_objects(job_id)
-        return _remembered((job_id, ""), lambda: _planned_headers(planned))
+        return _headers_of_jobs.get(job_id, lambda: _planned_headers(planned))
     except files.BrokenFile:
         return {}
     except Problem as problem:
@@ -280,19 +306,6 @@ def _planned_headers(planned: JobObjects) -> dict[str, Json]:
         each.name: headers.get(each.name) or header_json(made_object(planned.origin, each).path)
         for each in planned.objects
     }
-
-
-def _remembered(key: tuple[str, str], read: Callable[[], Json]) -> Json:
-    with _lock:
-        if key in _headers:
-            _headers.move_to_end(key)
-            return _headers[key]
-    header = read()
-    with _lock:
-        _headers[key] = header
-        while len(_headers) > _REMEMBERED_HEADERS:
-            _headers.popitem(last=False)
-    return header
 
 
 def existing(study_uid: str, series_uid: str | None = None, uid: str | None = None) -> list[StoredInstance]:

@@ -74,7 +74,10 @@ class JobObjects:
     objects: tuple[ResultObject, ...]
 
     def names(self) -> dict[str, str]:
-        """Return the name of each object by its SOP Instance UID, which the service knows before it makes the object."""
+        """Return the name of each object by its SOP Instance UID.
+
+        The service knows the UIDs before it makes the objects.
+        """
         return {result_uid(self.origin.job_id, each.name.removesuffix(".dcm")): each.name for each in self.objects}
 
 
@@ -135,7 +138,10 @@ def _reference(run: RunSnapshot) -> RunReference:
 
 
 def _overlays(job_id: str, snapshot: Snapshot, shown: Sequence[str]) -> Iterator[ResultObject]:
-    """Yield an object for the pictures of each size: all frames of an object have one size."""
+    """Yield an object for the overlays of each size.
+
+    All frames of an object have one size.
+    """
     sizes: dict[tuple[int, int], list[str]] = {}
     for uid in shown:
         gantry = snapshot.runs[uid].gantry

@@ -29,7 +29,10 @@ _DEIDENTIFICATION = (
 
 
 def result_uid(job_id: str, *names: str) -> str:
-    """Return the UID of a part of the results of a job: an object, its series, or an item in it."""
+    """Return the UID of a part of the results of a job.
+
+    A part is an object, its series, or an item in it.
+    """
     return deterministic_uid("job", job_id, *names)
 
 

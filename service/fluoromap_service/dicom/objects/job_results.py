@@ -78,7 +78,10 @@ def pictures_object(origin: ResultOrigin, series: PictureSeries, pictures: tuple
 
 
 def picture_headers(origin: ResultOrigin, series: tuple[PictureSeries, ...]) -> list[Json]:
-    """Return the headers of secondary captures that nobody has drawn, in the DICOM JSON model."""
+    """Return the headers of secondary captures that nobody has drawn.
+
+    They are in the DICOM JSON model.
+    """
     source = origin.source()
     return [header_json(io.BytesIO(pictures_file(source, each, None))) for each in series]
 
