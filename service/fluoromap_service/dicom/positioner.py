@@ -43,7 +43,7 @@ def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderW
     """
     primary = _within(header.number("PositionerPrimaryAngle"), -180, 180, warnings)
     secondary = _within(header.number("PositionerSecondaryAngle"), -90, 90, warnings)
-    if primary is None and secondary is None and (angles := _angles_about_isocentre(header)) is not None:
+    if primary is None and secondary is None and (angles := _angles_about_isocentre(header, warnings)) is not None:
         primary, secondary = angles
         _warn(warnings, HeaderWarning.ANGLES_FROM_ISOCENTRE)
     detector = _within(header.number("DistanceSourceToDetector") or None, LEAST_SOURCE_MM, 3000, warnings)
@@ -60,7 +60,7 @@ def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderW
     return GantryFacts(primary, secondary, detector, isocentre, spacing, missing)
 
 
-def _angles_about_isocentre(header: Header) -> Pair | None:
+def _angles_about_isocentre(header: Header, warnings: list[HeaderWarning]) -> Pair | None:
     """Return primary and secondary angle about the patient, from those about the isocentre (PS3.3 C.8.19.6.13.1.2).
 
     X of the isocentre system is the left of the table, Y is down, Z is the head of the table. Both pairs of angles turn the
@@ -68,11 +68,10 @@ def _angles_about_isocentre(header: Header) -> Pair | None:
     front, for a table that is not level, and for a detector that is turned in its plane: there the picture is not upright.
     """
     turn = _TURN_OF_POSITION.get(patient_position(header))
-    primary, secondary = (header.number(f"PositionerIsocenter{axis}Angle") for axis in ("Primary", "Secondary"))
+    primary = _within(header.number("PositionerIsocenterPrimaryAngle"), -180, 180, warnings)
+    secondary = _within(header.number("PositionerIsocenterSecondaryAngle"), -90, 90, warnings)
     rotated = abs(header.number("PositionerIsocenterDetectorRotationAngle") or 0.0) > _STILL_DEG
     if turn is None or primary is None or secondary is None or rotated or _is_tilted(header):
-        return None
-    if abs(primary) > 180 or abs(secondary) > 90:
         return None
     return (primary + turn + 180) % 360 - 180, secondary
 

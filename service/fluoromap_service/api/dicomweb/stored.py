@@ -282,7 +282,8 @@ def _results(study_uid: str | None) -> Iterator[StoredResult]:
 def _headers_of_results(job_id: str) -> dict[str, Json]:
     """Return the headers of the DICOM objects of a job by name.
 
-    It draws no picture. Empty for a job without results, or whose runs are damaged: the other instances of the study are shown nevertheless.
+    It draws no picture. Empty for a job without results, or whose runs are damaged: the other instances of the study are
+    shown nevertheless.
     """
     try:
         planned = plan_objects(job_id)
