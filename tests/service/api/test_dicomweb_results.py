@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -168,6 +169,28 @@ def test_each_object_is_made_alone_and_once(
     assert len(peer.retrieve_study(STUDY)) == 8
     zipped(service, study)
     assert len(drawn) == 3
+
+
+def test_frames_that_are_asked_for_at_once_are_drawn_once(
+    service: TestClient, study: FinishedStudy, drawn: list[str]
+) -> None:
+    (item,) = [
+        Dataset.from_json(each)
+        for each in service.get(f"{ADDRESS}/metadata").json()
+        if each.get("00200011", {}).get("Value") == [9011]
+    ]
+    with ThreadPoolExecutor(4) as threads:
+        numbers = [1, 2, 1, 2]
+        frames = list(
+            threads.map(
+                lambda number: picture(service.get(f"{address(item)}/frames/{number}/rendered?accept=image/png")),
+                numbers,
+            )
+        )
+    assert drawn == ["picture_of", "picture_of"]
+    assert [np.array_equal(frame, frames[number - 1]) for frame, number in zip(frames, numbers, strict=True)] == [
+        True
+    ] * 4
 
 
 def test_frames_of_pictures(service: TestClient, study: FinishedStudy, peer: Any) -> None:

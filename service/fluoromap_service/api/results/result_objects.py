@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import threading
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -51,6 +52,8 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 """The date of every file in the zip, so that the same results give the same bytes."""
 _LEVEL = 1
 """Compression of the zip: a higher level takes several times as long and saves a fifth."""
+_locks = tuple(threading.Lock() for _ in range(16))
+"""Locks for the objects that are being made; an object always has the same one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +207,9 @@ def object_file(job_id: str, name: str) -> KeptFile:
 def made_object(origin: ResultOrigin, planned: ResultObject) -> KeptFile:
     """Return the kept file of a planned object; make it when there is none."""
     dependencies = result_object_dependencies(origin.job_id, planned.name)
-    return kept_rendering(origin.job_id, dependencies, lambda: planned.content(origin))
+    # A viewer asks for all frames of an object at once: the first request makes it, and the others wait.
+    with _locks[hash((origin.job_id, planned.name)) % len(_locks)]:
+        return kept_rendering(origin.job_id, dependencies, lambda: planned.content(origin))
 
 
 def objects_zip(job_id: str) -> KeptFile:
