@@ -24,9 +24,15 @@ GROUPS = {
     "v1": "io.k8s.api.core.v1",
     "networking.k8s.io/v1": "io.k8s.api.networking.v1",
 }
-CUSTOMIZATION: dict[str, Any] = yaml.safe_load((FOLDER / "kustomization.yaml").read_text())
+CUSTOMIZATIONS: dict[Path, dict[str, Any]] = {
+    folder: yaml.safe_load((folder / "kustomization.yaml").read_text()) for folder in (FOLDER, FOLDER / "dicom")
+}
 OBJECTS: list[dict[str, Any]] = [
-    each for name in CUSTOMIZATION["resources"] for each in yaml.safe_load_all((FOLDER / name).read_text())
+    each
+    for folder, customization in CUSTOMIZATIONS.items()
+    for name in customization["resources"]
+    if name != "../"
+    for each in yaml.safe_load_all((folder / name).read_text())
 ]
 PODS: dict[str, dict[str, Any]] = {
     each["metadata"]["name"]: each["spec"]["template"]["spec"] for each in OBJECTS if "template" in each.get("spec", {})
@@ -52,13 +58,52 @@ def test_a_wrong_manifest_would_be_noticed() -> None:
 
 
 def test_every_manifest_is_applied() -> None:
-    assert {path.name for path in FOLDER.glob("*.yaml")} == {*CUSTOMIZATION["resources"], "kustomization.yaml"}
+    for folder, customization in CUSTOMIZATIONS.items():
+        files = {path.name for path in folder.glob("*.yaml")}
+        assert files == {*customization["resources"], "kustomization.yaml"} - {"../"}
+    assert "../" in CUSTOMIZATIONS[FOLDER / "dicom"]["resources"]
+
+
+def test_all_parts_have_one_image() -> None:
+    tags = {image["newTag"] for customization in CUSTOMIZATIONS.values() for image in customization["images"]}
+    images = {container["image"] for _, container in _containers()}
+    assert images == {f"fluoromap:{tag}" for tag in tags}
+    assert len(tags) == 1
 
 
 def test_the_page_applies_the_customization() -> None:
     """With ``--filename`` the image of ``kustomization.yaml`` does not count, and the API refuses that file itself."""
     commands = re.findall(r"kubectl apply [^`\n]+", (FOLDER / "README.md").read_text())
-    assert commands == ["kubectl apply --kustomize deploy/kubernetes/"]
+    assert commands == [f"kubectl apply --kustomize deploy/kubernetes/{folder}" for folder in ("", "dicom/")]
+
+
+def test_the_page_makes_every_secret() -> None:
+    """A pod waits without end for a secret, or for a key of it, that nobody made."""
+    page = (FOLDER / "README.md").read_text()
+    made = {
+        name: set(re.findall(r"--from-(?:literal|file)=([\w.-]+)", keys))
+        for name, keys in re.findall(r"create secret generic (\S+) \\\n((?:  --from.*\n)+)", page)
+    }
+    needed = {(volume["secret"]["secretName"], each["key"]) for volume, each in _secret_files()}
+    needed |= {
+        (source["name"], source["key"])
+        for _, container in _containers()
+        for variable in container["env"]
+        if (source := variable.get("valueFrom", {}).get("secretKeyRef"))
+    }
+    assert {name for name, _ in needed} | {"fluoromap-configuration"} == set(made)
+    assert [each for each in needed if each[1] not in made[each[0]]] == []
+    (sender,) = PODS["sender"]["containers"]
+    assert Path(sender["args"][-1]).name in made["fluoromap-configuration"]
+
+
+def _secret_files() -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    return [
+        (volume, each)
+        for spec in PODS.values()
+        for volume in spec["volumes"]
+        for each in volume.get("secret", {}).get("items", [])
+    ]
 
 
 def _containers() -> list[tuple[str, dict[str, Any]]]:
@@ -70,7 +115,7 @@ def _containers() -> list[tuple[str, dict[str, Any]]]:
 
 
 def test_containers_are_closed_and_limited() -> None:
-    assert len(_containers()) == 4
+    assert len(_containers()) == 6
     for _, container in _containers():
         security = container["securityContext"]
         assert security["readOnlyRootFilesystem"] is True

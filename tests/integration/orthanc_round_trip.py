@@ -1,7 +1,8 @@
 """The round trip with Orthanc: runs go to it, from it to the listener, and the results come back to it. No person is involved.
 
 Orthanc listens on all addresses, so this program must run in a network namespace of its own. Its arguments are the folder of a
-simulated study and a folder for everything else. It prints what Orthanc holds in the end, as JSON.
+simulated study and a folder for everything else. It prints what Orthanc holds in the end, as JSON, and the seconds from the first
+C-STORE until the last result was back.
 """
 
 from __future__ import annotations
@@ -58,6 +59,7 @@ def main() -> None:
         stack.enter_context(service(folder, sites=len(times)))
         eventually(lambda: client.get(f"{ORTHANC}/system").status_code == 200)
         wait_until_ready(SERVICE, folder / "data")
+        start = time.monotonic()
         subprocess.run(["storescu", "-aec", "ORTHANC", "127.0.0.1", "4242", *map(str, runs)], check=True)
         (known,) = client.get(f"{ORTHANC}/studies").json()
         client.post(f"{ORTHANC}/modalities/fluoromap/store", json={"Resources": [known]}).raise_for_status()
@@ -65,13 +67,14 @@ def main() -> None:
         job = eventually(lambda: ended_job(client))
         assert job["state"] == "succeeded", job
         delivery = eventually(lambda: delivered(client, f"{SERVICE}/v1/deliveries?job={job['id']}"))
+        seconds = time.monotonic() - start
         again = client.post(f"{SERVICE}/v1/jobs/{job['id']}/deliveries", json={"target": "archive"})
         archived = eventually(lambda: delivered(client, f"{SERVICE}/v1/deliveries?job={job['id']}&target=archive"))
         assert again.status_code == 202
         check_pixels(client, runs, objects_of(client, job["id"]))
         classes = [instance["00080016"]["Value"][0] for instance in found(client, runs[0], {})]
         with_job = {"job": job["id"], "attempts": [delivery["attempts"], archived["attempts"]]}
-        print(json.dumps(with_job | {"classes": classes}))
+        print(json.dumps(with_job | {"classes": classes, "seconds": round(seconds, 1)}))
 
 
 @contextmanager

@@ -46,6 +46,13 @@ SMOOTH = 2
 """Factor by which panels are drawn larger and then averaged, for smooth edges."""
 
 
+def map_picture_size(views: Sequence[Direction] = VIEWS) -> tuple[int, int]:
+    """Return rows and columns of a picture of the map, px."""
+    pitch = PANEL_PX + GAP_PX
+    rows = -(-len(views) // PANELS_A_ROW)
+    return rows * pitch - GAP_PX + FOOTER_PX, PANELS_A_ROW * pitch - GAP_PX + BAR_PX
+
+
 def draw_map_views(
     chamber: ChamberMap,
     views: Sequence[Direction] = VIEWS,
@@ -83,9 +90,9 @@ def draw_map_views(
     radius = float(np.linalg.norm(extent - middle, axis=1).max())
     px_per_mm = (PANEL_PX / 2 - MARGIN_PX) / radius
     pitch = PANEL_PX + GAP_PX
-    rows = -(-len(views) // PANELS_A_ROW)
-    width, height = PANELS_A_ROW * pitch - GAP_PX, rows * pitch - GAP_PX
-    picture = Image.new("RGB", (width + BAR_PX, height + FOOTER_PX), BACKGROUND)
+    rows, columns = map_picture_size(views)
+    width, height = columns - BAR_PX, rows - FOOTER_PX
+    picture = Image.new("RGB", (columns, rows), BACKGROUND)
     for index, (name, primary, secondary, letters) in enumerate(views):
         panel = _Panel(primary, secondary, middle, px_per_mm).draw(chamber, lines, times)
         _caption(panel, name, letters)

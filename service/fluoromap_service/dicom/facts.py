@@ -30,6 +30,7 @@ class HeaderWarning(StrEnum):
     PIXEL_SPACING_FROM_FIELD_OF_VIEW = "pixel_spacing_from_field_of_view"
     PIXEL_SPACING_FROM_INTENSIFIER = "pixel_spacing_from_intensifier"
     SOURCE_ISOCENTRE_FROM_MAGNIFICATION = "source_isocentre_from_magnification"
+    ANGLES_FROM_ISOCENTRE = "angles_from_isocentre"
     GEOMETRY_IMPLAUSIBLE = "geometry_implausible"
     ORIENTATION_CONFLICT = "orientation_conflict"
     ORIENTATION_UNUSABLE = "orientation_unusable"
@@ -57,6 +58,10 @@ _SENTENCES: dict[HeaderWarning, str] = {
     ),
     HeaderWarning.SOURCE_ISOCENTRE_FROM_MAGNIFICATION: (
         "DistanceSourceToPatient is missing; the service computes it from EstimatedRadiographicMagnificationFactor."
+    ),
+    HeaderWarning.ANGLES_FROM_ISOCENTRE: (
+        "PositionerPrimaryAngle and PositionerSecondaryAngle are missing; the service computes them from the angles about the "
+        "isocentre and the patient's position."
     ),
     HeaderWarning.GEOMETRY_IMPLAUSIBLE: "A geometry attribute has a value that no C-arm can have; it counts as missing.",
     HeaderWarning.ORIENTATION_CONFLICT: (

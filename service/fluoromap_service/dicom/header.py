@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -54,7 +55,9 @@ MACROS: dict[str, tuple[str, ...]] = {
         "TableHorizontalRotationAngle", "TableHeadTiltAngle", "TableCradleTiltAngle",
     ),
     "IsocenterReferenceSystemSequence": (
-        "TableXPositionToIsocenter", "TableYPositionToIsocenter", "TableZPositionToIsocenter",
+        "PositionerIsocenterPrimaryAngle", "PositionerIsocenterSecondaryAngle",
+        "PositionerIsocenterDetectorRotationAngle", "TableXPositionToIsocenter", "TableYPositionToIsocenter",
+        "TableZPositionToIsocenter", "TableHorizontalRotationAngle", "TableHeadTiltAngle", "TableCradleTiltAngle",
     ),
     "CollimatorShapeSequence": (
         "CollimatorShape", "CollimatorLeftVerticalEdge", "CollimatorRightVerticalEdge",
@@ -70,7 +73,10 @@ MACROS: dict[str, tuple[str, ...]] = {
     "PatientOrientationInFrameSequence": ("PatientOrientation",),
 }  # fmt: skip
 """The functional groups that the service reads, and the attributes of each."""
-_MACRO_OF = {keyword: macro for macro, keywords in MACROS.items() for keyword in keywords}
+_MACROS_OF = {
+    keyword: tuple(macro for macro, keywords in MACROS.items() if keyword in keywords)
+    for keyword in itertools.chain.from_iterable(MACROS.values())
+}
 
 _PLAIN = (
     "ImageType", "SOPClassUID", "SOPInstanceUID", "StudyInstanceUID", "SeriesInstanceUID", "SeriesNumber", "Modality",
@@ -80,7 +86,8 @@ _PLAIN = (
     "PositionerSecondaryAngleIncrement", "DistanceSourceToPatient", "EstimatedRadiographicMagnificationFactor",
     "IntensifierSize", "FieldOfViewDimensions", "TableMotion", "TableVerticalIncrement",
     "TableLateralIncrement", "TableLongitudinalIncrement", "RWavePointer", "SamplesPerPixel", "PhotometricInterpretation",
-    "PatientPosition", "TableAngle", "Manufacturer", "ManufacturerModelName",
+    "PatientPosition", "PatientOrientationCodeSequence", "PatientGantryRelationshipCodeSequence",
+    "TableAngle", "Manufacturer", "ManufacturerModelName",
     "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
 )  # fmt: skip
 
@@ -103,7 +110,7 @@ def _tag(attribute: str | BaseTag) -> BaseTag:
 
 # The service reads only these: patient data stays in the file.
 _WANTED: list[BaseTag | int] = [
-    *(_tag(keyword) for keyword in (*_PLAIN, *_MACRO_OF, *_FRAME_GROUPS)),
+    *(_tag(keyword) for keyword in (*_PLAIN, *_MACROS_OF, *_FRAME_GROUPS)),
     *(Tag(_PRIVATE_GROUP, block) for block in _PRIVATE_BLOCKS),
     *(Tag(_PRIVATE_GROUP, block << 8 | element) for block in _PRIVATE_BLOCKS for element in _PRIVATE_ELEMENTS),
 ]
@@ -203,19 +210,30 @@ class Header:
                 return values[0] if values else None
         return None
 
+    def code(self, *sequences: str) -> str:
+        """Return the value of a code; "" when absent.
+
+        ``sequences`` is the path to its item: code sequences, each in the first item of the one before.
+        """
+        dataset = self._dataset
+        for sequence in sequences:
+            dataset = (self._items(dataset, sequence)[:1] or [Dataset()])[0]
+        return next(iter(self._texts(dataset, "CodeValue")), "")
+
     def tags(self, keyword: str) -> tuple[int, ...]:
         """Return the values of an attribute that refers to other attributes (VR AT)."""
         return tuple(int(value) for value in _values(self._value(self._dataset, keyword)) if isinstance(value, int))
 
     def _places(self, keyword: str) -> Iterator[Dataset]:
         yield self._dataset
-        if macro := _MACRO_OF.get(keyword):
+        for macro in _MACROS_OF.get(keyword, ()):
             for group in self._groups:
                 yield from self._items(group, macro)[:1]
 
     def _macro_items(self, keyword: str) -> Iterator[Dataset]:
         for frame in self._per_frame:
-            yield (self._items(frame, _MACRO_OF[keyword])[:1] or [Dataset()])[0]
+            items = itertools.chain.from_iterable(self._items(frame, macro)[:1] for macro in _MACROS_OF[keyword])
+            yield next((item for item in items if keyword in item), Dataset())
 
     def _items(self, dataset: Dataset, keyword: str) -> list[Dataset]:
         tag = _tag(keyword)

@@ -14,6 +14,11 @@ _STILL_DEG = 0.5
 _STILL_MM = 1.0
 
 _TABLE_ANGLES = ("TableAngle", "TableHorizontalRotationAngle", "TableHeadTiltAngle", "TableCradleTiltAngle")
+# Codes of PS3.16 CID 20 and CID 21, in SNOMED CT and in its older form.
+_LYING = {"40199007": "S", "F-10340": "S", "1240000": "P", "F-10310": "P"}
+_ENTERING = {"102540008": "HF", "F-10470": "HF", "102541007": "FF", "F-10480": "FF"}
+# Degrees from an angle about the table to the angle about the patient.
+_TURN_OF_POSITION = {"HFS": 0.0, "HFP": 180.0}
 # Signs of the patient's axes (LPS) along the axes of a patient who lies on the back with the head first. PS3.3 C.7.3.1.1.2.
 _AXES_OF_POSITION = {"HFS": (1, 1, 1), "HFP": (-1, -1, 1), "FFS": (-1, 1, -1), "FFP": (1, -1, -1)}
 
@@ -33,10 +38,14 @@ class GantryFacts:
 def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderWarning]) -> GantryFacts:
     """Return the gantry values of legacy XA (PS3.3 C.8.7.5, C.8.7.3) or Enhanced XA (C.8.19.6).
 
-    A value that no C-arm can have counts as absent. So does a distance of 0, which some systems write for "unknown".
+    A value that no C-arm can have counts as absent. So does a distance of 0, which some systems write for "unknown". Angles
+    about the patient (C.8.7.5.1.2) come before those about the isocentre, which need the position of the patient.
     """
     primary = _within(header.number("PositionerPrimaryAngle"), -180, 180, warnings)
     secondary = _within(header.number("PositionerSecondaryAngle"), -90, 90, warnings)
+    if primary is None and secondary is None and (angles := _angles_about_isocentre(header, warnings)) is not None:
+        primary, secondary = angles
+        _warn(warnings, HeaderWarning.ANGLES_FROM_ISOCENTRE)
     detector = _within(header.number("DistanceSourceToDetector") or None, LEAST_SOURCE_MM, 3000, warnings)
     isocentre = _source_isocentre_mm(header, detector, warnings)
     spacing = _pixel_spacing_mm(header, rows, columns, warnings)
@@ -49,6 +58,43 @@ def gantry_facts(header: Header, rows: int, columns: int, warnings: list[HeaderW
     }
     missing = tuple(keyword for keyword, value in values.items() if value is None)
     return GantryFacts(primary, secondary, detector, isocentre, spacing, missing)
+
+
+def _angles_about_isocentre(header: Header, warnings: list[HeaderWarning]) -> Pair | None:
+    """Return primary and secondary angle about the patient, from those about the isocentre (PS3.3 C.8.19.6.13.1.2).
+
+    X of the isocentre system is the left of the table, Y is down, Z is the head of the table. Both pairs of angles turn the
+    detector from -Y first towards X, then towards Z. None for a patient who lies otherwise than head first and on back or
+    front, for a table that is not level, and for a detector that is turned in its plane: there the picture is not upright.
+    """
+    turn = _TURN_OF_POSITION.get(patient_position(header))
+    primary = _within(header.number("PositionerIsocenterPrimaryAngle"), -180, 180, warnings)
+    secondary = _within(header.number("PositionerIsocenterSecondaryAngle"), -90, 90, warnings)
+    rotated = abs(header.number("PositionerIsocenterDetectorRotationAngle") or 0.0) > _STILL_DEG
+    if turn is None or primary is None or secondary is None or rotated or _is_tilted(header):
+        return None
+    return (primary + turn + 180) % 360 - 180, secondary
+
+
+def patient_position(header: Header) -> str:
+    """Return how the patient lies, in the terms of PatientPosition.
+
+    These are HFS, HFP, FFS, FFP or another value. Enhanced objects may state it by codes. "" where the header does not state it.
+    """
+    stated = header.text("PatientPosition")
+    if stated:
+        return stated
+    entering = _ENTERING.get(header.code("PatientGantryRelationshipCodeSequence"), "")
+    lying = _LYING.get(header.code("PatientOrientationCodeSequence", "PatientOrientationModifierCodeSequence"), "")
+    return entering + lying if entering and lying else ""
+
+
+def _is_tilted(header: Header) -> bool:
+    """Return whether the table is tilted or turned.
+
+    Then its axes are not those of the isocentre.
+    """
+    return any(abs(header.number(angle) or 0.0) > _STILL_DEG for angle in _TABLE_ANGLES)
 
 
 def _within(value: float | None, low: float, high: float, warnings: list[HeaderWarning]) -> float | None:
@@ -150,8 +196,8 @@ def table_position(header: Header) -> tuple[Point | None, TableOrigin | None]:
     block lateral is towards the left, longitudinal towards the head, as recordings of a phantom have shown. Vertical is
     downwards everywhere. The position of a tilted or turned table counts as unknown, because its axes are not the patient's.
     """
-    signs = _AXES_OF_POSITION.get(header.text("PatientPosition") or "HFS")
-    if signs is None or any(abs(header.number(angle) or 0.0) > _STILL_DEG for angle in _TABLE_ANGLES):
+    signs = _AXES_OF_POSITION.get(patient_position(header) or "HFS")
+    if signs is None or _is_tilted(header):
         return None, None
     stated = {
         TableOrigin.ISOCENTRE: [header.number(f"Table{axis}PositionToIsocenter") for axis in "XYZ"],
@@ -173,8 +219,10 @@ def warn_of_motion(header: Header, warnings: list[HeaderWarning]) -> None:
     differ between frames. A cine that is DYNAMIC without such values has moved by an unknown amount.
     """
     gantry = [
-        _changes(header, "PositionerMotion", f"{axis}Increment", axis)
-        for axis in ("PositionerPrimaryAngle", "PositionerSecondaryAngle")
+        _changes(
+            header, "PositionerMotion", f"Positioner{axis}Increment", f"Positioner{axis}", f"PositionerIsocenter{axis}"
+        )
+        for axis in ("PrimaryAngle", "SecondaryAngle")
     ]
     detector = max(_spread_of_frames(header, "DistanceSourceToDetector"), default=0.0)
     if _moved(header, "PositionerMotion", gantry, _STILL_DEG) or detector > _STILL_MM:

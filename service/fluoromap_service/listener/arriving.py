@@ -11,7 +11,6 @@ from typing import Any
 
 from fluoromap_service.settings import settings
 from fluoromap_service.store import disk, files
-from fluoromap_service.store.private_folder import make_private_folder
 
 BUFFER_BYTES = 1 << 20
 """Bytes that are written to the disk at once."""
@@ -26,9 +25,7 @@ class ArrivingFile:
     """
 
     def __init__(self, **options: Any) -> None:
-        folder = files.incoming_folder()
-        make_private_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
+        folder = files.made_incoming_folder()
         self._stream = tempfile.NamedTemporaryFile(dir=folder, buffering=BUFFER_BYTES)  # noqa: SIM115
         fcntl.flock(self._stream.fileno(), fcntl.LOCK_SH)
         self._digest = hashlib.sha256()

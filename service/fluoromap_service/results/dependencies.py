@@ -60,12 +60,13 @@ def map_picture_dependencies(map_sha256: str, *, simulated: bool) -> Dependencie
     return {"kind": "map_picture", "drawing": drawing.VERSION, "map": map_sha256, "simulated": simulated}
 
 
-def result_object_dependencies(job_id: str) -> Dependencies:
-    """Return the dependencies of the DICOM objects of a job.
+def result_object_dependencies(job_id: str, name: str) -> Dependencies:
+    """Return the dependencies of a DICOM object of a job.
 
-    Only the job counts: a later version of the service may draw other pictures, but an object never changes under its UID.
+    The zip of all objects has a name too. Only the job counts: a later version of the service may draw other pictures, but
+    an object never changes under its UID.
     """
-    return {"kind": "dicom", "job_id": job_id}
+    return {"kind": "dicom", "job_id": job_id, "name": name}
 
 
 def report_dependencies(

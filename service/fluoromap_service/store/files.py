@@ -57,7 +57,7 @@ def incoming() -> Iterator[Path]:
 
     The file is removed at the end unless it was kept.
     """
-    handle, name = tempfile.mkstemp(dir=_made_incoming_folder())
+    handle, name = tempfile.mkstemp(dir=made_incoming_folder())
     path = Path(name)
     try:
         # The lock ends with this process, so that a clean-up recognises the files of a process that was killed.
@@ -74,7 +74,7 @@ def incoming_files() -> Iterator[Path]:
 
     The folder is removed at the end with the files that were not moved.
     """
-    folder = Path(tempfile.mkdtemp(dir=_made_incoming_folder()))
+    folder = Path(tempfile.mkdtemp(dir=made_incoming_folder()))
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_SH)
@@ -89,7 +89,8 @@ def incoming_folder() -> Path:
     return settings().files_dir / "incoming"
 
 
-def _made_incoming_folder() -> Path:
+def made_incoming_folder() -> Path:
+    """Return :func:`incoming_folder`; make it where there is none."""
     folder = incoming_folder()
     make_private_folder(folder.parent)
     folder.mkdir(exist_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from PIL import Image
 from pydicom.dataset import Dataset
 
 from fluoromap_service.api.http import file_pool
+from fluoromap_service.api.results import result_objects
 from fluoromap_service.dicom import deterministic_uid
 
 dicomweb_client = pytest.importorskip("dicomweb_client", reason="dicomweb-client is not installed")
@@ -117,6 +119,78 @@ def test_results_are_retrieved(service: TestClient, study: FinishedStudy, peer: 
     assert len(peer.retrieve_study_metadata(STUDY)) == 8
     (only,) = peer.retrieve_series(STUDY, expected["chamber.dcm"].SeriesInstanceUID)
     assert only.EncapsulatedDocument == expected["chamber.dcm"].EncapsulatedDocument
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The kinds of pictures that the service asked for, in order."""
+    pictures: list[str] = []
+    for name in ("picture_of", "map_picture_of"):
+        real = getattr(result_objects, name)
+
+        def noted(*arguments: Any, name: str = name, real: Any = real) -> Any:
+            pictures.append(name)
+            return real(*arguments)
+
+        monkeypatch.setattr(result_objects, name, noted)
+    return pictures
+
+
+def test_searches_and_headers_draw_nothing(
+    service: TestClient, study: FinishedStudy, peer: Any, drawn: list[str]
+) -> None:
+    assert len(peer.search_for_series(STUDY)) == 5
+    assert len(peer.search_for_instances(STUDY)) == 8
+    headers = peer.retrieve_study_metadata(STUDY)
+    assert len(headers) == 8
+    assert service.post(f"/v1/jobs/{study.job_id}/deliveries", json={"target": "nobody"}).status_code == 422
+    assert drawn == []
+    pictures = [Dataset.from_json(item) for item in headers if "NumberOfFrames" in Dataset.from_json(item)]
+    for item in (each for each in pictures if each.SOPClassUID.name.startswith("Multi-frame True Color")):
+        whole = peer.retrieve_instance(*place(item))
+        assert whole.pixel_array.size == int(item.NumberOfFrames) * item.Rows * item.Columns * 3
+        del whole.PixelData
+        assert whole == item
+    assert drawn.count("map_picture_of") == 1
+
+
+def test_each_object_is_made_alone_and_once(
+    service: TestClient, study: FinishedStudy, peer: Any, drawn: list[str]
+) -> None:
+    objects = {item["0020000E"]["Value"][0]: item for item in peer.search_for_instances(STUDY)}
+    headers = [Dataset.from_json(item) for item in objects.values()]
+    (report,) = [item for item in headers if item.Modality == "SR"]
+    (surface,) = [item for item in headers if item.Modality == "M3D"]
+    for item in (report, surface):
+        peer.retrieve_instance(*place(item))
+    assert drawn == []
+    zipped(service, study)
+    assert sorted(drawn) == ["map_picture_of", "picture_of", "picture_of"]
+    assert len(peer.retrieve_study(STUDY)) == 8
+    zipped(service, study)
+    assert len(drawn) == 3
+
+
+def test_frames_that_are_asked_for_at_once_are_drawn_once(
+    service: TestClient, study: FinishedStudy, drawn: list[str]
+) -> None:
+    (item,) = [
+        Dataset.from_json(each)
+        for each in service.get(f"{ADDRESS}/metadata").json()
+        if each.get("00200011", {}).get("Value") == [9011]
+    ]
+    with ThreadPoolExecutor(4) as threads:
+        numbers = [1, 2, 1, 2]
+        frames = list(
+            threads.map(
+                lambda number: picture(service.get(f"{address(item)}/frames/{number}/rendered?accept=image/png")),
+                numbers,
+            )
+        )
+    assert drawn == ["picture_of", "picture_of"]
+    assert [np.array_equal(frame, frames[number - 1]) for frame, number in zip(frames, numbers, strict=True)] == [
+        True
+    ] * 4
 
 
 def test_frames_of_pictures(service: TestClient, study: FinishedStudy, peer: Any) -> None:

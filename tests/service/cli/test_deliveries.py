@@ -19,7 +19,7 @@ from fluoromap_service.store.engine import writing
 
 def test_list_show_retry_and_send(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schema, "check", lambda: None)
-    monkeypatch.setenv("COLUMNS", "250")
+    monkeypatch.setenv("COLUMNS", "80")
     with writing() as session:
         outbox.register(session, TARGETS)
     study = make_study()

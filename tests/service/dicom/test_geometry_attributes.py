@@ -246,6 +246,108 @@ def test_enhanced_xa_that_moved(make_xa: MakeXa) -> None:
     assert found.primary_deg == 30
 
 
+def code_item(value: str) -> Dataset:
+    item = Dataset()
+    item.CodeValue = value
+    return item
+
+
+def about_isocentre(
+    make_xa: MakeXa, angles_deg: list[tuple[float, float]], system: dict[str, float] | None = None, **attributes: Any
+) -> InstanceFacts:
+    """Return the facts of a run with angles about the isocentre."""
+    per_frame = [
+        group(
+            IsocenterReferenceSystemSequence={
+                "PositionerIsocenterPrimaryAngle": primary,
+                "PositionerIsocenterSecondaryAngle": secondary,
+                "PositionerIsocenterDetectorRotationAngle": 0.0,
+                "TableHeadTiltAngle": 0.0,
+                **(system or {}),
+            }
+        )
+        for primary, secondary in angles_deg
+    ]
+    return facts(
+        make_xa, SOPClassUID=EnhancedXAImageStorage, PerFrameFunctionalGroupsSequence=per_frame, **attributes
+    )  # fmt: skip
+
+
+def by_codes(lying: str, entering: str) -> dict[str, list[Dataset]]:
+    orientation = code_item("102538003")
+    orientation.PatientOrientationModifierCodeSequence = [code_item(lying)]
+    return {
+        "PatientOrientationCodeSequence": [orientation],
+        "PatientGantryRelationshipCodeSequence": [code_item(entering)],
+    }
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        ({"PatientPosition": "HFS"}, (30, 20)),
+        ({"PatientPosition": "HFP"}, (-150, 20)),
+        (by_codes("40199007", "102540008"), (30, 20)),
+        (by_codes("F-10310", "F-10470"), (-150, 20)),
+    ],
+    ids=["HFS", "HFP", "HFS by codes", "HFP by old codes"],
+)
+def test_angles_about_the_isocentre(make_xa: MakeXa, attributes: dict[str, Any], expected: tuple[float, float]) -> None:
+    found = about_isocentre(make_xa, [(30.0, 20.0)] * 3, **attributes)
+    assert found.primary_deg is not None
+    assert found.secondary_deg is not None
+    assert (found.primary_deg, found.secondary_deg) == pytest.approx(expected)
+    assert HeaderWarning.ANGLES_FROM_ISOCENTRE in found.warnings
+    assert HeaderWarning.POSITIONER_MOVED not in found.warnings
+    # PS3.3 C.8.19.6.13.1.2: from the isocentre, the detector is opposite to Yp, whose axes are turned by Ap1 and then Ap2.
+    ap1, ap2 = np.radians(30.0), np.radians(20.0)
+    first = np.array([[np.cos(ap1), np.sin(ap1), 0], [-np.sin(ap1), np.cos(ap1), 0], [0, 0, 1]])
+    second = np.array([[1, 0, 0], [0, np.cos(ap2), -np.sin(ap2)], [0, np.sin(ap2), np.cos(ap2)]])
+    detector_in_room = (second @ first).T @ [0.0, -1.0, 0.0]
+    detector_in_patient = detector_in_room * ([1, 1, 1] if expected[0] > 0 else [-1, -1, 1])
+    np.testing.assert_allclose(view_axes(found.primary_deg, found.secondary_deg)[2], detector_in_patient, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("system", "attributes"),
+    [
+        ({}, {}), ({}, {"PatientPosition": "FFS"}), ({}, {"PatientPosition": "HFDL"}),
+        ({}, by_codes("40199007", "102541007")), ({"TableHeadTiltAngle": 5.0}, {"PatientPosition": "HFS"}),
+        ({"PositionerIsocenterDetectorRotationAngle": 90.0}, {"PatientPosition": "HFS"}),
+        ({"PositionerIsocenterSecondaryAngle": 100.0}, {"PatientPosition": "HFS"}),
+    ],
+    ids=["position not stated", "feet first", "on the side", "feet first by codes", "tilted", "rotated", "nonsense"],
+)  # fmt: skip
+def test_angles_about_the_isocentre_that_say_nothing_of_the_patient(
+    make_xa: MakeXa, system: dict[str, float], attributes: dict[str, Any]
+) -> None:
+    found = about_isocentre(make_xa, [(30.0, 20.0)] * 3, system, **attributes)
+    assert {"PositionerPrimaryAngle", "PositionerSecondaryAngle"} <= set(found.missing)
+    assert HeaderWarning.ANGLES_FROM_ISOCENTRE not in found.warnings
+
+
+def test_angles_about_the_patient_come_first(make_xa: MakeXa) -> None:
+    stated = {"PositionerPrimaryAngle": -10.0, "PositionerSecondaryAngle": 5.0}
+    found = about_isocentre(make_xa, [(30.0, 20.0)] * 3, PatientPosition="HFS", **stated)
+    assert (found.primary_deg, found.secondary_deg) == (-10, 5)
+    assert HeaderWarning.ANGLES_FROM_ISOCENTRE not in found.warnings
+
+
+def test_a_gantry_that_turns_about_the_isocentre_moves(make_xa: MakeXa) -> None:
+    turning = [(30.0, 20.0), (33.0, 20.0), (36.0, 20.0)]
+    assert HeaderWarning.POSITIONER_MOVED in about_isocentre(make_xa, turning, PatientPosition="HFS").warnings
+    stated = {"PositionerPrimaryAngle": 30.0, "PositionerSecondaryAngle": 20.0}
+    assert HeaderWarning.POSITIONER_MOVED in about_isocentre(make_xa, turning, **stated).warnings
+
+
+def test_a_table_that_is_tilted_in_the_isocentre_system_has_no_position(make_xa: MakeXa) -> None:
+    level, tilted = (
+        about_isocentre(make_xa, [(0.0, 0.0)] * 3, {"TableHeadTiltAngle": angle, **ISOCENTRE_TABLE})
+        for angle in (0.0, 5.0)
+    )
+    assert (level.table_mm, tilted.table_mm) == ((4, 5, 6), None)
+
+
 def ge_block(dataset: Dataset, lateral: str, longitudinal: str, vertical: str, block: int = 0x10) -> None:
     """Add GE's private table position; ``block``: the creator's element number."""
     dataset.add_new((0x0019, block), "LO", "DLX_SERIE_01")

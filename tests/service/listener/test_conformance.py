@@ -12,6 +12,7 @@ from pydicom.uid import UID
 
 from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.dicom.deidentification.dataset import deidentify
+from fluoromap_service.dicom.deidentification.profile import EDITION, basic_profile
 from fluoromap_service.dicom.deidentification.pseudonyms import Dates, Pseudonyms
 from fluoromap_service.dicom.header import MACROS
 from fluoromap_service.dicom.store_statuses import StoreStatus
@@ -57,6 +58,11 @@ def test_options_of_deidentification() -> None:
         deidentify(dataset, Pseudonyms(b"secret", "patient", "", dates))
         written |= {item.CodeValue for item in dataset.DeidentificationMethodCodeSequence}
     assert listed == written
+
+
+def test_edition_of_deidentification() -> None:
+    (stated,) = re.findall(r"edition\s(\w+): (\d+) attributes", section("De-identification"))
+    assert stated == (EDITION, str(len(basic_profile())))
 
 
 def test_statuses() -> None:

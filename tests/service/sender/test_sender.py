@@ -10,9 +10,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,8 @@ Serve = Callable[[Archive], AbstractContextManager[CStoreTarget | StowTarget]]
 BOTH = pytest.mark.parametrize("serve", [dicom_node, dicomweb_server], ids=["dicom", "dicomweb"])
 OUT_OF_RESOURCES = 0xA700
 SECRET = "0123456789abcdef"
+PATIENCE_SECONDS = 240
+"""A sender that never ends would hold the test up for ever."""
 
 
 def objects_of(study: FinishedStudy) -> dict[str, Dataset]:
@@ -222,6 +226,25 @@ def short_lease(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     settings.cache_clear()
 
 
+@contextmanager
+def killable_senders(target: CStoreTarget | StowTarget) -> Iterator[subprocess.Popen[str]]:
+    """Run the program of the killable senders, for ``PATIENCE_SECONDS`` at most.
+
+    Its own session lets the test end it together with the sender that it has forked.
+    """
+    program = [sys.executable, str(Path(__file__).with_name("killable_sender.py")), target.kind]
+    with subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as senders:  # fmt: skip
+        end = threading.Timer(PATIENCE_SECONDS, os.killpg, (senders.pid, signal.SIGKILL))
+        end.start()
+        try:
+            yield senders
+        finally:
+            end.cancel()
+            os.killpg(senders.pid, signal.SIGKILL)
+
+
 @BOTH
 @pytest.mark.usefixtures("short_lease")
 def test_sender_killed_twenty_times_delivers_everything_once(study: FinishedStudy, serve: Serve) -> None:
@@ -251,8 +274,7 @@ def test_sender_killed_twenty_times_delivers_everything_once(study: FinishedStud
 
     archive = Archive(arrival=arrival, on_stored=on_stored)
     with serve(archive) as target:
-        program = [sys.executable, str(Path(__file__).with_name("killable_sender.py")), target.kind]
-        with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as senders:
+        with killable_senders(target) as senders:
             assert senders.stdin is not None
             assert senders.stdout is not None
             senders.stdin.write(target.model_dump_json() + "\n")
@@ -262,7 +284,9 @@ def test_sender_killed_twenty_times_delivers_everything_once(study: FinishedStud
                 running.append(int(senders.stdout.readline()))
                 assert senders.stdout.readline() == "ended\n"
             senders.stdin.close()
+        end = time.monotonic() + PATIENCE_SECONDS
         while not all(delivery(job.job_id).state == "delivered" for job in jobs):
+            assert time.monotonic() < end, [history(job.job_id) for job in jobs]
             send_next(target)
     assert kills.total() == 20
     assert min(kills.values()) >= 8

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,26 +74,20 @@ def render_run(path: Path, facts: InstanceFacts, inverted: bool, frame: int, dis
     return _picture(255 - shown if inverted else shown, display)
 
 
-def render_result(archive: Path, name: str, frame: int, display: Display) -> bytes:
-    """Return a frame of a secondary capture in a zip for display.
+def render_result(path: Path, frame: int, display: Display) -> bytes:
+    """Return a frame of a secondary capture for display.
 
     It has no window. ``frame`` counts from 0.
     """
-    return _picture(_result_frame(archive, name, frame), display)
+    return _picture(pixel_array(path, index=frame), display)
 
 
-def result_frame_bytes(archive: Path, name: str, frame: int) -> bytes:
-    """Return the pixels of a frame of a secondary capture in a zip.
+def result_frame_bytes(path: Path, frame: int) -> bytes:
+    """Return the pixels of a frame of a secondary capture.
 
     ``frame`` counts from 0.
     """
-    return _result_frame(archive, name, frame).tobytes()
-
-
-def _result_frame(archive: Path, name: str, frame: int) -> NDArray[np.uint8]:
-    with zipfile.ZipFile(archive) as opened, opened.open(name) as stream:
-        pixels: NDArray[np.uint8] = pixel_array(cast(BinaryIO, stream), index=frame)
-    return pixels
+    return bytes(pixel_array(path, index=frame).tobytes())
 
 
 def _default_window(pixels: Pixels, stated: Pair | None) -> Window:

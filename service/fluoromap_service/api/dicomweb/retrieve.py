@@ -70,6 +70,8 @@ def _files(request: Request, instances: list[StoredInstance]) -> StreamingRespon
     for instance in instances:
         if asked and not asked & {"*", instance.transfer_syntax}:
             raise not_acceptable("The file is stored in another transfer syntax; ask for transfer-syntax=*.")
+    for instance in instances:
+        instance.make_file()
 
     def parts() -> Iterator[tuple[str, Iterator[bytes]]]:
         for instance in instances:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,22 +14,51 @@ from sqlalchemy import select
 
 from fluoromap_service.api.dicomweb.display import Display, render_result, render_run, result_frame_bytes
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
-from fluoromap_service.api.results.result_objects import objects_zip
+from fluoromap_service.api.results.result_objects import (
+    REPORT_NAME,
+    JobObjects,
+    find_object,
+    made_object,
+    object_file,
+    plan_objects,
+)
 from fluoromap_service.dicom import InstanceFacts
 from fluoromap_service.dicom.frames import frame_bytes
 from fluoromap_service.dicom.json_model import header_json
+from fluoromap_service.dicom.objects.job_results import picture_headers
 from fluoromap_service.problem import Problem, not_found
-from fluoromap_service.results.dependencies import result_object_dependencies
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Instance, Job, JobState, StudyInstance
-from fluoromap_service.store.renderings import KeptFile, find_rendering
 
 Json = dict[str, Any]
 
-_REMEMBERED_HEADERS = 2000
-_headers: OrderedDict[tuple[str, str], Json] = OrderedDict()
-_lock = threading.Lock()
+
+class _Remembered:
+    """The headers that were read last, by the hash of their file or the id of their job; ``most`` limits their number."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._headers: OrderedDict[str, Json] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: str, read: Callable[[], Json]) -> Json:
+        """Return what is remembered under a key; read it when there is nothing."""
+        with self._lock:
+            if key in self._headers:
+                self._headers.move_to_end(key)
+                return self._headers[key]
+        header = read()
+        with self._lock:
+            self._headers[key] = header
+            while len(self._headers) > self._most:
+                self._headers.popitem(last=False)
+        return header
+
+
+_headers_of_runs = _Remembered(2000)
+_headers_of_jobs = _Remembered(500)
+"""The headers of all results of a job, by the names of the objects."""
 
 
 class StoredInstance(Protocol):
@@ -59,6 +87,12 @@ class StoredInstance(Protocol):
     @property
     def frames(self) -> int:
         """Number of frames; 0 for an object without pictures."""
+
+    def make_file(self) -> None:
+        """Make the file when it does not exist yet.
+
+        A fault then comes before the first byte of an answer.
+        """
 
     def chunks(self) -> Iterator[bytes]:
         """Return the content of the file, piece by piece."""
@@ -90,7 +124,7 @@ class StoredRun:
     def header(self) -> Json:
         """The header in the DICOM JSON model."""
         # A hostile header can take any time, so another process reads it.
-        return _remembered((self.sha256, ""), lambda: run_in_pool(Task.READ_FILE, header_json, self._path))
+        return _headers_of_runs.get(self.sha256, lambda: run_in_pool(Task.READ_FILE, header_json, self._path))
 
     @property
     def transfer_syntax(self) -> str:
@@ -101,6 +135,9 @@ class StoredRun:
     def frames(self) -> int:
         """Number of frames."""
         return self.facts.frames
+
+    def make_file(self) -> None:
+        """Do nothing: somebody sent the file."""
 
     def chunks(self) -> Iterator[bytes]:
         """Return the content of the file, piece by piece."""
@@ -122,9 +159,9 @@ class StoredRun:
 
 @dataclass(frozen=True, slots=True)
 class StoredResult:
-    """A DICOM object of a job: a member of the job's zip, with its header."""
+    """A DICOM object of a job. Its header is known before the object is made."""
 
-    archive: Path
+    job_id: str
     name: str
     header: Json
 
@@ -153,18 +190,25 @@ class StoredResult:
         """Number of frames; 0 for a report or a surface."""
         return int(self.header.get("00280008", {"Value": [0]})["Value"][0])
 
+    def make_file(self) -> None:
+        """Make the file when it does not exist yet."""
+        object_file(self.job_id, self.name)
+
     def chunks(self) -> Iterator[bytes]:
         """Return the content of the file, piece by piece."""
-        with zipfile.ZipFile(self.archive) as archive, archive.open(self.name) as stream:
-            yield from iter(lambda: stream.read(files.CHUNK_BYTES), b"")
+        return _chunks(self._path)
 
     def frame(self, index: int) -> bytes:
         """Return the uncompressed pixels of a frame."""
-        return run_in_pool(Task.DRAW_PICTURE, result_frame_bytes, self.archive, self.name, index)
+        return run_in_pool(Task.DRAW_PICTURE, result_frame_bytes, self._path, index)
 
     def rendered(self, index: int, display: Display) -> bytes:
         """Return a frame as a picture file."""
-        return run_in_pool(Task.DRAW_PICTURE, render_result, self.archive, self.name, index, display)
+        return run_in_pool(Task.DRAW_PICTURE, render_result, self._path, index, display)
+
+    @property
+    def _path(self) -> Path:
+        return object_file(self.job_id, self.name).path
 
     def _value(self, tag: str) -> str:
         return str(self.header[tag]["Value"][0])
@@ -180,8 +224,8 @@ def instances_of(
 ) -> list[StoredInstance]:
     """Return the stored instances in the order of their UIDs.
 
-    Each argument limits them to a DICOM study, to a series, or to one UID. The results of a job are made when somebody asks
-    for its DICOM study. Without ``study_uid`` the list has only results that are made already.
+    Each argument limits them to a DICOM study, to a series, or to one UID. Without ``study_uid`` the list has the results only
+    of jobs whose DICOM study somebody has asked for.
     """
     query = select(Instance)
     if study_uid is not None:
@@ -216,7 +260,7 @@ def instances_of(
 def _results(study_uid: str | None) -> Iterator[StoredResult]:
     """Yield the DICOM objects of the jobs over a DICOM study.
 
-    Without ``study_uid`` these are the objects of all jobs that have them already.
+    Without ``study_uid`` these are the objects of all jobs whose report exists.
     """
     query = (
         select(Job.id)
@@ -230,48 +274,39 @@ def _results(study_uid: str | None) -> Iterator[StoredResult]:
     with reading() as session:
         jobs = list(session.scalars(query))
     for job_id in jobs:
-        kept = find_rendering(job_id, result_object_dependencies(job_id)) if study_uid is None else _made(job_id)
-        if kept is None:
-            continue
-        with zipfile.ZipFile(kept.path) as archive:
-            for name in archive.namelist():
-                yield StoredResult(kept.path, name, _header_of_result(kept, archive, name))
+        if study_uid is not None or find_object(job_id, REPORT_NAME) is not None:
+            for name, header in _headers_of_results(job_id).items():
+                yield StoredResult(job_id, name, header)
 
 
-def _made(job_id: str) -> KeptFile | None:
-    """Return the zip of a job's DICOM objects.
+def _headers_of_results(job_id: str) -> dict[str, Json]:
+    """Return the headers of the DICOM objects of a job by name.
 
-    None for a job without results, or whose runs are damaged: the other instances of the study are shown nevertheless.
+    It draws no picture. Empty for a job without results, or whose runs are damaged: the other instances of the study are
+    shown nevertheless.
     """
     try:
-        return objects_zip(job_id)
+        planned = plan_objects(job_id)
+        return _headers_of_jobs.get(job_id, lambda: _planned_headers(planned))
     except files.BrokenFile:
-        return None
+        return {}
     except Problem as problem:
         if problem.status in (429, 503):
             raise
-        return None
+        return {}
 
 
-def _header_of_result(kept: KeptFile, archive: zipfile.ZipFile, name: str) -> Json:
-    def read() -> Json:
-        with archive.open(name) as stream:
-            return header_json(stream)
-
-    return _remembered((kept.sha256, name), read)
-
-
-def _remembered(key: tuple[str, str], read: Callable[[], Json]) -> Json:
-    with _lock:
-        if key in _headers:
-            _headers.move_to_end(key)
-            return _headers[key]
-    header = read()
-    with _lock:
-        _headers[key] = header
-        while len(_headers) > _REMEMBERED_HEADERS:
-            _headers.popitem(last=False)
-    return header
+def _planned_headers(planned: JobObjects) -> dict[str, Json]:
+    job_id = planned.origin.job_id
+    kept = {each.name: find_object(job_id, each.name) for each in planned.objects}
+    drawn_later = [each for each in planned.objects if kept[each.name] is None and each.series is not None]
+    series = tuple(each.series for each in drawn_later if each.series is not None)
+    later = run_in_pool(Task.WRITE_DICOM, picture_headers, planned.origin, series) if series else []
+    headers = {each.name: header for each, header in zip(drawn_later, later, strict=True)}
+    return {
+        each.name: headers.get(each.name) or header_json(made_object(planned.origin, each).path)
+        for each in planned.objects
+    }
 
 
 def existing(study_uid: str, series_uid: str | None = None, uid: str | None = None) -> list[StoredInstance]:

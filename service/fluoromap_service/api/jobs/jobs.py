@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic.json_schema import SkipJsonSchema
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -74,7 +75,8 @@ def create_job(
     study_id: StudyId,
     caller: Writer,
     once: OnceJson,
-    body: JobRequest | None = None,
+    # Generated clients cannot leave out a body that may be null.
+    body: JobRequest | SkipJsonSchema[None] = None,
 ) -> Response:
     """Freeze the study and run the pipeline over it.
 

@@ -7,7 +7,6 @@ import re
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -24,11 +23,11 @@ from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.points import points_csv, points_of
-from fluoromap_service.api.results.result_objects import results_of
+from fluoromap_service.api.results.result_objects import JobObjects, plan_objects
 from fluoromap_service.api.results.tracks import read_tracks, tracks_csv
 from fluoromap_service.dicom.deidentification.pseudonyms import Dates, Pseudonyms
 from fluoromap_service.dicom.deidentification.run_file import deidentify_file
-from fluoromap_service.dicom.objects.job_results import JobResults, job_objects
+from fluoromap_service.dicom.objects.job_results import ResultOrigin, RunReference
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import ended_job_of, snapshot_of
 from fluoromap_service.results.origins import Origin
@@ -109,9 +108,7 @@ def get_deidentified(
     text that is burned into them stays. The list that leads back from the new UIDs stays in the data folder of the
     service.
     """
-    folder = files.incoming_folder()
-    folder.mkdir(parents=True, exist_ok=True)
-    stream = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - the background task closes it after the answer
+    stream = tempfile.TemporaryFile(dir=files.made_incoming_folder())  # noqa: SIM115 - the background task closes it after the answer
     try:
         write_export(job_id, stream, ExportOptions(dates, subject))
         size = stream.tell()
@@ -144,13 +141,13 @@ def write_export(job_id: str, stream: IO[bytes], options: ExportOptions) -> Path
         study_id, snapshot = job.study_id, snapshot_of(job)
         runs = {uid: run.sha256 for uid, run in snapshot.runs.items()}
         tables = dict(_tables(job_id))
-    results = _results(job_id)
+    planned = _planned(job_id)
     if not all(files.path_of(sha256).exists() for sha256 in runs.values()):
         raise Problem(409, "run_deleted", "Somebody deleted a run of this job; upload it again and start a new job.")
     pseudonyms = Pseudonyms(
         reidentification.secret(), _patient(next(iter(runs.values()))), options.subject, options.dates
     )
-    with _working_folder() as folder, zipfile.ZipFile(stream, "w") as archive:
+    with files.incoming_files() as folder, zipfile.ZipFile(stream, "w") as archive:
         _add(archive, "README.txt", README.format(dates=_SENTENCES[options.dates]).encode())
         replaced: dict[str, str] = {}
         copies: dict[Path, Path] = {}
@@ -159,10 +156,10 @@ def write_export(job_id: str, stream: IO[bytes], options: ExportOptions) -> Path
             replaced |= run_in_pool(Task.WRITE_DICOM, deidentify_file, source, copy, pseudonyms)
             copies[source] = copy
             _add(archive, f"runs/{pseudonyms.uid(uid)}.dcm", copy)
-        if results is not None:
-            changed = _renamed(results, copies, pseudonyms)
-            for name, content in run_in_pool(Task.WRITE_DICOM, job_objects, changed):
-                _add(archive, f"results/{name}", content)
+        if planned is not None:
+            origin = _renamed(planned.origin, copies, pseudonyms)
+            for each in planned.objects:
+                _add(archive, f"results/{each.name}", each.content(origin))
         for name, text in tables.items():
             _add(archive, name, text.encode())
         _add(archive, "activation-times.csv", _activation_times(snapshot.sites, pseudonyms).encode())
@@ -177,27 +174,36 @@ def _patient(sha256: str) -> str:
     return str(header.get("PatientID") or header.StudyInstanceUID)
 
 
-def _results(job_id: str) -> JobResults | None:
-    """Return the results of a job; None where nothing could be located."""
+def _planned(job_id: str) -> JobObjects | None:
+    """Return the DICOM objects of a job; None where nothing could be located."""
     try:
-        return results_of(job_id)
+        return plan_objects(job_id)
     except Problem as problem:
         if problem.code not in ("no_map", "not_ready"):
             raise
         return None
 
 
-def _renamed(results: JobResults, copies: Mapping[Path, Path], pseudonyms: Pseudonyms) -> JobResults:
-    """Let results refer to the de-identified runs.
+def _renamed(origin: ResultOrigin, copies: Mapping[Path, Path], pseudonyms: Pseudonyms) -> ResultOrigin:
+    """Return the origin of results that refer to the de-identified runs.
 
     Their UIDs derive from another id of the job.
     """
-    finished = results.finished + timedelta(days=pseudonyms.shift_days)
+    finished = origin.finished + timedelta(days=pseudonyms.shift_days)
+    return ResultOrigin(
+        pseudonyms.uid(origin.job_id),
+        _NO_DATE if pseudonyms.dates is Dates.REMOVE else finished,
+        copies[origin.first_run],
+        tuple(_renamed_run(run, pseudonyms) for run in origin.other_runs),
+    )
+
+
+def _renamed_run(run: RunReference, pseudonyms: Pseudonyms) -> RunReference:
     return dataclasses.replace(
-        results,
-        job_id=pseudonyms.uid(results.job_id),
-        finished=_NO_DATE if pseudonyms.dates is Dates.REMOVE else finished,
-        runs=tuple(copies[path] for path in results.runs),
+        run,
+        study_instance_uid=pseudonyms.uid(run.study_instance_uid),
+        series_instance_uid=pseudonyms.uid(run.series_instance_uid),
+        sop_instance_uid=pseudonyms.uid(run.sop_instance_uid),
     )
 
 
@@ -216,14 +222,6 @@ def _activation_times(sites: tuple[SiteSnapshot, ...], pseudonyms: Pseudonyms) -
     """Return the table of the sites with their runs, as ``PUT .../activation-times`` takes it."""
     rows = [[site.site, site.lat_ms, pseudonyms.uid(site.view_a), pseudonyms.uid(site.view_b)] for site in sites]
     return csv_text(("site", "lat_ms", "view_a", "view_b"), rows)
-
-
-@contextmanager
-def _working_folder() -> Iterator[Path]:
-    folder = files.incoming_folder()
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as name:
-        yield Path(name)
 
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes | Path) -> None:

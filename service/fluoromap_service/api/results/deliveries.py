@@ -15,7 +15,7 @@ from fluoromap_service.api.http.paths import DeliveryId, JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
-from fluoromap_service.api.results.result_objects import delivery_objects
+from fluoromap_service.api.results.result_objects import plan_objects
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.problem import not_found
 from fluoromap_service.store.engine import reading, writing
@@ -130,7 +130,7 @@ def create_delivery(job_id: JobId, body: DeliveryRequest, caller: Writer, once: 
     """
     with reading() as session:
         kind = outbox.target_kind(session, job_id, body.target)
-    objects = {} if kind == "webhook" else {item.sop_instance_uid: item.name for item in delivery_objects(job_id)}
+    objects = {} if kind == "webhook" else plan_objects(job_id).names()
 
     def start(session: Session) -> Response:
         delivery = outbox.request(session, job_id, body.target)

@@ -24,6 +24,9 @@ from fluoromap_service.store.models import Delivery, DeliveryState
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 
+LINE_WIDTH = 1000
+"""Characters of a line; a narrower terminal shows it as several."""
+
 DeliveryId = Annotated[str, typer.Argument(help="Id of the delivery, as 'list' shows it.")]
 
 
@@ -47,14 +50,15 @@ def list_deliveries(
         query = query.where(Delivery.target == target)
     with _current_database(data_dir), reading() as session:
         rows = session.scalars(query).all()
-    table = Table("id", "target", "job", "state", "attempts", "next attempt", "ended", "error")
+    table = Table("id", "target", "job", "state", "attempts", "next attempt", "ended", "error", box=None)
     for row in rows:
         due = row.due if row.state == DeliveryState.PENDING else None
         error = (row.error or {}).get("code", "")
         table.add_row(
             row.id, row.target, row.job_id, row.state, str(row.attempt), _second(due), _second(row.finished), error
         )
-    Console(soft_wrap=True).print(table)
+    # A column that is cut off would hide the ids that the other commands take.
+    Console(width=LINE_WIDTH).print(table)
 
 
 @app.command()

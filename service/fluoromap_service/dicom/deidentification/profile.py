@@ -1,4 +1,4 @@
-"""The actions of the Basic Application Level Confidentiality Profile (PS3.15 table E.1-1, edition 2026c)."""
+"""The actions of the Basic Application Level Confidentiality Profile (PS3.15 table E.1-1)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from enum import StrEnum
 from importlib.resources import files
 
 from pydicom.tag import BaseTag
+
+EDITION = "2026d"
+"""The edition of the standard whose table the service applies."""
 
 
 class Action(StrEnum):

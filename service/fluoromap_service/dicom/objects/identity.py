@@ -28,12 +28,21 @@ _DEIDENTIFICATION = (
 )  # fmt: skip
 
 
+def result_uid(job_id: str, *names: str) -> str:
+    """Return the UID of a part of the results of a job.
+
+    A part is an object, its series, or an item in it.
+    """
+    return deterministic_uid("job", job_id, *names)
+
+
 @dataclass(frozen=True, eq=False)
 class ResultSource:
     """The origin of the result objects of a job.
 
     job_id : id of the job, from which all UIDs derive. finished : its end, UTC; dates the objects, so that the same job
-    always gives the same bytes. headers : of the source runs, without pixels; the first gives patient and study.
+    always gives the same bytes. headers : of the source runs, without pixels. The first gives patient and study; the others
+    need only their UIDs.
     """
 
     job_id: str
@@ -42,7 +51,7 @@ class ResultSource:
 
     def uid(self, *names: str) -> str:
         """Return the UID of a part of the results."""
-        return deterministic_uid("job", self.job_id, *names)
+        return result_uid(self.job_id, *names)
 
     @property
     def frame_of_reference(self) -> str:

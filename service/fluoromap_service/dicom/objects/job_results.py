@@ -1,7 +1,8 @@
-"""All DICOM objects of a job, from its plain results."""
+"""The DICOM objects of a job, from its plain results."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -10,62 +11,86 @@ import numpy as np
 import pydicom
 from numpy.typing import NDArray
 from PIL import Image
+from pydicom.dataset import Dataset
 
+from fluoromap_service.dicom.json_model import Json, header_json
 from fluoromap_service.dicom.objects.identity import ResultSource
-from fluoromap_service.dicom.objects.pictures import Pictures, pictures_file
+from fluoromap_service.dicom.objects.pictures import PictureSeries, pictures_file
 from fluoromap_service.dicom.objects.report_site import ReportSite
 from fluoromap_service.dicom.objects.surface import surface_file
 
 
 @dataclass(frozen=True, slots=True)
-class JobResults:
-    """The results of a job that become DICOM objects.
+class RunReference:
+    """The UIDs by which an object refers to a source run."""
 
-    runs : files of the source runs. overlays : PNG files of the map on fluoroscopy. map_picture : PNG file of the map from
-    six sides. stl : file of the surface. Without a map the last two are None.
+    sop_class_uid: str
+    study_instance_uid: str
+    series_instance_uid: str
+    sop_instance_uid: str
+
+    def dataset(self) -> Dataset:
+        """Return the UIDs as a data set."""
+        header = Dataset()
+        header.SOPClassUID, header.SOPInstanceUID = self.sop_class_uid, self.sop_instance_uid
+        header.StudyInstanceUID, header.SeriesInstanceUID = self.study_instance_uid, self.series_instance_uid
+        return header
+
+
+@dataclass(frozen=True, slots=True)
+class ResultOrigin:
+    """The job of the objects and its source runs.
+
+    finished : end of the job, UTC. first_run : file of the first run, which gives patient and study. other_runs : in order.
     """
 
     job_id: str
     finished: datetime
-    runs: tuple[Path, ...]
-    sites: tuple[ReportSite, ...]
-    volume_ml: float | None
-    overlays: tuple[Path, ...]
-    map_picture: Path | None
-    stl: Path | None
+    first_run: Path
+    other_runs: tuple[RunReference, ...]
+
+    def source(self) -> ResultSource:
+        """Read the header of the first run."""
+        first = pydicom.dcmread(self.first_run, stop_before_pixels=True)
+        return ResultSource(self.job_id, self.finished, (first, *(run.dataset() for run in self.other_runs)))
 
 
-def job_objects(results: JobResults) -> list[tuple[str, bytes]]:
-    """Return name and content of each DICOM file of a job.
-
-    The same results give the same bytes.
-    """
+def report_object(origin: ResultOrigin, sites: tuple[ReportSite, ...], volume_ml: float | None) -> bytes:
+    """Return the structured report; ``volume_ml`` is None without a map."""
     # Importing highdicom takes a second: only a process that writes a report does it.
     from fluoromap_service.dicom.objects.report import report_file
 
-    headers = tuple(pydicom.dcmread(path, stop_before_pixels=True) for path in results.runs)
-    source = ResultSource(results.job_id, results.finished, headers)
-    objects = [("report.dcm", report_file(source, results.sites, results.volume_ml))]
-    for number, pixels in enumerate(_by_size(results.overlays), start=1):
-        drawn = Pictures(f"overlays-{number}", 9010 + number, "Activation map drawn into fluoroscopy frames", pixels)
-        objects.append((f"{drawn.name}.dcm", pictures_file(source, drawn)))
-    if results.map_picture is not None:
-        (pixels,) = _by_size((results.map_picture,))
-        drawn = Pictures("map", 9010, "Activation map of the chamber from six sides", pixels)
-        objects.append(("map.dcm", pictures_file(source, drawn)))
-    if results.stl is not None:
-        objects.append(("chamber.dcm", surface_file(source, results.stl.read_bytes())))
-    return objects
+    return report_file(origin.source(), sites, volume_ml)
 
 
-def _by_size(paths: tuple[Path, ...]) -> list[NDArray[np.uint8]]:
-    """Return the pictures of each size as one array.
+def pictures_object(origin: ResultOrigin, series: PictureSeries, pictures: tuple[Path, ...]) -> bytes:
+    """Return the secondary capture of drawn pictures, PNG files.
 
-    All frames of an object have one size.
+    Raises
+    ------
+    ValueError
+        When the pictures have another number or size than ``series`` says.
     """
-    groups: dict[tuple[int, ...], list[NDArray[np.uint8]]] = {}
-    for path in paths:
-        with Image.open(path) as picture:
-            pixels = np.asarray(picture.convert("RGB"), dtype=np.uint8)
-        groups.setdefault(pixels.shape, []).append(pixels)
-    return [np.stack(pictures) for pictures in groups.values()]
+    pixels = np.stack([_pixels(path) for path in pictures])
+    if pixels.shape != (series.frames, series.rows, series.columns, 3):
+        raise ValueError(f"the pictures of {series.name} have the shape {pixels.shape}, which its header contradicts")
+    return pictures_file(origin.source(), series, pixels)
+
+
+def picture_headers(origin: ResultOrigin, series: tuple[PictureSeries, ...]) -> list[Json]:
+    """Return the headers of secondary captures that nobody has drawn.
+
+    They are in the DICOM JSON model.
+    """
+    source = origin.source()
+    return [header_json(io.BytesIO(pictures_file(source, each, None))) for each in series]
+
+
+def surface_object(origin: ResultOrigin, stl: Path) -> bytes:
+    """Return the encapsulated STL; ``stl`` is the file of the surface."""
+    return surface_file(origin.source(), stl.read_bytes())
+
+
+def _pixels(path: Path) -> NDArray[np.uint8]:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"), dtype=np.uint8)
