@@ -1,7 +1,7 @@
 /** The fourth step: the map, the sites, the pictures, the downloads, and the comparison of two jobs. */
 import { get } from "../shared/api.js";
 import { attempt, element, field, select } from "../shared/elements.js";
-import { warningWords } from "../shared/words.js";
+import { jobLabel, warningWords } from "../shared/words.js";
 import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
 import { resultSites } from "./sites-table.js";
@@ -13,7 +13,7 @@ import { resultSites } from "./sites-table.js";
 export function resultsPanel(state, correct) {
   const place = element("div", {});
   const choice = select([], "", {});
-  const choiceField = field("Computation of", choice);
+  const choiceField = field("Show the computation of", choice);
   let shown = "";
   let forget = () => {};
 
@@ -70,7 +70,7 @@ export function resultsPanel(state, correct) {
 
   const fill = () => {
     const jobs = state.jobs.filter((job) => job.state === "succeeded");
-    choice.replaceChildren(...select(jobs.map((job) => [job.id, new Date(job.created).toLocaleString()]), jobs[0]?.id ?? "").children);
+    choice.replaceChildren(...select(jobs.map((job) => [job.id, jobLabel(job)]), jobs[0]?.id ?? "").children);
     const newest = jobs[0];
     choiceField.hidden = !newest;
     if (!newest) return place.replaceChildren(element("p", { class: "card" }, "There is no map yet. Start the computation in the third step."));

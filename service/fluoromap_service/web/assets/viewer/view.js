@@ -130,11 +130,11 @@ export class View extends FrameView {
     return this.pen.tool === "add" || this.pen.tool === "mark";
   }
 
-  /** Show the cross, at the chosen electrode or in the middle of the picture. */
+  /** Show the cross: at the chosen electrode, else at the catheter, else in the middle of the picture. */
   beginCross() {
     if (this.cross) return;
     const { width, height } = this.canvas;
-    const chosen = this.chosenElectrode;
+    const chosen = this.chosenElectrode ?? this.electrodes.findLast((each) => each.catheter === this.pen.catheter);
     this.cross = chosen ? { u: chosen.u_px, v: chosen.v_px } : this.#inside(this.placement.toFrame(this.canvas, this.run, width / 2, height / 2));
   }
 
@@ -231,6 +231,7 @@ export class View extends FrameView {
   async step(way) {
     const frame = await this.#store(() => (way < 0 ? this.marks.undo() : this.marks.redo()));
     if (typeof frame === "number") this.show(frame);
+    else if (frame === null) this.status.textContent = way < 0 ? "nothing to undo" : "nothing to redo";
   }
 
   /** @template T @param {() => Promise<T>} act */
