@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import pytest
@@ -89,7 +90,7 @@ def test_a_catheter_is_marked_from_its_tip_on(page: Any, view: Any, own_study: s
     page.get_by_role("button", name="Move electrodes", pressed=True).wait_for()
     found = electrodes(page, own_study)
     places = [found["mapping", number]["u_px"] for number in (1, 2, 3, 4)]
-    assert [b - a for a, b in zip(places, places[1:], strict=False)] == pytest.approx([5, 5, 5], abs=0.01)
+    assert [b - a for a, b in itertools.pairwise(places)] == pytest.approx([5, 5, 5], abs=0.01)
 
 
 def test_track_again_from_here_takes_the_frame_as_right_and_computes(page: Any, view: Any, own_study: str) -> None:

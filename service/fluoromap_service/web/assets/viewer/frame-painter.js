@@ -64,12 +64,15 @@ export class FramePainter {
     const names = study.catheters.map((each) => each.name);
     for (const electrode of electrodes) {
       const { x, y } = placement.toCanvas(canvas, this.run, electrode.u_px, electrode.v_px);
-      this.#electrode(context, x, y, electrode, catheterColour(names, electrode.catheter), keyOf(electrode) === chosen, window.devicePixelRatio || 1);
+      const next = electrodes.find((each) => each.catheter === electrode.catheter && each.electrode === electrode.electrode + 1);
+      // The name is on the side where the catheter is not.
+      const isLeft = next !== undefined && next.u_px > electrode.u_px;
+      this.#electrode(context, x, y, electrode, catheterColour(names, electrode.catheter), keyOf(electrode) === chosen, isLeft, window.devicePixelRatio || 1);
     }
   }
 
-  /** @param {CanvasRenderingContext2D} context @param {number} x @param {number} y @param {Mark} electrode @param {string} colour @param {boolean} chosen @param {number} unit */
-  #electrode(context, x, y, electrode, colour, chosen, unit) {
+  /** @param {CanvasRenderingContext2D} context @param {number} x @param {number} y @param {Mark} electrode @param {string} colour @param {boolean} chosen @param {boolean} isLeft @param {number} unit */
+  #electrode(context, x, y, electrode, colour, chosen, isLeft, unit) {
     const radius = (electrode.electrode === 1 ? 6.5 : 5) * unit;
     const outline = new Path2D();
     // Set by hand: a square. Detected: a circle. So they differ without colour too.
@@ -84,11 +87,13 @@ export class FramePainter {
     if (electrode.electrode === 1 || chosen) {
       context.font = `600 ${12 * unit}px system-ui`;
       const text = chosen ? `${electrode.catheter ?? "unnamed"} ${electrode.electrode}` : (electrode.catheter ?? "?");
+      const beside = isLeft ? x - radius - 3 * unit : x + radius + 3 * unit;
+      context.textAlign = isLeft ? "right" : "left";
       context.lineWidth = 3 * unit;
       context.strokeStyle = "rgba(0,0,0,.8)";
-      context.strokeText(text, x + radius + 3 * unit, y - radius);
+      context.strokeText(text, beside, y - radius);
       context.fillStyle = colour;
-      context.fillText(text, x + radius + 3 * unit, y - radius);
+      context.fillText(text, beside, y - radius);
     }
     context.fillStyle = colour;
     context.fillRect(x - unit, y - unit, 2 * unit, 2 * unit);
