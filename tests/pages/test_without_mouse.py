@@ -12,8 +12,8 @@ import pytest
 def view(page: Any, own_study: str) -> Any:
     """Return view a of the first site, focused by Tab."""
     page.goto(f"/studies/{own_study}#electrodes")
-    shown = page.locator(".view[data-view=a][data-electrodes='12']")
-    shown.wait_for()
+    page.locator(".view[data-view=a][data-electrodes='12']").wait_for()
+    shown = page.locator(".view[data-view=a]")
     for _ in range(60):
         page.keyboard.press("Tab")
         if shown.locator("canvas").evaluate("canvas => canvas === document.activeElement"):

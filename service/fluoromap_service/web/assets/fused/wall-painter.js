@@ -15,8 +15,8 @@ export class WallPainter {
     this.look = look;
     this.canvas = document.createElement("canvas");
     this.canvas.width = this.canvas.height = 1;
-    this.renderer = rendererOf(this.canvas, false);
-    this.renderer.setPixelRatio(1);
+    this.renderer = rendererOrNone(this.canvas);
+    this.renderer?.setPixelRatio(1);
     this.surface = new Surface(look, true);
     this.surface.mesh.frustumCulled = false;
     this.world = new THREE.Scene();
@@ -43,8 +43,10 @@ export class WallPainter {
     const origin = placement.origin(context.canvas, run);
     const part = this.#partOf(context.canvas, projection, shift, origin, scale);
     if (part.width <= 0 || part.height <= 0) return;
-    this.#render(part, projection, shift, origin, scale);
-    context.drawImage(this.canvas, 0, this.canvas.height - part.height, part.width, part.height, part.left, part.top, part.width, part.height);
+    if (this.renderer) {
+      this.#render(this.renderer, part, projection, shift, origin, scale);
+      context.drawImage(this.canvas, 0, this.canvas.height - part.height, part.width, part.height, part.left, part.top, part.width, part.height);
+    }
     context.beginPath();
     this.outline.trace(context, projection, shift, origin, scale);
     context.strokeStyle = OUTLINE;
@@ -68,16 +70,16 @@ export class WallPainter {
     return { left, top, width: Math.min(canvas.width, Math.ceil(Math.max(...x))) - left, height: Math.min(canvas.height, Math.ceil(Math.max(...y))) - top };
   }
 
-  /** Draw the wall in a part of a view, at the bottom left of the own canvas. @param {Part} part @param {import("./projection.js").Projection} projection @param {number[]} shift @param {{x: number, y: number}} origin @param {number} scale */
-  #render(part, projection, shift, origin, scale) {
+  /** Draw the wall in a part of a view, at the bottom left of the own canvas. @param {THREE.WebGLRenderer} renderer @param {Part} part @param {import("./projection.js").Projection} projection @param {number[]} shift @param {{x: number, y: number}} origin @param {number} scale */
+  #render(renderer, part, projection, shift, origin, scale) {
     const [x = 0, y = 0, z = 0] = shift;
     // The canvas grows only: another size would cost new memory of the graphics card in each frame.
     const [width, height] = [Math.max(part.width, this.canvas.width), Math.max(part.height, this.canvas.height)];
-    if (this.canvas.width !== width || this.canvas.height !== height) this.renderer.setSize(width, height, false);
-    this.renderer.setViewport(0, 0, part.width, part.height);
+    if (this.canvas.width !== width || this.canvas.height !== height) renderer.setSize(width, height, false);
+    renderer.setViewport(0, 0, part.width, part.height);
     this.surface.mesh.position.set(x, y, z);
     this.#aim(part, projection, shift, { x: origin.x - part.left, y: origin.y - part.top }, scale);
-    this.renderer.render(this.world, this.camera);
+    renderer.render(this.world, this.camera);
   }
 
   /** Aim the camera so that it maps the world to a part of a view. @param {Part} part @param {import("./projection.js").Projection} projection @param {number[]} shift @param {{x: number, y: number}} origin @param {number} scale */
@@ -104,7 +106,16 @@ export class WallPainter {
 
   close() {
     this.surface.close();
-    this.renderer.dispose();
-    this.renderer.forceContextLoss();
+    this.renderer?.dispose();
+    this.renderer?.forceContextLoss();
+  }
+}
+
+/** Return null where the browser cannot draw in 3D: then a view shows the outline and the sites. @param {HTMLCanvasElement} canvas */
+function rendererOrNone(canvas) {
+  try {
+    return rendererOf(canvas, false);
+  } catch {
+    return null;
   }
 }
