@@ -126,7 +126,7 @@ def study_files(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFiles:
 
 
 def compute_study(service_url: str, label: str, files: SimulatedFiles) -> tuple[str, str]:
-    """Make a study of the files, compute its map, and return the ids of the study and of its job."""
+    """Return the ids of a new study of the files and of its finished job."""
     with Client(service_url) as client:
         study = client.make_study(label)
         for path in files.runs:

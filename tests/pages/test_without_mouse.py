@@ -22,14 +22,14 @@ def view(page: Any, own_study: str) -> Any:
 
 
 def electrodes(page: Any, study: str, frame: int = 1) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return the electrodes of a frame of view a of site S01 as the service has them."""
+    """Return the stored electrodes of view a of site S01."""
     site = page.request.get(f"/v1/studies/{study}/sites/S01").json()
     address = f"/v1/studies/{study}/instances/{site['view_a']}/frames/{frame}/electrodes"
     return {(each["catheter"], each["electrode"]): each for each in page.request.get(address).json()}
 
 
 def press(page: Any, view: Any, *keys: str) -> None:
-    """Press keys of which the last one stores, and wait until the service has stored."""
+    """Press keys, and wait until the service has stored the change."""
     view.locator(".status").evaluate("status => (status.textContent = '')")
     for key in keys:
         page.keyboard.press(key)
@@ -45,7 +45,7 @@ def test_the_focus_and_the_choice_are_visible(page: Any, view: Any) -> None:
     view.locator(".status", has_text="mapping 2, found by the service").wait_for()
     page.keyboard.press("Shift+N")
     view.locator(".status", has_text="mapping 1").wait_for()
-    # The catheter of the choice is the one that the tools change.
+    # The tools now change the catheter of the chosen electrode.
     page.keyboard.press("[")
     view.locator(".status", has_text="reference 4").wait_for()
     assert page.get_by_label("Catheter to mark").input_value() == "reference"

@@ -100,7 +100,7 @@ export class View extends FrameView {
     this.#choose(electrode);
     if (electrode === null) return;
     this.status.textContent = `${electrode.catheter ?? "unnamed"} ${electrode.electrode}, ${electrode.source === "manual" ? "set by hand" : "found by the service"}`;
-    // Whoever chooses an electrode works on its catheter.
+    // A person who chooses an electrode works on its catheter.
     if (electrode.catheter !== null && electrode.catheter !== this.pen.catheter && !this.sets) this.pen.take({ catheter: electrode.catheter });
   }
 
