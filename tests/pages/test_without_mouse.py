@@ -29,7 +29,7 @@ def electrodes(page: Any, study: str, frame: int = 1) -> dict[tuple[str, int], d
 
 
 def press(page: Any, view: Any, *keys: str) -> None:
-    """Press keys, and wait until the service has stored the change."""
+    """Send keys, and wait until the service has stored the change."""
     view.locator(".status").evaluate("status => (status.textContent = '')")
     for key in keys:
         page.keyboard.press(key)

@@ -45,7 +45,7 @@ export function comparison(job, others, mapping) {
     const difference = mapNow && mapBefore ? mapDifference(mapNow, mapBefore) : null;
     place.replaceChildren(
       element("p", {}, difference === null ? "One of the computations has no map." : `The maps differ by ${number(difference, 1)} ms (root mean square over the covered wall).`),
-      mapNow && mapBefore ? element("p", {}, `Earliest site: ${earliest(mapBefore)} before, ${earliest(mapNow)} now. Total activation time: ${number(mapBefore.total_activation_time_ms, 0)} ms before, ${number(mapNow.total_activation_time_ms, 0)} ms now.`) : "",
+      mapNow && mapBefore ? element("p", {}, `Earliest site: ${earliest(mapBefore)} before, ${earliest(mapNow)} now. Whole activation: ${number(mapBefore.total_activation_time_ms, 0)} ms before, ${number(mapNow.total_activation_time_ms, 0)} ms now.`) : "",
       element("div", { class: "wide", tabIndex: 0, role: "region", "aria-label": "Sites of both computations" }, element("table", { class: "comparison" }, element("thead", {}, element("tr", {}, ...["Site", "Moved, mm", "Time changed, ms", "Times, ms", "Grade"].map((title) => element("th", { scope: "col" }, title)))), element("tbody", {}, ...rows))));
   };
   return element("section", {}, element("h2", {}, "Compare with another computation"),

@@ -116,7 +116,8 @@ export function viewerPanel(state, compute) {
   showPen();
   const keys = element("dl", { class: "keys" }, ...KEYS.flatMap(([key, act]) => [element("dt", {}, key), element("dd", {}, act)]));
   const help = element("details", {}, element("summary", {}, "Keys: everything works without a mouse"),
-    element("p", {}, "Go to a picture with Tab. Choose an electrode with N, move it with Shift and the arrows, then press T to compute with it."), keys);
+    element("p", {}, "Go to a picture with Tab. Choose an electrode with N, move it with Shift and the arrows, then press T to compute with it."),
+    element("p", { class: "soft" }, "After a computation, a frame with electrodes set by hand shows only their catheters. The other frames show all."), keys);
   place.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => { if (event.key.toLowerCase() === "h") help.open = !help.open; });
   return element("div", {},
     element("div", { class: "fields" }, field("Site", site), field("Catheter to mark", catheter),
