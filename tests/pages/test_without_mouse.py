@@ -98,7 +98,10 @@ def test_track_again_from_here_takes_the_frame_as_right_and_computes(page: Any, 
     page.keyboard.press("n")
     chosen = view.locator(".status").inner_text().split(" ")[0]
     page.keyboard.press("t")
+    # The new map comes by itself.
+    page.locator("#panel-map .scene canvas[data-drawn=yes]").first.wait_for()
     page.get_by_text("The computation has ended: finished.").wait_for()
+    page.locator("#panel-map .fused[data-frames]").nth(1).wait_for()
     stored = electrodes(page, own_study, frame=24)
     assert {each["source"] for each in stored.values()} == {"manual"}
     assert {name for name, _ in stored} == {chosen}
