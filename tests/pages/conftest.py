@@ -14,7 +14,7 @@ from processes import embedded, environment_of, wait_until_ready
 
 from fluoromap.phantom import StudySpec
 from fluoromap_service.cli.client import Client
-from fluoromap_service.dicom.simulation import simulate
+from fluoromap_service.dicom.simulation import SimulatedFiles, simulate
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test opens the pages")
 
@@ -119,12 +119,16 @@ def new_study() -> Callable[[Any, str], str]:
 
 
 @pytest.fixture(scope="session")
-def mapped_study(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
-    """Return the ids of a study with a map and of its job."""
+def study_files(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFiles:
+    """Return the files of a simulated study of five sites."""
     # Another heart than that of the fixture `simulated_study`: tests upload changed files of its runs.
-    files = simulate(tmp_path_factory.mktemp("mapped"), StudySpec(8, sites=5, frames=24), processes=1)
+    return simulate(tmp_path_factory.mktemp("mapped"), StudySpec(8, sites=5, frames=24), processes=1)
+
+
+def compute_study(service_url: str, label: str, files: SimulatedFiles) -> tuple[str, str]:
+    """Return the ids of a new study of the files and of its finished job."""
     with Client(service_url) as client:
-        study = client.make_study("With a map")
+        study = client.make_study(label)
         for path in files.runs:
             client.upload(study, path)
         client.put_activation_times(study, files.activation_times)
@@ -132,6 +136,18 @@ def mapped_study(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> 
         states = [each["state"] for each in client.follow(job)]
         assert states[-1] == "succeeded", states
     return study, job
+
+
+@pytest.fixture(scope="session")
+def mapped_study(service_url: str, study_files: SimulatedFiles) -> tuple[str, str]:
+    """Return the ids of a study with a map and of its job. No test changes it."""
+    return compute_study(service_url, "With a map", study_files)
+
+
+@pytest.fixture
+def own_study(service_url: str, study_files: SimulatedFiles, mapped_study: tuple[str, str]) -> str:
+    """Return the id of a study with the same map, for a test that changes it. The service takes the stages from the other study."""
+    return compute_study(service_url, "With a map, to change", study_files)[0]
 
 
 @pytest.fixture(scope="session")

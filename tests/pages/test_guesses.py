@@ -41,3 +41,20 @@ def test_a_file_that_is_no_run_is_refused_in_words(
     page.locator("#files").set_input_files([tmp_path / "letter.dcm", tmp_path / "times.csv"])
     page.get_by_text("column lat_ms: must be a number").wait_for()
     assert page.locator("li .notice.problem").count() == 2
+
+
+def test_a_folder_is_sent_without_the_files_that_are_no_runs(
+    page: Any, new_study: Callable[[Any, str], str], tmp_path: Path
+) -> None:
+    study = new_study(page, "A folder")
+    folder = tmp_path / "study"
+    folder.mkdir()
+    for number, angle in ((1, 0.0), (2, 90.0)):
+        (folder / f"run{number}.dcm").write_bytes(small_run(tmp_path, number, angle))
+    (folder / "times.csv").write_text("site,lat_ms\nS01,12\n")
+    (folder / "truth.json").write_text("{}")
+    page.locator("#folder").set_input_files(folder)
+    page.get_by_text("left out: no run and no table").wait_for()
+    page.get_by_text("1 of 1 sites are ready").wait_for()
+    assert page.locator("li .notice.problem").count() == 0
+    assert len(page.request.get(f"{study}/instances").json()["items"]) == 2

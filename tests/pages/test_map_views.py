@@ -148,3 +148,15 @@ def test_colours_uncertainty_and_time_change_every_view(map_page: Any) -> None:
         change()
         seen.append(on_canvas(map_page, "a"))
         assert (seen[-1] != seen[-2]).mean() > 0.01
+
+
+def test_a_browser_without_webgl_shows_the_outline_and_the_sites(page: Any, mapped_study: tuple[str, str]) -> None:
+    page.add_init_script(
+        "const real = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {"
+        "  return kind.startsWith('webgl') ? null : real.call(this, kind, ...rest); };"
+    )
+    page.goto(f"/studies/{mapped_study[0]}#map")
+    page.get_by_text("This browser cannot draw in 3D").wait_for()
+    page.locator(".fused[data-frames]").nth(1).wait_for()
+    assert 0.001 < coloured(on_canvas(page, "a")).mean() < 0.05

@@ -110,7 +110,10 @@ export class FusedPanel {
   /** @param {boolean} playing */
   play(playing) {
     this.playing = playing;
-    for (const view of this.views) view.playback.play(playing);
+    for (const view of this.views) {
+      view.playback.play(playing);
+      view.showCount();
+    }
     this.playButton.textContent = playing ? "Pause" : "Play";
     this.playButton.setAttribute("aria-label", `${this.playButton.textContent} the map over fluoroscopy`);
   }

@@ -2,10 +2,7 @@
 import { element } from "../shared/elements.js";
 import { direction, number } from "../shared/words.js";
 import { siteText, timeText } from "../map/site-text.js";
-import { Cine } from "../viewer/cine.js";
-import { FramePainter } from "../viewer/frame-painter.js";
-import { Placement } from "../viewer/placement.js";
-import { FRAME_MS, Playback } from "../viewer/playback.js";
+import { FrameView } from "../viewer/frame-view.js";
 import { drawLabels } from "./labels.js";
 import { Projection } from "./projection.js";
 
@@ -18,8 +15,8 @@ import { Projection } from "./projection.js";
 const REACH_PX = 16;
 const DOUBTFUL = "#ffb040";
 
-/** The event `chosen` has the name of the site that a person clicked. */
-export class FusedView extends EventTarget {
+/** The event `chosen` has the name of the site that a person clicked; `play` asks for both views to play or pause. */
+export class FusedView extends FrameView {
   /**
    * @param {import("../study/page.js").StudyState} state
    * @param {Run} run
@@ -29,63 +26,35 @@ export class FusedView extends EventTarget {
    * @param {{earliest: string|null, distance: string}} goal The earliest site, and its distance from the tip of this run in words.
    */
   constructor(state, run, place, wall, bar, goal) {
-    super();
-    this.state = state;
-    this.run = run;
+    const name = `view ${place.view}`;
+    const label = `The map over ${name} of site ${place.site}, ${direction(run.gantry)}`;
+    super(state, run, { canvas: { role: "img", "aria-label": label }, slider: `Frame of the map over ${name}`, frame: place.frame });
     this.place = place;
     this.wall = wall;
     this.bar = bar;
     this.goal = goal;
     this.map = wall.look.map;
     this.projection = new Projection(place.projection);
-    this.frame = place.frame;
-    this.shownFrames = 0;
+    this.edges = this.projection.edges;
     this.showsElectrodes = false;
-    this.painter = new FramePainter(run);
-    this.placement = new Placement();
-    this.cine = new Cine(state.path, run, () => this.draw());
-    this.playback = new Playback(run.frame_time_ms ?? FRAME_MS, (frames) => this.show(this.frame + frames));
-    const name = `view ${place.view}`;
-    this.canvas = element("canvas", { tabIndex: 0, role: "img", "aria-label": `The map over ${name} of site ${place.site}, ${direction(run.gantry)}` });
-    this.slider = element("input", { type: "range", min: 1, max: run.frames, value: this.frame, "aria-label": `Frame of the map over ${name}`, oninput: () => this.show(Number(this.slider.value)) });
-    this.count = element("span", {});
-    this.element = element("div", { class: "view fused", "data-fused": place.view },
+    this.element.classList.add("fused");
+    this.element.dataset.fused = place.view;
+    this.element.append(
       element("div", { class: "caption" }, element("strong", {}, `View ${place.view}`), `${direction(run.gantry)} of site ${place.site}`),
       element("div", { class: "picture" }, this.canvas, bar), element("div", { class: "caption" }, this.slider, this.count));
     this.#listen();
-    new ResizeObserver(() => this.#fit()).observe(this.canvas);
     this.show(this.frame);
   }
 
-  close() {
-    this.cine.close();
+  get countText() {
+    return `${super.countText}${this.frame === this.place.frame ? ", diastole" : ""}`;
   }
 
-  #fit() {
-    const ratio = window.devicePixelRatio || 1;
-    this.canvas.width = Math.round(this.canvas.clientWidth * ratio);
-    this.canvas.height = Math.round(this.canvas.clientHeight * ratio);
-    this.draw();
+  switchPlay() {
+    this.dispatchEvent(new Event("play"));
   }
 
-  /** @param {number} frame From 1; past the end it begins again. */
-  show(frame) {
-    this.frame = ((frame - 1 + this.run.frames) % this.run.frames) + 1;
-    this.slider.value = String(this.frame);
-    this.count.textContent = `${this.frame} / ${this.run.frames}${this.frame === this.place.frame ? ", diastole" : ""}`;
-    this.draw();
-  }
-
-  draw() {
-    // A hidden tab has no size.
-    if (!this.canvas.width || !this.canvas.clientWidth) return;
-    const pixels = this.cine.pixels(this.frame);
-    if (pixels) {
-      this.painter.setPixels(pixels);
-      this.shownFrames += 1;
-      this.element.dataset.frames = String(this.shownFrames);
-    }
-    this.painter.paintFrame(this.canvas, this.placement);
+  paintOver() {
     const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
     this.wall.paint(context, this.placement, this.run, this.projection, this.shift);
     if (this.showsElectrodes) this.painter.paintElectrodes(this.canvas, this.placement, this.state.study, this.place.frames[this.frame - 1]?.electrodes ?? [], null);
@@ -152,7 +121,7 @@ export class FusedView extends EventTarget {
   /** Letters of the patient at the edges, and the kind of data. @param {CanvasRenderingContext2D} context @param {number} unit */
   #edges(context, unit) {
     const { width, height } = this.canvas;
-    const { left, right, top } = this.projection.edges;
+    const { left, right, top } = this.edges;
     const purpose = `${this.map.simulated ? "simulated data, " : ""}for research`;
     context.font = `${12 * unit}px system-ui`;
     context.textBaseline = "middle";
@@ -176,48 +145,23 @@ export class FusedView extends EventTarget {
     let drag = null;
     this.canvas.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => {
       this.canvas.setPointerCapture(event.pointerId);
-      drag = { ...this.#point(event), moved: false };
+      drag = { ...this.at(event), moved: false };
     });
     this.canvas.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => {
       if (!drag) return;
-      const { x, y } = this.#point(event);
+      const { x, y } = this.at(event);
       if (!drag.moved && Math.hypot(x - drag.x, y - drag.y) < 3) return;
-      this.placement.shift.x += x - drag.x;
-      this.placement.shift.y += y - drag.y;
+      this.pan(x - drag.x, y - drag.y);
       drag = { x, y, moved: true };
-      this.draw();
     });
     this.canvas.addEventListener("pointerup", () => {
       if (drag && !drag.moved) this.#pick(drag.x, drag.y);
       drag = null;
     });
     this.canvas.addEventListener("pointercancel", () => (drag = null));
-    this.canvas.addEventListener("wheel", (/** @type {WheelEvent} */ event) => {
-      event.preventDefault();
-      const { x, y } = this.#point(event);
-      this.placement.zoomAt(this.canvas, Math.exp(-event.deltaY / 400), x, y);
-      this.draw();
-    }, { passive: false });
     this.canvas.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
-      const middle = [this.canvas.width / 2, this.canvas.height / 2];
-      const zoom = (/** @type {number} */ factor) => this.placement.zoomAt(this.canvas, factor, middle[0] ?? 0, middle[1] ?? 0);
-      /** @type {Record<string, () => void>} */
-      const acts = {
-        ArrowRight: () => this.show(this.frame + 1), ArrowLeft: () => this.show(this.frame - 1), Home: () => this.show(1), End: () => this.show(this.run.frames),
-        "+": () => zoom(1.25), "-": () => zoom(0.8), 0: () => this.placement.reset(), " ": () => this.dispatchEvent(new Event("play")),
-      };
-      const act = acts[event.key];
-      if (!act || event.ctrlKey || event.altKey || event.metaKey) return;
-      act();
-      event.preventDefault();
-      this.draw();
+      if (!event.ctrlKey && !event.altKey && !event.metaKey && this.press(event.key)) event.preventDefault();
     });
-  }
-
-  /** @param {MouseEvent} event */
-  #point(event) {
-    const box = this.canvas.getBoundingClientRect();
-    return { x: ((event.clientX - box.left) * this.canvas.width) / box.width, y: ((event.clientY - box.top) * this.canvas.height) / box.height };
   }
 
   /** @param {number} x @param {number} y */

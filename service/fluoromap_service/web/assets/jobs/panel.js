@@ -39,6 +39,9 @@ function problemsOf(state, job) {
   return lines.length ? element("ul", { class: "notice problem" }, ...lines) : null;
 }
 
+/** Whether a running job has its map: tracks of single views follow. @param {Job} job */
+const hasMap = (job) => job.stages.some((stage) => stage.name === "fuse" && stage.state === "done");
+
 /** @param {StudyState} state @param {() => void} showMap */
 export function jobPanel(state, showMap) {
   const view = select([["both", "both views"], ["a", "view a only"], ["b", "view b only"]], "both");
@@ -46,7 +49,7 @@ export function jobPanel(state, showMap) {
   const chosen = {};
   const plugins = element("div", {});
   const current = element("div", { "aria-live": "polite" });
-  const start = element("button", { type: "button", class: "main", onclick: () => attempt(run) }, "Compute the map");
+  const start = element("button", { type: "button", class: "main", onclick: () => attempt(() => run()) }, "Compute the map");
 
   attempt(async () => {
     const all = await get("/v1/plugins");
@@ -71,31 +74,38 @@ export function jobPanel(state, showMap) {
     current.replaceChildren(
       element("div", { class: "card", "data-job": job.state },
         element("div", { class: "row" }, element("h2", {}, `Computation: ${JOB_STATES[job.state] ?? job.state}`), element("span", { class: "grow" }), running ? cancel : null,
-          job.state === "succeeded" ? button("Show the map", showMap, { class: "main" }) : null),
+          job.state === "succeeded" || (running && hasMap(job)) ? button("Show the map", showMap, { class: "main" }) : null),
         ...progressOf(job)));
     if (problems) current.append(problems);
   };
-  /** @param {Job} job */
-  const watch = async (job) => {
+  /** @param {Job} job @param {boolean} showsMap Whether the page goes on to the map as soon as there is one. */
+  const watch = async (job, showsMap) => {
     start.disabled = true;
     show(job);
-    const ended = await follow(job, show);
+    const ended = await follow(job, (news) => {
+      show(news);
+      if (state.mapped?.id === news.id || !hasMap(news)) return;
+      state.takeMap(news);
+      if (showsMap) showMap();
+    });
     start.disabled = false;
+    state.mapped = null;
     await state.load();
     show(ended);
     state.dispatchEvent(new Event("job"));
     announce(`The computation has ended: ${JOB_STATES[ended.state] ?? ended.state}.`, ended.state === "failed" ? "problem" : "done");
   };
-  const run = async () => {
+  const run = async (showsMap = false) => {
     const pipeline = Object.fromEntries(Object.entries(chosen).map(([kind, entry]) => [kind, { name: entry.plugin.value, params: entry.form.value() }]));
     const job = await send("POST", `${state.path}/jobs`, { pipeline, view: view.value });
-    await watch(job);
+    await watch(job, showsMap);
   };
-  state.addEventListener("compute", () => start.disabled || attempt(run));
+  // A correction has one aim, the new map.
+  state.addEventListener("compute", () => start.disabled || attempt(() => run(true)));
   state.addEventListener("changed", () => {
     const [newest] = state.jobs;
     if (!newest || current.children.length) return;
-    if (newest.state === "queued" || newest.state === "running") attempt(async () => watch(await get(`/v1/jobs/${newest.id}`)));
+    if (newest.state === "queued" || newest.state === "running") attempt(async () => watch(await get(`/v1/jobs/${newest.id}`), false));
     else attempt(async () => show(await get(`/v1/jobs/${newest.id}`)));
   });
   if (state.jobs[0]) state.dispatchEvent(new Event("changed"));

@@ -25,7 +25,7 @@ export function mapPanel(look, points, catheters, title) {
     try {
       scene = new MapScene(place, look, points, catheters);
     } catch (error) {
-      place.append(element("p", { class: "notice problem" }, `This browser cannot show the map in 3D (${error instanceof Error ? error.message : error}). The pictures below show it.`));
+      place.append(element("p", { class: "notice problem" }, `This browser cannot draw in 3D: ${error instanceof Error ? error.message : error} The map from six sides is among the downloads; the views over fluoroscopy show outline and sites. Turn on WebGL in the settings of the browser.`));
       return;
     }
     panel.scene = scene;

@@ -69,6 +69,7 @@ export class Surface {
     geometry.setIndex(map.faces.flat());
     geometry.computeVertexNormals();
     geometry.computeBoundingSphere();
+    geometry.computeBoundingBox();
     geometry.setAttribute("known", new THREE.Float32BufferAttribute(map.covered.map(Number), 1));
     geometry.setAttribute("time", new THREE.Float32BufferAttribute(extended(map.faces, map.lat_ms), 1));
     this.uniforms = {
@@ -93,6 +94,14 @@ export class Surface {
     scale.colours.slice(0, MOST_BANDS).forEach((rgb, k) => this.uniforms.colours.value[k]?.set((rgb[0] ?? 0) / 255, (rgb[1] ?? 0) / 255, (rgb[2] ?? 0) / 255));
     [this.uniforms.start.value, this.uniforms.step_.value, this.uniforms.bands.value] = [scale.start, scale.step, scale.bands];
     this.uniforms.until.value = untilMs ?? EVER;
+  }
+
+  /** Draw the faces of one side only. @param {THREE.Side} side */
+  show(side) {
+    const material = /** @type {THREE.Material} */ (this.mesh.material);
+    if (material.side === side) return;
+    material.side = side;
+    material.needsUpdate = true;
   }
 
   close() {

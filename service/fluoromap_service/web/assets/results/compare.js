@@ -1,7 +1,7 @@
 /** Two jobs of a study compared: sites moved by how much, times, and the difference of the maps. */
 import { get } from "../shared/api.js";
 import { attempt, button, element, field, select } from "../shared/elements.js";
-import { number } from "../shared/words.js";
+import { jobLabel, number } from "../shared/words.js";
 import { tipDistance } from "./tip-distance.js";
 
 /** @typedef {import("../shared/types.js").Job} Job */
@@ -22,14 +22,14 @@ function mapDifference(a, b) {
   return count ? Math.sqrt(sum / count) : null;
 }
 
-/** @param {Job} job */
-const label = (job) => new Date(job.created).toLocaleString();
+/** @param {ChamberMap} map */
+const earliest = (map) => map.earliest[0]?.site ?? "none";
 
 /** @param {Job} job @param {Job[]} others @param {string} mapping Name of the mapping catheter. */
 export function comparison(job, others, mapping) {
   const choices = others.filter((each) => each.id !== job.id && each.state === "succeeded");
-  if (!choices.length) return element("p", { class: "soft" }, "After a second computation you can compare both here.");
-  const other = select(choices.map((each) => [each.id, label(each)]), choices[0]?.id ?? "");
+  if (!choices.length) return element("p", { class: "soft" }, "After a second computation you can compare both here: after a correction, or with the activation times of another rhythm.");
+  const other = select(choices.map((each) => [each.id, jobLabel(each)]), choices[0]?.id ?? "");
   const place = element("div", { "aria-live": "polite" });
   const compare = async () => {
     const [now, before, mapNow, mapBefore] = await Promise.all([job.id, other.value].flatMap((id) => [get(`/v1/jobs/${id}/points`)]).concat([job.id, other.value].map((id) => get(`/v1/jobs/${id}/map`).catch(() => null))));
@@ -39,13 +39,15 @@ export function comparison(job, others, mapping) {
       const former = /** @type {any} */ (old.get(tip.site));
       const moved = former ? tipDistance(former, tip) : null;
       const shift = former && tip.lat_ms !== null && former.lat_ms !== null ? tip.lat_ms - former.lat_ms : null;
-      return element("tr", {}, element("td", {}, tip.site), element("td", { class: "figure" }, number(moved?.mm, 2)), element("td", { class: "figure" }, number(shift, 1)), element("td", {}, `${former?.grade ?? "–"} → ${tip.grade}`));
+      return element("tr", {}, element("td", {}, tip.site), element("td", { class: "figure" }, number(moved?.mm, 2)),
+        element("td", { class: "figure" }, number(shift, 1)), element("td", { class: "figure" }, `${number(former?.lat_ms, 0)} → ${number(tip.lat_ms, 0)}`), element("td", {}, `${former?.grade ?? "–"} → ${tip.grade}`));
     });
     const difference = mapNow && mapBefore ? mapDifference(mapNow, mapBefore) : null;
     place.replaceChildren(
       element("p", {}, difference === null ? "One of the computations has no map." : `The maps differ by ${number(difference, 1)} ms (root mean square over the covered wall).`),
-      element("table", {}, element("thead", {}, element("tr", {}, ...["Site", "Moved, mm", "Time changed, ms", "Grade"].map((title) => element("th", { scope: "col" }, title)))), element("tbody", {}, ...rows)));
+      mapNow && mapBefore ? element("p", {}, `Earliest site: ${earliest(mapBefore)} before, ${earliest(mapNow)} now. Whole activation: ${number(mapBefore.total_activation_time_ms, 0)} ms before, ${number(mapNow.total_activation_time_ms, 0)} ms now.`) : "",
+      element("div", { class: "wide", tabIndex: 0, role: "region", "aria-label": "Sites of both computations" }, element("table", { class: "comparison" }, element("thead", {}, element("tr", {}, ...["Site", "Moved, mm", "Time changed, ms", "Times, ms", "Grade"].map((title) => element("th", { scope: "col" }, title)))), element("tbody", {}, ...rows))));
   };
   return element("section", {}, element("h2", {}, "Compare with another computation"),
-    element("div", { class: "fields" }, field("Computation of", other), button("Compare", () => attempt(compare))), place);
+    element("div", { class: "fields" }, field("Compare with the computation of", other), button("Compare", () => attempt(compare))), place);
 }

@@ -7,9 +7,12 @@ const FILES = [
   ["mesh.ply", "Mesh, PLY"], ["mesh.stl", "Mesh, STL"], ["mesh.glb", "Mesh, GLB"], ["mesh.vtp", "Mesh, VTP"], ["mesh.mat", "Mesh, OpenEP"], ["mesh.csv", "Mesh, CSV"], ["map.png", "Map from six sides, PNG"],
 ];
 
-/** @param {import("../shared/types.js").Job} job */
-export function downloads(job) {
-  const links = FILES.map(([name, title]) =>
+/** Files that a job without a map lacks. */
+const OF_MAP = /^(mesh|map)\./;
+
+/** @param {import("../shared/types.js").Job} job @param {boolean} hasMap */
+export function downloads(job, hasMap) {
+  const links = FILES.filter(([name]) => hasMap || !OF_MAP.test(name)).map(([name, title]) =>
     element("li", {}, element("a", { href: `/v1/jobs/${job.id}/${name}`, ...(name === "report.html" ? { target: "_blank" } : { download: "" }) }, title)));
   return element("section", {}, element("h2", {}, "Downloads"), element("ul", { class: "row downloads" }, ...links));
 }

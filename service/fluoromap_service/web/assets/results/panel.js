@@ -1,7 +1,7 @@
 /** The fourth step: the map, the sites, the pictures, the downloads, and the comparison of two jobs. */
 import { get } from "../shared/api.js";
 import { attempt, element, field, select } from "../shared/elements.js";
-import { warningWords } from "../shared/words.js";
+import { jobLabel, warningWords } from "../shared/words.js";
 import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
 import { resultSites } from "./sites-table.js";
@@ -13,17 +13,21 @@ import { resultSites } from "./sites-table.js";
 export function resultsPanel(state, correct) {
   const place = element("div", {});
   const choice = select([], "", {});
-  const choiceField = field("Computation of", choice);
+  const choiceField = field("Show the computation of", choice);
   let shown = "";
+  /** The newest job when a person last looked: only a newer one replaces what a person chose. */
+  let newestBefore = "";
   let forget = () => {};
+  /** Adds what a job gives only at its end. @type {((job: Job) => Promise<void>)|null} */
+  let complete = null;
 
   /** @param {Job} job */
   const show = async (job) => {
+    shown = job.id;
     // The library of 3D is large: the page is ready before it arrives.
-    const [{ mapPanel }, { MapLook }, { FusedPanel }, points, map, overlays, reasons] = await Promise.all([
-      import("../map/panel.js"), import("../map/look.js"), import("../fused/panel.js"),
-      get(`/v1/jobs/${job.id}/points`), get(`/v1/jobs/${job.id}/map`).catch((error) => error),
-      get(`/v1/jobs/${job.id}/overlays`).catch(() => ({ overlays: [] })), get("/v1/reasons"),
+    const [{ mapPanel }, { MapLook }, points, map, reasons] = await Promise.all([
+      import("../map/panel.js"), import("../map/look.js"),
+      get(`/v1/jobs/${job.id}/points`), get(`/v1/jobs/${job.id}/map`).catch((error) => error), get("/v1/reasons"),
     ]);
     const sentences = new Map(reasons.map((/** @type {any} */ each) => [each.code, each.sentence]));
     const tips = points.points.filter((/** @type {any} */ each) => each.catheter === state.study.mapping && each.electrode === 1);
@@ -33,57 +37,72 @@ export function resultsPanel(state, correct) {
     const markRow = () => {
       for (const row of table.querySelectorAll("tr[data-site]")) row.classList.toggle("chosen", row.dataset.site === state.chosen);
     };
+    const files = element("div", {}, downloads(job, hasMap), comparison(job, state.jobs, state.study.mapping));
+    complete = null;
     forget();
     if (!tips.some((/** @type {any} */ tip) => tip.site === state.chosen)) state.chosen = earliest;
     if (!hasMap) {
       state.addEventListener("chosen", markRow);
       forget = () => state.removeEventListener("chosen", markRow);
-      place.replaceChildren(element("p", { class: "notice problem" }, map.message), table, downloads(job), comparison(job, state.jobs, state.study.mapping));
+      place.replaceChildren(element("p", { class: "notice problem" }, map.message), table, files);
       place.dataset.job = job.id;
       return markRow();
     }
     const look = new MapLook(map);
     const catheters = state.study.catheters.map((each) => each.name);
     const chamber = mapPanel(look, points.points, catheters, `${state.study.label}: ${map.simulated ? "simulated data, " : ""}for research`);
-    const fused = new FusedPanel(state, job.id, overlays.overlays, look, tips);
+    const overFluoroscopy = element("div", {}, element("p", { class: "card" }, "The map over fluoroscopy follows at the end of the computation."));
+    /** @type {import("../fused/panel.js").FusedPanel|null} */
+    let fused = null;
     const choose = () => {
       chamber.scene?.choose(state.chosen);
       markRow();
-      return fused.follow(state.chosen);
+      return fused?.follow(state.chosen);
+    };
+    complete = async (ended) => {
+      complete = null;
+      const [{ FusedPanel }, { overlays }] = await Promise.all([import("../fused/panel.js"), get(`/v1/jobs/${ended.id}/overlays`).catch(() => ({ overlays: [] }))]);
+      if (shown !== ended.id) return;
+      fused = new FusedPanel(state, ended.id, overlays, look, tips);
+      overFluoroscopy.replaceChildren(fused.element);
+      await fused.follow(state.chosen);
     };
     state.addEventListener("chosen", choose);
     forget = () => {
       state.removeEventListener("chosen", choose);
       chamber.scene?.close();
-      fused.close();
+      fused?.close();
     };
     chamber.addEventListener("made", () => {
       chamber.scene.addEventListener("chosen", (/** @type {CustomEvent} */ event) => state.choose(event.detail));
       choose();
     });
     const warnings = map.warnings.map((/** @type {string} */ code) => element("li", {}, sentences.get(code) ?? warningWords(code)));
-    place.replaceChildren(chamber, warnings.length ? element("ul", { class: "notice problem" }, ...warnings) : "",
-      fused.element, table, downloads(job), comparison(job, state.jobs, state.study.mapping));
+    place.replaceChildren(chamber, warnings.length ? element("ul", { class: "notice problem" }, ...warnings) : "", overFluoroscopy, table, files);
     place.dataset.job = job.id;
-    return choose();
+    choose();
+    if (job.state === "succeeded") await complete(job);
   };
 
   const fill = () => {
-    const jobs = state.jobs.filter((job) => job.state === "succeeded");
-    choice.replaceChildren(...select(jobs.map((job) => [job.id, new Date(job.created).toLocaleString()]), jobs[0]?.id ?? "").children);
-    const newest = jobs[0];
+    const jobs = state.jobs.filter((job) => job.state === "succeeded" || job.id === state.mapped?.id);
+    const [newest] = jobs;
     choiceField.hidden = !newest;
     if (!newest) return place.replaceChildren(element("p", { class: "card" }, "There is no map yet. Start the computation in the third step."));
-    if (newest.id === shown) return undefined;
-    shown = newest.id;
-    choice.value = newest.id;
-    return attempt(() => show(newest));
+    choice.replaceChildren(...select(jobs.map((job) => [job.id, jobLabel(job)]), newest.id).children);
+    if (newest.id !== newestBefore) {
+      newestBefore = newest.id;
+      return attempt(() => show(newest));
+    }
+    choice.value = shown;
+    return newest.id === shown && newest.state === "succeeded" && complete ? attempt(() => complete?.(newest) ?? Promise.resolve()) : undefined;
   };
   choice.addEventListener("change", () => {
     const job = state.jobs.find((each) => each.id === choice.value);
     if (job) attempt(() => show(job));
   });
   state.addEventListener("changed", fill);
+  state.addEventListener("mapped", fill);
   fill();
   return element("div", {}, choiceField, place);
 }

@@ -62,6 +62,9 @@ export function announce(message, kind = "done") {
   place.replaceChildren(element("p", { class: `notice ${kind}` }, text, " ", close));
 }
 
+/** Take the message away: it belongs to a step that nobody sees any more. */
+export const clearMessage = () => byId("message").replaceChildren();
+
 /** Do something that may fail, and show the failure. @template T @param {() => Promise<T>} act @returns {Promise<T|undefined>} */
 export async function attempt(act) {
   try {

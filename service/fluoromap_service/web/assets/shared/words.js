@@ -79,6 +79,9 @@ export function direction(gantry) {
 /** @param {number|null|undefined} value @param {number} digits */
 export const number = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "−"));
 
+/** @param {import("./types.js").Job} job */
+export const jobLabel = (job) => new Date(job.created).toLocaleString();
+
 /** @param {string|null} time */
 export function shortTime(time) {
   return time === null ? "time unknown" : new Date(time).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });

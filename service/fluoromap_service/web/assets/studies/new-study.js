@@ -40,7 +40,7 @@ function catheterRow(types, name, type) {
 /** @param {any[]} types Answer of `GET /v1/catheter-types`. */
 export function newStudyForm(types) {
   const label = element("input", { required: true, maxLength: 200, id: "label" });
-  const chamber = element("input", { maxLength: 100, placeholder: "right ventricle" });
+  const chamber = element("input", { maxLength: 100 });
   const rows = element("div", {}, ...DEFAULTS.map(([name, type]) => catheterRow(types, name ?? "", type ?? TYPED_IN)));
   const add = button("Add a catheter", () => rows.append(catheterRow(types, "", TYPED_IN)));
   const create = async () => {
@@ -51,7 +51,7 @@ export function newStudyForm(types) {
   return element(
     "form",
     { onsubmit: (/** @type {Event} */ event) => { event.preventDefault(); attempt(create); } },
-    element("div", { class: "fields" }, field("Name of the study", label, "No patient name."), field("Chamber", chamber)),
+    element("div", { class: "fields" }, field("Name of the study", label, "No patient name."), field("Chamber", chamber, "For example right ventricle.")),
     element("p", { class: "soft" }, "The catheter named reference stays where it is; all positions count from it. The catheter named mapping is the moving tip."),
     rows,
     element("div", { class: "row" }, add, element("button", { type: "submit", class: "main" }, "Create the study")),

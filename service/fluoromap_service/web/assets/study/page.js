@@ -9,8 +9,8 @@ import { tabs } from "./tabs.js";
 import { viewerPanel } from "../viewer/panel.js";
 
 /**
- * The study as its panels share it. `changed` fires after each change of runs or sites, `job` when a job has ended, `compute`
- * when a person asks for a new job, `chosen` when a person chooses another site.
+ * The study as its panels share it. `changed` fires after each change of runs or sites, `mapped` when a running job has its map,
+ * `job` when a job has ended, `compute` when a person asks for a new job, `chosen` when a person chooses another site.
  */
 export class StudyState extends EventTarget {
   /** @param {import("../shared/types.js").Study} study */
@@ -24,6 +24,8 @@ export class StudyState extends EventTarget {
     this.sites = [];
     /** @type {import("../shared/types.js").Job[]} */
     this.jobs = [];
+    /** @type {import("../shared/types.js").Job|null} The running job that has its map already. */
+    this.mapped = null;
     /** @type {string|null} The site that a person looks at. */
     this.chosen = null;
   }
@@ -39,6 +41,13 @@ export class StudyState extends EventTarget {
   /** The newest job with results. */
   get finished() {
     return this.jobs.find((job) => job.state === "succeeded") ?? null;
+  }
+
+  /** Take the map of a job that still runs. @param {import("../shared/types.js").Job} job */
+  takeMap(job) {
+    this.mapped = job;
+    this.jobs = [job, ...this.jobs.filter((each) => each.id !== job.id)];
+    this.dispatchEvent(new Event("mapped"));
   }
 
   /** @param {string|null} site */

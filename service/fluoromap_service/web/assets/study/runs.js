@@ -10,9 +10,10 @@ import { uploadZone } from "./uploads.js";
 /** Say in words what a computation still lacks. @param {StudyState} state */
 function sentences(state) {
   if (!state.runs.length) return ["This study has no runs yet. Drop its DICOM files and the table of its activation times into the box.",
-    "To try it without data, write a simulated study with ./run fluoromap simulate study and drop that folder."];
+    "To try it without data, type ./run fluoromap simulate study in a second terminal, in the folder of the program. Then drop the new folder study into the box."];
   const ready = state.sites.filter((site) => site.ready && site.site !== null).length;
-  const lines = [`${ready} of ${state.sites.length} sites are ready for the computation.`];
+  const lines = [state.sites.length ? `${ready} of ${state.sites.length} sites are ready for the computation.`
+    : "No runs are paired to a site yet. Complete their angles, or add a site and choose its two runs."];
   if (state.sites.length && state.sites.every((site) => site.lat_ms === null)) {
     lines.push("The activation times are missing. Drop their table into the box, or type names and times below.");
   }

@@ -1,5 +1,5 @@
 /** Tabs by the pattern of the WAI-ARIA authoring practices; a panel is made when it is first shown. */
-import { element } from "../shared/elements.js";
+import { clearMessage, element } from "../shared/elements.js";
 
 /**
  * @param {HTMLElement} place
@@ -20,6 +20,7 @@ export function tabs(place, panels) {
 
   /** @param {string} name */
   function show(name) {
+    if (entries.get(name)?.panel.hidden) clearMessage();
     for (const [each, entry] of entries) {
       const chosen = each === name;
       entry.tab.setAttribute("aria-selected", String(chosen));

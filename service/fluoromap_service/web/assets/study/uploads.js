@@ -1,9 +1,12 @@
 /** Drag and drop of DICOM files and tables, with progress for each file. */
 import { Problem, upload } from "../shared/api.js";
 import { element } from "../shared/elements.js";
+import { listed } from "../shared/words.js";
 
 const AT_ONCE = 2;
 const TABLE = /\.(csv|tsv|txt)$/i;
+/** Files that folders hold besides runs and tables. */
+const OTHER = /(^\.|^desktop\.ini$|^dicomdir$|\.(json|toml|md|html|pdf|png|jpe?g|gif|xml|zip)$)/i;
 
 /** Return all files of a drop, folders included. @param {DataTransfer} transfer @returns {Promise<File[]>} */
 async function droppedFiles(transfer) {
@@ -51,8 +54,10 @@ async function sendFile(path, file, onProgress) {
 export function uploadZone(path, onChange) {
   const rows = element("ul", { class: "cards", "aria-label": "Files", "aria-live": "polite" });
   const input = element("input", { type: "file", multiple: true, id: "files", "aria-label": "Choose files" });
+  const folder = element("input", { type: "file", webkitdirectory: true, id: "folder", "aria-label": "Choose a folder" });
   const zone = element("div", { class: "drop" },
-    element("p", {}, element("strong", {}, "Drop DICOM files or folders here"), ", and a table of activation times (CSV: site,lat_ms)."), input);
+    element("p", {}, element("strong", {}, "Drop DICOM files or folders here"), ", and a table of activation times (CSV: site,lat_ms)."),
+    element("div", { class: "row choices" }, element("label", { class: "row" }, "Files", input), element("label", { class: "row" }, "A folder", folder)));
 
   /** @param {File} file */
   const send = async (file) => {
@@ -74,8 +79,11 @@ export function uploadZone(path, onChange) {
     };
   };
 
-  /** @param {File[]} files */
-  const sendAll = async (files) => {
+  /** @param {File[]} all */
+  const sendAll = async (all) => {
+    const files = all.filter((file) => !OTHER.test(file.name));
+    const others = all.filter((file) => OTHER.test(file.name)).map((file) => file.name);
+    if (others.length) rows.append(element("li", { class: "card" }, element("strong", {}, listed(others)), " ", element("span", { class: "soft" }, "left out: no run and no table")));
     const isTable = (/** @type {File} */ file) => TABLE.test(file.name);
     // Tables go last: then the answer says truly which of their sites have no runs.
     for (const some of [files.filter((file) => !isTable(file)), files.filter(isTable)]) {
@@ -89,7 +97,7 @@ export function uploadZone(path, onChange) {
     }
   };
 
-  input.addEventListener("change", () => { sendAll([...input.files]); input.value = ""; });
+  for (const each of [input, folder]) each.addEventListener("change", () => { sendAll([...each.files]); each.value = ""; });
   for (const name of ["dragenter", "dragover"]) zone.addEventListener(name, (/** @type {DragEvent} */ event) => { event.preventDefault(); zone.classList.add("over"); });
   zone.addEventListener("dragleave", () => zone.classList.remove("over"));
   zone.addEventListener("drop", async (/** @type {DragEvent} */ event) => {

@@ -2,15 +2,20 @@
 import { get } from "../shared/api.js";
 import { catheterColour } from "../shared/catheter-colours.js";
 import { attempt, button, element, field, select } from "../shared/elements.js";
-import { control, KEYS } from "./controls.js";
+import { KEYS, listenToKeys } from "./keys.js";
+import { Pen } from "./pen.js";
+import { listenToPointer } from "./pointer.js";
 import { View } from "./view.js";
 
 /** @typedef {import("../study/page.js").StudyState} StudyState */
 
+/** @type {[import("./pen.js").Tool, string][]} */
+const TOOLS = [["edit", "Move electrodes"], ["add", "Add an electrode"], ["mark", "Mark from the tip"], ["contrast", "Contrast"], ["pan", "Move picture"]];
+
 /** @param {StudyState} state @param {() => void} compute */
 export function viewerPanel(state, compute) {
   const names = () => state.study.catheters.map((each) => each.name);
-  const pen = { catheter: state.study.mapping, tool: "edit", next: 1 };
+  const pen = new Pen(state.study);
   /** @type {View[]} */
   let views = [];
   let active = 0;
@@ -19,33 +24,23 @@ export function viewerPanel(state, compute) {
   const site = select([], "", { "aria-label": "Site" });
   const catheter = select([], "", {});
   const legend = element("p", { class: "row" });
-  const tools = [["edit", "Move electrodes"], ["mark", "Mark from the tip"], ["contrast", "Contrast"], ["pan", "Move picture"]].map(([name, label]) =>
-    button(label ?? "", () => setTool(name ?? ""), { "aria-pressed": String(name === pen.tool), "data-tool": name }));
+  const tools = TOOLS.map(([name, label]) => button(label, () => pen.take({ tool: name }), { "data-tool": name }));
 
-  const showHint = () => {
-    const count = state.study.catheters.find((each) => each.name === pen.catheter)?.electrodes ?? 0;
+  const showPen = () => {
+    const { catheter: name, count, next, tool } = pen;
+    for (const each of tools) each.setAttribute("aria-pressed", String(each.dataset["tool"] === tool));
+    catheter.value = name;
     hint.textContent = {
-      edit: "Drag an electrode to move it. Circle: found by the service. Square: set by hand. A change counts from this frame on; the next computation tracks the run again from here.",
-      mark: `Click electrode ${pen.next} of ${count} of the catheter "${pen.catheter}"${pen.next === 1 ? ", which is its tip" : ""}. Esc ends.`,
+      edit: "Drag an electrode to move it; click it and press Delete to remove it. Circle: found by the service. Square: set by hand. A change counts from this frame on: the next computation tracks the run again from here.",
+      add: `Click the place of an electrode that the catheter "${name}" lacks in this frame. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
+      mark: `Click electrode ${next} of ${count} of the catheter "${name}"${next === 1 ? ", which is its tip" : ""}. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
       contrast: "Drag left and right for the width, up and down for the centre of the grey levels.",
       pan: "Drag to move the picture; the wheel zooms.",
-    }[pen.tool] ?? "";
+    }[tool];
   };
-  /** @param {string} tool */
-  const setTool = (tool) => {
-    pen.tool = tool;
-    pen.next = 1;
-    for (const each of tools) each.setAttribute("aria-pressed", String(each.dataset["tool"] === tool));
-    showHint();
-  };
-  /** @param {"mark"|"end"|"marked"} act */
-  const onPen = (act) => {
-    const count = state.study.catheters.find((each) => each.name === pen.catheter)?.electrodes ?? 0;
-    if (act !== "marked") return setTool(act === "mark" ? "mark" : "edit");
-    pen.next += 1;
-    if (pen.next > count) setTool("edit");
-    showHint();
-  };
+  const trackAgain = () => attempt(async () => {
+    if (await current()?.confirm()) compute();
+  });
 
   /** Draw the line of the chosen electrode in the other view. @param {View} from @param {View} other @param {any} electrode */
   const showLine = async (from, other, electrode) => {
@@ -75,7 +70,8 @@ export function viewerPanel(state, compute) {
       return run ? [new View(index === 0 ? "a" : "b", state, run, pen)] : [];
     });
     views.forEach((view, index) => {
-      control(view, onPen);
+      listenToPointer(view);
+      listenToKeys(view, trackAgain);
       view.canvas.addEventListener("focus", () => (active = index));
       const other = views[1 - index];
       if (other) view.addEventListener("chosen", (event) => showLine(view, other, /** @type {CustomEvent} */ (event).detail));
@@ -107,24 +103,29 @@ export function viewerPanel(state, compute) {
   };
 
   site.addEventListener("change", open);
-  catheter.addEventListener("change", () => { pen.catheter = catheter.value; pen.next = 1; showHint(); });
+  catheter.addEventListener("change", () => pen.take({ catheter: catheter.value }));
+  pen.addEventListener("changed", showPen);
   state.addEventListener("changed", fill);
   state.addEventListener("job", () => views.forEach((view) => attempt(() => view.marks.load())));
   state.addEventListener("chosen", () => {
     const index = state.sites.findIndex((each) => each.site !== null && each.site === state.chosen);
     if (index >= 0 && String(index) !== site.value) { site.value = String(index); open(); }
   });
-  fill();
-  showHint();
   const current = () => views[active];
+  fill();
+  showPen();
   const keys = element("dl", { class: "keys" }, ...KEYS.flatMap(([key, act]) => [element("dt", {}, key), element("dd", {}, act)]));
-  const help = element("details", {}, element("summary", {}, "Keys and buttons"), keys);
+  const help = element("details", {}, element("summary", {}, "Keys: everything works without a mouse"),
+    element("p", {}, "Go to a picture with Tab. Choose an electrode with N, move it with Shift and the arrows, then press T to compute with it."),
+    element("p", { class: "soft" }, "After a computation, a frame with electrodes set by hand shows only their catheters. The other frames show all."), keys);
   place.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => { if (event.key.toLowerCase() === "h") help.open = !help.open; });
   return element("div", {},
     element("div", { class: "fields" }, field("Site", site), field("Catheter to mark", catheter),
       element("div", { class: "row", role: "group", "aria-label": "Tool" }, ...tools),
+      button("Delete", () => current()?.removeChosen(), { title: "Delete the chosen electrode: click it first" }),
       button("Undo", () => current()?.step(-1)), button("Redo", () => current()?.step(1)),
       button("Automatic again", () => current()?.resetFrame(), { title: "Forget the electrodes set by hand in this frame" }),
+      button("Track again from here", trackAgain, { title: "The catheter is right in this frame: follow it through the run from here, and compute the map" }),
       button("Compute the map again", compute, { class: "main" })),
     legend, hint, place, help);
 }
