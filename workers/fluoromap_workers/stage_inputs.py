@@ -44,7 +44,7 @@ from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, load_later, stage_of, stages_of
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode, form_of
-from fluoromap_service.store.models import Base, StageRow
+from fluoromap_service.store.models import Json, StageRow
 from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
 from fluoromap_workers.point_rows import point_rows
 
@@ -71,8 +71,8 @@ class Work:
         Computes the result.
     refused : callable
         Makes the result that says why the plugin refused.
-    rows : callable, optional
-        Makes the database rows that belong to a result.
+    points : callable, optional
+        Makes the columns of the points that belong to a result.
     plugin : str
         Hash of the plugin with its version and parameters: of everything that all partial results depend on.
     """
@@ -81,7 +81,7 @@ class Work:
     kind: type[Any]
     compute: Callable[[Context], Any]
     refused: Callable[[Refusal], Any]
-    rows: Callable[[Any], Iterable[Base]] | None = None
+    points: Callable[[Any], Iterable[Json]] | None = None
     plugin: str = ""
 
 
@@ -233,11 +233,11 @@ def _triangulate(job: StoredJob, study: str) -> Work:
         sites = tuple(RejectedSite(site.site, (refusal.reason,)) for site in matching.sites)
         return Triangulation((), (*matching.rejected, *sites), (str(refusal),))
 
-    def rows(located: Triangulation) -> Iterable[Base]:
+    def points(located: Triangulation) -> Iterable[Json]:
         return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
     key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
-    return Work(key, Triangulation, compute, refused, rows)
+    return Work(key, Triangulation, compute, refused, points)
 
 
 def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:
