@@ -42,9 +42,9 @@ from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_version, plugin_of
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, load_later, stage_of, stages_of
-from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode, form_of
 from fluoromap_service.store.models import Json, StageRow
+from fluoromap_service.study.run_files import checked_run
 from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
 from fluoromap_workers.point_rows import point_rows
 
@@ -151,11 +151,12 @@ def _segment(job: StoredJob, uid: str) -> Work:
     plugin = job.snapshot.segmenter
 
     def compute(context: Context) -> Segmentation:
-        frames = open_frames(files.checked_path(run.sha256), facts)
-        shown = Run(
-            frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames, run.sha256,
-        )  # fmt: skip
-        found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
+        with checked_run(run.sha256, facts) as path:
+            shown = Run(
+                open_frames(path, facts), np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames,
+                run.sha256,
+            )  # fmt: skip
+            found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
         found = _returned(found, Segmentation, plugin.name)
         if len(found.frames) != facts.frames:
             raise ValueError(f"{plugin.name} returned {len(found.frames)} frames, expected {facts.frames}")

@@ -47,7 +47,7 @@ def csv_pieces(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterato
     writer = csv.writer(stream)
     writer.writerow(columns)
     for row in rows:
-        writer.writerow([_plain_text(value) for value in row])
+        writer.writerow([_plain_text(value) if isinstance(value, str) else value for value in row])
         if stream.tell() >= PIECE_CHARACTERS:
             yield stream.getvalue().encode()
             stream.seek(0)
@@ -55,12 +55,12 @@ def csv_pieces(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterato
     yield stream.getvalue().encode()
 
 
-def _plain_text(value: Any) -> Any:
+def _plain_text(value: str) -> str:
     """Return a cell's value that a spreadsheet shows as text.
 
     The spreadsheet never runs it as a formula (OWASP, CSV injection).
     """
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
+    return f"'{value}" if value.startswith(_FORMULA_STARTS) else value
 
 
 def csv_response(text: str, file_name: str) -> Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal
@@ -227,9 +228,9 @@ def _sample(sample: Sample) -> dict[str, Any]:
     }
 
 
-def tracks_csv(entries: Iterable[Entry]) -> list[bytes]:
+def tracks_csv(entries: Iterable[Entry]) -> Iterator[bytes]:
     """Return tracks as CSV in pieces, one line an electrode and frame; the rejected views come last."""
-    return list(csv_pieces(COLUMNS, _lines(entries)))
+    return csv_pieces(COLUMNS, _lines(entries))
 
 
 def _lines(entries: Iterable[Entry]) -> Iterator[list[Any]]:
@@ -249,9 +250,9 @@ def _lines(entries: Iterable[Entry]) -> Iterator[list[Any]]:
         yield [view["site"], view["view"], *[None] * 20, str(Grade.REJECTED), ";".join(view["reasons"])]
 
 
-def _csv_of(job_id: str, origin: Origin, site: str | None = None, view: View | None = None) -> list[bytes]:
+def _csv_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
     with reading() as session:
-        return tracks_csv(read_entries(session, job_of(session, job_id), origin, site, view))
+        return list(tracks_csv(read_entries(session, job_of(session, job_id), origin, site, view)))
 
 
 def _json_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
@@ -287,7 +288,10 @@ def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
     """
 
     def make() -> bytes:
-        return b"".join(_csv_of(job_id, Origin.REFERENCE))
+        content = io.BytesIO()
+        with reading() as session:
+            content.writelines(tracks_csv(read_entries(session, job_of(session, job_id), Origin.REFERENCE)))
+        return content.getvalue()
 
     return kept_rendering(job_id, tracks_table_dependencies(job_id, job_version), make)
 
