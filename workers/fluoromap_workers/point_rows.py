@@ -26,7 +26,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
     for planned in snapshot.sites:
         site = located.get(planned.site)
         reference_doubts = site.doubts_about(snapshot.reference) if site else ()
-        for catheter in snapshot.catalogue().catheters:
+        for catheter in snapshot.catalogue.catheters:
             doubts = tuple(reason for name, reason in notes.get(planned.site, ()) if name == catheter.name)
             for electrode in range(1, catheter.electrodes + 1):
                 point = site.point(catheter.name, electrode) if site else None
@@ -36,7 +36,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
                 else:
                     rows.append(_located(job_id, planned, site, point, doubts, reference_doubts))
     for not_ready in snapshot.rejected:
-        for catheter in snapshot.catalogue().catheters:
+        for catheter in snapshot.catalogue.catheters:
             for electrode in range(1, catheter.electrodes + 1):
                 rows.append(_rejected(job_id, not_ready, catheter.name, electrode, not_ready.reasons))
     return rows

@@ -95,7 +95,7 @@ class StoredJob:
 
     @property
     def catalogue(self) -> Catalogue:
-        return self.snapshot.catalogue()
+        return self.snapshot.catalogue
 
     def stage(self, name: StageName) -> StageRow:
         """Return the job's one stage of that name."""
@@ -145,12 +145,12 @@ def _returned(result: Any, expected: type[Result], name: str) -> Result:
 
 def _segment(job: StoredJob, uid: str) -> Work:
     run, catalogue = job.snapshot.runs[uid], job.catalogue
-    facts = InstanceFacts.from_json(run.facts)
     px_per_mm = run.gantry.px_per_mm
     marks = {frame - 1: _chains(electrodes) for frame, electrodes in run.corrections.items()}
     plugin = job.snapshot.segmenter
 
     def compute(context: Context) -> Segmentation:
+        facts = InstanceFacts.from_json(run.facts)
         with checked_run(run.sha256, facts) as path:
             shown = Run(
                 open_frames(path, facts), np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames,
@@ -163,13 +163,15 @@ def _segment(job: StoredJob, uid: str) -> Work:
         return found
 
     def refused(refusal: Refusal) -> Segmentation:
+        facts = InstanceFacts.from_json(run.facts)
         frames = tuple(FrameChains(frame, (), refusal.reason) for frame in range(facts.frames))
         motion, times_ms = np.zeros(facts.frames), np.array(facts.frame_times_ms)
         return Segmentation(frames, None, (), motion, times_ms, facts.r_wave_frames)
 
+    # After a correction the keys of all runs are compared: the facts count as they are stored, without being decoded.
+    shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
     key = _key(
-        job, "segment", run.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames, px_per_mm,
-        asdict(catalogue), run.model_dump(include={"corrections"}),
+        job, "segment", run.sha256, *shown, px_per_mm, asdict(catalogue), run.model_dump(include={"corrections"})
     )  # fmt: skip
     return Work(key, Segmentation, compute, refused)
 
