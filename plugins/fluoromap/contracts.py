@@ -106,13 +106,19 @@ def grade_of(covariance_mm2: ArrayLike, reasons: Iterable[Reason] = ()) -> Grade
     A up to 2 mm, B up to 4 mm, C beyond (largest semi-axis of the 95 % ellipsoid). Reasons that no covariance contains limit
     the grade: see ``AT_BEST_C`` and ``AT_BEST_B``.
     """
+    return grades_of(np.asarray(covariance_mm2)[None], reasons)[0]
+
+
+def grades_of(covariances_mm2: ArrayLike, reasons: Iterable[Reason] = ()) -> list[Grade]:
+    """Return the grades of covariances (n, 3, 3) that have the same reasons; see :func:`grade_of`."""
+    covariances = np.asarray(covariances_mm2, dtype=np.float64)
     doubts = set(reasons)
     if doubts & AT_BEST_C:
-        return Grade.C
-    largest = float(np.linalg.eigvalsh(np.asarray(covariance_mm2, dtype=np.float64))[-1])
-    semi_axis_mm = float(np.sqrt(CHI2_95_3D * max(largest, 0.0)))
-    grade = Grade.A if semi_axis_mm <= 2.0 else Grade.B if semi_axis_mm <= 4.0 else Grade.C
-    return Grade.B if grade is Grade.A and doubts & AT_BEST_B else grade
+        return [Grade.C] * len(covariances)
+    largest = np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)
+    semi_axes_mm = np.sqrt(CHI2_95_3D * largest).tolist()
+    best = Grade.B if doubts & AT_BEST_B else Grade.A
+    return [best if axis <= 2.0 else Grade.B if axis <= 4.0 else Grade.C for axis in semi_axes_mm]
 
 
 def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: type = np.float64) -> NDArray[Any]:

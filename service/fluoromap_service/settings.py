@@ -90,7 +90,7 @@ class Settings(BaseSettings):
         """The origins of other web pages that may use the API, without any by default."""
         return tuple(self.cors_origins.lower().split())
 
-    @property
+    @functools.cached_property
     def effective_database_url(self) -> str:
         return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'fluoromap.sqlite'}"
 

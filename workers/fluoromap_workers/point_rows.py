@@ -8,25 +8,25 @@ import numpy as np
 
 from fluoromap.contracts import ElectrodePoint, Grade, LocatedSite, Matching, Triangulation, grade_of
 from fluoromap.reasons import Reason
-from fluoromap_service.store.models import Point
+from fluoromap_service.store.models import Json
 from fluoromap_service.study.snapshot import RejectedSiteSnapshot, SiteSnapshot, Snapshot
 
 _UPPER = np.triu_indices(3)
 
 
-def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulation: Triangulation) -> list[Point]:
-    """Return the rows of all points of a job, located or rejected.
+def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulation: Triangulation) -> list[Json]:
+    """Return the columns of all points of a job, located or rejected.
 
     Sites that were not ready and sites that could not be located have rows too, with their reasons.
     """
-    rows: list[Point] = []
+    rows: list[Json] = []
     notes = {site.site: site.notes for site in matching.sites}
     located = {site.site: site for site in triangulation.sites}
     refused = {site.site: site.reasons for site in triangulation.rejected}
     for planned in snapshot.sites:
         site = located.get(planned.site)
         reference_doubts = site.doubts_about(snapshot.reference) if site else ()
-        for catheter in snapshot.catalogue().catheters:
+        for catheter in snapshot.catalogue.catheters:
             doubts = tuple(reason for name, reason in notes.get(planned.site, ()) if name == catheter.name)
             for electrode in range(1, catheter.electrodes + 1):
                 point = site.point(catheter.name, electrode) if site else None
@@ -36,7 +36,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
                 else:
                     rows.append(_located(job_id, planned, site, point, doubts, reference_doubts))
     for not_ready in snapshot.rejected:
-        for catheter in snapshot.catalogue().catheters:
+        for catheter in snapshot.catalogue.catheters:
             for electrode in range(1, catheter.electrodes + 1):
                 rows.append(_rejected(job_id, not_ready, catheter.name, electrode, not_ready.reasons))
     return rows
@@ -45,34 +45,34 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
 def _located(
     job_id: str, planned: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...],
     reference_doubts: tuple[Reason, ...],
-) -> Point:  # fmt: skip
+) -> Json:  # fmt: skip
     relative = point.relative_mm is not None and point.relative_covariance_mm2 is not None
     own = (*point.reasons, *site.reasons, *doubts)
     relative_own = (*own, *reference_doubts) if relative else own
     reasons = dict.fromkeys(relative_own)
     if not relative:
         reasons[Reason.NO_REFERENCE] = None
-    return Point(
-        job_id=job_id,
-        site=planned.site,
-        catheter=point.catheter,
-        electrode=point.electrode,
-        position_mm=point.position_mm.tolist(),
-        covariance_mm2=_six(point.covariance_mm2),
-        relative_mm=point.relative_mm.tolist() if point.relative_mm is not None else None,
-        relative_covariance_mm2=_six(point.relative_covariance_mm2) if relative else None,
-        view_a=planned.view_a,
-        view_b=planned.view_b,
-        frame_a=site.frame_a + 1,
-        frame_b=site.frame_b + 1,
-        residual_a_px=point.residual_px[0],
-        residual_b_px=point.residual_px[1],
-        ray_angle_deg=point.ray_angle_deg,
-        lat_ms=planned.lat_ms,
-        grade=grade_of(point.covariance_mm2, own),
-        relative_grade=grade_of(point.relative_covariance_mm2, relative_own) if relative else Grade.REJECTED,  # type: ignore[arg-type]
-        reasons=[str(reason) for reason in reasons],
-    )
+    return {
+        "job_id": job_id,
+        "site": planned.site,
+        "catheter": point.catheter,
+        "electrode": point.electrode,
+        "position_mm": point.position_mm.tolist(),
+        "covariance_mm2": _six(point.covariance_mm2),
+        "relative_mm": point.relative_mm.tolist() if point.relative_mm is not None else None,
+        "relative_covariance_mm2": _six(point.relative_covariance_mm2) if relative else None,
+        "view_a": planned.view_a,
+        "view_b": planned.view_b,
+        "frame_a": site.frame_a + 1,
+        "frame_b": site.frame_b + 1,
+        "residual_a_px": point.residual_px[0],
+        "residual_b_px": point.residual_px[1],
+        "ray_angle_deg": point.ray_angle_deg,
+        "lat_ms": planned.lat_ms,
+        "grade": grade_of(point.covariance_mm2, own),
+        "relative_grade": grade_of(point.relative_covariance_mm2, relative_own) if relative else Grade.REJECTED,  # type: ignore[arg-type]
+        "reasons": [str(reason) for reason in reasons],
+    }
 
 
 def _rejected(
@@ -81,19 +81,19 @@ def _rejected(
     catheter: str,
     electrode: int,
     reasons: tuple[Reason, ...],
-) -> Point:
-    return Point(
-        job_id=job_id,
-        site=planned.site,
-        catheter=catheter,
-        electrode=electrode,
-        view_a=planned.view_a,
-        view_b=planned.view_b,
-        lat_ms=planned.lat_ms,
-        grade=Grade.REJECTED,
-        relative_grade=Grade.REJECTED,
-        reasons=[str(reason) for reason in reasons],
-    )
+) -> Json:
+    return {
+        "job_id": job_id,
+        "site": planned.site,
+        "catheter": catheter,
+        "electrode": electrode,
+        "view_a": planned.view_a,
+        "view_b": planned.view_b,
+        "lat_ms": planned.lat_ms,
+        "grade": Grade.REJECTED,
+        "relative_grade": Grade.REJECTED,
+        "reasons": [str(reason) for reason in reasons],
+    }
 
 
 def _six(covariance: Any) -> list[float]:

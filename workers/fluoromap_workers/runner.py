@@ -134,7 +134,7 @@ def finish_known(job_id: str) -> None:
             works = [(claim, _prepare(session, claim)) for claim in job_life.ready(session, job_id)]
             stored = _addresses(session, [work.key for _, work in works])
         known = [
-            (claim, _with_rows(work, stored[work.key]))
+            (claim, _with_points(work, stored[work.key]))
             for claim, work in works
             if work.key in stored and files.is_whole(stored[work.key])
         ]
@@ -159,7 +159,7 @@ def _run(held: Claim, connection: Connection, bound: BoundLogger) -> None:
             bound.info("stage_done", reused=True)
             return
     result, content = _computed(held, work, StageContext(connection, held, work.plugin))
-    rows = tuple(work.rows(result)) if work.rows else ()
+    points = tuple(work.points(result)) if work.points else ()
     connection.check()
     sha256 = hashlib.sha256(content).hexdigest()
     with files.incoming() as path:
@@ -167,7 +167,7 @@ def _run(held: Claim, connection: Connection, bound: BoundLogger) -> None:
         with writing() as session:
             files.keep(session, path, sha256=sha256)
             session.merge(StageResult(key=work.key, sha256=sha256))
-            if not job_life.finish(session, held, StoredResult(sha256, rows), reused=False):
+            if not job_life.finish(session, held, StoredResult(sha256, points), reused=False):
                 raise StageStopped("the claim was lost while the result was stored")
     remember(sha256, result, len(content))
     bound.info("stage_done", reused=False)
@@ -207,7 +207,7 @@ def _snapshot(job_id: str) -> Snapshot:
 def _stored(session: Session, work: Work) -> StoredResult | None:
     """Return the result that an earlier job stored for the same work."""
     sha256 = _addresses(session, [work.key]).get(work.key)
-    return None if sha256 is None or not files.is_whole(sha256) else _with_rows(work, sha256)
+    return None if sha256 is None or not files.is_whole(sha256) else _with_points(work, sha256)
 
 
 def _addresses(session: Session, keys: Sequence[str]) -> dict[str, str]:
@@ -216,8 +216,8 @@ def _addresses(session: Session, keys: Sequence[str]) -> dict[str, str]:
     return {row.key: row.sha256 for row in session.execute(query)}
 
 
-def _with_rows(work: Work, sha256: str) -> StoredResult:
-    return StoredResult(sha256, tuple(work.rows(load_file(work.kind, sha256))) if work.rows else ())
+def _with_points(work: Work, sha256: str) -> StoredResult:
+    return StoredResult(sha256, tuple(work.points(load_file(work.kind, sha256))) if work.points else ())
 
 
 def _held_files(session: Session, addresses: Sequence[str]) -> set[str]:

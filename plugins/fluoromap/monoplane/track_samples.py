@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from fluoromap.contracts import Array, BoolArray, Grade, LocatedSite, StudyVariation, Track, grade_of
+from fluoromap.contracts import Array, BoolArray, Grade, LocatedSite, StudyVariation, Track, grades_of
 from fluoromap.geometry import Camera
 from fluoromap.reasons import Reason
 
@@ -163,25 +163,28 @@ def track_samples(
     doubts : tuple of Reason
         Reasons of the electrode's point at its site: they apply to the track too.
     """
-    doubts = (*track.reasons[index], *doubts)
-    source = camera.source_world_mm
-    for frame, located in enumerate(track.located[:, index]):
+    doubts = tuple(dict.fromkeys((*track.reasons[index], *doubts)))
+    positions, covariances = track.positions_mm[:, index], track.covariance_mm2[:, index]
+    if track.relative_covariance_mm2 is not None:
+        same_frame = origins.same_frame[:, None, None]
+        covariances = np.where(same_frame, track.relative_covariance_mm2[:, index], covariances)
+    along, lateral = (sd.tolist() for sd in split_along_ray(covariances, positions - camera.source_world_mm))
+    from_origin = positions - origins.positions_mm
+    baseline = track.baseline_mm[:, index] - origins.positions_mm
+    without_origin = tuple(dict.fromkeys((*doubts, Reason.NO_REFERENCE)))
+    grades, borrowed_grades = (grades_of(covariances, reasons) for reasons in (doubts, without_origin))
+    for frame, located in enumerate(track.located[:, index].tolist()):
         if not located:
             yield _without_position(frame, None, (*doubts, Reason.TRACK_INTERRUPTED))
             continue
         pixel = track.pixels_uv[frame, index]
         if not origins.known[frame]:
-            yield _without_position(frame, pixel, (*doubts, Reason.NO_REFERENCE))
+            yield _without_position(frame, pixel, without_origin)
             continue
-        reasons = (*doubts, Reason.NO_REFERENCE) if origins.borrowed[frame] else doubts
-        position, covariance = track.positions_mm[frame, index], track.covariance_mm2[frame, index]
-        if origins.same_frame[frame] and track.relative_covariance_mm2 is not None:
-            covariance = track.relative_covariance_mm2[frame, index]
-        along, lateral = split_along_ray(covariance, position - source)
-        origin = origins.positions_mm[frame]
+        borrowed = origins.borrowed[frame]
         yield Sample(
-            frame + 1, position - origin, track.baseline_mm[frame, index] - origin, covariance, along, lateral, pixel,
-            grade_of(covariance, reasons), tuple(dict.fromkeys(reasons)),
+            frame + 1, from_origin[frame], baseline[frame], covariances[frame], along[frame], lateral[frame], pixel,
+            borrowed_grades[frame] if borrowed else grades[frame], without_origin if borrowed else doubts,
         )  # fmt: skip
 
 
@@ -189,21 +192,21 @@ def _without_position(frame: int, pixel: Array | None, reasons: tuple[Reason, ..
     return Sample(frame + 1, None, None, None, None, None, pixel, Grade.REJECTED, tuple(dict.fromkeys(reasons)))
 
 
-def split_along_ray(covariance_mm2: Array, ray: Array) -> tuple[float, float]:
+def split_along_ray(covariance_mm2: Array, ray: Array) -> tuple[Array, Array]:
     """Return the standard deviations along a ray and across it, in mm.
 
     Parameters
     ----------
-    covariance_mm2 : (3, 3)
-    ray : (3,)
+    covariance_mm2 : (..., 3, 3)
+    ray : (..., 3)
         Direction of any length.
 
     Returns
     -------
-    tuple of float
+    tuple of ndarray (...)
         Along the ray; and the root mean square of the two directions across it.
     """
-    direction = ray / np.linalg.norm(ray)
-    along = float(direction @ covariance_mm2 @ direction)
-    across = (float(np.trace(covariance_mm2)) - along) / 2
-    return float(np.sqrt(max(along, 0.0))), float(np.sqrt(max(across, 0.0)))
+    direction = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    along = np.einsum("...i,...ij,...j->...", direction, covariance_mm2, direction)
+    across = (np.trace(covariance_mm2, axis1=-2, axis2=-1) - along) / 2
+    return np.sqrt(np.maximum(along, 0.0)), np.sqrt(np.maximum(across, 0.0))

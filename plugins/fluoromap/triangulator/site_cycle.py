@@ -12,7 +12,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, PhasePair, SiteCycle
 from fluoromap.triangulator.estimate import Method
 from fluoromap.triangulator.table_motion import Jump, jump_source
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_of_pairs
 from fluoromap.triangulator.uncertainty import (
     Motion,
     UncertaintyParams,
@@ -61,7 +61,9 @@ class CycleMoments:
 
 def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) -> CycleMoments | None:
     """Return the moments of a site's cycle; None where too few show its electrodes."""
-    moments = [(pair.phase, pixels_in_both_views(pair)) for pair in pairs if pair.phase is not None]
+    timed = [(pair.phase, pair) for pair in pairs if pair.phase is not None]
+    pixels_of = pixels_of_pairs([pair for _, pair in timed])
+    moments = [(phase, pixels) for (phase, _), pixels in zip(timed, pixels_of, strict=True)]
     counts: dict[tuple[str, int], int] = {}
     for shown, times in Counter(pixels.labels for _, pixels in moments).items():
         for label in shown:

@@ -63,6 +63,35 @@ def pixels_in_both_views(pair: PhasePair) -> TwoViewPixels:
     return TwoViewPixels(first, (in_a[0], in_b[0]), (in_a[1], in_b[1]))
 
 
+def pixels_of_pairs(pairs: Sequence[PhasePair]) -> list[TwoViewPixels]:
+    """Return the electrodes that both views show, for each pair as :func:`pixels_in_both_views`.
+
+    Most pairs of a cycle show the same chains; their pixels are gathered together.
+    """
+    alike: dict[tuple[tuple[tuple[str, tuple[int, ...]], ...], ...], list[int]] = {}
+    for index, pair in enumerate(pairs):
+        views = (tuple((chain.catheter, chain.electrodes) for chain in of.chains) for of in (pair.a, pair.b))
+        alike.setdefault(tuple(views), []).append(index)
+    found: dict[int, TwoViewPixels] = {}
+    for members in alike.values():
+        first = pairs[members[0]]
+        labels = _labels(first.a.chains)
+        if labels != _labels(first.b.chains) or len(set(labels)) != len(labels):
+            found |= {index: pixels_in_both_views(pairs[index]) for index in members}
+            continue
+        of_a, of_b = (
+            _stacked([chain for index in members for chain in getattr(pairs[index], view).chains])
+            for view in ("a", "b")
+        )
+        (a, sa), (b, sb) = (
+            [part.reshape(len(members), len(labels), *part.shape[1:]) for part in of] for of in (of_a, of_b)
+        )
+        found |= {
+            index: TwoViewPixels(labels, (a[row], b[row]), (sa[row], sb[row])) for row, index in enumerate(members)
+        }
+    return [found[index] for index in range(len(pairs))]
+
+
 def _labels(chains: Sequence[NamedChain]) -> tuple[tuple[str, int], ...]:
     return tuple(itertools.chain.from_iterable(_labels_of(chain.catheter, chain.electrodes) for chain in chains))
 

@@ -187,7 +187,10 @@ class InstanceFacts:
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields as JSON types, for :meth:`from_json`."""
-        value = dataclasses.asdict(self)
+        # Not by asdict, which copies the time of each frame: a job of many runs would wait for it.
+        value = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        value["frame_times_ms"] = list(self.frame_times_ms)
+        value["pixels"] = dataclasses.asdict(self.pixels)
         value["acquired"] = self.acquired.isoformat() if self.acquired else None
         value["warnings"] = [str(warning) for warning in self.warnings]
         value["table_origin"] = str(self.table_origin) if self.table_origin else None

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydicom.uid import DeflatedExplicitVRLittleEndian
 
 from fluoromap.drawing.png import encode_png
 from fluoromap_service.dicom.codestream import Pixels, decode, largest_codestream
@@ -48,13 +50,18 @@ class DicomFrames:
         """
         if not 0 <= index < len(self):
             raise IndexError(f"the run has {len(self)} frames")
-        with open_dicom(self._path) as file:
+        with self._opened() as file:
             return read_frame(file, self._layout, index)
 
     def __iter__(self) -> Iterator[Pixels]:
-        with open_dicom(self._path) as file:
+        with self._opened() as file:
             for index in range(len(self)):
                 yield read_frame(file, self._layout, index)
+
+    def _opened(self) -> AbstractContextManager[BufferedReader]:
+        # The layout knows the transfer syntax. To read it again takes longer than to read a frame.
+        is_deflated = self._layout.transfer_syntax == DeflatedExplicitVRLittleEndian
+        return open_dicom(self._path) if is_deflated else self._path.open("rb")
 
 
 def open_frames(path: Path, facts: InstanceFacts) -> DicomFrames:

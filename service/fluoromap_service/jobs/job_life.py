@@ -21,10 +21,10 @@ from fluoromap_service.store.clock import CLOCK_TOLERANCE_SECONDS, db_now
 from fluoromap_service.store.models import (
     ENDED_JOB,
     ENDED_STAGE,
-    Base,
     Event,
     Job,
     JobState,
+    Json,
     Point,
     StageRow,
     StageState,
@@ -62,10 +62,10 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class StoredResult:
-    """A stage's result in the store: the hash of its file, and the rows that belong to it."""
+    """A stage's result in the store: the hash of its file, and the columns of the points that belong to it."""
 
     sha256: str
-    rows: tuple[Base, ...] = ()
+    points: tuple[Json, ...] = ()
 
 
 def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
@@ -133,7 +133,7 @@ def finish_ready(session: Session, job_id: str, results: Sequence[tuple[Claim, S
         ],
     )
     for _, result in ended:
-        session.add_all(result.rows)
+        _add_points(session, result)
     _settle(session, job)
 
 
@@ -193,7 +193,7 @@ def finish(session: Session, held: Claim, result: StoredResult, *, reused: bool)
     job = _lock(session, held.job_id)
     if not _end(session, held, StageState.DONE, result=result.sha256, reused=reused, progress=1.0):
         return False
-    session.add_all(result.rows)
+    _add_points(session, result)
     _settle(session, job)
     return True
 
@@ -350,6 +350,12 @@ def _lock(session: Session, job_id: str) -> Job:
     # The snapshot is long and never changes: it stays in the database.
     answer = session.scalars(locking.options(defer(Job.snapshot)), execution_options={"populate_existing": True})
     return answer.one()
+
+
+def _add_points(session: Session, result: StoredResult) -> None:
+    # A study has a thousand points: objects of the mapper would take ten times as long.
+    if result.points:
+        session.execute(insert(Point), result.points)
 
 
 def _end(session: Session, held: Claim, state: StageState, **values: Any) -> bool:

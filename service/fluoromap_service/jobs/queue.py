@@ -16,6 +16,9 @@ from fluoromap_service.store.engine import writing
 RUN_STAGE = "fluoromap.run_stage"
 """Name of the registered task that runs a stage by its id."""
 
+POLL_SECONDS = 0.02
+"""Time between two looks into the folder of messages. A correction waits for it; a look takes 0.1 ms."""
+
 DRAIN_SECONDS = 20
 """How long a worker that must end waits for its running stages before it gives them back."""
 
@@ -32,7 +35,7 @@ def _transport_options(url: str) -> dict[str, Any]:
             "data_folder_in": str(queue / "messages"),
             "data_folder_out": str(queue / "messages"),
             "control_folder": str(queue / "control"),
-            "polling_interval": 0.1,
+            "polling_interval": POLL_SECONDS,
         }
     # Without timeouts a silently dropped network would block a publisher for ever.
     return {"socket_timeout": 5, "socket_connect_timeout": 2}

@@ -13,6 +13,8 @@ from fluoromap_service.store.clock import CLOCK_TOLERANCE_SECONDS, db_now
 from fluoromap_service.store.models import ENDED_STAGE, Job, JobState, StageRow, StageState
 
 LONGEST_REPUBLISH_SECONDS = 60.0
+ANNOUNCED_AT_ONCE = 8
+"""Most announcements after one request or stage. Each of them wakes a worker, which then takes stages until none is ready."""
 AGE_OF_A_STAGE_SECONDS = 5.0
 """Age of a job that counts as one stage less when workers choose the next stage."""
 
@@ -26,7 +28,7 @@ class ReadyStage:
     name: str
 
 
-def take_due(session: Session, limit: int = 32) -> list[int]:
+def take_due(session: Session, limit: int = ANNOUNCED_AT_ONCE) -> list[int]:
     """Return the ready stages that need an announcement, and note that they are announced.
 
     These are stages that were never announced, and stages whose announcement is so old that it may be lost. A worker that hears

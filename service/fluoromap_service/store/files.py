@@ -16,6 +16,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -136,8 +137,7 @@ def is_whole(sha256: str) -> bool:
     """
     path = path_of(sha256)
     try:
-        facts = path.stat()
-        state = facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
+        state = _state_of(path)
         with _checked_lock:
             if _checked.get(sha256) == state:
                 _checked.move_to_end(sha256)
@@ -146,11 +146,20 @@ def is_whole(sha256: str) -> bool:
             return False
     except FileNotFoundError:
         return False
+    _remember_check(sha256, state)
+    return True
+
+
+def _state_of(path: Path) -> tuple[int, ...]:
+    facts = path.stat()
+    return facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
+
+
+def _remember_check(sha256: str, state: tuple[int, ...]) -> None:
     with _checked_lock:
         _checked[sha256] = state
         while len(_checked) > _REMEMBERED_CHECKS:
             _checked.popitem(last=False)
-    return True
 
 
 def checked_path(sha256: str) -> Path:
@@ -164,6 +173,29 @@ def checked_path(sha256: str) -> Path:
     if not is_whole(sha256):
         raise BrokenFile(sha256)
     return path_of(sha256)
+
+
+@contextmanager
+def checked_meanwhile(sha256: str) -> Iterator[Path]:
+    """Give the path of a stored file, whose content is checked while the caller works with it.
+
+    For a caller that reads a small part of a long file, and that no content can harm: a decoder needs :func:`checked_path`.
+
+    Raises
+    ------
+    BrokenFile
+        At the end, when the file is missing or its content has another hash; whatever the caller raised.
+    """
+    with ThreadPoolExecutor(1) as checker:
+        whole = checker.submit(is_whole, sha256)
+        try:
+            yield path_of(sha256)
+        except Exception:
+            if not whole.result():
+                raise BrokenFile(sha256) from None
+            raise
+    if not whole.result():
+        raise BrokenFile(sha256)
 
 
 def read(sha256: str) -> bytes:
@@ -210,6 +242,8 @@ def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
         os.fsync(folder)
     finally:
         os.close(folder)
+    # This process has just read or written the whole content.
+    _remember_check(sha256, _state_of(target))
     if session.get(File, sha256) is None:
         session.add(File(sha256=sha256))
         session.flush()

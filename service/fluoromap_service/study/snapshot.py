@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
@@ -121,8 +122,9 @@ class Snapshot(_Frozen):
     sites: tuple[SiteSnapshot, ...]
     rejected: tuple[RejectedSiteSnapshot, ...]
 
+    @functools.cached_property
     def catalogue(self) -> Catalogue:
-        """Return the catheters with their roles."""
+        """The catheters with their roles."""
         return Catalogue(tuple(each.catheter() for each in self.catheters), self.reference, self.mapping)
 
     @property

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fluoromap.contracts import Array
+from fluoromap.contracts import Array, NamedChain, Observation, PhasePair
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry, ray_angle_deg
 from fluoromap.matching.two_view import fundamental_matrix, signed_epipolar_px, triangulate_linear
 from fluoromap.triangulator.estimate import triangulate_maximum_likelihood
+from fluoromap.triangulator.two_view_pixels import pixels_in_both_views, pixels_of_pairs
 
 
 def camera(primary: float, secondary: float = 0.0) -> Camera:
@@ -94,3 +95,30 @@ def test_the_answer_has_the_least_reprojection_error_nearby() -> None:
     found = triangulate_maximum_likelihood(a, b, *pixels, unit(50), unit(50))
     for _ in range(20):
         assert (cost(found) <= cost(found + rng.normal(0, 0.01, (50, 3)))).all()
+
+
+def test_pairs_gathered_together_show_the_same_pixels_as_each_by_itself() -> None:
+    rng = np.random.default_rng(5)
+
+    def view(frame: int, *chains: tuple[str, tuple[int, ...]]) -> Observation:
+        return Observation(
+            frame, 0.1 * frame, tuple(
+                NamedChain(name, electrodes, rng.normal(size=(len(electrodes), 2)), np.stack([np.eye(2)] * len(electrodes)))
+                for name, electrodes in chains
+            ),
+        )  # fmt: skip
+
+    whole, part, other = ("mapping", (1, 2, 3)), ("mapping", (1, 3)), ("reference", (1, 2))
+    shown = [
+        ((whole, other), (whole, other)),
+        ((whole,), (part,)),
+        ((whole, other), (whole, other)),
+        ((other,), ()),
+        ((), ()),
+    ]
+    pairs = [PhasePair(0.1 * k, view(k, *a), view(k, *b)) for k, (a, b) in enumerate(shown)]
+    for gathered, pair in zip(pixels_of_pairs(pairs), pairs, strict=True):
+        alone = pixels_in_both_views(pair)
+        assert gathered.labels == alone.labels
+        for found, expected in ((gathered.pixels, alone.pixels), (gathered.covariances, alone.covariances)):
+            assert all(np.array_equal(one, same) for one, same in zip(found, expected, strict=True))

@@ -37,7 +37,7 @@ from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrac
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Base, Instance, Point, StageRow, Study, StudyInstance
+from fluoromap_service.store.models import Instance, Json, StageRow, Study, StudyInstance
 from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
     GantrySnapshot,
@@ -99,10 +99,10 @@ class FinishedStudy:
             assert held is not None
             yield session, held
 
-    def end(self, name: str, subject: str | None, result: Any, rows: list[Base] | None = None) -> None:
+    def end(self, name: str, subject: str | None, result: Any, points: list[Json] | None = None) -> None:
         with self.claimed(name, subject) as (session, held):
             sha256 = files.keep_bytes(session, encode(result))
-            stored = job_life.StoredResult(sha256, tuple(rows or ()))
+            stored = job_life.StoredResult(sha256, tuple(points or ()))
             assert job_life.finish(session, held, stored, reused=False)
 
     def fail(self, name: str, subject: str | None = None, code: str = "plugin_failed") -> None:
@@ -136,32 +136,32 @@ class FinishedStudy:
         self.mapped(outcome)
         self.followed()
 
-    def _points(self) -> list[Base]:
-        located = Point(
-            job_id=self.job_id,
-            site="S01",
-            catheter="mapping",
-            electrode=1,
-            position_mm=TIP_MM.tolist(),
-            covariance_mm2=[2.0, 0.0, 0.0, 2.0, 0.0, 2.0],
-            relative_mm=(TIP_MM - REFERENCE_MM).tolist(),
-            relative_covariance_mm2=[0.1, 0.01, 0.0, 0.1, 0.0, 0.1],
-            view_a=self.uids["S01", "a"],
-            view_b=self.uids["S01", "b"],
-            frame_a=DIASTOLE + 1,
-            frame_b=DIASTOLE + 1,
-            residual_a_px=0.25,
-            residual_b_px=0.5,
-            ray_angle_deg=90.0,
-            lat_ms=41.0,
-            grade="C",
-            relative_grade="A",
-            reasons=["identity_by_motion"],
-        )
-        rejected = Point(
-            job_id=self.job_id, site="S03", catheter="mapping", electrode=1, lat_ms=None, grade="rejected",
-            relative_grade="rejected", reasons=["one_view_only", "no_activation_time"],
-        )  # fmt: skip
+    def _points(self) -> list[Json]:
+        located = {
+            "job_id": self.job_id,
+            "site": "S01",
+            "catheter": "mapping",
+            "electrode": 1,
+            "position_mm": TIP_MM.tolist(),
+            "covariance_mm2": [2.0, 0.0, 0.0, 2.0, 0.0, 2.0],
+            "relative_mm": (TIP_MM - REFERENCE_MM).tolist(),
+            "relative_covariance_mm2": [0.1, 0.01, 0.0, 0.1, 0.0, 0.1],
+            "view_a": self.uids["S01", "a"],
+            "view_b": self.uids["S01", "b"],
+            "frame_a": DIASTOLE + 1,
+            "frame_b": DIASTOLE + 1,
+            "residual_a_px": 0.25,
+            "residual_b_px": 0.5,
+            "ray_angle_deg": 90.0,
+            "lat_ms": 41.0,
+            "grade": "C",
+            "relative_grade": "A",
+            "reasons": ["identity_by_motion"],
+        }
+        rejected = {
+            "job_id": self.job_id, "site": "S03", "catheter": "mapping", "electrode": 1, "lat_ms": None, "grade": "rejected",
+            "relative_grade": "rejected", "reasons": ["one_view_only", "no_activation_time"],
+        }  # fmt: skip
         return [located, rejected]
 
 

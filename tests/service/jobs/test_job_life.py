@@ -132,6 +132,15 @@ def test_a_ready_stage_is_announced_once_and_again_only_after_a_while(job: str) 
         assert sorted(turns.take_due(session)) == _stage_ids(job, "segment")
 
 
+def test_few_stages_are_announced_at_once(job: str) -> None:
+    segments = _stage_ids(job, "segment")
+    announced: list[int] = []
+    for _ in segments:
+        with writing() as session:
+            announced += turns.take_due(session, limit=1)
+    assert sorted(announced) == segments
+
+
 def test_a_stage_is_claimed_once(job: str) -> None:
     stage = _stage_ids(job, "segment")[0]
     assert _claim(stage) is not None

@@ -41,6 +41,28 @@ def test_a_damaged_file_is_never_read(data_dir: Path, damage: Callable[[Path], A
             read(sha256)
 
 
+def test_a_file_that_is_checked_meanwhile_counts_only_when_it_is_whole(data_dir: Path) -> None:
+    sha256 = _stored(b"content")
+    with files.checked_meanwhile(sha256) as path:
+        assert path.read_bytes() == b"content"
+    with pytest.raises(ZeroDivisionError), files.checked_meanwhile(sha256):
+        raise ZeroDivisionError
+    files.path_of(sha256).write_bytes(b"damaged content")
+    with pytest.raises(BrokenFile), files.checked_meanwhile(sha256):
+        pass
+    with pytest.raises(BrokenFile), files.checked_meanwhile(sha256):
+        raise ZeroDivisionError("the damage broke the reader")
+
+
+def test_a_process_does_not_read_a_file_again_that_it_stored(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(_: Path) -> str:
+        raise AssertionError("read again")
+
+    sha256 = _stored(b"content")
+    monkeypatch.setattr(files, "sha256_of", never)
+    assert files.is_whole(sha256)
+
+
 def test_storing_the_same_content_mends_a_damaged_file(data_dir: Path) -> None:
     sha256 = _stored(b"content")
     files.path_of(sha256).write_bytes(b"")

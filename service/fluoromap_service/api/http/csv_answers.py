@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from fastapi import Request, Response
 
 MEDIA_TYPE = "text/csv"
+MEDIA_TYPE_UTF8 = "text/csv; charset=utf-8"
+PIECE_CHARACTERS = 1 << 18
 _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 """Beginnings of a formula by OWASP's list, full-width signs too."""
 
@@ -36,25 +38,39 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
     None becomes an empty field. Lines end in CRLF (RFC 4180).
     """
-    stream = io.StringIO()
+    return b"".join(csv_pieces(columns, rows)).decode()
+
+
+def csv_pieces(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[bytes]:
+    """Return the text of :func:`csv_text` as UTF-8, piece by piece."""
+    stream = io.StringIO(newline="")
     writer = csv.writer(stream)
     writer.writerow(columns)
-    writer.writerows([_plain_text(value) for value in row] for row in rows)
-    return stream.getvalue()
+    for row in rows:
+        writer.writerow([_plain_text(value) if isinstance(value, str) else value for value in row])
+        if stream.tell() >= PIECE_CHARACTERS:
+            yield stream.getvalue().encode()
+            stream.seek(0)
+            stream.truncate()
+    yield stream.getvalue().encode()
 
 
-def _plain_text(value: Any) -> Any:
+def _plain_text(value: str) -> str:
     """Return a cell's value that a spreadsheet shows as text.
 
     The spreadsheet never runs it as a formula (OWASP, CSV injection).
     """
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
+    return f"'{value}" if value.startswith(_FORMULA_STARTS) else value
 
 
 def csv_response(text: str, file_name: str) -> Response:
     """Return CSV text as a download."""
-    headers = {"Content-Disposition": f'attachment; filename="{file_name}"', "Vary": "Accept"}
-    return Response(text, media_type="text/csv; charset=utf-8", headers=headers)
+    return Response(text, media_type=MEDIA_TYPE_UTF8, headers=csv_headers(file_name))
+
+
+def csv_headers(file_name: str) -> dict[str, str]:
+    """Return the headers of a CSV download."""
+    return {"Content-Disposition": f'attachment; filename="{file_name}"', "Vary": "Accept"}
 
 
 def csv_entry(description: str, example: str) -> dict[str, Any]:

@@ -83,5 +83,7 @@ def _zipped(files: Iterable[ArchiveFile]) -> Iterator[bytes]:
             entry.compress_type = zipfile.ZIP_DEFLATED if file.compress else zipfile.ZIP_STORED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, file.content, compresslevel=_LEVEL)
+            # A table of a study has 20 MB, and the next file may need as much while it is made.
+            del file
             yield outflow.take()
     yield outflow.take()

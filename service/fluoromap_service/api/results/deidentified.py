@@ -24,7 +24,7 @@ from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.points import points_csv, points_of
 from fluoromap_service.api.results.result_objects import JobObjects, plan_objects
-from fluoromap_service.api.results.tracks import read_tracks, tracks_csv
+from fluoromap_service.api.results.tracks import read_entries, tracks_csv
 from fluoromap_service.dicom.deidentification.pseudonyms import Dates, Pseudonyms
 from fluoromap_service.dicom.deidentification.run_file import deidentify_file
 from fluoromap_service.dicom.objects.job_results import ResultOrigin, RunReference
@@ -212,7 +212,7 @@ def _tables(job_id: str) -> Iterator[tuple[str, str]]:
         with reading() as session:
             job = ended_job_of(session, job_id, "export")
             yield "points.csv", points_csv(points_of(session, job, Origin.REFERENCE))
-            yield "tracks.csv", tracks_csv(read_tracks(session, job, Origin.REFERENCE))
+            yield "tracks.csv", b"".join(tracks_csv(read_entries(session, job, Origin.REFERENCE))).decode()
     except Problem as problem:
         if problem.code != "not_ready":
             raise

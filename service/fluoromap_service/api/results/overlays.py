@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,6 +27,7 @@ from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.renderings import KeptFile, kept_rendering
+from fluoromap_service.study.run_files import checked_run
 
 router = APIRouter(tags=["results"])
 
@@ -69,14 +71,16 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
     look = _marked(fusion, look)
 
     def make() -> bytes:
-        return run_in_pool(Task.DRAW_PICTURE, draw_fusion, _run_path(fusion), fusion, look, moving)
+        with _run_file(fusion) as path:
+            return run_in_pool(Task.DRAW_PICTURE, draw_fusion, path, fusion, look, moving)
 
     return kept_rendering(job_id, overlay_dependencies(fusion, look, moving=moving), make)
 
 
 def jpeg_of(fusion: Fusion, look: Look) -> bytes:
     """Return a new JPEG of an overlay, which nothing keeps."""
-    return run_in_pool(Task.DRAW_PICTURE, draw_fusion_jpeg, _run_path(fusion), fusion, _marked(fusion, look))
+    with _run_file(fusion) as path:
+        return run_in_pool(Task.DRAW_PICTURE, draw_fusion_jpeg, path, fusion, _marked(fusion, look))
 
 
 def _marked(fusion: Fusion, look: Look) -> Look:
@@ -84,11 +88,11 @@ def _marked(fusion: Fusion, look: Look) -> Look:
     return replace(look, simulated=fusion.facts.simulated)
 
 
-def _run_path(fusion: Fusion) -> Path:
+def _run_file(fusion: Fusion) -> AbstractContextManager[Path]:
     if not files.path_of(fusion.sha256).exists():
         detail = "Somebody deleted this run; upload it again and start a new job to get its overlay."
         raise Problem(409, "run_deleted", detail)
-    return files.checked_path(fusion.sha256)
+    return checked_run(fusion.sha256, fusion.facts)
 
 
 @router.get(

@@ -124,7 +124,7 @@ def _values(job_id: str) -> dict[str, Any]:
         guessed = sites_by_row_order(session, job)
         rows = tips(points, snapshot.mapping, chamber)
         electrode_rows = electrodes(points)
-        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE, tip_of=snapshot.mapping)) if tracked else []
+        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE, snapshot.mapping)) if tracked else []
         return {
             "job": read_job(session, job),
             "label": study.label if study else "Mapping study",

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from fluoromap.contracts import Grade, View
 from fluoromap.monoplane.track_samples import Sample
 from fluoromap.reasons import Reason
-from fluoromap_service.api.http.csv_answers import csv_entry, csv_response, csv_text, wants_csv
+from fluoromap_service.api.http.csv_answers import (
+    MEDIA_TYPE_UTF8,
+    PIECE_CHARACTERS,
+    csv_entry,
+    csv_headers,
+    csv_pieces,
+    wants_csv,
+)
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
@@ -130,31 +140,38 @@ ViewQuery = Annotated[Literal["a", "b"] | None, Query(description="Only this vie
 TracksJson = dict[str, Any]
 """An answer as JSON values: pydantic would take too long for thousands of samples."""
 
+Entry = tuple[Literal["tracks", "rejected"], dict[str, Any]]
+"""One entry of the answer as JSON values, and the list to which it belongs."""
 
-def read_tracks(
+
+def read_entries(
     session: Session,
     job: Job,
     origin: Origin,
     site: str | None = None,
     view: View | None = None,
     tip_of: str | None = None,
-) -> TracksJson:
-    """Return the tracks of one site or of all, in the shape of :class:`Tracks`.
+) -> Iterator[Entry]:
+    """Return the entries of :class:`Tracks` for one site or for all, one after the other.
 
-    With ``tip_of``, the name of a catheter, only the tracks of its tip.
+    As values all samples of a study take ten times the memory of their text, so a caller takes one entry at a time. With
+    ``tip_of``, the name of a catheter, only the tracks of its tip.
 
     Raises
     ------
     Problem
         404 for a site that the job does not have; 409 ``not_ready`` while the track of one of the sites is not done.
     """
-    tracks, rejected = [], []
     for found in tracks_of(session, job, origin, site, view, tip_of):
         if isinstance(found, RejectedView):
             codes = list(dict.fromkeys(str(reason) for reason in found.reasons))
-            rejected.append({"site": found.site, "view": found.view, "reasons": codes, "message": found.message})
+            yield (
+                "rejected",
+                {"site": found.site, "view": found.view, "reasons": codes, "message": found.message},
+            )
         else:
-            tracks.append(
+            yield (
+                "tracks",
                 {
                     "site": found.site,
                     "view": found.view,
@@ -162,10 +179,34 @@ def read_tracks(
                     "electrode": found.electrode,
                     "solver": found.solver,
                     "samples": [_sample(sample) for sample in found.samples],
-                }
+                },
             )
-    frame = {"axes": "LPS", "origin": str(origin), "unit": "mm"}
-    return {"frame": frame, "tracks": tracks, "rejected": rejected}
+
+
+def read_tracks(session: Session, job: Job, origin: Origin, tip_of: str) -> TracksJson:
+    """Return the tracks of a catheter's tips in the shape of :class:`Tracks`; the errors are those of :func:`read_entries`."""
+    answer: TracksJson = {"frame": _frame(origin), "tracks": [], "rejected": []}
+    for name, entry in read_entries(session, job, origin, tip_of=tip_of):
+        answer[name].append(entry)
+    return answer
+
+
+def _frame(origin: Origin) -> dict[str, str]:
+    return {"axes": "LPS", "origin": str(origin), "unit": "mm"}
+
+
+def _json_pieces(entries: Iterable[Entry], origin: Origin) -> list[bytes]:
+    """Return the text of :class:`Tracks`, in pieces."""
+    texts: dict[str, list[bytes]] = {"tracks": [], "rejected": []}
+    for name, entry in entries:
+        texts[name].append(msgspec.json.encode(entry))
+    start = b'{"frame":' + msgspec.json.encode(_frame(origin))
+    lists = [[b',"' + name.encode() + b'":[', *_with_commas(of), b"]"] for name, of in texts.items()]
+    return [start, *itertools.chain.from_iterable(lists), b"}"]
+
+
+def _with_commas(texts: Sequence[bytes]) -> list[bytes]:
+    return [piece for text in texts for piece in (b",", text)][1:]
 
 
 def _sample(sample: Sample) -> dict[str, Any]:
@@ -187,13 +228,17 @@ def _sample(sample: Sample) -> dict[str, Any]:
     }
 
 
-def tracks_csv(answer: TracksJson) -> str:
-    """Return tracks as CSV, one line an electrode and frame."""
-    return csv_text(COLUMNS, _lines(answer))
+def tracks_csv(entries: Iterable[Entry]) -> Iterator[bytes]:
+    """Return tracks as CSV in pieces, one line an electrode and frame; the rejected views come last."""
+    return csv_pieces(COLUMNS, _lines(entries))
 
 
-def _lines(answer: TracksJson) -> Iterator[list[Any]]:
-    for track in answer["tracks"]:
+def _lines(entries: Iterable[Entry]) -> Iterator[list[Any]]:
+    rejected = []
+    for name, track in entries:
+        if name == "rejected":
+            rejected.append(track)
+            continue
         for sample in track["samples"]:
             yield [
                 track["site"], track["view"], track["catheter"], track["electrode"], track["solver"], sample["frame"],
@@ -201,14 +246,39 @@ def _lines(answer: TracksJson) -> Iterator[list[Any]]:
                 *(sample["covariance_mm2"] or [None] * 6), *(sample["baseline_mm"] or [None] * 3),
                 sample["u_px"], sample["v_px"], sample["grade"], ";".join(sample["reasons"]),
             ]  # fmt: skip
-    for rejected in answer["rejected"]:
-        reasons = ";".join(rejected["reasons"])
-        yield [rejected["site"], rejected["view"], *[None] * 20, str(Grade.REJECTED), reasons]
+    for view in rejected:
+        yield [view["site"], view["view"], *[None] * 20, str(Grade.REJECTED), ";".join(view["reasons"])]
 
 
-def _read(job_id: str, origin: Origin, site: str | None, view: View | None) -> TracksJson:
+def _csv_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
     with reading() as session:
-        return read_tracks(session, job_of(session, job_id), origin, site, view)
+        return list(tracks_csv(read_entries(session, job_of(session, job_id), origin, site, view)))
+
+
+def _json_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
+    with reading() as session:
+        return _json_pieces(read_entries(session, job_of(session, job_id), origin, site, view), origin)
+
+
+def _whole_answer(pieces: Sequence[bytes], media_type: str, headers: dict[str, str]) -> Response:
+    """Return an answer whose pieces are all made; it is never joined in memory."""
+    headers = {**headers, "Content-Length": str(sum(map(len, pieces)))}
+    return StreamingResponse(_large_pieces(pieces), 200, headers, media_type)
+
+
+def _large_pieces(pieces: Iterable[bytes]) -> Iterator[bytes]:
+    """Return the same bytes in pieces of about 256 KB: each takes a thread's turn."""
+    waiting = bytearray()
+    for piece in pieces:
+        waiting += piece
+        if len(waiting) >= PIECE_CHARACTERS:
+            yield bytes(waiting)
+            waiting.clear()
+    yield bytes(waiting)
+
+
+def _csv_answer(pieces: Sequence[bytes]) -> Response:
+    return _whole_answer(pieces, MEDIA_TYPE_UTF8, csv_headers("tracks.csv"))
 
 
 def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
@@ -218,7 +288,10 @@ def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
     """
 
     def make() -> bytes:
-        return tracks_csv(_read(job_id, Origin.REFERENCE, None, None)).encode()
+        content = io.BytesIO()
+        with reading() as session:
+            content.writelines(tracks_csv(read_entries(session, job_of(session, job_id), Origin.REFERENCE)))
+        return content.getvalue()
 
     return kept_rendering(job_id, tracks_table_dependencies(job_id, job_version), make)
 
@@ -244,10 +317,9 @@ def get_tracks(
     their reasons. The answer is 409 `not_ready` until the stage `monoplane` of the site (without `site`: of all sites)
     is done.
     """
-    answer = _read(job_id, origin, site, view)
     if wants_csv(request):
-        return csv_response(tracks_csv(answer), "tracks.csv")
-    return JSONResponse(answer, headers={"Vary": "Accept"})
+        return _csv_answer(_csv_of(job_id, origin, site, view))
+    return _whole_answer(_json_of(job_id, origin, site, view), "application/json", {"Vary": "Accept"})
 
 
 @router.get(
@@ -264,4 +336,4 @@ def get_tracks_csv(
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
     """Return the same tracks as `tracks`, always as CSV."""
-    return csv_response(tracks_csv(_read(job_id, origin, site, view)), "tracks.csv")
+    return _csv_answer(_csv_of(job_id, origin, site, view))

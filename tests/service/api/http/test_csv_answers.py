@@ -48,8 +48,8 @@ def test_points_and_tracks_neutralise_sites_and_catheters(formula: str) -> None:
     )  # fmt: skip
     row = dict(zip(*_cells(points.points_csv([point])), strict=True))
     assert (row["site"], row["catheter"], row["lat_ms"]) == (f"'{formula}", f"'{formula}", "-3.0")
-    rejected = [{"site": formula, "view": "a", "reasons": []}]
-    row = dict(zip(*_cells(tracks.tracks_csv({"tracks": [], "rejected": rejected})), strict=True))
+    pieces = tracks.tracks_csv([("rejected", {"site": formula, "view": "a", "reasons": []})])
+    row = dict(zip(*_cells(b"".join(pieces).decode()), strict=True))
     assert row["site"] == f"'{formula}"
 
 
