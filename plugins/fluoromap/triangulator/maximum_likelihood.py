@@ -24,7 +24,7 @@ class MaximumLikelihood:
     """
 
     name: ClassVar[str] = "maximum-likelihood"
-    version: ClassVar[str] = "8"
+    version: ClassVar[str] = "9"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:
