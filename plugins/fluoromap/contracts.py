@@ -486,8 +486,8 @@ class StudyVariation:
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry_angle: float = 1.458
-    gantry_offset: float = 2.269
+    gantry_angle: float = 1.265
+    gantry_offset: float = 2.206
 
 
 @dataclass(frozen=True, eq=False)
@@ -553,9 +553,10 @@ class LocatedSite:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Rotation and shift of view b's camera against its header.
+    """Rotation and shift of view b against view a, beyond their headers.
 
-    They are estimated from the study's electrodes.
+    They are estimated from the study's electrodes. No electrode shows which view is wrong, so that each camera takes its expected
+    share.
     applied : whether the cameras of the located sites contain it. rotation_deg : (3,) rotation vector about the isocentre;
     offset_mm : (3,), both in the world frame. epipolar_before_px, epipolar_after_px : Sampson RMS over the study.
     """

@@ -30,7 +30,12 @@ from fluoromap.triangulator.study_equations import (
     site_equations,
 )
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import GANTRY_KINDS, LARGEST_MULTIPLE, UncertaintyParams
+from fluoromap.triangulator.uncertainty import (
+    GANTRY_KINDS,
+    LARGEST_MULTIPLE,
+    UncertaintyParams,
+    credible_covariance,
+)
 
 GATE_EPIPOLAR_RATIO = 1.3
 """Ratio of epipolar RMS to pixel noise below which the header is believed."""
@@ -50,6 +55,7 @@ LEAST_AGREEING = 0.7
 UNEXPLAINED_BELOW = 1e-6
 """Probability of a site's misfit by chance below which its electrodes are wrong."""
 _STEPS = 4
+_AS_HEADER = (np.eye(4), np.eye(4))
 _NEGLIGIBLE = 9.0
 """Difference of log evidence beyond which a kind of heart counts as ruled out."""
 
@@ -58,18 +64,19 @@ _NEGLIGIBLE = 9.0
 class GantryBelief:
     """The gantry's estimated error and its remaining uncertainty.
 
-    camera_b_displacement : (4, 4) displacement of the world as view b sees it; the identity where the header is believed.
+    displacements : (4, 4) of the world as view a and view b see it; the identity where the header is believed.
     covariance : (14, 14) of the remaining errors, see :func:`~fluoromap.triangulator.uncertainty.gantry_effect_px`.
     """
 
-    camera_b_displacement: Array
+    displacements: tuple[Array, Array]
     covariance: Array
 
     def cameras(self, nominal: Cameras) -> Cameras:
         """Return the cameras corrected from the header's nominal ones."""
-        if (self.camera_b_displacement == np.eye(4)).all():
+        if all((one == np.eye(4)).all() for one in self.displacements):
             return nominal
-        return nominal[0], nominal[1].displaced(self.camera_b_displacement)
+        in_a, in_b = self.displacements
+        return nominal[0].displaced(in_a), nominal[1].displaced(in_b)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +93,18 @@ class StudyBelief:
     doubt: Reason | None = None
 
 
+def any_study_belief(params: UncertaintyParams) -> StudyBelief:
+    """Return the belief about any gantry and any heart, as second moments.
+
+    Solvers estimate with it. :func:`header_belief` has the tails too, for the ellipsoids that are stated.
+    """
+    return _belief(GantryBelief(_AS_HEADER, params.header_covariance()), HeartScale(), params)
+
+
 def header_belief(params: UncertaintyParams) -> StudyBelief:
     """Return the belief where no electrode shows the gantry's error or the heart's variation."""
-    return _belief(GantryBelief(np.eye(4), params.header_covariance()), HeartScale(), params)
+    covariance = credible_covariance(*params.header_moments())
+    return _belief(GantryBelief(_AS_HEADER, covariance), HeartScale(), params)
 
 
 def study_belief(
@@ -135,7 +151,7 @@ def calibrate(
         return [site_equations(gantry.cameras(nominal), pixels, catalogue, gaps, params) for nominal, pixels in sites]
 
     unknowns = GANTRY_UNKNOWNS + len(gaps)
-    rows = equations(GantryBelief(np.eye(4), usual))
+    rows = equations(GantryBelief(_AS_HEADER, usual))
     agree = [_is_explained(one, usual, len(gaps)) for one in rows]
     if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
         # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.
@@ -144,7 +160,7 @@ def calibrate(
     mixture = _weigh(information(rows, np.zeros(unknowns)), usual, len(gaps))
     noise = float(np.sqrt(np.mean(np.concatenate([one.pixel_variance for one in rows]))))
     before = _epipolar_rms_px(rows, mixture, np.zeros(unknowns), params)
-    as_header = GantryBelief(np.eye(4), mixture.gantry_covariance(np.zeros(GANTRY_UNKNOWNS)))
+    as_header = GantryBelief(_AS_HEADER, mixture.gantry_covariance(np.zeros(GANTRY_UNKNOWNS)))
     kept = Calibration(False, np.zeros(3), np.zeros(3), before, before)
     electrodes = sum(one.epipolar for one in rows)
     if electrodes < FEWEST_ELECTRODES or before <= GATE_EPIPOLAR_RATIO * noise or mixture.log_odds <= GATE_LOG_ODDS:
@@ -153,12 +169,13 @@ def calibrate(
     for _ in range(_STEPS):
         found = mixture.mean[6:12] - mixture.mean[:6]
         at = np.concatenate([np.zeros(6), found, np.zeros(unknowns - 12)])
-        rows = equations(GantryBelief(_displacement(found), usual))
+        rows = equations(GantryBelief((np.eye(4), _displacement(found)), usual))
         mixture = _weigh(information(rows, at), usual, len(gaps))
-    # View b takes the whole difference. An error that both views share is a displacement of the world, which is free.
-    at = np.concatenate([np.zeros(6), found, np.zeros(2)])
-    corrected = GantryBelief(_displacement(found), mixture.gantry_covariance(at))
-    after = _epipolar_rms_px(rows, mixture, np.concatenate([at, np.zeros(len(gaps))]), params)
+    after = _epipolar_rms_px(rows, mixture, at, params)
+    # No electrode shows which view is wrong: each takes its expected share of the difference.
+    in_a = mixture.mean[:6]
+    displacements = _displacement(in_a), _displacement(found) @ _displacement(in_a)
+    corrected = GantryBelief(displacements, mixture.gantry_covariance(np.array([*in_a, *(found + in_a), 0.0, 0.0])))
     distance = found**2 / (2 * LARGEST_MULTIPLE**2 * np.diagonal(usual)[6:12])
     offset_mm = float(np.linalg.norm(found[3:]))
     shifted = offset_mm > FARTHEST_OFFSET_MM and float(distance[:3].sum()) < float(distance[3:].sum())
@@ -166,7 +183,7 @@ def calibrate(
     if float(distance.sum()) > FARTHEST_CHI2 or _misfit(rows, mixture.scale) > STILL_MISFIT:
         # Something else is wrong, such as a mirrored image, a moved table or runs of another study.
         covariance = as_header.covariance + LARGEST_MULTIPLE**2 * usual
-        return kept, _belief(GantryBelief(np.eye(4), covariance), mixture.scale, params, doubt)
+        return kept, _belief(GantryBelief(_AS_HEADER, covariance), mixture.scale, params, doubt)
     calibration = Calibration(True, np.degrees(found[:3]), found[3:], before, after)
     return calibration, _belief(corrected, mixture.scale, params, doubt if shifted else None)
 
@@ -193,8 +210,9 @@ def _displacement(six: Array) -> Array:
 class _Mixture:
     """The unknowns over all kinds of gantry and heart, weighed by their evidence.
 
-    mean : (u,), covariance : (u, u) of the unknowns against header and catalogue. scale : RMS of the heart's scales.
-    log_odds : for a gantry with errors against one without.
+    mean : (u,) of the unknowns against header and catalogue. covariance : (14, 14) of the gantry's errors about their mean; its
+    95 % ellipsoids hold 95 % of the mixture. scale : RMS of the heart's scales. log_odds : for a gantry with errors against one
+    without.
     """
 
     mean: Array
@@ -205,7 +223,7 @@ class _Mixture:
     def gantry_covariance(self, about: Array) -> Array:
         """Return the second moment (14, 14) of the gantry's errors about the applied correction ``about`` (14,)."""
         left = self.mean[:GANTRY_UNKNOWNS] - about
-        moment: Array = self.covariance[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] + np.outer(left, left)
+        moment: Array = self.covariance + np.outer(left, left)
         return moment
 
 
@@ -249,7 +267,10 @@ def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
     total = sum(weight for _, weight in likely)
     answers = [(heart.posterior(of_gantry), weight / total) for (heart, of_gantry, _), weight in likely]
     mean = np.sum([weight * own for (_, own), weight in answers], axis=0)
-    covariance = np.sum([weight * (own + np.outer(at - mean, at - mean)) for (own, at), weight in answers], axis=0)
+    moments = np.array(
+        [(own + np.outer(at - mean, at - mean))[:GANTRY_UNKNOWNS, :GANTRY_UNKNOWNS] for (own, at), _ in answers]
+    )
+    covariance = credible_covariance(np.array([weight for _, weight in answers]), moments)
     breathing, beats = (
         float(np.sqrt(sum(weight / total * getattr(heart.scale, of) ** 2 for (heart, *_), weight in likely)))
         for of in ("breathing", "beats")

@@ -27,7 +27,13 @@ from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
 from fluoromap.triangulator.reference_origin import common_origin, deviates
-from fluoromap.triangulator.self_calibration import GantryBelief, calibrate, header_belief, study_belief
+from fluoromap.triangulator.self_calibration import (
+    GantryBelief,
+    any_study_belief,
+    calibrate,
+    header_belief,
+    study_belief,
+)
 from fluoromap.triangulator.site_locator import Moment, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
@@ -108,7 +114,7 @@ def locate_study(
     looks = _looks(sites, catalogue, context, params)
     usable, rejected, notes = _usable_sites(sites, looks)
     header = header_belief(params)
-    locator = SiteLocator(method, catalogue, header, header, params.spacing_limit_mm)
+    locator = SiteLocator(method, catalogue, header, any_study_belief(params), params.spacing_limit_mm)
     return _locate_sites([(site, None, locator) for site, _ in usable], catalogue, context, rejected, notes, None)
 
 
@@ -141,8 +147,9 @@ def calibrate_and_locate(
     gap_doubts = dict.fromkeys(contradicted, Reason.CATALOGUE_CONTRADICTED) | dict.fromkeys(
         wrong, Reason.SPACING_MISMATCH
     )
+    any_study = any_study_belief(params)
     as_calibrated, as_header = (
-        SiteLocator(method, catalogue, own, header, params.spacing_limit_mm, gap_doubts) for own in (belief, header)
+        SiteLocator(method, catalogue, own, any_study, params.spacing_limit_mm, gap_doubts) for own in (belief, header)
     )
     work = [
         (site, jump, as_calibrated if i in found.same_gantry else as_header)
@@ -337,8 +344,8 @@ def _doubt_note(doubt: Reason) -> str:
 def _calibration_note(calibration: Calibration) -> str:
     angle, offset = np.linalg.norm(calibration.rotation_deg), np.linalg.norm(calibration.offset_mm)
     return (
-        "The two views contradict each other more than pixel noise allows. Self-calibration turned view b by "
-        f"{angle:.2f} degrees and shifted it by {offset:.1f} mm against its header. This changed the electrodes' mean "
+        "The two views contradict each other more than pixel noise allows. Self-calibration turned the "
+        f"views by {angle:.2f} degrees and shifted them by {offset:.1f} mm against each other. This changed the electrodes' mean "
         f"epipolar distance from {calibration.epipolar_before_px:.1f} to {calibration.epipolar_after_px:.1f} px."
     )
 

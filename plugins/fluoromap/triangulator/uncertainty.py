@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
+from scipy.optimize import brentq
+from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue, follows_tip
-from fluoromap.contracts import Array
+from fluoromap.contracts import CHI2_95_3D, Array
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.two_view_pixels import Cameras
 
@@ -39,16 +42,19 @@ class GantryKind:
 GANTRY_KINDS = tuple(
     GantryKind(angle, offset, share * given)
     for angle, share, by_offset in (
-        (0.5, 0.30, (0.50, 0.36, 0.14)),
-        (1.0, 0.45, (0.50, 0.36, 0.14)),
-        (2.0, 0.20, (0.20, 0.50, 0.30)),
+        (0.5, 0.60, (0.50, 0.36, 0.14)),
+        (1.0, 0.25, (0.50, 0.36, 0.14)),
+        (2.0, 0.10, (0.20, 0.50, 0.30)),
         (4.0, 0.05, (0.05, 0.25, 0.70)),
     )
     for offset, given in zip((1.0, 2.0, 4.0), by_offset, strict=True)
 )
-"""Kinds of gantry. A real C-arm had 0.2 to 0.33 degree and 0.5 to 0.8 mm, with tails to 0.8 degree and 2.2 mm. Offsets exceed
-their stated value more often than angles do; a C-arm with wrong angles tends to have wrong offsets too."""
+"""Kinds of gantry. A real C-arm had 0.2 to 0.33 degree and 0.5 to 0.8 mm, with tails to 0.8 degree and 2.2 mm. Its angles are of
+the first kind, which therefore has the largest share. Offsets exceed their stated value more often than angles do; a C-arm with
+wrong angles tends to have wrong offsets too."""
 LARGEST_MULTIPLE = 4.0
+OFFSET_UNKNOWNS = np.array([3, 4, 5, 9, 10, 11])
+"""The gantry's unknowns that are offsets, see :func:`gantry_effect_px`."""
 
 
 class UncertaintyParams(BaseModel, extra="forbid"):
@@ -121,6 +127,12 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         covariance: Array = self.gantry_covariance() * shares
         return covariance
 
+    def header_moments(self) -> tuple[Array, Array]:
+        """Return the shares (k,) and second moments (k, 14, 14) of all kinds of gantry."""
+        shares = np.array([kind.share for kind in GANTRY_KINDS])
+        moments = np.array([self.gantry_covariance() * kind.multiples**2 for kind in GANTRY_KINDS])
+        return shares, moments
+
     def scaled(self, breathing: float, beats: float) -> UncertaintyParams:
         """Return the parameters with these multiples of breathing and beats."""
         return self.model_copy(
@@ -131,6 +143,51 @@ class UncertaintyParams(BaseModel, extra="forbid"):
                 "beat_sd_mm": beats * self.beat_sd_mm,
             }
         )
+
+
+def credible_covariance(shares: Array, moments: Array) -> Array:
+    """Return the covariance (14, 14) of a mixture of gantries, with honest tails.
+
+    A mixture has heavier tails than the normal distribution with its second moment: the 95 % ellipsoid of that holds the
+    offset of only 90 % of ``GANTRY_KINDS``. The offsets are therefore widened until the ellipsoid holds 95 %. Angles keep
+    their second moment: the electrodes of a study show how wrong its angles are.
+
+    Parameters
+    ----------
+    shares : ndarray, shape (k,)
+        Share of each kind of gantry. The sum is 1.
+    moments : ndarray, shape (k, 14, 14)
+        Second moment of each kind's errors about the mean of the mixture.
+    """
+    whole = np.einsum("k,kij->ij", shares, moments)
+    usual = whole[OFFSET_UNKNOWNS, OFFSET_UNKNOWNS]
+    widened = np.ones(len(whole))
+    if (usual > 0).all():
+        sizes = (moments[:, OFFSET_UNKNOWNS, OFFSET_UNKNOWNS] / usual).mean(axis=1)
+        widened[OFFSET_UNKNOWNS] = np.sqrt(max(_credible_size(shares, sizes), 1.0))
+    covariance: Array = widened[:, None] * whole * widened
+    return covariance
+
+
+def _credible_size(shares: Array, sizes: Array) -> float:
+    """Return the variance of a mixture's 95 % sphere.
+
+    The mixture consists of spherical normal distributions with variances ``sizes`` (k,).
+    """
+    present = (shares > 0) & (sizes > 0)
+    shares, sizes = shares[present], sizes[present]
+    if sizes.max() - sizes.min() < 1e-9:
+        return float(sizes.max())
+    left = partial(_outside, shares, sizes)
+    return float(brentq(left, sizes.min(), sizes.max()))
+
+
+def _outside(shares: Array, sizes: Array, size: float) -> float:
+    """Return a mixture's share beyond a 95 % sphere, less 5 %.
+
+    The sphere is that of the variance ``size``.
+    """
+    return float(shares @ chi2.sf(CHI2_95_3D * size / sizes, 3)) - 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.phantom.ideal_matching import matched_sites
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.linear import Linear
-from fluoromap.triangulator.self_calibration import header_belief
+from fluoromap.triangulator.self_calibration import any_study_belief
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 EXACT = {
@@ -378,5 +378,5 @@ def test_a_track_belongs_to_its_study_only_when_it_is_read() -> None:
 
 
 def test_without_a_study_the_variation_is_that_of_any_study() -> None:
-    belief = header_belief(UncertaintyParams())
+    belief = any_study_belief(UncertaintyParams())
     assert astuple(belief.variation) == pytest.approx(astuple(StudyVariation()), abs=1e-3)

@@ -11,7 +11,7 @@ from fluoromap_service.results.points import alternative_positions
 
 
 class CalibrationOut(BaseModel):
-    """The gantry's self-calibration by the electrodes: the correction of view b's camera against its header."""
+    """The gantry's self-calibration by the electrodes: the correction of view b against view a, beyond the headers."""
 
     applied: bool = Field(description="Whether the positions contain the correction.")
     rotation_deg: Position = Field(description="Rotation vector about the isocentre.")
