@@ -24,7 +24,7 @@ def view(page: Any, own_study: str) -> Any:
 
 
 def electrodes(page: Any, study: str) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return the stored electrodes of view a of site S01 in the frame that the page shows."""
+    """Return the stored electrodes of the frame in view a of site S01."""
     frame = page.get_by_label("Frame of view a").input_value()
     site = page.request.get(f"/v1/studies/{study}/sites/S01").json()
     address = f"/v1/studies/{study}/instances/{site['view_a']}/frames/{frame}/electrodes"
