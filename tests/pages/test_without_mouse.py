@@ -12,8 +12,10 @@ import pytest
 def view(page: Any, own_study: str) -> Any:
     """Return view a of the first site, focused by Tab."""
     page.goto(f"/studies/{own_study}#electrodes")
-    page.locator(".view[data-view=a][data-electrodes='12']").wait_for()
     shown = page.locator(".view[data-view=a]")
+    # The page begins with the frame of the map.
+    shown.get_by_text("used for the map").wait_for()
+    page.locator(".view[data-view=a][data-electrodes='12']").wait_for()
     for _ in range(60):
         page.keyboard.press("Tab")
         if shown.locator("canvas").evaluate("canvas => canvas === document.activeElement"):
@@ -21,8 +23,9 @@ def view(page: Any, own_study: str) -> Any:
     pytest.fail("Tab does not reach the picture")
 
 
-def electrodes(page: Any, study: str, frame: int = 1) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return the stored electrodes of view a of site S01."""
+def electrodes(page: Any, study: str) -> dict[tuple[str, int], dict[str, Any]]:
+    """Return the stored electrodes of the frame in view a of site S01."""
+    frame = page.get_by_label("Frame of view a").input_value()
     site = page.request.get(f"/v1/studies/{study}/sites/S01").json()
     address = f"/v1/studies/{study}/instances/{site['view_a']}/frames/{frame}/electrodes"
     return {(each["catheter"], each["electrode"]): each for each in page.request.get(address).json()}
@@ -94,7 +97,6 @@ def test_a_catheter_is_marked_from_its_tip_on(page: Any, view: Any, own_study: s
 
 
 def test_track_again_from_here_takes_the_frame_as_right_and_computes(page: Any, view: Any, own_study: str) -> None:
-    page.keyboard.press("End")
     page.keyboard.press("n")
     chosen = view.locator(".status").inner_text().split(" ")[0]
     page.keyboard.press("t")
@@ -102,7 +104,7 @@ def test_track_again_from_here_takes_the_frame_as_right_and_computes(page: Any, 
     page.locator("#panel-map .scene canvas[data-drawn=yes]").first.wait_for()
     page.get_by_text("The computation has ended: finished.").wait_for()
     page.locator("#panel-map .fused[data-frames]").nth(1).wait_for()
-    stored = electrodes(page, own_study, frame=24)
+    stored = electrodes(page, own_study)
     assert {each["source"] for each in stored.values()} == {"manual"}
     assert {name for name, _ in stored} == {chosen}
 

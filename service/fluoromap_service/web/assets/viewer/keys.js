@@ -8,7 +8,7 @@ export const KEYS = [
   ["Tab", "go to a picture, a button or a field"], ["Space", "play or pause"], ["← →", "previous or next frame"], ["Home End", "first or last frame"],
   ["+ −", "zoom (also the wheel)"], ["0", "whole frame, usual contrast"], ["N, Shift + N", "choose the next or previous electrode (also ] and [ )"],
   ["Shift + arrows", "move the chosen electrode by 1 pixel for each press"], ["Delete", "delete the chosen electrode"],
-  ["A", "add an electrode that the catheter lacks: move the cross with the arrows, set it with Enter"],
+  ["A", "add an electrode that the catheter lacks: move the cross with the arrows (Shift: 10 pixels), set it with Enter"],
   ["M", "mark a whole catheter from its tip on: arrows and Enter for each electrode"], ["Esc", "end adding or marking"],
   ["T", "track again from here: this frame is right, so compute with it"],
   ["Ctrl + Z, Ctrl + Y", "undo, redo"], ["right button", "drag: contrast"], ["middle button", "drag: move the picture"],

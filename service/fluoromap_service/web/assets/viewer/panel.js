@@ -19,6 +19,9 @@ export function viewerPanel(state, compute) {
   /** @type {View[]} */
   let views = [];
   let active = 0;
+  /** @type {Map<string, number>} Run -> the frame that the newest map uses. */
+  let mapFrames = new Map();
+  let framesOf = "";
   const place = element("div", { class: "views" });
   const hint = element("p", { class: "soft", "aria-live": "polite" });
   const site = select([], "", { "aria-label": "Site" });
@@ -31,7 +34,7 @@ export function viewerPanel(state, compute) {
     for (const each of tools) each.setAttribute("aria-pressed", String(each.dataset["tool"] === tool));
     catheter.value = name;
     hint.textContent = {
-      edit: "Drag an electrode to move it; click it and press Delete to remove it. Circle: found by the service. Square: set by hand. A change counts from this frame on: the next computation tracks the run again from here.",
+      edit: "Drag an electrode to move it; click it and press Delete to remove it. Circle: found by the service. Square: set by hand. A change counts from this frame on: the next computation tracks the run again from here. A change in the frame \"used for the map\" moves the map most.",
       add: `Click the place of an electrode that the catheter "${name}" lacks in this frame. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
       mark: `Click electrode ${next} of ${count} of the catheter "${name}"${next === 1 ? ", which is its tip" : ""}. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
       contrast: "Drag left and right for the width, up and down for the centre of the grey levels.",
@@ -59,6 +62,16 @@ export function viewerPanel(state, compute) {
     }
   };
 
+  const loadMapFrames = async () => {
+    const job = state.finished;
+    if (!job || job.id === framesOf) return;
+    framesOf = job.id;
+    /** @type {{points: import("../shared/types.js").Point[]}} */
+    const { points } = await get(`/v1/jobs/${job.id}/points`);
+    mapFrames = new Map(points.flatMap(({ views: { a, b } }) => [a, b].flatMap((each) => (each?.frame ? [[each.sop_instance_uid, each.frame]] : []))));
+    for (const view of views) view.setMapFrame(mapFrames.get(view.run.sop_instance_uid) ?? null);
+  };
+
   const open = () => {
     for (const view of views) view.close();
     const chosen = state.sites[Number(site.value)];
@@ -70,6 +83,7 @@ export function viewerPanel(state, compute) {
       return run ? [new View(index === 0 ? "a" : "b", state, run, pen)] : [];
     });
     views.forEach((view, index) => {
+      view.setMapFrame(mapFrames.get(view.run.sop_instance_uid) ?? null);
       listenToPointer(view);
       listenToKeys(view, trackAgain);
       view.canvas.addEventListener("focus", () => (active = index));
@@ -83,6 +97,7 @@ export function viewerPanel(state, compute) {
   };
 
   const fill = () => {
+    attempt(loadMapFrames);
     const choicesOfPen = state.study.catheters.map((each) => /** @type {[string, string]} */ ([each.name, `${each.name} (${each.electrodes})`]));
     catheter.replaceChildren(...select(choicesOfPen, pen.catheter).children);
     legend.replaceChildren(...state.study.catheters.map((each) => {

@@ -21,6 +21,10 @@ export class View extends FrameView {
     super(state, run, { canvas: { role: "application", "aria-label": label }, slider: `Frame of view ${letter}`, frame: 1 });
     this.letter = letter;
     this.pen = pen;
+    /** @type {number|null} The frame that the newest map uses. */
+    this.mapFrame = null;
+    /** Whether a person has not gone to a frame yet. */
+    this.isUntouched = true;
     /** @type {string|null} */
     this.chosen = null;
     /** @type {{start: number[], end: number[], colour: string}|null} */
@@ -47,13 +51,30 @@ export class View extends FrameView {
     pen.addEventListener("changed", this.followPen);
     this.canvas.addEventListener("focus", this.followPen);
     this.marks.addEventListener("stored", () => (this.status.textContent = "stored"));
-    this.show(1);
+    super.show(1);
     attempt(() => this.marks.load());
   }
 
   close() {
     super.close();
     this.pen.removeEventListener("changed", this.followPen);
+  }
+
+  /** @param {number} frame */
+  show(frame) {
+    this.isUntouched = false;
+    super.show(frame);
+  }
+
+  get countText() {
+    return `${super.countText}${this.frame === this.mapFrame ? ", used for the map" : ""}`;
+  }
+
+  /** Say which frame the newest map uses, and begin there: a correction in it changes the map most. @param {number|null} frame */
+  setMapFrame(frame) {
+    this.mapFrame = frame;
+    if (frame !== null && this.isUntouched) this.show(frame);
+    else this.showCount();
   }
 
   get playing() {
@@ -147,6 +168,7 @@ export class View extends FrameView {
   /** Move an electrode without storing it yet. @param {Electrode} electrode @param {number} u @param {number} v */
   carry(electrode, u, v) {
     if (this.playing) this.switchPlay();
+    this.isUntouched = false;
     const place = this.#inside({ u, v });
     this.carried = { frame: this.frame, electrode: { ...electrode, u_px: place.u, v_px: place.v, sd_px: 1, source: "manual" } };
     this.draw();
