@@ -380,11 +380,9 @@ class Campaign:
         self.wrong["different"] += 1
         names = ", ".join(name for name, content in found.items() if content != self.expected[name])
         failed = self._stack.rows(
-            f"SELECT name, subject, error FROM stage WHERE job_id = '{job}' AND state <> 'succeeded'"
+            f"SELECT name, subject, error FROM stage WHERE job_id = '{job}' AND error IS NOT NULL"
         )
-        print(
-            f"  job {job}: {names} differ, see {self._write(job, found)}; stages without result: {failed}", flush=True
-        )
+        print(f"  job {job}: {names} differ, see {self._write(job, found)}; failed stages: {failed}", flush=True)
 
     def _start(self) -> str:
         key = {"Idempotency-Key": uuid.uuid4().hex}
