@@ -60,7 +60,10 @@ def _of_unit_errors(source: ErrorSource) -> Array:
 
 
 def _inverse(covariances: Array) -> Array:
-    """Return the inverses of matrices (..., 2, 2). The general routine takes ten times as long for thousands of them."""
+    """Return the inverses of matrices (..., 2, 2).
+
+    The general routine takes much longer for thousands of them.
+    """
     (a, b), (c, d) = np.moveaxis(covariances, (-2, -1), (0, 1))
     determinant = a * d - b * c
     if not determinant.all():

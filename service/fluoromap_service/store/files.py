@@ -177,7 +177,7 @@ def checked_path(sha256: str) -> Path:
 
 @contextmanager
 def checked_meanwhile(sha256: str) -> Iterator[Path]:
-    """Give the path of a stored file, whose content is checked while the caller works with it.
+    """Check a stored file while the caller reads it.
 
     For a caller that reads a small part of a long file, and that no content can harm: a decoder needs :func:`checked_path`.
 

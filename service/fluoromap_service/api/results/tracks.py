@@ -152,7 +152,7 @@ def read_entries(
     view: View | None = None,
     tip_of: str | None = None,
 ) -> Iterator[Entry]:
-    """Return the entries of :class:`Tracks` for one site or for all, one after the other.
+    """Return the entries of :class:`Tracks`, one after the other.
 
     As values all samples of a study take ten times the memory of their text, so a caller takes one entry at a time. With
     ``tip_of``, the name of a catheter, only the tracks of its tip.
@@ -184,7 +184,10 @@ def read_entries(
 
 
 def read_tracks(session: Session, job: Job, origin: Origin, tip_of: str) -> TracksJson:
-    """Return the tracks of a catheter's tips in the shape of :class:`Tracks`; the errors are those of :func:`read_entries`."""
+    """Return the tracks of a catheter's tips as :class:`Tracks`.
+
+    The errors are those of :func:`read_entries`.
+    """
     answer: TracksJson = {"frame": _frame(origin), "tracks": [], "rejected": []}
     for name, entry in read_entries(session, job, origin, tip_of=tip_of):
         answer[name].append(entry)
@@ -229,7 +232,10 @@ def _sample(sample: Sample) -> dict[str, Any]:
 
 
 def tracks_csv(entries: Iterable[Entry]) -> Iterator[bytes]:
-    """Return tracks as CSV in pieces, one line an electrode and frame; the rejected views come last."""
+    """Return tracks as CSV in pieces.
+
+    There is one line for each electrode and frame. The rejected views come last.
+    """
     return csv_pieces(COLUMNS, _lines(entries))
 
 
@@ -261,13 +267,19 @@ def _json_of(job_id: str, origin: Origin, site: str | None, view: View | None) -
 
 
 def _whole_answer(pieces: Sequence[bytes], media_type: str, headers: dict[str, str]) -> Response:
-    """Return an answer whose pieces are all made; it is never joined in memory."""
+    """Return an answer of pieces that are all made.
+
+    They are never joined in memory.
+    """
     headers = {**headers, "Content-Length": str(sum(map(len, pieces)))}
     return StreamingResponse(_large_pieces(pieces), 200, headers, media_type)
 
 
 def _large_pieces(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """Return the same bytes in pieces of about 256 KB: each takes a thread's turn."""
+    """Return the same bytes in pieces of about 256 KB.
+
+    The server sends each piece from another thread, so small pieces take longer.
+    """
     waiting = bytearray()
     for piece in pieces:
         waiting += piece
