@@ -62,7 +62,7 @@ class MotionPrior:
         )
 
     name: ClassVar[str] = "motion-prior"
-    version: ClassVar[str] = "7"
+    version: ClassVar[str] = "6"
 
     def __init__(self, params: MotionPrior.Params) -> None:
         self._params = params.with_any_gantry()
