@@ -44,7 +44,7 @@ _WORST_FIT = 2.0
 _BENDING = 0.12
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
-_CLEARLY_LESS = 0.5
+_CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
 
 
@@ -269,8 +269,8 @@ class ChainDetector:
         """Return which chains can be catheters of the catalogue, (n,).
 
         Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
-        alike, so proposals that are clearly less probable may be parts of a dark shaft: less than a long chain's weaker
-        electrodes, or less than all electrodes of a short one. At most one proposal for each gap is excused so.
+        alike, so proposals in less than half of the gaps may be parts of a dark shaft if they are less probable: less than a
+        long chain's weaker electrodes, or clearly less than all electrodes of a short one and 0.77 at most.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         odds_of_free, odds = log_odds(seen.probability_at(free)), log_odds(proposed.probability)
@@ -284,14 +284,14 @@ class ChainDetector:
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:
-                like = max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS)
+                like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
             sure, alike = (
                 unexplained_between(chain, free[odds_of_free >= limit], family.catheter, self.px_per_mm)
                 for limit in (EVEN_ODDS, like)
             )
             row = proposed.points_uv[odds >= onwards]
             listed[index] = (
-                sure < len(own) and not alike and not continues(chain, row, family.catheter, self.px_per_mm)
+                2 * sure < len(own) and not alike and not continues(chain, row, family.catheter, self.px_per_mm)
             )
         return listed
 
