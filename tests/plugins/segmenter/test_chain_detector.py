@@ -139,9 +139,7 @@ def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
     found = chains_found(drawn([catheter]), np.concatenate([catheter, shaft]), [0.99] * 4 + [0.6], [0.9] * 5)
     assert any(lies_on(chain, catheter) for chain in found)
     # As probable as its weakest electrode, it is an electrode that the catalogue does not list.
-    weak = chains_found(
-        drawn([catheter]), np.concatenate([catheter, shaft]), [0.99, 0.7, 0.99, 0.99, 0.7], [0.9] * 5
-    )
+    weak = chains_found(drawn([catheter]), np.concatenate([catheter, shaft]), [0.99, 0.7, 0.99, 0.99, 0.7], [0.9] * 5)
     assert not any(lies_on(chain, catheter) for chain in weak)
 
 

@@ -48,4 +48,4 @@ def test_a_line_past_both_ends_says_nothing():
 def test_outside_the_image_there_is_no_shaft():
     row, _ = row_and_shaft(0.0)
     shaft = ShaftImage(np.full((200, 200), 6.0, np.float32), 1, 0.1, PX)
-    assert np.all(shaft_beyond_ends((row + [120.0, 0.0])[None], ABLATION.tip_mm, shaft) == 0.0)
+    assert np.all(shaft_beyond_ends((row + np.array([120.0, 0.0]))[None], ABLATION.tip_mm, shaft) == 0.0)

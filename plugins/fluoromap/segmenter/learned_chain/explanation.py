@@ -54,9 +54,7 @@ def find_scale(
     tried = [
         one
         for inverted in (False, True)
-        for one in _explanations(
-            run, replace(run.pixels, monochrome1=inverted), catalogue, scales_px_per_mm, trained
-        )
+        for one in _explanations(run, replace(run.pixels, monochrome1=inverted), catalogue, scales_px_per_mm, trained)
     ]
     return _smallest_of_the_best(tried)
 
