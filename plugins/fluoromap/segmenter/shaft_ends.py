@@ -19,7 +19,9 @@ _DARKEST = 1.5
 
 
 def shaft_beyond_ends(chains_uv: Array, tip_mm: float, shaft_image: ShaftImage) -> Array:
-    """Return how much more a shaft shows beyond the last electrode than beyond the tip, (n,) from -2 to 2.
+    """Return how much more a shaft shows behind than before chains.
+
+    The result (n,) lies between -2 and 2.
 
     Parameters
     ----------
@@ -36,9 +38,10 @@ def shaft_beyond_ends(chains_uv: Array, tip_mm: float, shaft_image: ShaftImage) 
 
 
 def _darkest_ray(ends_uv: Array, ways: Array, later_mm: float, shaft_image: ShaftImage) -> Array:
-    """Return the depth of the darkest ray from each end, in clear shafts, (n,) from -1 to 1; 0 outside the image.
+    """Return the depth of the darkest ray from each end.
 
-    A ray's depth is the mean of the darker side less the middle.
+    A ray's depth is the mean of the darker side less the middle, in depths of a clear shaft: (n,) from -1 to 1, and 0 outside
+    the image.
     """
     smooth, scale = shaft_image.smooth, 1.0 / shaft_image.reduction
     angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD

@@ -19,7 +19,7 @@ def drawn(path, depth=0.2, size=200):
 
 
 def row_and_shaft(turn_rad):
-    """Return electrodes along +u, and the path of a shaft that turns behind the last one."""
+    """Return electrodes along +u, and a shaft's path that turns behind them."""
     row = np.array([60.0, 100.0]) + np.outer(ABLATION.arc_lengths_mm * PX, [1.0, 0.0])
     behind = row[-1] + np.outer(np.arange(0.0, 40.0), [np.cos(turn_rad), np.sin(turn_rad)])
     return row, np.concatenate([np.linspace(row[0], row[-1], 60), behind])
