@@ -1,5 +1,5 @@
 # One image for the API, the worker and every other command of the program.
-FROM python:3.12-slim-bookworm AS build
+FROM python:3.12-slim-bookworm@sha256:782412e85d0f0984994c290652577d4018aff08145c85b262bb63dc0c7522254 AS build
 WORKDIR /src
 RUN python -m venv /opt/fluoromap
 COPY requirements.lock ./
@@ -11,7 +11,7 @@ COPY workers workers
 COPY migrations migrations
 RUN /opt/fluoromap/bin/pip install --no-cache-dir --no-deps .
 
-FROM python:3.12-slim-bookworm
+FROM python:3.12-slim-bookworm@sha256:782412e85d0f0984994c290652577d4018aff08145c85b262bb63dc0c7522254
 RUN useradd --uid 10001 --user-group --no-create-home --home-dir /var/lib/fluoromap --shell /usr/sbin/nologin fluoromap \
     && install -d -o fluoromap -g fluoromap -m 0750 /var/lib/fluoromap
 COPY --from=build /opt/fluoromap /opt/fluoromap

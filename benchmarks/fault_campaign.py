@@ -336,14 +336,14 @@ def send_study(stack: Stack, folder: Path) -> str:
     return study
 
 
-def results(stack: Stack, job: str) -> dict[str, str]:
-    """Return the hash of each result of a job, without the job's own id."""
-    hashes = {}
+def results(stack: Stack, job: str) -> dict[str, bytes]:
+    """Return each result of a job, without the job's own id."""
+    contents = {}
     for name in RESULTS:
         answer = stack.ask("GET", f"/v1/jobs/{job}/{name}")
         answer.raise_for_status()
-        hashes[name] = hashlib.sha256(answer.content.replace(job.encode(), b"job")).hexdigest()
-    return hashes
+        contents[name] = answer.content.replace(job.encode(), b"job")
+    return contents
 
 
 class Campaign:
@@ -358,10 +358,31 @@ class Campaign:
         self._study = send_study(stack, folder)
         self.expected = self._undisturbed()
 
-    def _undisturbed(self) -> dict[str, str]:
+    def _undisturbed(self) -> dict[str, bytes]:
         job = self._start()
         _until(lambda: self._state(job) == "succeeded", "the undisturbed job did not succeed")
-        return results(self._stack, job)
+        found = results(self._stack, job)
+        self._write("undisturbed", found)
+        return found
+
+    def _write(self, name: str, contents: dict[str, bytes]) -> Path:
+        folder = self._stack.folder / f"results-{name}"
+        folder.mkdir()
+        for part, content in contents.items():
+            (folder / part).write_bytes(content)
+        return folder
+
+    def _compare(self, job: str) -> None:
+        """Count a job whose results differ, and say where they lie."""
+        found = results(self._stack, job)
+        if found == self.expected:
+            return
+        self.wrong["different"] += 1
+        names = ", ".join(name for name, content in found.items() if content != self.expected[name])
+        failed = self._stack.rows(
+            f"SELECT name, subject, error FROM stage WHERE job_id = '{job}' AND error IS NOT NULL"
+        )
+        print(f"  job {job}: {names} differ, see {self._write(job, found)}; failed stages: {failed}", flush=True)
 
     def _start(self) -> str:
         key = {"Idempotency-Key": uuid.uuid4().hex}
@@ -392,8 +413,8 @@ class Campaign:
                 _until(lambda job=job: self._state(job) in ("succeeded", "failed", "cancelled"), "the job hangs")  # type: ignore[misc]
                 if self._state(job) != "succeeded":
                     self.wrong["lost"] += 1
-                elif results(self._stack, job) != self.expected:
-                    self.wrong["different"] += 1
+                else:
+                    self._compare(job)
             except Hung as hung:
                 print(f"  job {job}: {hung}")
                 self.wrong["hung"] += 1
@@ -438,7 +459,8 @@ def run(name: str, faults: int, each_round: int, seed: int, folder: Path, second
     print(
         f"  {orphans} files without row; all jobs of a round ended at most {campaign.slowest_end:.0f} s after its last fault"
     )
-    print(f"  {(time.monotonic() - begin) / 60:.1f} min, results {campaign.expected}", flush=True)
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in campaign.expected.items()}
+    print(f"  {(time.monotonic() - begin) / 60:.1f} min, results {hashes}", flush=True)
     return +campaign.wrong
 
 

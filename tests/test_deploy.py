@@ -120,3 +120,4 @@ def test_every_container_has_limits_and_a_bounded_log() -> None:
             assert service["mem_limit"], name
             assert service["logging"]["options"]["max-size"], name
             assert "no-new-privileges:true" in service["security_opt"], name
+            assert "build" in service or re.search(r":\d\S*@sha256:[0-9a-f]{64}$", service["image"]), name

@@ -83,7 +83,7 @@ def test_images_are_pinned_and_ports_stay_on_this_machine() -> None:
             assert port.startswith("127.0.0.1:")
     for line in (TOP / "Dockerfile").read_text().splitlines():
         if line.startswith("FROM"):
-            assert re.search(r":\d", line)
+            assert re.search(r":\d\S*@sha256:[0-9a-f]{64}\b", line)
 
 
 def test_long_running_services_are_watched_and_may_end_their_work() -> None:

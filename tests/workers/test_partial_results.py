@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import delete, select
+from sqlalchemy.exc import OperationalError
 
 from fluoromap.contracts import RejectedSite, Silent
 from fluoromap.matching import study_matching
@@ -23,6 +24,7 @@ from fluoromap_service.jobs import job_life
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import StageResult, StageRow
+from fluoromap_workers import partial_results
 from fluoromap_workers.partial_results import StageContext
 
 COUNTED: tuple[tuple[Any, str], ...] = (
@@ -127,6 +129,19 @@ def test_a_corrected_frame_computes_its_own_site_again_in_another_process(
     assert whole["state"] == "succeeded"
     points = [service.get(f"/v1/jobs/{of}/points").json()["points"] for of in (again, whole["id"])]
     assert points[0] == points[1]
+
+
+@pytest.mark.parametrize("error", [OperationalError("", {}, Exception("no connection")), OSError("read error")])
+def test_a_stage_computes_all_parts_where_the_earlier_ones_cannot_be_read(
+    error: Exception, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away() -> Any:
+        raise error
+
+    monkeypatch.setattr(partial_results, "reading", away)
+    context = StageContext(Silent(), job_life.Claim(1, "a job", 1, "match", "study"), "a")
+    rejected = RejectedSite("S01", (Reason.NO_ELECTRODES,))
+    assert context.recall(RejectedSite, ("S01",), lambda: rejected) == rejected
 
 
 def test_a_partial_result_is_used_for_equal_inputs_only(data_dir: Path) -> None:

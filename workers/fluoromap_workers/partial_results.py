@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, TypeVar
 
+import structlog
 from sqlalchemy import select
 
 from fluoromap_service.jobs.job_life import Claim
@@ -23,9 +24,11 @@ from fluoromap_service.store.codec import (
     form_of,
     partial_results,
 )
-from fluoromap_service.store.engine import reading
+from fluoromap_service.store.engine import DATABASE_AWAY, reading
 from fluoromap_service.store.models import Job, StageRow
 from fluoromap_service.store.value_hash import digest
+
+log = structlog.get_logger(__name__)
 
 T = TypeVar("T")
 
@@ -98,9 +101,13 @@ class StageContext:
 
     def _read_earlier(self) -> Iterator[Mapping[str, Block]]:
         yield from self._earlier
-        for partial in self._unread:
-            self._earlier.append(partial)
-            yield partial
+        # Without them the stage computes everything, so nothing that happens here may stop it.
+        try:
+            for partial in self._unread:
+                self._earlier.append(partial)
+                yield partial
+        except (*DATABASE_AWAY, OSError) as error:
+            log.warning("partial_results_unread", error=type(error).__name__)
 
 
 def _earlier_results(held: Claim) -> Iterator[Mapping[str, Block]]:
@@ -122,6 +129,5 @@ def _earlier_results(held: Claim) -> Iterator[Mapping[str, Block]]:
             .order_by(StageRow.id.desc())
         ).all()  # fmt: skip
     for sha256 in list(dict.fromkeys(result for result, _ in newest if result))[:_EARLIER_RESULTS]:
-        # Without them the stage computes everything, so no error of an old file may stop it.
         with suppress(files.BrokenFile, StoredOtherwise):
             yield partial_results(files.read(sha256))

@@ -9,8 +9,7 @@ from typing import Any, Protocol
 
 import structlog
 from sqlalchemy import select
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
-from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 from structlog.typing import FilteringBoundLogger as BoundLogger
 
@@ -20,7 +19,7 @@ from fluoromap_service.jobs.job_life import Claim, StoredResult
 from fluoromap_service.jobs.stage_results import load_file, remember
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode
-from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.engine import DATABASE_AWAY, reading, writing
 from fluoromap_service.store.files import BrokenFile
 from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
@@ -100,7 +99,7 @@ def work(held: Claim, connection: Connection) -> None:
         _run(held, connection, bound)
     except StageStopped:
         bound.info("stage_stopped")
-    except (OperationalError, InterfaceError, PoolTimeout, OSError) as error:
+    except (*DATABASE_AWAY, OSError) as error:
         # The machine failed, not the plugin: the lease runs out and another attempt follows.
         bound.warning("stage_interrupted", error=type(error).__name__)
     except BrokenFile as broken:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
 from fluoromap_service.settings import settings
@@ -17,6 +18,9 @@ from fluoromap_service.store.disk import NoSpace
 from fluoromap_service.store.private_folder import make_private_file, make_private_folder
 
 BUSY_TIMEOUT_MS = 30_000
+DATABASE_AWAY = (OperationalError, InterfaceError, PoolTimeout)
+"""The errors of a database that cannot be reached, is locked, or has no free connection."""
+
 POSTGRESQL = {
     "connect_timeout": 5,
     "keepalives_idle": 30,

@@ -11,13 +11,12 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from sqlalchemy import select
-from sqlalchemy.exc import DataError, InterfaceError, OperationalError
-from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.disk import FULL
-from fluoromap_service.store.engine import reading
+from fluoromap_service.store.engine import DATABASE_AWAY, reading
 from fluoromap_service.store.files import BrokenFile
 from fluoromap_service.store.models import Instance
 
@@ -88,9 +87,6 @@ _CODES = {
 }
 """Codes of errors that the framework raises."""
 
-
-DATABASE_AWAY = (OperationalError, InterfaceError, PoolTimeout)
-"""The errors of a database that cannot be reached, is locked, or has no free connection."""
 
 DATABASE_RETRY_SECONDS = 5
 

@@ -17,12 +17,13 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from fluoromap_service import auth
-from fluoromap_service.api.http.problems import DATABASE_AWAY, answer, database_away
+from fluoromap_service.api.http.problems import answer, database_away
 from fluoromap_service.api.http.session import session_token
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.auth import Caller, Scope
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
+from fluoromap_service.store.engine import DATABASE_AWAY
 
 SIGN_IN = "/sign-in"
 SESSION = "/session"

@@ -13,11 +13,11 @@ from starlette.concurrency import run_in_threadpool
 
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.paths import JobId
-from fluoromap_service.api.http.problems import DATABASE_AWAY, responses
+from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of
-from fluoromap_service.store.engine import reading
+from fluoromap_service.store.engine import DATABASE_AWAY, reading
 from fluoromap_service.store.models import ENDED_JOB, Event
 
 router = APIRouter(tags=["jobs"])
