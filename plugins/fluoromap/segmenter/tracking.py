@@ -232,7 +232,8 @@ def _accepted(
 def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
     """Return whether more frames show a longer catheter there.
 
-    They are compared with the frames that show the track's own chain. A chain of the seed or of the first frame can be a part of it, and would keep it out of every frame.
+    They are compared with the frames that show the track's own chain. A chain of the seed or of the first frame can be a part of
+    the longer catheter, and would keep it out of every frame.
     """
     against = 0
     for frame, chain in track.chains.items():
