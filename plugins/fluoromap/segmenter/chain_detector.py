@@ -30,10 +30,10 @@ from fluoromap.segmenter.linking import (
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
-from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer
+from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
-from fluoromap.segmenter.unlisted import SURE, continues, not_on, shows_row, unexplained_between
+from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
@@ -44,6 +44,7 @@ _WORST_FIT = 2.0
 _BENDING = 0.12
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
+_CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
 
 
@@ -268,27 +269,29 @@ class ChainDetector:
         """Return which chains can be catheters of the catalogue, (n,).
 
         Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
-        alike: in a long chain, proposals in less than half of the gaps may be parts of the shaft, if they are less probable
-        than the chain's weaker electrodes.
+        alike, so proposals in less than half of the gaps may be parts of a dark shaft if they are less probable: less than a
+        long chain's weaker electrodes, or clearly less than all electrodes of a short one and 0.77 at most.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
-        probability_of_free = seen.probability_at(free)
+        odds_of_free, odds = log_odds(seen.probability_at(free)), log_odds(proposed.probability)
         listed = np.zeros(len(chains), np.bool_)
         for index, chain in enumerate(chains):
             family = self._family(chain)
             if family is None:
                 continue
-            least, most = SURE, 0
+            own = log_odds(seen.probability_at(chain.pixels_uv))
+            onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
-                least = max(SURE, float(np.quantile(seen.probability_at(chain.pixels_uv), _WEAKER, method="lower")))
-                most = (len(chain.electrodes) - 1) // 2
+                like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
+            else:
+                like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
             sure, alike = (
-                unexplained_between(chain, free[probability_of_free >= limit], family.catheter, self.px_per_mm)
-                for limit in (SURE, least)
+                unexplained_between(chain, free[odds_of_free >= limit], family.catheter, self.px_per_mm)
+                for limit in (EVEN_ODDS, like)
             )
-            onwards = proposed.points_uv[proposed.probability >= least]
+            row = proposed.points_uv[odds >= onwards]
             listed[index] = (
-                sure <= most and not alike and not continues(chain, onwards, family.catheter, self.px_per_mm)
+                2 * sure < len(own) and not alike and not continues(chain, row, family.catheter, self.px_per_mm)
             )
         return listed
 

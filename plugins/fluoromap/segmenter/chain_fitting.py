@@ -18,8 +18,10 @@ from fluoromap.segmenter.linking import (
 )
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.refinement import ElectrodeFit, predict_on_curve, refine
+from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 
 _SHAFT_WEIGHT = 1.0
+_ENDS_WEIGHT = 3.0
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
 
 
@@ -86,8 +88,10 @@ def fit_chains(
             electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm
         )
         fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
+        ends = _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter.tip_mm, shaft_image)
+        directed = fit + ends
         for index, row in enumerate(rows):
-            best = index if fit[index] >= fit[index + len(rows)] else index + len(rows)
+            best = index if directed[index] >= directed[index + len(rows)] else index + len(rows)
             likelihood[row, column] = fit[best]
             electrode_fits[row, column] = electrode_fit, best
     probabilities = kind_probabilities(likelihood, families)

@@ -20,7 +20,7 @@ _SHARED = 1.5
 _LOST = 2.0
 _WORTH = 6.0
 _FLOOR_FALLS = 0.6
-_BEST = 80
+_BEST, _LEAST_OF_FAMILY = 80, 20
 _SIDE_MM = 1.75
 _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
 
@@ -228,8 +228,10 @@ def best_chains(
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
     found: list[CandidateChain] = []
+    # A long catheter has many chains that differ in one electrode: they must not crowd out the other families.
+    most = max(_LEAST_OF_FAMILY, _BEST // len(families))
     for index, (paths, scores) in enumerate(zip(possible.rows, possible.scores, strict=True)):
-        best = np.argsort(-scores)[:_BEST]
+        best = np.argsort(-scores)[:most]
         found += [
             CandidateChain(tuple(paths[row].tolist()), index, float(scores[row]))
             for row in best
@@ -238,7 +240,7 @@ def best_chains(
     if not found:
         return ()
     values = {id(chain): chain.score + families[chain.family].worth for chain in found}
-    found = sorted(found, key=lambda chain: -values[id(chain)])[:_BEST]
+    found = sorted(found, key=lambda chain: -values[id(chain)])
     within = np.full((len(found), max(len(chain.candidates) for chain in found)), -1, np.int64)
     for row, chain in enumerate(found):
         within[row, : len(chain.candidates)] = chain.candidates

@@ -31,6 +31,7 @@ _LONG_RUN = 5
 _REVERSED_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
+_LEAST_AGAINST = 2
 
 ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
@@ -134,6 +135,12 @@ def track_chains(
     if not found:
         return ()
     tracks = _follow(found, frame_times_ms, catheters, search, seed)
+    outvoted = [track for track in tracks if _is_outvoted(track, found)]
+    if outvoted:
+        found = [_without(entry, outvoted) for entry in found]
+        kept = () if seed is None else tuple(chain for chain in seed.chains if not _starts(chain, seed.frame, outvoted))
+        seed = None if seed is None else replace(seed, chains=kept)
+        tracks = _follow(found, frame_times_ms, catheters, search, seed)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
     if accepts is not None:
         least = max(least, _ACCEPTED_AT_LEAST * len(found))
@@ -220,6 +227,24 @@ def _accepted(
         seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
         tracks = _follow(found, frame_times_ms, catheters, search, seed)
     return tracks
+
+
+def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
+    """Return whether more frames show a longer catheter there.
+
+    They are compared with the frames that show the track's own chain. A chain of the seed or of the first frame can be a part of
+    the longer catheter, and would keep it out of every frame.
+    """
+    against = 0
+    for frame, chain in track.chains.items():
+        longer = [other for other in found[frame].chains if len(other.electrodes) > len(chain.electrodes)]
+        against += found[frame].manual_needed is None and any(_overlaps(chain, [other]) for other in longer)
+    return not track.manual and against > max(track.detections, _LEAST_AGAINST - 1)
+
+
+def _starts(chain: Chain, frame: int, tracks: Sequence[_Track]) -> bool:
+    """Return whether one of these tracks began with this chain of the seed."""
+    return any(track.from_seed and _overlaps(chain, [track.chains[frame]]) for track in tracks if frame in track.chains)
 
 
 def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:

@@ -11,6 +11,8 @@ from fluoromap.contracts import Array, BoolArray, Chain
 
 SURE = 0.5
 """Proposals of this probability have to be explained."""
+EVEN_ODDS = 0.0
+"""The log-odds of :data:`SURE`."""
 
 _OWN_MM = 1.2
 _BESIDE_MM = 1.0

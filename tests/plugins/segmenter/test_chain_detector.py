@@ -133,6 +133,16 @@ def test_a_short_chain_with_a_sure_point_between_its_electrodes_is_unlisted():
     assert chains_found(drawn([catheter]), points, [0.99] * 4 + [0.8], [0.9] * 5) == ()
 
 
+def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
+    catheter = row_of("ablation", (60, 60), 0.3)
+    shaft = 0.5 * (catheter[1:2] + catheter[2:3])
+    found = chains_found(drawn([catheter]), np.concatenate([catheter, shaft]), [0.99] * 4 + [0.6], [0.9] * 5)
+    assert any(lies_on(chain, catheter) for chain in found)
+    # As probable as its weakest electrode, it is an electrode that the catalogue does not list.
+    weak = chains_found(drawn([catheter]), np.concatenate([catheter, shaft]), [0.99, 0.7, 0.99, 0.99, 0.7], [0.9] * 5)
+    assert not any(lies_on(chain, catheter) for chain in weak)
+
+
 def test_a_long_row_is_accepted_with_less_from_each_electrode():
     doubted = np.full(10, 0.3)
     assert ACCEPTANCE.accepts(doubted, 2.5)

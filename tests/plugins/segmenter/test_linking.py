@@ -1,9 +1,17 @@
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
 from fluoromap.segmenter.four_step.contrast import Contrast
-from fluoromap.segmenter.linking import ShaftImage, catheter_families, evidence, kind_probabilities, link_candidates
+from fluoromap.segmenter.linking import (
+    PossibleChains,
+    ShaftImage,
+    best_chains,
+    catheter_families,
+    evidence,
+    kind_probabilities,
+    link_candidates,
+)
 from fluoromap.segmenter.proposals import probability_of_contrast
 
 PX = 5.75
@@ -85,3 +93,20 @@ def test_kinds_respect_how_many_of_each_the_catalogue_has():
     mapping = [dict(row).get("mapping", 0.0) for row in given]
     assert sum(mapping) == pytest.approx(1.0)
     assert mapping[2] > mapping[0]
+
+
+def test_the_many_chains_of_a_long_catheter_do_not_crowd_out_a_short_one():
+    catalogue = Catalogue(
+        (catheter_type("decapolar-2-5-2", "cs"), catheter_type("quadripolar-2-5-2", "rv")), "cs", "rv"
+    )
+    families = catheter_families(catalogue)
+    rng = np.random.default_rng(0)
+    row, _ = straight(catalogue["cs"], (20, 60), 0.1, 0.5)
+    doubled = np.concatenate([row, row + rng.normal(0, 1.0, row.shape)])
+    short, _ = straight(catalogue["rv"], (60, 250), 0.1)
+    points = np.concatenate([doubled, short])
+    # Two candidates for each of ten electrodes: hundreds of chains that all score more than the short catheter.
+    long_rows = np.arange(10) + 10 * rng.integers(0, 2, (300, 10))
+    possible = PossibleChains((long_rows, np.arange(20, 24)[None]), (rng.uniform(5.0, 6.0, 300), np.array([4.0])))
+    chosen = best_chains(possible, points, families, PX)
+    assert sorted(families[chain.family].names for chain in chosen) == [("cs",), ("rv",)]

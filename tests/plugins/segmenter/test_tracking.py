@@ -111,3 +111,23 @@ def test_an_accepted_track_is_there_in_most_frames():
     found = run([[chain(POINTS + 100)] if frame < 8 else [] for frame in range(20)])
     assert track_chains(found, times(20), 1)[0].chains
     assert not track_chains(found, times(20), 1, accepts=lambda chains: True)[0].chains
+
+
+def test_a_part_of_a_longer_catheter_does_not_keep_it_out():
+    long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
+    found = run([[chain(long + frame, "cs")] for frame in range(6)])
+    # The mean of the frames shows four of its electrodes only, and they are found again in every frame.
+    seed = FrameChains(2, (chain(long[3:7] + 2, "rv"),))
+
+    def search(frame, known, shift, reach_px, taken):
+        return chain(long[3:7] + frame, "rv") if len(known.electrodes) == 4 else chain(long + frame, "cs")
+
+    entries = track_chains(found, np.arange(6) * 100.0, 2, search, seed)
+    assert [[len(one.electrodes) for one in entry.chains] for entry in entries] == [[10]] * 6
+
+
+def test_a_short_catheter_stays_where_one_frame_shows_a_longer_one_at_its_place():
+    long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
+    found = run([[chain(long, "cs")] if frame == 3 else [chain(long[3:7], "rv")] for frame in range(6)])
+    entries = track_chains(found, np.arange(6) * 100.0, 2, lambda *asked: asked[1])
+    assert all(len(entry.chains[0].electrodes) == 4 for entry in entries)

@@ -35,13 +35,16 @@ class Explanation:
 
 
 def find_scale(
-    run: Run, catalogue: Catalogue, scales_px_per_mm: Sequence[float] = SCALES_PX_PER_MM
+    run: Run,
+    catalogue: Catalogue,
+    scales_px_per_mm: Sequence[float] = SCALES_PX_PER_MM,
+    trained: Trained | None = None,
 ) -> Explanation | None:
     """Return the scale and the polarity at which the catalogue explains a run best.
 
     ``run.px_per_mm`` and ``run.pixels.monochrome1`` are not used. A larger scale explains the same pictures by stronger
     foreshortening, so the smallest scale that explains nearly as much as the best is returned. It is right to about 20 %: enough
-    to find electrodes and to show them, not to locate them.
+    to find electrodes and to show them, not to locate them. ``trained`` : the shipped network by default.
 
     Returns
     -------
@@ -51,18 +54,21 @@ def find_scale(
     tried = [
         one
         for inverted in (False, True)
-        for one in _explanations(run, replace(run.pixels, monochrome1=inverted), catalogue, scales_px_per_mm)
+        for one in _explanations(run, replace(run.pixels, monochrome1=inverted), catalogue, scales_px_per_mm, trained)
     ]
     return _smallest_of_the_best(tried)
 
 
-def is_inverted(run: Run, catalogue: Catalogue) -> bool:
-    """Return whether the catalogue explains the run only with its grey levels inverted."""
+def is_inverted(run: Run, catalogue: Catalogue, trained: Trained | None = None) -> bool:
+    """Return whether the catalogue explains the run only with its grey levels inverted.
+
+    ``trained`` : the shipped network by default.
+    """
     inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
-    of_inverted = _smallest_of_the_best(_explanations(run, inverted, catalogue, (run.px_per_mm,)))
+    of_inverted = _smallest_of_the_best(_explanations(run, inverted, catalogue, (run.px_per_mm,), trained))
     if of_inverted is None:
         return False
-    (as_it_says,) = _explanations(run, run.pixels, catalogue, (run.px_per_mm,))
+    (as_it_says,) = _explanations(run, run.pixels, catalogue, (run.px_per_mm,), trained)
     return of_inverted.electrodes > as_it_says.electrodes
 
 
@@ -83,15 +89,15 @@ def _smallest_of_the_best(tried: Sequence[Explanation]) -> Explanation | None:
 
 
 def _explanations(
-    run: Run, pixels: PixelFacts, catalogue: Catalogue, scales_px_per_mm: Sequence[float]
+    run: Run, pixels: PixelFacts, catalogue: Catalogue, scales_px_per_mm: Sequence[float], trained: Trained | None
 ) -> list[Explanation]:
     """Explain a few frames of a run at each scale."""
     field = find_field(run.frames, pixels)
     transform = LogTransform.of_run(pixels, field.mean_level)
     frames = list(evenly_spaced_frames(len(run.frames)))
     images = [field.fill(transform(run.frames[frame])) for frame in frames[:: max(1, len(frames) // _FRAMES)][:_FRAMES]]
-    trained = read_weights(SHIPPED)
-    return [_explained(images, field, pixels, catalogue, scale, trained) for scale in scales_px_per_mm]
+    network = read_weights(SHIPPED) if trained is None else trained
+    return [_explained(images, field, pixels, catalogue, scale, network) for scale in scales_px_per_mm]
 
 
 def _explained(

@@ -16,7 +16,7 @@ from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
-from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
@@ -45,7 +45,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -58,19 +58,20 @@ class LearnedChain:
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
-        found = self._segment(run, catalogue, marks, context)
-        if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue):
+        trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
+        found = self._segment(run, catalogue, marks, context, trained)
+        if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
             _log.warning(
                 "The electrodes are bright: the grey levels were inverted although the header does not say so."
             )
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
-            found = self._segment(replace(run, pixels=inverted), catalogue, marks, context)
+            found = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)
         return found
 
-    def _segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
-        trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
+    def _segment(
+        self, run: Run, catalogue: Catalogue, marks: Marks, context: Context, trained: Trained
+    ) -> Segmentation:
         alone = len(run.frames) == 1
-
         frame_ms = float(np.diff(run.frame_times_ms).max(initial=0.0))
 
         def detector_of(field: FieldMask) -> Detector:

@@ -26,7 +26,7 @@ _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
-_LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.2, -2.0
+_LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.07, -2.0
 """Log-odds of the middle electrode in each mean; less where half of the single frames show the catheter; of the worst electrode."""
 _LOW_QUANTILE = 0.1
 _LEAST_LONG = 0.0

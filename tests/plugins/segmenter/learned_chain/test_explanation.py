@@ -10,7 +10,8 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.learned_chain.explanation import find_scale, is_inverted
-from fluoromap.segmenter.learned_chain.plugin import LearnedChain
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
+from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 
 PX_PER_MM = 512 / 178 * 2
 HIGHEST = 4095
@@ -57,6 +58,28 @@ def test_an_inverted_run_is_segmented_all_the_same(frames, caplog):
     found = LearnedChain().segment(inverted, DEFAULT_CATALOGUE, {}, Silent())
     assert sum(len(chain.electrodes) for chain in found.frames[2].chains) >= 8
     assert "inverted" in caplog.text
+
+
+@pytest.fixture
+def blind_weights(tmp_path):
+    """A weights file whose network sees no electrode anywhere."""
+    with np.load(SHIPPED, allow_pickle=False) as shipped:
+        arrays = {name: shipped[name] for name in shipped.files}
+    arrays["calibration"] = np.array([1.0, -40.0, 1.0], np.float32)
+    path = tmp_path / "blind.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def test_scale_and_polarity_are_those_of_the_jobs_own_weights(frames, blind_weights, caplog):
+    inverted = replace(run_of([np.uint16(HIGHEST) - frame for frame in frames]), px_per_mm=PX_PER_MM)
+    segmenter = LearnedChain(LearnedChainParams(weights=str(blind_weights)))
+    found = segmenter.segment(inverted, DEFAULT_CATALOGUE, {}, Silent())
+    assert all(entry.chains == () for entry in found.frames)
+    assert "inverted" not in caplog.text
+    trained = read_weights(blind_weights)
+    assert not is_inverted(inverted, DEFAULT_CATALOGUE, trained)
+    assert find_scale(inverted, DEFAULT_CATALOGUE, trained=trained) is None
 
 
 @pytest.mark.parametrize("level", [20, 600])
