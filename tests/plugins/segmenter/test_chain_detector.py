@@ -4,29 +4,15 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
-from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
+from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.linking import Trust
+from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
 from fluoromap.segmenter.proposals import Likeness, Proposals
 
 PX = 4.0
 SIZE = 360
 CATALOGUE = Catalogue(
     (catheter_type("decapolar-2-5-2", "cs"), catheter_type("ablation-4", "ablation")), "cs", "ablation"
-)
-ACCEPTANCE = Acceptance(
-    least_clearness=0.1,
-    again_clearness=0.1,
-    sure_clearness=0.1,
-    extra_clearness=0.3,
-    least_score=0.4,
-    seen_score=0.15,
-    least_seen=0.85,
-    unseen_evidence=-0.9,
-    strict=True,
-    row_chain_score=2.0,
-    row_score=0.2,
-    trust=Trust(share=0.25, chain=0.7),
 )
 
 
@@ -92,7 +78,7 @@ def chains_found(image, points, probability, scores):
     everywhere = np.ones(image.shape, np.bool_)
     field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
     evidence = Evidence(image, points, probability, scores)
-    detector = ChainDetector(CATALOGUE, field, PX, lambda x: evidence, ACCEPTANCE)
+    detector = ChainDetector(CATALOGUE, field, PX, lambda x: evidence, IN_A_RUN)
     return detector.find_chains(image, 0).chains
 
 
@@ -145,19 +131,19 @@ def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
 
 def test_a_long_row_is_accepted_with_less_from_each_electrode():
     doubted = np.full(10, 0.3)
-    assert ACCEPTANCE.accepts(doubted, 2.5)
-    assert not ACCEPTANCE.accepts(doubted, 1.5)
-    assert not ACCEPTANCE.accepts(doubted[:4], 2.5)
-    assert not ACCEPTANCE.accepts(np.full(10, 0.1), 8.0)
+    assert IN_A_RUN.accepts(doubted, 2.5)
+    assert not IN_A_RUN.accepts(doubted, 1.5)
+    assert not IN_A_RUN.accepts(doubted[:4], 2.5)
+    assert not IN_A_RUN.accepts(np.full(10, 0.1), 8.0)
 
 
 def test_a_row_displaced_by_a_pair_is_not_accepted():
     displaced = np.array([0.9] * 8 + [0.01] * 2)
-    assert not ACCEPTANCE.accepts(displaced, 5.0)
-    assert not ACCEPTANCE.accepts(displaced[::-1], 5.0)
-    assert ACCEPTANCE.accepts(np.array([0.9] * 6 + [0.01] * 2 + [0.9] * 2), 5.0)
+    assert not IN_A_RUN.accepts(displaced, 5.0)
+    assert not IN_A_RUN.accepts(displaced[::-1], 5.0)
+    assert IN_A_RUN.accepts(np.array([0.9] * 6 + [0.01] * 2 + [0.9] * 2), 5.0)
 
 
 def test_chains_are_accepted_one_by_one():
     scores = np.stack([np.full(4, 0.9), np.full(4, 0.1)])
-    assert ACCEPTANCE.accepts(scores, np.array([5.0, 5.0])).tolist() == [True, False]
+    assert IN_A_RUN.accepts(scores, np.array([5.0, 5.0])).tolist() == [True, False]

@@ -17,8 +17,7 @@ from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import Trust
 from fluoromap.segmenter.log_image import Image
 
-_TRUST = Trust(share=0.25, chain=0.7)
-_IN_A_RUN = Acceptance(
+IN_A_RUN = Acceptance(
     least_clearness=0.1,
     again_clearness=0.1,
     sure_clearness=0.1,
@@ -30,9 +29,9 @@ _IN_A_RUN = Acceptance(
     strict=True,
     row_chain_score=2.0,
     row_score=0.2,
-    trust=_TRUST,
+    trust=Trust(share=0.25, chain=0.7),
 )
-_ALONE = replace(_IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, least_score=0.4)
+_ALONE = replace(IN_A_RUN, least_clearness=0.3, sure_clearness=0.5)
 """Scores are probabilities. In a single frame no other frame confirms a chain."""
 
 _COARSE_BITS = 8
@@ -64,5 +63,5 @@ def electrode_chains(
             network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, network.reach_cells
         )
 
-    detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else _IN_A_RUN)
+    detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else IN_A_RUN)
     return FrameSearch(detector, network, len(catalogue.catheters), frame_ms <= SHARED_MS)
