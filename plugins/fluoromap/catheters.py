@@ -95,24 +95,27 @@ class Catheter:
 class Catalogue:
     """The catheters of one study, and the roles of reference and mapping catheter.
 
-    The reference catheter is the origin of coordinates.
+    The reference catheter is the origin of coordinates. Only a study with a single catheter, which maps, has none (None);
+    its coordinates count from the isocentre.
 
     Raises
     ------
     ValueError
-        When names repeat or a role names no catheter.
+        When names repeat, a role names no catheter, or several catheters have no reference.
     """
 
     catheters: tuple[Catheter, ...]
-    reference: str
+    reference: str | None
     mapping: str
 
     def __post_init__(self) -> None:
         names = [catheter.name for catheter in self.catheters]
         if len(set(names)) != len(names):
             raise ValueError("catheter names must differ")
+        if self.reference is None and len(names) > 1:
+            raise ValueError("one of several catheters must be the reference")
         for role in (self.reference, self.mapping):
-            if role not in names:
+            if role is not None and role not in names:
                 raise ValueError(f"no catheter is named {role!r}")
         if self.reference == self.mapping:
             raise ValueError("the reference and the mapping catheter must differ")

@@ -536,8 +536,11 @@ class LocatedSite:
         origin = self.doubts_about(reference) if reference is not None else ()
         return tuple(dict.fromkeys((*own, *self.reasons, *origin)))
 
-    def doubts_about(self, catheter: str) -> tuple[Reason, ...]:
-        """Return the reasons of a catheter's points, and of the whole site, that limit the grade."""
+    def doubts_about(self, catheter: str | None) -> tuple[Reason, ...]:
+        """Return the reasons of a catheter's points, and of the whole site, that limit the grade.
+
+        Without a catheter, those of the whole site.
+        """
         own = [reason for point in self.points if point.catheter == catheter for reason in point.reasons]
         reasons = (*own, *self.reasons)
         return tuple(dict.fromkeys(reason for reason in reasons if reason in AT_BEST_C))

@@ -15,6 +15,7 @@ class Reason(StrEnum):
     IDENTITY_BY_MOTION = "identity_by_motion"
     IDENTITY_UNCERTAIN = "identity_uncertain"
     NO_REFERENCE = "no_reference"
+    NO_RESTING_CATHETER = "no_resting_catheter"
     NO_ACTIVATION_TIME = "no_activation_time"
     ONE_VIEW_ONLY = "one_view_only"
     VIEWS_PARALLEL = "views_parallel"
@@ -58,7 +59,8 @@ _SENTENCES: dict[Reason, str] = {
     Reason.CATHETER_NOT_FOUND: "This catheter was not found in one of the views; mark it by hand on one frame.",
     Reason.IDENTITY_BY_MOTION: "The reference catheter was chosen among look-alikes because it moves least between the sites.",
     Reason.IDENTITY_UNCERTAIN: "Two catheters could be exchanged; name one of them by hand on one frame.",
-    Reason.NO_REFERENCE: "The reference catheter was not located here; its mean position over the other sites was used.",
+    Reason.NO_REFERENCE: "No reference catheter was located here; its mean over the other sites was used, else the isocentre.",
+    Reason.NO_RESTING_CATHETER: "No catheter rests in this study; a table that moved between the two views would not be noticed.",
     Reason.NO_ACTIVATION_TIME: "This site has no activation time; send one with the activation-time table.",
     Reason.ONE_VIEW_ONLY: "This site has only one run; a second view at least 30 degrees away is needed.",
     Reason.VIEWS_PARALLEL: "The two views are less than 20 degrees apart, which gives no depth; record a view farther away.",
@@ -93,7 +95,7 @@ _SENTENCES: dict[Reason, str] = {
 
 AT_BEST_C = frozenset({
     Reason.IDENTITY_UNCERTAIN, Reason.EXTRA_CATHETER, Reason.TABLE_MOVED, Reason.GEOMETRY_DOUBTFUL, Reason.SPACING_MISMATCH,
-    Reason.VIEW_MIRRORED, Reason.PAIRING_FAILED,
+    Reason.VIEW_MIRRORED, Reason.PAIRING_FAILED, Reason.NO_RESTING_CATHETER,
 })  # fmt: skip
 """Doubts about which electrode this is or where its views are: no covariance contains them, so the grade is at best C."""
 AT_BEST_B = frozenset({Reason.CATALOGUE_CONTRADICTED, Reason.MARK_NOT_USED})

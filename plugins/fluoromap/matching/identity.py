@@ -62,7 +62,7 @@ def look_alike_groups(catalogue: Catalogue) -> tuple[tuple[str, ...], ...]:
 
 
 def name_look_alikes(
-    names: tuple[str, ...], reference: str, sites: Sequence[Sequence[PairedCatheter]]
+    names: tuple[str, ...], reference: str | None, sites: Sequence[Sequence[PairedCatheter]]
 ) -> tuple[list[list[str]], Reason | None]:
     """Name the catheters of one group of look-alikes at every site.
 
@@ -78,7 +78,7 @@ def name_look_alikes(
     ----------
     names : tuple of str
         Of the group, in the catalogue's order.
-    reference : str
+    reference : str or None
         The catalogue's reference, in the group or not.
     sites : sequence of sequences
         The paired catheters of this group at each site, at most as many as names.
@@ -121,7 +121,7 @@ def name_look_alikes(
 
 def _assign_names(
     names: tuple[str, ...],
-    reference: str,
+    reference: str | None,
     fixed: dict[int, str],
     sites: Sequence[Sequence[PairedCatheter]],
     places: list[list[int]],
@@ -136,7 +136,7 @@ def _assign_names(
     free = [place for place in range(count) if place not in order and place in shown]
     left = [name for name in names if name not in order.values()]
     reason: Reason | None = None
-    if free and reference in left and len(left) > 1:
+    if free and reference is not None and reference in left and len(left) > 1:
         stillest, reason = _stillest(sites, places, free)
         order[stillest] = reference
         free.remove(stillest)

@@ -275,7 +275,7 @@ class _Run:
         return replace(self, view=replace(self.view, camera=replace(camera, matrix=flipped)))
 
 
-def _from_reference(electrodes: ViewElectrodes, reference: str) -> tuple[Array, BoolArray]:
+def _from_reference(electrodes: ViewElectrodes, reference: str | None) -> tuple[Array, BoolArray]:
     """Return weights (n, m, m) that subtract the reference's mean, and the frames (n,) that show the reference."""
     is_reference = np.array([name == reference for name in electrodes.catheters])
     visible = electrodes.visible & is_reference

@@ -53,7 +53,7 @@ def isocentre_origins(frames: int) -> FrameOrigins:
     return FrameOrigins(np.zeros((frames, 3)), ~never, never, never)
 
 
-def reference_origins(track: Track, site: LocatedSite, catheter: str, others_mm: Array | None) -> FrameOrigins:
+def reference_origins(track: Track, site: LocatedSite, catheter: str | None, others_mm: Array | None) -> FrameOrigins:
     """Return the mean of the reference catheter's electrodes in each frame.
 
     A frame may show only some of the electrodes. Then each of them gives an estimate of the mean, by subtracting its
@@ -64,8 +64,8 @@ def reference_origins(track: Track, site: LocatedSite, catheter: str, others_mm:
     track : Track
     site : LocatedSite
         The site of the track.
-    catheter : str
-        Name of the reference catheter.
+    catheter : str or None
+        Name of the reference catheter, where the study has one.
     others_mm : (3,) or None
         Mean over the other sites, from the isocentre, for a site that has no diastolic mean of its own.
     """
@@ -90,7 +90,7 @@ def reference_origins(track: Track, site: LocatedSite, catheter: str, others_mm:
     return FrameOrigins(mean, np.ones_like(same_frame), borrowed, same_frame)
 
 
-def in_study(track: Track, camera: Camera, reference: str, variation: StudyVariation) -> Track:
+def in_study(track: Track, camera: Camera, reference: str | None, variation: StudyVariation) -> Track:
     """Return the track with the covariances of a study with this variation.
 
     A solver assumes any gantry and any heart, so that its result depends on one site alone. A study shows how far its heart
@@ -101,8 +101,8 @@ def in_study(track: Track, camera: Camera, reference: str, variation: StudyVaria
     track : Track
     camera : Camera
         Camera of the tracked view.
-    reference : str
-        Name of the reference catheter.
+    reference : str or None
+        Name of the reference catheter, where the study has one.
     variation : StudyVariation
         Of the study.
     """

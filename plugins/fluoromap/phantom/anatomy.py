@@ -51,21 +51,20 @@ class Resident:
 class Anatomy:
     """One heart with its catheters.
 
-    reference : fixed in the right heart. resting : the catheters beside it, for each site one entry of each, because they slip a
-    little when the mapping catheter is turned. mapping : in the left ventricle, one entry a site.
+    resting : in the right heart, one entry a site: the reference catheter, which is fixed, then the catheters beside it, which slip
+    a little when the mapping catheter is turned. mapping : in the left ventricle, one entry a site.
     contacts_mm : (sites, 3) points where the mapping tip's end touches the wall at diastole.
     """
 
     chamber: Chamber
     rate_hz: float
-    reference: Resident
     resting: tuple[tuple[Resident, ...], ...]
     mapping: tuple[Resident, ...]
     contacts_mm: Array
 
     def residents(self, site: int) -> tuple[Resident, ...]:
         """Return reference, resting and mapping catheters at a site."""
-        return (self.reference, *self.resting[site], self.mapping[site])
+        return (*self.resting[site], self.mapping[site])
 
 
 def draw_anatomy(
@@ -77,29 +76,29 @@ def draw_anatomy(
     sinus, circular ones and all others in the right atrium.
     """
     rate = float(rng.uniform(*HEART_RATE_HZ[heart]))
-    chamber, reference, resting = _right_heart(rng, catalogue)
+    chamber, resting = _right_heart(rng, catalogue)
     contacts = spread_over_wall(chamber, sites, rng)
     mapping = [_mapping_shaft(catalogue[catalogue.mapping], chamber, contact, rng) for contact in contacts]
 
     rocking = rng.normal(size=3)
     rocking *= ROCKING_MM / np.linalg.norm(rocking)
-    tips = np.stack([reference.rest_mm[0], *(shaft.rest_mm[0] for shaft in resting), *contacts])
-    # Catheters in the right heart lie on trabeculae or in a vein and follow the wall less.
-    follow = np.array([0.5, *(0.7 for _ in resting), *np.ones(sites)])[:, None, None]
+    tips = np.stack([*(shaft.rest_mm[0] for shaft in resting), *contacts])
+    # Catheters in the right heart lie on trabeculae or in a vein and follow the wall less, the reference least.
+    follow = np.array([*(0.7 if number else 0.5 for number in range(len(resting))), *np.ones(sites)])[:, None, None]
     common = follow * wall_vectors(chamber, tips, rocking)
     own = follow * np.stack([non_affine_vectors(rng) for _ in tips])
-    first_mapping = 1 + len(resting)
+    first_mapping = len(resting)
     excursion = float(rng.uniform(*_EXCURSION_MM))
     vectors = _strength(common, own, rate, excursion, first_mapping) * common + own
-    slips = rng.normal(0, PACING_SLIP_MM, (sites, len(resting), 3))
+    slips = np.zeros((sites, len(resting), 3))
+    slips[:, 1:] = rng.normal(0, PACING_SLIP_MM, slips[:, 1:].shape)
     return Anatomy(
         chamber,
         rate,
-        Resident(reference, vectors[0]),
         tuple(
             tuple(
                 Resident(shaft.with_tip_displaced(slip), v)
-                for shaft, slip, v in zip(resting, at_site, vectors[1:first_mapping], strict=True)
+                for shaft, slip, v in zip(resting, at_site, vectors[:first_mapping], strict=True)
             )
             for at_site in slips
         ),
@@ -108,10 +107,10 @@ def draw_anatomy(
     )
 
 
-def _right_heart(rng: np.random.Generator, catalogue: Catalogue) -> tuple[Chamber, Shaft, list[Shaft]]:
-    """Draw the left ventricle, the reference catheter and the catheters that rest beside it.
+def _right_heart(rng: np.random.Generator, catalogue: Catalogue) -> tuple[Chamber, list[Shaft]]:
+    """Draw the left ventricle and the resting catheters, the reference first.
 
-    The apex points to the patient's left, front and feet.
+    The apex points to the patient's left, front and feet. Without a reference catheter activation times count from the focus.
     """
     apex = np.array([0.55, -0.55, -0.63]) + rng.normal(0, 0.08, 3)
     apex /= np.linalg.norm(apex)
@@ -126,7 +125,7 @@ def _right_heart(rng: np.random.Generator, catalogue: Catalogue) -> tuple[Chambe
 
     entry = np.array([-18.0, 8.0, 95.0]) + rng.normal(0, 4, 3)
     atrium = np.array([-26.0, 4.0, 34.0]) + rng.normal(0, 4, 3)
-    names = [catalogue.reference, *(n for n in catalogue.names if n not in (catalogue.reference, catalogue.mapping))]
+    names = sorted((n for n in catalogue.names if n != catalogue.mapping), key=lambda name: name != catalogue.reference)
     places = _places([catalogue[name] for name in names])
     tips = [in_heart(*place.tip) for _, place in places]
     shafts: dict[str, Shaft] = {}
@@ -142,11 +141,14 @@ def _right_heart(rng: np.random.Generator, catalogue: Catalogue) -> tuple[Chambe
     focus = spread_over_wall(undecided, 1, rng)[0]
     speed = float(rng.uniform(0.6, 1.0))
     from_focus = Chamber(centre, axes, np.array(SEMI_AXES_MM), focus, speed, 0.0)
-    reference, *resting = (shafts[name] for name in names)
-    reference_tip = reference.rest_mm[0]
-    septum = from_focus.on_wall(reference_tip)
-    delay = float(from_focus.activation_ms(septum)) + float(np.linalg.norm(reference_tip - septum)) / _SEPTUM_MM_PER_MS
-    return Chamber(centre, axes, np.array(SEMI_AXES_MM), focus, speed, delay), reference, resting
+    resting = [shafts[name] for name in names]
+    delay = 0.0
+    if resting:
+        reference_tip = resting[0].rest_mm[0]
+        septum = from_focus.on_wall(reference_tip)
+        through_septum = float(np.linalg.norm(reference_tip - septum)) / _SEPTUM_MM_PER_MS
+        delay = float(from_focus.activation_ms(septum)) + through_septum
+    return Chamber(centre, axes, np.array(SEMI_AXES_MM), focus, speed, delay), resting
 
 
 @dataclass(frozen=True, slots=True)

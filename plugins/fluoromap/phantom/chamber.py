@@ -31,7 +31,7 @@ class Chamber:
     conduction_mm_per_ms : float
         Speed along the wall, the same everywhere; 1 mm/ms is 1 m/s.
     reference_ms : float
-        Activation of the reference catheter after the focus: the zero of activation times.
+        Activation of the reference catheter after the focus: the zero of activation times. 0 without that catheter.
     """
 
     centre_mm: Array

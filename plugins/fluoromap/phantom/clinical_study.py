@@ -113,7 +113,7 @@ def _residents(conditions: Conditions, anatomy: Anatomy, site: int) -> tuple[Res
     for number, (resident, catheter) in enumerate(zip(anatomy.residents(site), _catheters(conditions), strict=True)):
         rest = resident.shaft.rest_mm[:_SHAFT_POINTS]
         if catheter.name == "pacing":
-            usual = anatomy.resting[0][0].shaft.rest_mm[:_SHAFT_POINTS]
+            usual = anatomy.resting[0][number].shaft.rest_mm[:_SHAFT_POINTS]
             rest = usual + conditions.pacing_slip * (rest - usual)
         # Reference and pacing catheter stay bent alike at all sites; the mapping catheter is turned at each.
         key = [conditions.seed, _BENDS, number, site if catheter.name == "mapping" else 0]

@@ -74,7 +74,7 @@ class StudySpec:
     dose : float
         Photons a pixel, as a multiple of the appearance's.
     catalogue : Catalogue
-        2 to 6 catheters, with the reference and the mapping catheter.
+        1 to 6 catheters. A single catheter maps, and its study has no reference.
 
     Raises
     ------
@@ -156,7 +156,7 @@ class SiteTruth:
     """Truth of one site at diastole, averaged over the beats of its two runs.
 
     diastole_mm : catheter -> (electrodes, 3), LPS from the isocentre, breathing averaged over both runs.
-    relative_mm : the same minus the reference catheter's mean, free of breathing. contact_mm : (3,) point where the
+    relative_mm : free of breathing, minus the mean of the reference catheter, if any. contact_mm : (3,) point where the
     mapping tip's end touches the wall, without breathing. lat_ms : activation time there without annotation noise.
     """
 
@@ -181,7 +181,7 @@ class SimulatedStudy:
     """All sites of one heart.
 
     chamber : the wall without breathing, with its focus. reference_mm : (3,) mean of the reference catheter at diastole
-    without breathing; the chamber minus it is in the map's coordinates.
+    without breathing; the chamber minus it is in the map's coordinates. It is 0 where the study has no reference.
     """
 
     spec: StudySpec
@@ -211,7 +211,7 @@ def simulate_study(spec: StudySpec) -> SimulatedStudy:
         start = starts[1] + float(times_rng.uniform(90, 240))
         annotated = float(activation[index] + times_rng.normal(0, ACTIVATION_NOISE_MS))
         sites.append(_site(spec, anatomy, cameras, index, starts, (float(activation[index]), annotated)))
-    reference = _diastole_mm(anatomy.residents(0))[spec.catalogue.reference].mean(axis=0)
+    reference = origin_mm(_diastole_mm(anatomy.residents(0)), spec.catalogue)
     return SimulatedStudy(spec, spec.catalogue, anatomy.chamber, reference, anatomy.rate_hz, tuple(sites))
 
 
@@ -261,7 +261,7 @@ def _site(
     runs = tuple(_run(spec, cameras[view], exposures[view], times, index, view, starts[view]) for view in (0, 1))
     breathing = np.mean([e.breathing.at(times).mean(axis=0) for e in exposures], axis=0)
     diastole = _diastole_mm(residents)
-    origin = diastole[spec.catalogue.reference].mean(axis=0)
+    origin = origin_mm(diastole, spec.catalogue)
     truth = SiteTruth(
         MappingProxyType({name: _read_only(points + breathing) for name, points in diastole.items()}),
         MappingProxyType({name: _read_only(points - origin) for name, points in diastole.items()}),
@@ -275,6 +275,26 @@ def _diastole_mm(residents: tuple[Resident, ...]) -> dict[str, Array]:
     """Return the electrodes at diastole of the average beat without breathing, catheter -> (electrodes, 3)."""
     pulses = Beats.even(1.0, 1.0).pulses(np.array([DIASTOLIC_PHASE]))
     return {r.shaft.catheter.name: r.shaft.electrodes_mm(r.shaft.lines_mm(pulses @ r.vectors_mm))[0] for r in residents}
+
+
+def origin_mm(electrodes_mm: Mapping[str, Array], catalogue: Catalogue) -> Array:
+    """Return the mean of the reference catheter's electrodes.
+
+    It is the isocentre where the study has no reference.
+
+    Parameters
+    ----------
+    electrodes_mm : mapping of catheter to (..., electrodes, 3)
+    catalogue : Catalogue
+
+    Returns
+    -------
+    ndarray (..., 3)
+    """
+    if catalogue.reference is None:
+        return np.zeros(3)
+    mean: Array = electrodes_mm[catalogue.reference].mean(axis=-2)
+    return mean
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,6 +94,7 @@ class SiteLocator:
                 self.any_study.gantry.covariance, jump,
             )  # fmt: skip
         reasons = [reason for reason, holds in (
+            (Reason.NO_RESTING_CATHETER, self.catalogue.reference is None),
             (Reason.NO_REFERENCE, reference_mm is None),
             (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
         ) if holds]  # fmt: skip

@@ -272,10 +272,12 @@ def _from_one_origin(
 
     Sites that show other electrodes of the reference catheter than most sites do are located again.
     """
-    origin = common_origin(located, catalogue.reference)
+    reference = catalogue.reference
+    if reference is None or (origin := common_origin(located, reference)) is None:
+        return list(located)
     same: list[LocatedSite] = []
     for first, (site, jump, locator) in zip(located, work, strict=True):
-        if origin is not None and deviates(first, catalogue.reference, origin):
+        if deviates(first, reference, origin):
             again = _Location(site, jump, replace(locator, origin=origin))
             first = context.recall(LocatedSite, again.inputs, again.located_site)
         same.append(first)

@@ -32,6 +32,10 @@ class FinishedMap:
     warnings: tuple[Reason, ...]
     simulated: bool
 
+    def origin(self, chosen: Origin) -> Origin:
+        """Return the origin of the map's answer: the chosen one, or the isocentre where no site has a reference."""
+        return Origin.ISOCENTRE if self.reference_mm is None else chosen
+
     def shift_mm(self, origin: Origin) -> Array:
         """Return the vector (3,) to add to the map's coordinates.
 

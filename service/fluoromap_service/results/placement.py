@@ -67,7 +67,8 @@ class MapPlacement:
         World = map + shift. The frame counts from 0.
         """
         mean_mm = np.zeros(3) if self.finished.reference_mm is None else self.finished.reference_mm
-        shown = self.chains.get(frame, {}).get(self.snapshot.reference)
+        reference = self.snapshot.reference
+        shown = None if reference is None else self.chains.get(frame, {}).get(reference)
         return map_shift_mm(self.site, self.camera, shown, self._tracked_mm(frame), mean_mm)
 
     def tip_uv(self, frame: int) -> Array | None:
@@ -164,7 +165,7 @@ def _chains(site: MatchedSite, view: View) -> dict[int, dict[str, NamedChain]]:
     return chains
 
 
-def _origins(session: Session, job: Job, site: LocatedSite, view: View, reference: str) -> FrameOrigins | None:
+def _origins(session: Session, job: Job, site: LocatedSite, view: View, reference: str | None) -> FrameOrigins | None:
     stage = stage_of(session, job.id, "monoplane", site.site)
     if stage is None or stage.state != StageState.DONE:
         return None

@@ -27,15 +27,15 @@ def point_rows(session: Session, job: Job) -> Sequence[Point]:
 
 
 def alternative_positions(
-    triangulation: Triangulation, reference: str, origin: Origin
+    triangulation: Triangulation, reference: str | None, origin: Origin
 ) -> Iterator[tuple[str, ElectrodePoint, Array]]:
     """Return the electrodes that the other pairing of the catheters would put elsewhere.
 
     Parameters
     ----------
     triangulation : Triangulation
-    reference : str
-        Name of the reference catheter.
+    reference : str or None
+        Name of the reference catheter, where the study has one.
     origin : Origin
 
     Returns
@@ -53,7 +53,7 @@ def alternative_positions(
                 yield site.site, point, point.alternative_mm - zero_mm
 
 
-def _alternative_reference_mm(site: LocatedSite, reference: str) -> Array | None:
+def _alternative_reference_mm(site: LocatedSite, reference: str | None) -> Array | None:
     """Return the reference catheter's origin (3,) under the other pairing.
 
     That pairing may move this catheter too.

@@ -22,7 +22,7 @@ from fluoromap.reasons import Reason
 from fluoromap_service.jobs.stage_results import SiteTracks, load, stages_of
 from fluoromap_service.problem import not_found
 from fluoromap_service.results.finished import done_stage, snapshot_of, stage_not_ready
-from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.origins import Origin, origin_in
 from fluoromap_service.store.models import Job, StageRow, StageState
 
 
@@ -74,7 +74,7 @@ def tracks_of(
         raise not_found("site in this job")
     triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
     views = [entry for entry in snapshot.views if view in (None, entry)]
-    origins = _OriginOfTracks(origin, snapshot.reference, map_origin(triangulation))
+    origins = _OriginOfTracks(origin_in(job, origin), snapshot.reference, map_origin(triangulation))
     for stage in stages_of(session, job.id, "monoplane"):
         if site in (None, stage.subject):
             yield from _site(job, stage, views, triangulation, origins, tip_of)
@@ -86,10 +86,10 @@ def tracks_of(
 
 @dataclass(frozen=True, slots=True)
 class _OriginOfTracks:
-    """The origin that the reader chose, the reference catheter, and its mean over the sites in mm from the isocentre."""
+    """The origin of the answer, the reference catheter, and its mean over the sites in mm from the isocentre."""
 
     origin: Origin
-    catheter: str
+    catheter: str | None
     mean_mm: tuple[float, float, float] | None
 
     def frames(self, track: Track, site: LocatedSite) -> FrameOrigins:

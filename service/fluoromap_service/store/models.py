@@ -112,7 +112,7 @@ class Study(Base):
     chamber: Mapped[str | None] = mapped_column(String(100))
     notes: Mapped[str | None] = mapped_column(Text)
     catheters: Mapped[list[Any]]
-    reference: Mapped[str] = mapped_column(String(64))
+    reference: Mapped[str | None] = mapped_column(String(64))
     mapping: Mapped[str] = mapped_column(String(64))
     gantry: Mapped[Json] = mapped_column(default=dict)  # completes the headers of all runs
     # The DICOM study whose runs join this study; only for a study that a DICOM door made.

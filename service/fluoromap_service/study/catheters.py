@@ -59,24 +59,23 @@ def catalogue_with_roles(catheters: tuple[Catheter, ...], reference: str | None)
     """Return a catalogue of these catheters with their roles.
 
     The mapping catheter is the one named ``mapping``, otherwise the one with the longest tip. The reference catheter is
-    ``reference``, otherwise the one named ``reference``, otherwise the first that does not map.
+    ``reference``, otherwise the one named ``reference``, otherwise the first that does not map. A single catheter maps, and
+    its study has no reference.
 
     Raises
     ------
     Problem
-        422 when there are fewer than two catheters, when names repeat, or when a role has no catheter.
+        422 when names repeat, or when ``reference`` names no catheter or the mapping catheter.
     """
-    if len(catheters) < 2:
-        raise _unusable("catheters", "a study needs a mapping catheter and a reference catheter")
     names = [catheter.name for catheter in catheters]
     mapping = "mapping" if "mapping" in names else max(catheters, key=lambda catheter: catheter.tip_mm).name
     if reference is None:
         others = [name for name in names if name != mapping]
-        reference = "reference" if "reference" in others else next(iter(others), mapping)
+        reference = "reference" if "reference" in others else next(iter(others), None)
     elif reference not in names:
         raise _unusable("reference", f"no catheter is named {reference!r}")
     elif reference == mapping:
-        raise _unusable("reference", f"{reference!r} is the mapping catheter; the reference must be another one")
+        raise _unusable("reference", f"{reference!r} is the mapping catheter; name another catheter or leave this out")
     try:
         return Catalogue(catheters, reference, mapping)
     except ValueError as error:

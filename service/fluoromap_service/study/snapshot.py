@@ -111,7 +111,7 @@ class Snapshot(_Frozen):
 
     study: str
     catheters: tuple[StudyCatheter, ...]
-    reference: str
+    reference: str | None
     mapping: str
     segmenter: PluginSnapshot
     triangulator: PluginSnapshot

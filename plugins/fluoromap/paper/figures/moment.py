@@ -29,7 +29,7 @@ from fluoromap.geometry import Camera
 from fluoromap.monoplane.track_samples import in_study
 from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy
 from fluoromap.phantom.ideal_matching import matched_sites
-from fluoromap.phantom.simulated_study import ACTIVATION_NOISE_MS
+from fluoromap.phantom.simulated_study import ACTIVATION_NOISE_MS, origin_mm
 from fluoromap.registry import DEFAULTS, build_fuser, build_monoplane, build_triangulator
 
 PhantomView = Literal["LAT", "PA"]
@@ -155,8 +155,8 @@ def _site_at(
         exact=_mapped_site(catalogue, site, truth, np.zeros((3, 3))),
         single_view=_mapped_site(catalogue, site, single_view, covariance[frame, tip]),
         other_cycles_mm=_tip_mm(catalogue, _electrodes_mm(catalogue, without_own_cycle, frame)),
-        exact_origin_mm=truth[catalogue.reference].mean(axis=0),
-        single_view_origin_mm=single_view[catalogue.reference].mean(axis=0),
+        exact_origin_mm=origin_mm(truth, catalogue),
+        single_view_origin_mm=origin_mm(single_view, catalogue),
         camera=monoplane_view.camera,
         ray=ray / np.linalg.norm(ray),
         tip_uv=track.pixels_uv[frame, tip],
@@ -172,7 +172,7 @@ def _electrodes_mm(catalogue: Catalogue, track: Track, frame: int) -> dict[str, 
 
 def _tip_mm(catalogue: Catalogue, electrodes_mm: dict[str, Array]) -> Array:
     """Return the mapping tip (3,) minus the reference catheter's mean."""
-    tip: Array = electrodes_mm[catalogue.mapping][0] - electrodes_mm[catalogue.reference].mean(axis=0)
+    tip: Array = electrodes_mm[catalogue.mapping][0] - origin_mm(electrodes_mm, catalogue)
     return tip
 
 
@@ -198,6 +198,6 @@ def _moved_mm(catalogue: Catalogue, site: SimulatedSite, run: SimulatedRun) -> A
     Both positions are minus the reference catheter's mean.
     """
     points = run.truth.points_mm
-    tip = points[catalogue.mapping][:, 0] - points[catalogue.reference].mean(axis=1)
+    tip = points[catalogue.mapping][:, 0] - origin_mm(points, catalogue)
     moved: Array = np.linalg.norm(tip - site.truth.relative_mm[catalogue.mapping][0], axis=1)
     return moved

@@ -119,7 +119,7 @@ def activation_map(finished: FinishedMap, origin: Origin) -> ActivationMap:
     chamber, shift = finished.chamber, finished.shift_mm(origin)
     covered = chamber.covered.tolist()
     return ActivationMap(
-        frame=FrameOfReference(origin=origin),
+        frame=FrameOfReference(origin=finished.origin(origin)),
         vertices_mm=(chamber.vertices_mm + shift).tolist(),
         faces=chamber.faces.tolist(),
         lat_ms=_where(covered, chamber.lat_ms.tolist()),
@@ -263,4 +263,6 @@ def get_mesh(
         finished = map_of(session, job_of(session, job_id))
     mesh = mesh_of(job_id, finished, mesh_format, origin)
     media_type = MESH_MEDIA_TYPES[mesh_format]
-    return file_response(request, mesh.path, mesh.sha256, media_type, f"chamber-{origin}.{mesh_format}")
+    return file_response(
+        request, mesh.path, mesh.sha256, media_type, f"chamber-{finished.origin(origin)}.{mesh_format}"
+    )

@@ -19,7 +19,7 @@ from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery,
 from fluoromap_service.api.results.study_geometry import StudyGeometry, study_geometry
 from fluoromap_service.jobs.stage_results import load
 from fluoromap_service.results.finished import done_stage, job_of, snapshot_of
-from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.origins import Origin, origin_in
 from fluoromap_service.results.points import point_rows
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
@@ -125,7 +125,7 @@ def points_of(session: Session, job: Job, origin: Origin) -> list[Point]:
     Problem
         409 ``not_ready`` before the stage ``triangulate`` is done.
     """
-    guessed = sites_by_row_order(session, job)
+    guessed, origin = sites_by_row_order(session, job), origin_in(job, origin)
     return [_point(row, origin, row.site in guessed) for row in point_rows(session, job)]
 
 
@@ -175,6 +175,7 @@ def _lines(points: list[Point]) -> Iterator[list[Any]]:
 def _read(job_id: str, origin: Origin) -> Points:
     with reading() as session:
         job = job_of(session, job_id)
+        origin = origin_in(job, origin)
         points = points_of(session, job, origin)
         triangulation = load(Triangulation, done_stage(session, job, "triangulate"))
         study = study_geometry(triangulation, snapshot_of(job).reference, origin)

@@ -37,7 +37,7 @@ from fluoromap_service.results.finished import ended_job_of, job_of, snapshot_of
 from fluoromap_service.results.fusion import fusion_of
 from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.mesh_files import MeshFormat, mesh_of
-from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.origins import Origin, origin_in
 from fluoromap_service.results.placement import located_views
 from fluoromap_service.results.points import point_rows
 from fluoromap_service.store import files
@@ -97,7 +97,8 @@ def plan_objects(job_id: str) -> JobObjects:
         job = ended_job_of(session, job_id, "DICOM zip")
         snapshot = snapshot_of(job)
         tips = [row for row in point_rows(session, job) if (row.catheter, row.electrode) == (snapshot.mapping, 1)]
-        sites = tuple(site for row in tips if (site := _site(row)) is not None)
+        counted_from = origin_in(job, Origin.REFERENCE)
+        sites = tuple(site for row in tips if (site := _site(row, counted_from)) is not None)
         if not sites:
             raise Problem(409, "no_map", "No site could be located, so there is nothing to report; see the points.")
         try:
@@ -123,13 +124,16 @@ def plan_objects(job_id: str) -> JobObjects:
     return JobObjects(origin, (report, *drawn))
 
 
-def _site(row: Point) -> ReportSite | None:
-    """Return a located tip from the reference catheter; None where it has no position."""
-    if row.relative_mm is None or row.relative_covariance_mm2 is None:
+def _site(row: Point, origin: Origin) -> ReportSite | None:
+    """Return a located tip from an origin; None where it has no position."""
+    position_mm, covariance_mm2 = row.position_mm, row.covariance_mm2
+    if origin is Origin.REFERENCE:
+        position_mm, covariance_mm2 = row.relative_mm, row.relative_covariance_mm2
+    if position_mm is None or covariance_mm2 is None:
         return None
-    xx, xy, xz, yy, yz, zz = row.relative_covariance_mm2
+    xx, xy, xz, yy, yz, zz = covariance_mm2
     covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    x, y, z = row.relative_mm
+    x, y, z = position_mm
     return ReportSite(row.site, (x, y, z), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])), row.lat_ms)
 
 

@@ -51,8 +51,11 @@ class StudyGeometry(BaseModel):
     alternatives: list[AlternativeOut] = Field(description="In the same frame as the points.")
 
 
-def study_geometry(triangulation: Triangulation, reference: str, origin: Origin) -> StudyGeometry:
-    """Return the study's part of an answer; ``reference`` is the name of the reference catheter."""
+def study_geometry(triangulation: Triangulation, reference: str | None, origin: Origin) -> StudyGeometry:
+    """Return the study's part of an answer.
+
+    ``reference`` is the name of the reference catheter, where the study has one.
+    """
     calibration, budget = triangulation.calibration, triangulation.budget
     return StudyGeometry(
         calibration=None if calibration is None else CalibrationOut(

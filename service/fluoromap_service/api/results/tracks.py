@@ -31,7 +31,7 @@ from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position, Six
 from fluoromap_service.results.dependencies import tracks_table_dependencies
 from fluoromap_service.results.finished import job_of
-from fluoromap_service.results.origins import Origin
+from fluoromap_service.results.origins import Origin, origin_in
 from fluoromap_service.results.tracks import RejectedView, tracks_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
@@ -188,7 +188,7 @@ def read_tracks(session: Session, job: Job, origin: Origin, tip_of: str) -> Trac
 
     The errors are those of :func:`read_entries`.
     """
-    answer: TracksJson = {"frame": _frame(origin), "tracks": [], "rejected": []}
+    answer: TracksJson = {"frame": _frame(origin_in(job, origin)), "tracks": [], "rejected": []}
     for name, entry in read_entries(session, job, origin, tip_of=tip_of):
         answer[name].append(entry)
     return answer
@@ -263,7 +263,8 @@ def _csv_of(job_id: str, origin: Origin, site: str | None, view: View | None) ->
 
 def _json_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
     with reading() as session:
-        return _json_pieces(read_entries(session, job_of(session, job_id), origin, site, view), origin)
+        job = job_of(session, job_id)
+        return _json_pieces(read_entries(session, job, origin, site, view), origin_in(job, origin))
 
 
 def _whole_answer(pieces: Sequence[bytes], media_type: str, headers: dict[str, str]) -> Response:

@@ -47,7 +47,8 @@ class StudyIn(BaseModel):
     reference: Line | None = Field(
         None,
         max_length=64,
-        description="The catheter from which coordinates count; by default the catheter named 'reference'.",
+        description="The catheter from which coordinates count; by default the catheter named 'reference'. A study with one "
+        "catheter has none, and its coordinates count from the isocentre.",
     )
     notes: str | None = Field(None, max_length=10_000)
 
@@ -73,7 +74,7 @@ class StudyOut(BaseModel):
     label: str = Field(examples=["Dog 3, sinus rhythm"])
     chamber: str | None = Field(examples=["right ventricle"])
     catheters: list[StudyCatheter]
-    reference: str = Field(examples=["reference"])
+    reference: str | None = Field(description="Null in a study with one catheter.", examples=["reference"])
     mapping: str = Field(description="The catheter whose tip maps.", examples=["mapping"])
     notes: str | None = Field(examples=[None])
     gantry: GantryOut = Field(description="Values for all runs whose headers lack them.")
@@ -158,7 +159,8 @@ def _catheters(given: list[CatheterIn] | None) -> tuple[Catheter, ...]:
 def _changed_catalogue(study: Study, body: StudyPatch) -> Catalogue:
     changed = "catheters" in body.model_fields_set
     catheters = _catheters(body.catheters) if changed else catalogue_of(study).catheters
-    keeps_reference = "reference" not in body.model_fields_set and study.reference in {item.name for item in catheters}
+    remains = len(catheters) > 1 and study.reference in {item.name for item in catheters}
+    keeps_reference = "reference" not in body.model_fields_set and remains
     return catalogue_with_roles(catheters, study.reference if keeps_reference else body.reference)
 
 

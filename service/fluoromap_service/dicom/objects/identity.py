@@ -55,7 +55,7 @@ class ResultSource:
 
     @property
     def frame_of_reference(self) -> str:
-        """UID of the frame of reference: patient axes (LPS), origin at the reference catheter."""
+        """UID of the frame of reference: patient axes (LPS), origin at the reference catheter, if any, else the isocentre."""
         return self.uid("frame of reference")
 
 

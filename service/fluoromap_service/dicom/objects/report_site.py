@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ReportSite:
-    """A located site: tip position in mm (LPS, from the reference catheter), its largest SD, the activation time."""
+    """A located site: tip position in mm (LPS, from the origin of the job), its largest SD, the activation time."""
 
     site: str
     position_mm: tuple[float, float, float]

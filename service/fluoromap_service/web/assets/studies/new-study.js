@@ -52,7 +52,7 @@ export function newStudyForm(types) {
     "form",
     { onsubmit: (/** @type {Event} */ event) => { event.preventDefault(); attempt(create); } },
     element("div", { class: "fields" }, field("Name of the study", label, "No patient name."), field("Chamber", chamber, "For example right ventricle.")),
-    element("p", { class: "soft" }, "The catheter named reference stays where it is; all positions count from it. The catheter named mapping is the moving tip."),
+    element("p", { class: "soft" }, "The catheter named reference stays where it is; all positions count from it. With one catheter only, positions count from the isocentre and a moved table would not be noticed. The catheter named mapping is the moving tip."),
     rows,
     element("div", { class: "row" }, add, element("button", { type: "submit", class: "main" }, "Create the study")),
   );
