@@ -43,6 +43,9 @@ def test_a_catalogue_needs_different_names_and_two_roles() -> None:
         Catalogue((one, two), "reference", "mapping")
     with pytest.raises(ValueError, match="differ"):
         Catalogue((one, two), "reference", "reference")
+    with pytest.raises(ValueError, match="must be the reference"):
+        Catalogue((one, two), None, "reference")
+    assert Catalogue((one,), None, "reference").names == ("reference",)
     with pytest.raises(KeyError):
         DEFAULT_CATALOGUE["nobody"]
 

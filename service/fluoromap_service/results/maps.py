@@ -33,7 +33,10 @@ class FinishedMap:
     simulated: bool
 
     def origin(self, chosen: Origin) -> Origin:
-        """Return the origin of the map's answer: the chosen one, or the isocentre where no site has a reference."""
+        """Return the origin of the map's answer.
+
+        It is the chosen one, or the isocentre where no site has a located reference catheter.
+        """
         return Origin.ISOCENTRE if self.reference_mm is None else chosen
 
     def shift_mm(self, origin: Origin) -> Array:

@@ -42,7 +42,7 @@ def _refusal(folder: Path, text: str) -> str:
         ("[gantry]\nprimary_deg = 1979-05-27", ["gantry.primary_deg:", "valid number"]),
         (TWO_CATHETERS + "tip = 4", ["catheters.number 2.tip:", "edge_spacing_mm, tip_mm, ring_mm"]),
         ("[[catheters]]\nname = 'x'\ntype = 'y'", ["catheters.number 1:", "ablation-4"]),
-        ("[[catheters]]\nname = 'x'\ntype = 'ablation-4'", ["catheters:", "a reference catheter"]),
+        ("reference = 'x'\n[[catheters]]\nname = 'x'\ntype = 'ablation-4'", ["reference:", "leave this out"]),
         ("reference = 'cs'", ["reference:", "the catheters are reference, pacing, mapping"]),
         ("[pipeline.fusers]", ["pipeline.fusers:", "segmenter, triangulator, monoplane, fuser"]),
         ("[pipeline.fuser]\nname = 'x'", ["pipeline.fuser.name:", "convex-hull, smooth-surface"]),

@@ -9,7 +9,10 @@ from fluoromap_service.dicom.objects.identity import ResultSource, code, file_by
 
 
 def surface_file(source: ResultSource, stl: bytes) -> bytes:
-    """Return the surface as a DICOM file; ``stl`` is in mm (LPS), from the origin of the job."""
+    """Return the surface as a DICOM file.
+
+    ``stl`` is in mm (LPS), from the origin of the job.
+    """
     dataset = Dataset()
     set_identity(dataset, source, EncapsulatedSTLStorage, "chamber", 9020, "M3D")
     del dataset.BodyPartExamined  # The Encapsulated Document Series module has none (PS3.3 C.24.1).

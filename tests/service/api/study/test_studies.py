@@ -43,13 +43,35 @@ def test_roles_of_named_catheters(service: TestClient) -> None:
     assert service.post("/v1/studies", json=body).json()["reference"] == "cs"
 
 
+def test_a_single_catheter_maps_and_the_study_has_no_reference(service: TestClient) -> None:
+    body = {"label": "x", "catheters": [_catheter("only")]}
+    answer = service.post("/v1/studies", json=body)
+    assert answer.status_code == 201, answer.text
+    study = answer.json()
+    assert (study["reference"], study["mapping"]) == (None, "only")
+    path = answer.headers["location"]
+    assert service.get(path).json() == study
+    named = service.post("/v1/studies", json=body | {"reference": "only"})
+    assert "leave this out" in named.json()["errors"][0]["message"]
+    assert service.patch(path, json={"reference": "only"}).status_code == 422
+    assert service.patch(path, json={"notes": "apex"}).json()["reference"] is None
+
+
+def test_a_study_changes_to_a_single_catheter_and_back(service: TestClient, study_path: str) -> None:
+    single = service.patch(study_path, json={"catheters": [_catheter("reference")]}).json()
+    assert (single["reference"], single["mapping"]) == (None, "reference")
+    again = service.patch(study_path, json={"catheters": [_catheter("cs"), _catheter("mapping")]}).json()
+    assert (again["reference"], again["mapping"]) == ("cs", "mapping")
+
+
 @pytest.mark.parametrize(
     ("body", "where"),
     [
         ({}, "body.label"),
         ({"label": ""}, "body.label"),
         ({"label": "x", "surprise": 1}, "body.surprise"),
-        ({"label": "x", "catheters": [_catheter("only")]}, "catheters"),
+        ({"label": "x", "catheters": [_catheter("only")], "reference": "only"}, "reference"),
+        ({"label": "x", "catheters": [_catheter("only")], "reference": "nobody"}, "reference"),
         ({"label": "x", "catheters": [_catheter("a"), _catheter("a")]}, "catheters"),
         ({"label": "x", "catheters": [_catheter("a"), _catheter("mapping")], "reference": "mapping"}, "reference"),
         ({"label": "x", "reference": "nobody"}, "reference"),
