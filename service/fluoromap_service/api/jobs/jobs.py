@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
-from pydantic.json_schema import SkipJsonSchema
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -75,21 +74,20 @@ def create_job(
     study_id: StudyId,
     caller: Writer,
     once: OnceJson,
-    # Generated clients cannot leave out a body that may be null.
-    body: JobRequest | SkipJsonSchema[None] = None,
+    # Not "or None" in the schema: generated clients cannot leave out a body that may be null.
+    body: JobRequest = JobRequest(),
 ) -> Response:
     """Freeze the study and run the pipeline over it.
 
     The job reuses the results of earlier jobs. At least one site needs both views, their geometry and an activation
     time. Otherwise 422 lists the missing values of each site.
     """
-    wanted = body or JobRequest()
 
     def start(session: Session) -> Response:
         study = session.get(Study, study_id)
         if study is None:
             raise not_found("study")
-        snapshot = freeze(session, study, wanted.pipeline, wanted.view)
+        snapshot = freeze(session, study, body.pipeline, body.view)
         job = job_life.create(session, study.id, snapshot)
         session.flush()
         answer = read_job(session, job)
