@@ -106,6 +106,9 @@ def test_one_catheter_is_located_from_the_isocentre_mapped_and_exported(service:
     assert json.loads(archive.read("map.json"))["frame"] == ISOCENTRE
     assert b"no_resting_catheter" in archive.read("points.csv")
 
+    deidentified = zipfile.ZipFile(io.BytesIO(service.get(f"{base}/deidentified.zip").content))
+    assert any(name.endswith("points.csv") for name in deidentified.namelist())
+
     objects = zipfile.ZipFile(io.BytesIO(service.get(f"{base}/dicom").content))
     written = str(pydicom.dcmread(io.BytesIO(objects.read("report.dcm"))))
     graphics = re.findall(r"Graphic Data\s+FL: \[(.+?)\]", written)
