@@ -122,9 +122,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
 
         It is the second moment over all kinds of gantry.
         """
-        shares = sum((kind.share * kind.multiples**2 for kind in GANTRY_KINDS), np.zeros(14))
-        covariance: Array = self.gantry_covariance() * shares
-        return covariance
+        return _second_moment(*self.header_moments())
 
     def header_moments(self) -> tuple[Array, Array]:
         """Return the shares (k,) and second moments (k, 14, 14) of all kinds of gantry."""
@@ -158,7 +156,7 @@ def credible_covariance(shares: Array, moments: Array) -> Array:
     moments : ndarray, shape (k, 14, 14)
         Second moment of each kind's errors about the mean of the mixture.
     """
-    whole = np.einsum("k,kij->ij", shares, moments)
+    whole = _second_moment(shares, moments)
     usual = whole[OFFSET_UNKNOWNS, OFFSET_UNKNOWNS]
     widened = np.ones(len(whole))
     if (usual > 0).all():
@@ -166,6 +164,11 @@ def credible_covariance(shares: Array, moments: Array) -> Array:
         widened[OFFSET_UNKNOWNS] = np.sqrt(max(_credible_size(shares, sizes), 1.0))
     covariance: Array = widened[:, None] * whole * widened
     return covariance
+
+
+def _second_moment(shares: Array, moments: Array) -> Array:
+    moment: Array = np.einsum("k,kij->ij", shares, moments)
+    return moment
 
 
 def _credible_size(shares: Array, sizes: Array) -> float:
