@@ -14,7 +14,6 @@ The benchmark opens Chromium as a machine without a graphics card does. A machin
 
 from __future__ import annotations
 
-import shutil
 import sys
 import tempfile
 import time
@@ -22,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from playwright.sync_api import Page, sync_playwright
+from browser import open_page
+from playwright.sync_api import Page
 from rich.console import Console
 
 from fluoromap.phantom import StudySpec
@@ -33,8 +33,6 @@ from fluoromap_service.cli.supervisor import private_service
 from fluoromap_service.dicom.simulation import simulate
 
 RATE_HZ = 60.0
-ARGUMENTS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
-PATIENCE_MS = 240_000
 COUNT = """([views, seconds]) => new Promise(done => {
   const painted = () => views.map(view => Number(view.dataset.frames));
   const [start, before] = [performance.now(), painted()];
@@ -54,37 +52,26 @@ LOADED = """([view, frames]) => new Promise(done => {
 
 
 def main(frames: int, seconds: float) -> None:
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        sys.exit("There is no Chromium to open the pages in; install it (on Debian: apt-get install chromium).")
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
+    with tempfile.TemporaryDirectory() as folder:
         simulate(Path(folder) / "study", StudySpec(seed=7, sites=5, frames=frames, frame_rate_hz=RATE_HZ))
         with private_service(Path(folder) / "service") as url:
             with Client(url) as client, progress_bars(Console(stderr=True)) as progress:
                 study = upload(client, find_files(Path(folder) / "study"), "cine", progress).study
                 run_job(client, study, progress)
-            opened = driver.chromium.launch(executable_path=browser, args=ARGUMENTS)
-            page = opened.new_page(viewport={"width": 1280, "height": 900}, base_url=url)
-            page.set_default_timeout(PATIENCE_MS)
-            page.goto(f"/studies/{study}#electrodes")
-            page.locator(".view[data-frames]").nth(1).wait_for()
-            for letters in ("a", "ab"):
-                for letter in letters:
-                    page.get_by_role("button", name=f"Play view {letter}").click()
-                report(
-                    page,
-                    f"{len(letters)} view",
-                    [f"#panel-electrodes .view[data-view={each}]" for each in letters],
-                    frames,
-                    seconds,
-                )
-                for letter in letters:
-                    page.get_by_role("button", name=f"Pause view {letter}").click()
-            page.get_by_role("tab", name="4 Map and results").click()
-            page.locator(".fused[data-frames]").nth(1).wait_for()
-            page.get_by_role("button", name="Play the map over fluoroscopy").click()
-            report(page, "2 views with the map", [f".fused[data-fused={each}]" for each in "ab"], frames, seconds)
-            opened.close()
+            with open_page(url) as page:
+                page.goto(f"/studies/{study}#electrodes")
+                page.locator(".view[data-frames]").nth(1).wait_for()
+                for letters in ("a", "ab"):
+                    for letter in letters:
+                        page.get_by_role("button", name=f"Play view {letter}").click()
+                    playing = [f"#panel-electrodes .view[data-view={each}]" for each in letters]
+                    report(page, f"{len(letters)} view", playing, frames, seconds)
+                    for letter in letters:
+                        page.get_by_role("button", name=f"Pause view {letter}").click()
+                page.get_by_role("tab", name="4 Map and results").click()
+                page.locator(".fused[data-frames]").nth(1).wait_for()
+                page.get_by_role("button", name="Play the map over fluoroscopy").click()
+                report(page, "2 views with the map", [f".fused[data-fused={each}]" for each in "ab"], frames, seconds)
 
 
 def report(page: Page, title: str, selectors: list[str], frames: int, seconds: float) -> None:

@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="folder that keeps the simulated study")
     given = parser.parse_args()
     spec = StudySpec(seed=2026, sites=given.sites, frames=given.frames, frame_rate_hz=given.rate)
-    folder = _simulated(spec, given.folder)
+    folder = simulated_files(spec, given.folder)
     print(f"{spec.sites} sites, 2 views, {spec.frames} frames at {spec.frame_rate_hz:g}/s; segmenter {given.segmenter}")
     pure = _pure(folder, spec, given.segmenter) if "pure" in given.parts else None
     one = _one_worker(folder, given.segmenter, pure) if "one" in given.parts else None
@@ -95,7 +95,7 @@ def main() -> None:
         _turns(folder, given.segmenter, given.queued)
 
 
-def _simulated(spec: StudySpec, folder: Path | None) -> Path:
+def simulated_files(spec: StudySpec, folder: Path | None = None) -> Path:
     """Return the folder with the files of the study.
 
     The study is simulated where the folder is not complete.
@@ -199,7 +199,7 @@ def _service(workers: int | None) -> Iterator[tuple[httpx.Client, ProcessFigures
 
 def _one_worker(folder: Path, segmenter: str, pure: dict[str, float] | None) -> JobTimes:
     with _service(1) as (http, figures):
-        study, _ = _upload(http, folder)
+        study, _ = upload_study(http, folder)
         _, times = _job(http, figures, study, segmenter)
     _show_job("one worker process", times)
     if pure is not None:
@@ -214,7 +214,7 @@ def _one_worker(folder: Path, segmenter: str, pure: dict[str, float] | None) -> 
 def _all_workers(folder: Path, segmenter: str, corrections: int, one: JobTimes | None) -> None:
     processors = len(os.sched_getaffinity(0))
     with _service(None) as (http, figures):
-        study, uploads = _upload(http, folder)
+        study, uploads = upload_study(http, folder)
         print(
             f"upload: {sum(uploads):.2f} s; first {uploads[0]:.3f} s, median of the last ten {median(uploads[-10:]):.3f} s"
         )
@@ -234,8 +234,8 @@ def _all_workers(folder: Path, segmenter: str, corrections: int, one: JobTimes |
 def _turns(folder: Path, segmenter: str, queued: int) -> None:
     """Measure a job of two sites alone, and behind jobs of the whole study."""
     with _service(None) as (http, _):
-        large, _ = _upload(http, folder)
-        small, _ = _upload(http, folder, sites=2)
+        large, _ = upload_study(http, folder)
+        small, _ = upload_study(http, folder, sites=2)
 
         def submit(study: str, number: int) -> str:
             """Start a job that reuses no result of another number, because its catheters differ."""
@@ -246,7 +246,7 @@ def _turns(folder: Path, segmenter: str, queued: int) -> None:
             ]
             named[0]["tip_mm"] += 0.001 * number
             http.patch(f"/v1/studies/{study}", json={"catheters": named}).raise_for_status()
-            return _start(http, study, segmenter)
+            return start_job(http, study, segmenter)
 
         start = time.perf_counter()
         _stage_ends(http, submit(small, 0), start)
@@ -274,7 +274,7 @@ def _show_job(title: str, times: JobTimes) -> None:
     )
 
 
-def _upload(http: httpx.Client, folder: Path, sites: int | None = None) -> tuple[str, list[float]]:
+def upload_study(http: httpx.Client, folder: Path, sites: int | None = None) -> tuple[str, list[float]]:
     """Return the study and the seconds of each upload; ``sites`` takes only the first ones."""
     study: str = http.post("/v1/studies", json={"label": "clinical study"}).raise_for_status().json()["id"]
     seconds = []
@@ -296,7 +296,7 @@ def _job(http: httpx.Client, figures: ProcessFigures, study: str, segmenter: str
     figures.sample()
     worker, api = figures.processor_seconds("worker"), figures.processor_seconds("api")
     start = time.perf_counter()
-    job = _start(http, study, segmenter)
+    job = start_job(http, study, segmenter)
     ended = _stage_ends(http, job, start)
     end_s = time.perf_counter() - start
     figures.sample()
@@ -310,7 +310,7 @@ def _job(http: httpx.Client, figures: ProcessFigures, study: str, segmenter: str
     )
 
 
-def _start(http: httpx.Client, study: str, segmenter: str) -> str:
+def start_job(http: httpx.Client, study: str, segmenter: str) -> str:
     body = {"pipeline": {"segmenter": {"name": segmenter}}}
     job: str = http.post(f"/v1/studies/{study}/jobs", json=body).raise_for_status().json()["id"]
     return job
@@ -394,7 +394,7 @@ def _corrections(http: httpx.Client, study: str, segmenter: str, count: int) -> 
         path, electrodes = electrodes_to_put(http, study, site["view_a"], frame=1 + number)
         start = time.perf_counter()
         http.put(path, json=electrodes).raise_for_status()
-        job = _start(http, study, segmenter)
+        job = start_job(http, study, segmenter)
         while http.get(f"/v1/jobs/{job}/map").status_code != 200:
             if time.perf_counter() - start > PATIENCE_S:
                 raise SystemExit("no map after the correction")
