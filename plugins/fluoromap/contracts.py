@@ -486,8 +486,8 @@ class StudyVariation:
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry_angle: float = 1.458
-    gantry_offset: float = 2.269
+    gantry_angle: float = 1.007
+    gantry_offset: float = 2.137
 
 
 @dataclass(frozen=True, eq=False)
