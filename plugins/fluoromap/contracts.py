@@ -486,8 +486,8 @@ class StudyVariation:
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry_angle: float = 1.007
-    gantry_offset: float = 2.137
+    gantry_angle: float = 1.124
+    gantry_offset: float = 2.169
 
 
 @dataclass(frozen=True, eq=False)
