@@ -85,14 +85,15 @@ def _unevenness(track: Sequence[Observation]) -> float:
 def _resting_beats(track: Sequence[Observation], rest: float) -> list[dict[str, tuple[Array, float]]]:
     """Return the catheters' places in each beat's diastole.
 
-    A place is the mean pixel (2,) of the electrodes, with its variance an axis. Only catheters count that show the same electrodes in all frames.
+    A place is the mean pixel (2,) of the electrodes, with its variance an axis. A frame counts for a catheter only where it shows
+    all electrodes that the run shows of it.
     """
     beats: list[dict[str, list[tuple[Array, float]]]] = []
-    whole = {
-        chain.catheter: max((c.electrodes for o in track for c in o.chains if c.catheter == chain.catheter), key=len)
-        for observation in track
-        for chain in observation.chains
-    }
+    whole: dict[str, tuple[int, ...]] = {}
+    for observation in track:
+        for chain in observation.chains:
+            if len(chain.electrodes) > len(whole.get(chain.catheter, ())):
+                whole[chain.catheter] = chain.electrodes
     before = None
     for observation in track:
         if observation.phase is None:
