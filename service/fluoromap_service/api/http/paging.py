@@ -35,13 +35,7 @@ class Paging:
     shows that another page follows.
     """
 
-    def __init__(
-        self,
-        request: Request,
-        response: Response,
-        limit: Annotated[int, Query(ge=1, le=500, description="Most items on a page.")] = 50,
-        cursor: Annotated[str | None, Query(max_length=500, description="`next` of the page before.")] = None,
-    ) -> None:
+    def __init__(self, request: Request, response: Response, limit: int, cursor: str | None) -> None:
         self._request = request
         self._response = response
         self.limit = limit
@@ -105,7 +99,17 @@ class Paging:
         return Page(items=[shape(item) for item in shown], next=following)
 
 
-Pages = Annotated[Paging, Depends()]
+async def _paging(
+    request: Request,
+    response: Response,
+    limit: Annotated[int, Query(ge=1, le=500, description="Most items on a page.")] = 50,
+    cursor: Annotated[str | None, Query(max_length=500, description="`next` of the page before.")] = None,
+) -> Paging:
+    # Not the class itself: FastAPI would run it in a thread, which costs more than the class.
+    return Paging(request, response, limit, cursor)
+
+
+Pages = Annotated[Paging, Depends(_paging)]
 
 
 def _encode(key: list[Any]) -> str:

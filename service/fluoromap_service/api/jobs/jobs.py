@@ -6,7 +6,7 @@ import asyncio
 import time
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -18,6 +18,7 @@ from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import JobId, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.jobs.job_answers import JobAnswer, JobSummary, etag_of, job_summaries, read_job
 from fluoromap_service.jobs import job_life, queue
@@ -27,7 +28,7 @@ from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import ENDED_JOB, Job, Study
 from fluoromap_service.study.freeze import PipelineRequest, freeze
 
-router = APIRouter(tags=["jobs"])
+router = new_router(tags=["jobs"])
 
 POLL_SECONDS = 0.25
 """Time between two queries of the database while a client waits."""

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
@@ -14,6 +14,7 @@ from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.dicom import frame_png
 from fluoromap_service.problem import Problem, not_found
@@ -24,7 +25,7 @@ from fluoromap_service.study.catheters import catalogue_of
 from fluoromap_service.study.instances import StudyRun
 from fluoromap_service.study.preview import ScaleSource
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
 
 class PreviewElectrodeOut(BaseModel):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -15,6 +15,7 @@ from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
 from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
@@ -27,7 +28,7 @@ from fluoromap_service.study import instances, sites, studies
 from fluoromap_service.study.binding import BoundSite, binding_of, views_of
 from fluoromap_service.study.instances import StudyRun
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
 SITE = "Mapping site of all runs of the request."
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import SiteName, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies
 from fluoromap_service.study.binding import BoundSite, binding_of, site_of
 
-router = APIRouter(prefix="/v1/studies/{study_id}/sites", tags=["sites"])
+router = new_router("/v1/studies/{study_id}/sites", tags=["sites"])
 
 
 class SiteOut(BaseModel):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from fastapi import Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -12,6 +12,7 @@ from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339
 from fluoromap_service.api.study.catheters import MOST_CATHETERS, CatheterIn, Line
@@ -29,7 +30,7 @@ from fluoromap_service.study.catheters import (
 )
 from fluoromap_service.study.instances import runs_of, unlink_unreferenced
 
-router = APIRouter(prefix="/v1/studies", tags=["studies"])
+router = new_router("/v1/studies", tags=["studies"])
 
 
 class StudyIn(BaseModel):
