@@ -148,7 +148,10 @@ def revoke_token(name: str) -> None:
 def any_token() -> bool:
     """Return whether there is any token, valid or not."""
     with reading() as session:
-        return session.scalar(select(Token.id).limit(1)) is not None
+        return session.scalar(_A_TOKEN) is not None
+
+
+_A_TOKEN = select(Token.id).limit(1)
 
 
 def verify(text: str) -> Caller | None:

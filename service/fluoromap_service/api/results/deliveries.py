@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http.idempotency import OnceJson
-from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paging import NewestFirst, Page, Pages
 from fluoromap_service.api.http.paths import DeliveryId, JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
@@ -23,6 +23,8 @@ from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Delivery, DeliveryObject, DeliveryState, ObjectState
 
 router = new_router(tags=["deliveries"])
+
+_DELIVERIES = NewestFirst(Delivery)
 
 State = Literal["pending", "delivered", "failed"]
 _STATES: dict[State, tuple[DeliveryState, ...]] = {
@@ -107,7 +109,7 @@ def list_deliveries(
     if state is not None:
         conditions.append(Delivery.state.in_(_STATES[state]))
     with reading() as session:
-        found = pages.newest_first(session, Delivery, *conditions)
+        found = pages.newest_first(session, _DELIVERIES, *conditions)
     return pages.page_of_newest(found, _summary)
 
 

@@ -52,10 +52,10 @@ def get_frames(
     if first > facts.frames:
         raise not_found("frame")
     sent = min(count, facts.frames - first + 1, max(1, MOST_BYTES // (facts.rows * facts.columns)))
-    etag = f'"{run.instance.sha256[:32]}-{first}-{sent}"'
+    etag = f'"{run.sha256[:32]}-{first}-{sent}"'
     if is_known(request, etag):
         return not_modified(etag)
-    path = files.path_of(run.instance.sha256)
+    path = files.path_of(run.sha256)
     content = run_in_pool(Task.DRAW_PICTURE, cine_8bit, path, facts, first - 1, sent)
     return Response(
         content,

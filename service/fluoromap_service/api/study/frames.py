@@ -80,16 +80,16 @@ def get_frame(
     chosen = None if window is None else _window(window)
     run, catalogue = _run_with_frame(study_id, uid, n)
     if electrodes:
-        path, px_per_mm = files.checked_path(run.instance.sha256), _px_per_mm(run)
+        path, px_per_mm = files.checked_path(run.sha256), _px_per_mm(run)
         marked = run_in_pool(
             Task.FIND_ELECTRODES, preview.preview_png, path, run.facts, catalogue, n - 1, px_per_mm, chosen
         )
         return Response(marked, media_type="image/png", headers={"Cache-Control": "no-store"})
     shown = "" if chosen is None else f"-{chosen[0]:g}-{chosen[1]:g}"
-    etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
+    etag = f'"{run.sha256[:32]}-{n}{shown}"'
     if is_known(request, etag):
         return not_modified(etag)
-    path = files.checked_path(run.instance.sha256)
+    path = files.checked_path(run.sha256)
     picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
     # A stored file never changes, so a browser may keep the picture.
     return Response(
@@ -104,7 +104,7 @@ def get_preview(study_id: StudyId, uid: InstanceUid, n: FrameNumber, caller: Rea
     The run's geometry may be incomplete: then the scale is found from the study's catheters, and `scale` says so.
     """
     run, catalogue = _run_with_frame(study_id, uid, n)
-    path = files.checked_path(run.instance.sha256)
+    path = files.checked_path(run.sha256)
     found = run_in_pool(
         Task.FIND_ELECTRODES, preview.preview_electrodes, path, run.facts, catalogue, n - 1, _px_per_mm(run)
     )

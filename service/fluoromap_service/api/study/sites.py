@@ -80,7 +80,7 @@ def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]
     The pairs of runs that have no name yet follow.
     """
     with reading() as session:
-        binding = binding_of(session, studies.get(session, study_id).id)
+        binding = binding_of(session, study_id, runs=studies.runs_of(session, study_id))
         return pages.page_of_all((*binding.sites, *binding.pairs), _shape, lambda site: site.site or f"/{site.pair}")
 
 

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap_service.api.http.idempotency import OnceJson
-from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paging import NewestFirst, Page, Pages
 from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
@@ -31,6 +31,9 @@ from fluoromap_service.study.catheters import (
 from fluoromap_service.study.instances import runs_of, unlink_unreferenced
 
 router = new_router("/v1/studies", tags=["studies"])
+
+
+_STUDIES = NewestFirst(Study)
 
 
 class StudyIn(BaseModel):
@@ -114,7 +117,7 @@ def create_study(body: StudyIn, once: OnceJson, caller: Writer) -> Response:
 def list_studies(pages: Pages, caller: Reader) -> Page[StudyOut]:
     """List the studies, the newest first."""
     with reading() as session:
-        return pages.page_of_newest(pages.newest_first(session, Study), _shape)
+        return pages.page_of_newest(pages.newest_first(session, _STUDIES), _shape)
 
 
 @router.get("/{study_id}", responses=responses(401, 403, 404))
