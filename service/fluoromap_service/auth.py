@@ -184,7 +184,10 @@ class Callers:
         self._memory = _Memory(None)
 
     def remembered(self, token: str | None) -> Caller | None:
-        """Return the caller of a token, or of a request without one; None when only a query can find it."""
+        """Return the caller of a token; None when only a query can find it.
+
+        ``token`` None is a request without a token.
+        """
         memory = self._memory
         if memory.change is None or memory.change != last_change():
             return None
@@ -195,9 +198,9 @@ class Callers:
         return caller if expires is None or time.time() < expires else None
 
     def look_up(self, token: str | None) -> Caller | None:
-        """Return the caller of a token, or of a request without one; None when nobody may be let in.
+        """Return the caller of a token; None when nobody may be let in.
 
-        While no token was ever made, the caller is :data:`OPEN`.
+        ``token`` None is a request without a token. While no token was ever made, the caller is :data:`OPEN`.
         """
         # Before the queries: a change between here and them makes the memory old, never wrong.
         change = last_change()

@@ -119,7 +119,7 @@ def create_app() -> FastAPI:
         redoc_url=None,
         openapi_url=None,
         redirect_slashes=False,
-        # Not by include_router: it matches the routers one after the other, and the one that fits twice.
+        # Not by include_router: it matches all routes of each router in turn, and those of the right router twice.
         routes=[route for router in (*ROUTERS, _description()) for route in router.routes],
         lifespan=_lifespan,
     )
