@@ -6,6 +6,7 @@ address only. A revoked or expired token still counts, so that revoking a token 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import ipaddress
 import secrets
@@ -229,6 +230,7 @@ class _Memory:
     callers: dict[str, tuple[Caller, float | None]] = field(default_factory=dict)
 
 
+@functools.lru_cache(maxsize=1024)
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach an address or name."""
     if host == "localhost":

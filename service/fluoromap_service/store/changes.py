@@ -15,13 +15,21 @@ from fluoromap_service.store.engine import engine
 class _Counter:
     """A connection that counts the commits of all other connections, because it never writes itself."""
 
-    def __init__(self, path: str) -> None:
-        self._connection = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
+    def __init__(self, database: Engine) -> None:
+        # Made by the engine, so that it certainly counts the commits to the same database.
+        pooled = database.raw_connection()
+        assert pooled.driver_connection is not None
+        self._connection = pooled.driver_connection
+        pooled.detach()
         self._lock = threading.Lock()
+        self._ask("PRAGMA busy_timeout=0")
 
     def number(self) -> int:
+        return self._ask("PRAGMA data_version")
+
+    def _ask(self, pragma: str) -> int:
         with self._lock:
-            return int(self._connection.execute("PRAGMA data_version").fetchone()[0])
+            return int(self._connection.execute(pragma).fetchone()[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +58,6 @@ def last_change() -> Change | None:
 
 @functools.lru_cache(maxsize=1)
 def _counter(database: Engine) -> _Counter | None:
-    path = database.url.database
-    if database.dialect.name != "sqlite" or not path or path == ":memory:":
-        return None
-    return _Counter(path)
+    # Each connection to ":memory:" has a database of its own.
+    in_memory = database.url.database in (None, "", ":memory:")
+    return None if database.dialect.name != "sqlite" or in_memory else _Counter(database)
