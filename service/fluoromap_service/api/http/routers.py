@@ -16,17 +16,21 @@ from fluoromap_service.api.http.query_names import check_query_names
 
 
 class OneThreadRoute(APIRoute):
-    """A route whose function runs in a thread, and nothing else of the request.
+    """A route whose ordinary function runs in a thread, and nothing else of the request.
 
     FastAPI would check the answer of such a function in a second thread. The change of threads costs more than the check.
+    Coroutines and streams stay as they are.
     """
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         super().__init__(path, _in_thread(endpoint), **options)
 
 
+_NOT_ORDINARY = (inspect.iscoroutinefunction, inspect.isasyncgenfunction, inspect.isgeneratorfunction)
+
+
 def _in_thread(function: Callable[..., Any]) -> Callable[..., Any]:
-    if inspect.iscoroutinefunction(function):
+    if any(kind(function) for kind in _NOT_ORDINARY):
         return function
 
     @functools.wraps(function)
