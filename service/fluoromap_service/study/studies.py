@@ -48,6 +48,9 @@ def get(session: Session, study_id: str) -> Study:
 
 
 _STUDY = select(Study).where(Study.id == bindparam("study_id"))
+# Read it again under the lock: it may have changed since this session read it.
+_LOCKED_STUDY = _STUDY.with_for_update().execution_options(populate_existing=True)
+_NOW = select(db_now())
 
 
 def runs_of(session: Session, study_id: str) -> list[StudyRun]:
@@ -69,13 +72,11 @@ def lock(session: Session, study_id: str) -> Study:
 
     Other transactions cannot change it until this one ends. The time of the change is stored.
     """
-    query = select(Study).where(Study.id == study_id).with_for_update()
-    # Read it again under the lock: it may have changed since this session read it.
-    study = session.scalars(query.execution_options(populate_existing=True)).one_or_none()
+    study = session.scalars(_LOCKED_STUDY, {"study_id": study_id}).one_or_none()
     if study is None:
         raise not_found("study")
     # Its runs, sites and corrections have no times of their own.
-    study.updated = session.scalars(select(db_now())).one()
+    study.updated = session.scalars(_NOW).one()
     return study
 
 
