@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterable
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header
+from fastapi import Depends, Header
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
@@ -14,13 +14,14 @@ from starlette.concurrency import run_in_threadpool
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of
 from fluoromap_service.store.engine import DATABASE_AWAY, reading
 from fluoromap_service.store.models import ENDED_JOB, Event
 
-router = APIRouter(tags=["jobs"])
+router = new_router(tags=["jobs"])
 
 POLL_SECONDS = 0.25
 OVERLAP = 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from types import FrameType
 
@@ -25,6 +26,9 @@ from fluoromap_service.store.engine import writing
 STOP_SECONDS = 5
 """Time that open requests get at the end."""
 
+SWITCH_SECONDS = 0.001
+"""Longest time that a thread computes while the event loop waits for the interpreter; Python's own default is 5 ms."""
+
 app = typer.Typer(add_completion=False)
 
 
@@ -41,6 +45,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
         # A request may name a target before the sender has started.
         with writing() as session:
             outbox.register(session, read_targets())
+    sys.setswitchinterval(SWITCH_SECONDS)
     service = create_app()
     config = uvicorn.Config(
         service,
