@@ -9,13 +9,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair
+from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.estimate import Estimate, Method
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.self_calibration import StudyBelief
-from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
+from fluoromap.triangulator.site_cycle import CycleMoments, SiteMotion, cycle_moments, locate_cycle
 from fluoromap.triangulator.spacing import spacing_mismatches
 from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
 from fluoromap.triangulator.table_motion import Jump, jump_source
@@ -54,26 +54,44 @@ class SiteLocator:
     gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
     origin: ReferenceOrigin | None = None
 
-    def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
+    def cameras(self, site: MatchedSite) -> Cameras:
+        """Return the cameras of a site as the study shows them."""
+        return self.belief.gantry.cameras((site.camera_a, site.camera_b))
+
+    def moments(self, site: MatchedSite) -> CycleMoments | None:
+        """Return the moments of a site's cycle; None where the views show too few."""
+        known = _phase(site.diastole) is not None
+        return cycle_moments(site.cycle, self.cameras(site), self.method) if known else None
+
+    def cycle(self, site: MatchedSite, jump: Jump | None, moments: CycleMoments) -> SiteCycle:
+        """Locate a site at the moments of its cycle."""
+        rest = _phase(site.diastole)
+        assert rest is not None, "the site has moments"
+        return locate_cycle(
+            moments, rest, self.cameras(site), self.catalogue, self.any_study.params, self.method,
+            self.any_study.gantry.covariance, jump,
+        )  # fmt: skip
+
+    def locate(
+        self, site: MatchedSite, jump: Jump | None, motion: SiteMotion
+    ) -> tuple[LocatedSite, Moment, list[str]] | None:
         """Locate a site in 3D.
 
         Returns
         -------
         tuple or None
-            The site, its diastole for the error budget, and sentences for the report. None where no plausible position
-            agrees with both views.
+            The site without its cycle, its diastole for the error budget, and sentences for the report. None where no plausible
+            position agrees with both views.
         """
-        cameras = self.belief.gantry.cameras((site.camera_a, site.camera_b))
-        rest = site.diastole.a.phase if site.diastole.a.phase is not None else site.diastole.b.phase
-        moments = cycle_moments(site.cycle, cameras, self.method) if rest is not None else None
-        moment = self._moment(site.diastole, cameras, moments, jump)
+        cameras = self.cameras(site)
+        moment = self._moment(site.diastole, cameras, motion, jump)
         if moment is None:
             return None
         doubts = tuple(dict.fromkeys(reason for reason, holds in (
             (Reason.TABLE_MOVED, (jump is not None and jump.is_certain) or self.belief.doubt is Reason.TABLE_MOVED),
             (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
         ) if holds))  # fmt: skip
-        other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
+        other = self._moment(site.alternative.diastole, cameras, motion, jump) if site.alternative else None
         points, reference_mm = self._points(site, moment, moment.joint_mm2, cameras, doubts)
         # The study's origin depends on the other sites.
         alone = replace(self, origin=None)
@@ -87,12 +105,6 @@ class SiteLocator:
                 add_alternative(points, others, shift, p),
                 add_alternative(a_priori, any_others, shift, p),
             )
-        cycle = None
-        if moments is not None and rest is not None:
-            cycle = locate_cycle(
-                moments, rest, cameras, self.catalogue, self.any_study.params, self.method,
-                self.any_study.gantry.covariance, jump,
-            )  # fmt: skip
         reasons = [reason for reason, holds in (
             (Reason.NO_RESTING_CATHETER, self.catalogue.reference is None),
             (Reason.NO_REFERENCE, reference_mm is None),
@@ -106,7 +118,7 @@ class SiteLocator:
             frame_b=site.diastole.b.frame,
             points=points,
             reference_mm=reference_mm,
-            cycle=cycle,
+            cycle=None,
             reasons=(*reasons, *doubts),
             variation=self.belief.variation,
             a_priori=a_priori,
@@ -114,16 +126,15 @@ class SiteLocator:
         return answer, moment, [] if jump is not None and jump.is_certain else _breathing_note(site.site, moment)
 
     def _moment(
-        self, pair: PhasePair, cameras: Cameras, cycle: CycleMoments | None, jump: Jump | None
+        self, pair: PhasePair, cameras: Cameras, site_motion: SiteMotion, jump: Jump | None
     ) -> Moment | None:
         pixels = pixels_in_both_views(pair)
         start = self.method.start(cameras, pixels)
         if not _plausible(start):
             return None
-        phase = pair.a.phase if pair.a.phase is not None else pair.b.phase
-        motion = (
-            cycle.motion(np.array(phase), phase, pixels.labels) if cycle is not None and phase is not None else None
-        )
+        phase, motion = _phase(pair), None
+        if site_motion.labels and phase is not None:
+            motion = site_motion.at(np.array(phase), phase, pixels.labels)
         sources, any_sources = (
             self._sources(belief, cameras, start, pixels.labels, motion, jump)
             for belief in (self.belief, self.any_study)
@@ -237,6 +248,11 @@ def _inflation(rows: Array, residuals_px: Array, errors_px2: Array) -> float:
     apart = rows @ residuals_px
     misfit = float(apart @ np.linalg.solve(rows @ errors_px2 @ rows.T, apart))
     return misfit / len(rows) if chi2.sf(misfit, len(rows)) < DOUBTFUL_BELOW else 1.0
+
+
+def _phase(pair: PhasePair) -> float | None:
+    """Return the phase of a pair: that of view a, or where it is unknown that of view b."""
+    return pair.a.phase if pair.a.phase is not None else pair.b.phase
 
 
 def _plausible(points_mm: Array) -> bool:

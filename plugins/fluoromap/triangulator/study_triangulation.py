@@ -19,6 +19,7 @@ from fluoromap.contracts import (
     LocatedSite,
     MatchedSite,
     RejectedSite,
+    SiteCycle,
     StudyVariation,
     Triangulation,
 )
@@ -34,6 +35,7 @@ from fluoromap.triangulator.self_calibration import (
     header_belief,
     study_belief,
 )
+from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments, SiteMotion
 from fluoromap.triangulator.site_locator import Moment, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
@@ -233,10 +235,10 @@ def _locate_sites(
     used: list[_Work] = []
     for index, one in enumerate(work):
         context.check()
-        location = _Location(*one)
+        location = _Location(*one, context)
         of_site = context.recall(SiteErrors, location.inputs, partial(_errors, location))
         if of_site.located:
-            located.append(context.recall(LocatedSite, location.inputs, location.located_site))
+            located.append(location.located_site())
             used.append(one)
             errors.append(of_site)
             notes += of_site.notes
@@ -248,21 +250,45 @@ def _locate_sites(
 
 
 class _Location:
-    """The location of one site, computed when it is first needed."""
+    """The location of one site in two parts, each computed when it is first needed.
 
-    def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator) -> None:
+    The cycle depends on the site's own cameras. The electrodes at diastole depend on all that the study shows: a correction at
+    another site often changes their covariances, and the cycle only where it changes the calibrated cameras.
+    """
+
+    def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator, context: Context) -> None:
         self.inputs = (site, jump, locator.catalogue, locator.belief, locator.gap_doubts, locator.origin)
+        self._cycle_inputs = (site, jump, locator.catalogue, *locator.cameras(site))
         self._work = site, jump, locator
+        self._context = context
 
     @functools.cached_property
     def answer(self) -> tuple[LocatedSite, Moment, list[str]] | None:
+        """The site without its cycle, see :meth:`SiteLocator.locate`."""
         site, jump, locator = self._work
-        return locator.locate(site, jump)
+        return locator.locate(site, jump, self._context.recall(SiteMotion, self._cycle_inputs, self._motion))
 
     def located_site(self) -> LocatedSite:
         """Return the site in 3D."""
+        without_cycle = self._context.recall(LocatedSite, self.inputs, self._without_cycle)
+        cycle = self._context.recall(SiteCycle, self._cycle_inputs, self._cycle)
+        return replace(without_cycle, cycle=cycle) if cycle.labels else without_cycle
+
+    def _without_cycle(self) -> LocatedSite:
         assert self.answer is not None, "the site was located before"
         return self.answer[0]
+
+    @functools.cached_property
+    def _moments(self) -> CycleMoments | None:
+        site, _, locator = self._work
+        return locator.moments(site)
+
+    def _motion(self) -> SiteMotion:
+        return SiteMotion() if self._moments is None else self._moments.motion
+
+    def _cycle(self) -> SiteCycle:
+        site, jump, locator = self._work
+        return NO_CYCLE if self._moments is None else locator.cycle(site, jump, self._moments)
 
 
 def _from_one_origin(
@@ -278,8 +304,7 @@ def _from_one_origin(
     same: list[LocatedSite] = []
     for first, (site, jump, locator) in zip(located, work, strict=True):
         if deviates(first, reference, origin):
-            again = _Location(site, jump, replace(locator, origin=origin))
-            first = context.recall(LocatedSite, again.inputs, again.located_site)
+            first = _Location(site, jump, replace(locator, origin=origin), context).located_site()
         same.append(first)
     return same
 

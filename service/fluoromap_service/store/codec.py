@@ -149,7 +149,7 @@ def partial_results(content: bytes) -> Mapping[str, Block]:
 def form_of(kind: type[Any]) -> str:
     """Return the hash of a type's form, which changes when a contract or the layout does.
 
-    The form is the layout, the names and types of its fields, and those of all dataclasses in it.
+    The form is the layout, the names and types of its fields, whether it is stored apart, and the same of all dataclasses in it.
     """
     return _form_of(cast(Hashable, kind))
 
@@ -164,7 +164,7 @@ def _form_of(kind: Any) -> str:
         if dataclasses.is_dataclass(hint) and isinstance(hint, type) and hint.__qualname__ not in found:
             hints = typing.get_type_hints(hint)
             fields = [(field.name, str(hints[field.name])) for field in dataclasses.fields(hint)]
-            found[hint.__qualname__] = fields
+            found[hint.__qualname__] = [*fields, ("stored apart", "")] if _is_apart(hint) else fields
             for field in dataclasses.fields(hint):
                 visit(hints[field.name])
 
