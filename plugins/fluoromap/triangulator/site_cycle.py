@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,39 +25,12 @@ from fluoromap.triangulator.uncertainty import (
 IN_MOST_PAIRS = 0.8
 """Share of the moments at which both views must show an electrode for it to belong to the site's cycle."""
 FEWEST_MOMENTS = 4
-_HARMONICS = 5
-_SMOOTHNESS = 1e-3
 NO_CYCLE = SiteCycle(np.zeros(0), (), np.zeros((0, 0, 3)), np.zeros((0, 0, 3, 3)))
 """The cycle of a site whose views show too few moments."""
+_HARMONICS = 5
+_SMOOTHNESS = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class SiteMotion:
-    """The smooth motion of a site's m electrodes over the cycle.
-
-    labels : (catheter, electrode) of each; empty where no cycle is known. coefficients : (k, m, 3) of the waves in ``_waves``, mm.
-    """
-
-    labels: tuple[tuple[str, int], ...] = ()
-    coefficients: Array = field(default_factory=lambda: np.zeros((1 + 2 * _HARMONICS, 0, 3)))
-
-    def at(self, phases: Array, diastolic_phase: float, labels: Sequence[tuple[str, int]]) -> Motion:
-        """Return the motion of these electrodes at phases (...).
-
-        An electrode that is not part of the cycle gets the mean motion of the others.
-        """
-        displaced = np.einsum("...k,kmc->...mc", _waves(phases) - _waves(diastolic_phase), self.coefficients)
-        velocity = np.einsum("...k,kmc->...mc", _waves(phases, derivative=True), self.coefficients)
-        known = [self.labels.index(label) if label in self.labels else -1 for label in labels]
-        return Motion(
-            *(
-                np.concatenate([of, of.mean(axis=-2, keepdims=True)], axis=-2)[..., known, :]
-                for of in (displaced, velocity)
-            )
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class CycleMoments:
     """The moments of the cycle at which both views show the same electrodes, and their motion.
 
@@ -67,14 +38,27 @@ class CycleMoments:
     located separately.
     """
 
-    phases: Array
-    pixels: TwoViewPixels
-    positions_mm: Array
+    def __init__(self, phases: Array, pixels: TwoViewPixels, positions_mm: Array) -> None:
+        self.labels = pixels.labels
+        self.phases = phases
+        self.pixels = pixels
+        self.positions_mm = positions_mm
+        self._coefficients = _fit(phases, positions_mm)
 
-    @functools.cached_property
-    def motion(self) -> SiteMotion:
-        """Smooth motion through the moments."""
-        return SiteMotion(self.pixels.labels, _fit(self.phases, self.positions_mm))
+    def motion(self, phases: Array, diastolic_phase: float, labels: Sequence[tuple[str, int]]) -> Motion:
+        """Return the motion of these electrodes at phases (...).
+
+        An electrode that is not part of the cycle gets the mean motion of the others.
+        """
+        displaced = np.einsum("...k,kmc->...mc", _waves(phases) - _waves(diastolic_phase), self._coefficients)
+        velocity = np.einsum("...k,kmc->...mc", _waves(phases, derivative=True), self._coefficients)
+        known = [self.labels.index(label) if label in self.labels else -1 for label in labels]
+        return Motion(
+            *(
+                np.concatenate([of, of.mean(axis=-2, keepdims=True)], axis=-2)[..., known, :]
+                for of in (displaced, velocity)
+            )
+        )
 
 
 def cycle_moments(pairs: Sequence[PhasePair], cameras: Cameras, method: Method) -> CycleMoments | None:
@@ -128,7 +112,7 @@ def locate_cycle(
     The covariance grows where the heart moves fast. A ``jump`` of the table between the two runs displaces all moments alike.
     """
     start, pixels = moments.positions_mm, moments.pixels
-    motion = moments.motion.at(moments.phases, diastolic_phase, pixels.labels)
+    motion = moments.motion(moments.phases, diastolic_phase, moments.labels)
     sources = common_sources(cameras, start, pixels.labels, catalogue, params, gantry_covariance, motion)
     if jump is not None:
         sources = (*sources, jump_source(cameras, start, jump))
@@ -136,7 +120,7 @@ def locate_cycle(
     noise = (pixels.covariances[0] + bends[0], pixels.covariances[1] + bends[1])
     found = method.estimate_moments(cameras, pixels, start, visible_breathing(cameras, start, params))
     covariances = found.covariances_mm2(noise, sources)
-    return SiteCycle(moments.phases, pixels.labels, found.points_mm, covariances)
+    return SiteCycle(moments.phases, moments.labels, found.points_mm, covariances)
 
 
 def _fit(phases: Array, positions_mm: Array) -> Array:

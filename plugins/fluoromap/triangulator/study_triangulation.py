@@ -6,7 +6,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import get_args
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
-from fluoromap.triangulator.reference_origin import common_origin, deviates
+from fluoromap.triangulator.reference_origin import ReferenceOrigin, common_origin, deviates
 from fluoromap.triangulator.self_calibration import (
     GantryBelief,
     any_study_belief,
@@ -35,15 +34,14 @@ from fluoromap.triangulator.self_calibration import (
     header_belief,
     study_belief,
 )
-from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments, SiteMotion
-from fluoromap.triangulator.site_locator import Moment, SiteLocator
+from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
+from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     LARGEST_MULTIPLE,
-    Share,
     UncertaintyParams,
     error_sources,
     pixel_noise_px2,
@@ -90,20 +88,6 @@ class StudyChecks:
     gantry: GantryBelief | None = None
     variation: StudyVariation | None = None
     doubt: Reason | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class SiteErrors:
-    """What the report of the study needs to know about a site's location.
-
-    located : whether a plausible position agrees with both views. electrodes : number of located electrodes. squares_mm2 : sum
-    of their variances from each source of error, in the order of :class:`~fluoromap.contracts.ErrorBudget`.
-    """
-
-    located: bool
-    electrodes: int
-    squares_mm2: tuple[float, ...]
-    notes: tuple[str, ...]
 
 
 def locate_study(
@@ -232,67 +216,62 @@ def _locate_sites(
 ) -> Triangulation:
     located: list[LocatedSite] = []
     errors: list[SiteErrors] = []
-    used: list[_Work] = []
+    locations: list[_Location] = []
     for index, one in enumerate(work):
         context.check()
         location = _Location(*one, context)
-        of_site = context.recall(SiteErrors, location.inputs, partial(_errors, location))
-        if of_site.located:
-            located.append(location.located_site())
-            used.append(one)
-            errors.append(of_site)
-            notes += of_site.notes
+        found = location.locate(None)
+        if found is not None:
+            located.append(found[0])
+            locations.append(location)
+            errors.append(found[1])
+            notes += found[1].notes
         else:
             rejected.append(RejectedSite(one[0].site, (Reason.PAIRING_FAILED,)))
         context.progress((index + 1) / len(work))
-    located = _from_one_origin(located, used, catalogue, context)
+    located = _from_one_origin(located, locations, catalogue)
     return Triangulation(tuple(located), tuple(rejected), tuple(notes), calibration, _budget(errors))
 
 
 class _Location:
-    """The location of one site in two parts, each computed when it is first needed.
+    """The location of one site.
 
-    The cycle depends on the site's own cameras. The electrodes at diastole depend on all that the study shows: a correction at
-    another site often changes their covariances, and the cycle only where it changes the calibrated cameras.
+    Its diastole and its cycle depend on the site and its cameras alone; they are recalled where these did not change. Other sites
+    change only the size of the errors, from which the covariances follow quickly.
     """
 
     def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator, context: Context) -> None:
-        self.inputs = (site, jump, locator.catalogue, locator.belief, locator.gap_doubts, locator.origin)
-        self._cycle_inputs = (site, jump, locator.catalogue, *locator.cameras(site))
-        self._work = site, jump, locator
-        self._context = context
+        self._site, self._jump, self._locator = site, jump, locator
+        inputs = (site, jump, locator.catalogue, *locator.cameras(site))
+        self._diastole = context.recall(Diastole, inputs, self._locate_diastole)
+        self._cycle = context.recall(SiteCycle, inputs, self._locate_cycle)
 
-    @functools.cached_property
-    def answer(self) -> tuple[LocatedSite, Moment, list[str]] | None:
-        """The site without its cycle, see :meth:`SiteLocator.locate`."""
-        site, jump, locator = self._work
-        return locator.locate(site, jump, self._context.recall(SiteMotion, self._cycle_inputs, self._motion))
+    def locate(self, origin: ReferenceOrigin | None) -> tuple[LocatedSite, SiteErrors] | None:
+        """Return the site in 3D, see :meth:`SiteLocator.locate`.
 
-    def located_site(self) -> LocatedSite:
-        """Return the site in 3D."""
-        without_cycle = self._context.recall(LocatedSite, self.inputs, self._without_cycle)
-        cycle = self._context.recall(SiteCycle, self._cycle_inputs, self._cycle)
-        return replace(without_cycle, cycle=cycle) if cycle.labels else without_cycle
-
-    def _without_cycle(self) -> LocatedSite:
-        assert self.answer is not None, "the site was located before"
-        return self.answer[0]
+        None where no plausible position agrees with both views.
+        """
+        first, other = self._diastole.chosen, self._diastole.alternative
+        if first is None:
+            return None
+        locator = self._locator if origin is None else replace(self._locator, origin=origin)
+        return locator.locate(self._site, self._jump, first, other, self._cycle if self._cycle.labels else None)
 
     @functools.cached_property
     def _moments(self) -> CycleMoments | None:
-        site, _, locator = self._work
-        return locator.moments(site)
+        return self._locator.moments(self._site)
 
-    def _motion(self) -> SiteMotion:
-        return SiteMotion() if self._moments is None else self._moments.motion
+    def _locate_diastole(self) -> Diastole:
+        return self._locator.diastole(self._site, self._jump, self._moments)
 
-    def _cycle(self) -> SiteCycle:
-        site, jump, locator = self._work
-        return NO_CYCLE if self._moments is None else locator.cycle(site, jump, self._moments)
+    def _locate_cycle(self) -> SiteCycle:
+        if self._moments is None or self._diastole.chosen is None:
+            return NO_CYCLE
+        return self._locator.cycle(self._site, self._jump, self._moments)
 
 
 def _from_one_origin(
-    located: Sequence[LocatedSite], work: Sequence[_Work], catalogue: Catalogue, context: Context
+    located: Sequence[LocatedSite], locations: Sequence[_Location], catalogue: Catalogue
 ) -> list[LocatedSite]:
     """Give all sites the same origin.
 
@@ -302,10 +281,9 @@ def _from_one_origin(
     if reference is None or (origin := common_origin(located, reference)) is None:
         return list(located)
     same: list[LocatedSite] = []
-    for first, (site, jump, locator) in zip(located, work, strict=True):
-        if deviates(first, reference, origin):
-            first = _Location(site, jump, replace(locator, origin=origin), context).located_site()
-        same.append(first)
+    for first, location in zip(located, locations, strict=True):
+        again = location.locate(origin) if deviates(first, reference, origin) else None
+        same.append(first if again is None else again[0])
     return same
 
 
@@ -377,25 +355,6 @@ def _calibration_note(calibration: Calibration) -> str:
     )
 
 
-_BUDGET = get_args(Share)
-
-
-def _errors(location: _Location) -> SiteErrors:
-    """Return the share of a site in the report of the study."""
-    if location.answer is None:
-        return SiteErrors(False, 0, (), ())
-    _, moment, notes = location.answer
-    gain = moment.found.gain
-    squares = dict.fromkeys(_BUDGET, 0.0)
-    squares["pixels"] += float(np.trace(gain @ moment.noise_px2 @ gain.T))
-    for source in moment.sources:
-        for share in set(source.shares):
-            of = [k for k, own in enumerate(source.shares) if own == share]
-            effect = gain @ source.effect_px[:, of]
-            squares[share] += float(np.trace(effect @ source.covariance[np.ix_(of, of)] @ effect.T))
-    return SiteErrors(True, len(moment.found.points_mm), tuple(squares.values()), tuple(notes))
-
-
 def _budget(sites: Sequence[SiteErrors]) -> ErrorBudget | None:
     """Return the RMS of each source of error over all located electrodes.
 
@@ -405,4 +364,4 @@ def _budget(sites: Sequence[SiteErrors]) -> ErrorBudget | None:
     if not count:
         return None
     totals = np.sum([site.squares_mm2 for site in sites], axis=0)
-    return ErrorBudget(**{f"{name}_mm": float(np.sqrt(of / count)) for name, of in zip(_BUDGET, totals, strict=True)})
+    return ErrorBudget(**{f"{name}_mm": float(np.sqrt(of / count)) for name, of in zip(BUDGET, totals, strict=True)})
