@@ -292,19 +292,13 @@ def _same_gantry(sites: Sequence[SiteLook]) -> list[int]:
 
     Only such sites share the gantry's errors.
     """
-    best: list[int] = []
-    for one in sites:
-        alike = [
-            i for i, site in enumerate(sites)
-            if _angle_deg(one.camera_a, site.camera_a) < _SAME_GANTRY_DEG
-            and _angle_deg(one.camera_b, site.camera_b) < _SAME_GANTRY_DEG
-        ]  # fmt: skip
-        best = max(best, alike, key=len)
-    return best
-
-
-def _angle_deg(first: Camera, second: Camera) -> float:
-    return float(np.degrees(np.arccos(np.clip(first.axis_world @ second.axis_world, -1, 1))))
+    if not sites:
+        return []
+    alike = np.ones((len(sites), len(sites)), dtype=np.bool_)
+    for view in (0, 1):
+        axes = np.array([site.cameras[view].axis_world for site in sites])
+        alike &= np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1))) < _SAME_GANTRY_DEG
+    return [int(i) for i in np.flatnonzero(alike[np.argmax(alike.sum(axis=1))])]
 
 
 def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue) -> list[str]:
