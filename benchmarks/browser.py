@@ -15,7 +15,10 @@ PATIENCE_MS = 240_000
 
 @contextmanager
 def open_page(url: str) -> Iterator[Page]:
-    """Open a page in Chromium as on a machine without a graphics card; addresses count from ``url``."""
+    """Open Chromium as on a machine without a graphics card.
+
+    ``url`` : start of all addresses of the page.
+    """
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         sys.exit("There is no Chromium to open the pages in; install it (on Debian: apt-get install chromium).")

@@ -29,6 +29,7 @@ DRAWN = """before => {
   const panel = document.querySelector("#panel-map [data-job]");
   return panel && panel.dataset.job !== before && panel.querySelector(".scene canvas[data-drawn=yes]");
 }"""
+SHOWN = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 LOCATED = "#panel-map tr[data-grade]:not([data-grade=rejected])"
 SHOWN_JOB = "#panel-map [data-job]"
 
@@ -77,6 +78,7 @@ def correct(page: Page, site: str) -> float:
     start = time.perf_counter()
     page.get_by_role("button", name="Compute the map again").click()
     page.wait_for_function(DRAWN, arg=before)
+    page.evaluate(SHOWN)
     seconds = time.perf_counter() - start
     page.get_by_text("The computation has ended: finished.").wait_for()
     return seconds

@@ -125,29 +125,40 @@ def study_files(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFiles:
     return simulate(tmp_path_factory.mktemp("mapped"), StudySpec(8, sites=5, frames=24), processes=1)
 
 
-def compute_study(service_url: str, label: str, files: SimulatedFiles) -> tuple[str, str]:
-    """Return the ids of a new study of the files and of its finished job."""
-    with Client(service_url) as client:
-        study = client.make_study(label)
-        for path in files.runs:
-            client.upload(study, path)
-        client.put_activation_times(study, files.activation_times)
-        job = client.start_job(study)
-        states = [each["state"] for each in client.follow(job)]
-        assert states[-1] == "succeeded", states
-    return study, job
+@pytest.fixture(scope="session")
+def compute_study(service_url: str) -> Callable[[str, SimulatedFiles], tuple[str, str]]:
+    """Return a function that computes a new study of files, and returns the ids of study and job."""
+
+    def compute(label: str, files: SimulatedFiles) -> tuple[str, str]:
+        with Client(service_url) as client:
+            study = client.make_study(label)
+            for path in files.runs:
+                assert client.upload(study, path).uid
+            client.put_activation_times(study, files.activation_times)
+            job = client.start_job(study)
+            states = [each["state"] for each in client.follow(job)]
+            assert states[-1] == "succeeded", states
+        return study, job
+
+    return compute
 
 
 @pytest.fixture(scope="session")
-def mapped_study(service_url: str, study_files: SimulatedFiles) -> tuple[str, str]:
+def mapped_study(
+    compute_study: Callable[[str, SimulatedFiles], tuple[str, str]], study_files: SimulatedFiles
+) -> tuple[str, str]:
     """Return the ids of a study with a map and of its job. No test changes it."""
-    return compute_study(service_url, "With a map", study_files)
+    return compute_study("With a map", study_files)
 
 
 @pytest.fixture
-def own_study(service_url: str, study_files: SimulatedFiles, mapped_study: tuple[str, str]) -> str:
+def own_study(
+    compute_study: Callable[[str, SimulatedFiles], tuple[str, str]],
+    study_files: SimulatedFiles,
+    mapped_study: tuple[str, str],
+) -> str:
     """Return the id of a study with the same map, for a test that changes it. The service takes the stages from the other study."""
-    return compute_study(service_url, "With a map, to change", study_files)[0]
+    return compute_study("With a map, to change", study_files)[0]
 
 
 @pytest.fixture(scope="session")

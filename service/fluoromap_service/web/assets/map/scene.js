@@ -25,6 +25,8 @@ export class MapScene extends EventTarget {
     this.map = look.map;
     /** @type {string|null} */
     this.chosen = null;
+    /** The drawing that the browser was asked for; 0: none. */
+    this.asked = 0;
     const made = (/** @type {string} */ tag, /** @type {string} */ name) => {
       const each = document.createElement(tag);
       each.className = name;
@@ -84,6 +86,7 @@ export class MapScene extends EventTarget {
 
   /** Give the memory of the graphics card back; a browser has few such contexts. */
   close() {
+    cancelAnimationFrame(this.asked);
     this.look.removeEventListener("changed", this.recolour);
     this.surface.close();
     this.catheters.close();
@@ -119,8 +122,15 @@ export class MapScene extends EventTarget {
     this.draw();
   }
 
+  /** Draw once before the browser shows its next picture, however many changes ask for it: without a graphics card each drawing takes a tenth of a second. */
   draw() {
-    if (!this.orbit) return;
+    this.asked ||= requestAnimationFrame(() => {
+      this.asked = 0;
+      this.#paint();
+    });
+  }
+
+  #paint() {
     const { camera } = this.orbit;
     this.sun.position.copy(camera.position);
     this.renderer.render(this.world, camera);

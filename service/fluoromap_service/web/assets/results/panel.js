@@ -1,10 +1,10 @@
 /** The fourth step: the map, the sites, the pictures, the downloads, and the comparison of two jobs. */
 import { get } from "../shared/api.js";
 import { attempt, element, field, select } from "../shared/elements.js";
-import { jobLabel, warningWords } from "../shared/words.js";
+import { jobLabel, listed, warningWords } from "../shared/words.js";
 import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
-import { resultSites } from "./sites-table.js";
+import { lostSites, resultSites } from "./sites-table.js";
 
 /** @typedef {import("../study/page.js").StudyState} StudyState */
 /** @typedef {import("../shared/types.js").Job} Job */
@@ -25,15 +25,16 @@ export function resultsPanel(state, correct) {
   const show = async (job) => {
     shown = job.id;
     // The library of 3D is large: the page is ready before it arrives.
-    const [{ mapPanel }, { MapLook }, points, map, reasons] = await Promise.all([
+    const [{ mapPanel }, { MapLook }, points, map, sentences] = await Promise.all([
       import("../map/panel.js"), import("../map/look.js"),
-      get(`/v1/jobs/${job.id}/points`), get(`/v1/jobs/${job.id}/map`).catch((error) => error), get("/v1/reasons"),
+      state.points(job.id), get(`/v1/jobs/${job.id}/map`).catch((error) => error), state.sentences(),
     ]);
-    const sentences = new Map(reasons.map((/** @type {any} */ each) => [each.code, each.sentence]));
-    const tips = points.points.filter((/** @type {any} */ each) => each.catheter === state.study.mapping && each.electrode === 1);
+    const tips = await state.tips(job.id);
     const hasMap = !(map instanceof Error);
     const earliest = hasMap ? (map.earliest[0]?.site ?? null) : null;
-    const table = resultSites(tips, earliest, sentences, (site) => state.choose(site), (site) => { state.choose(site); correct(); });
+    const correctSite = (/** @type {string} */ site) => { state.choose(site); correct(); };
+    const lost = lostSites(tips, sentences, correctSite);
+    const table = resultSites(tips, earliest, sentences, (site) => state.choose(site), correctSite);
     const markRow = () => {
       for (const row of table.querySelectorAll("tr[data-site]")) row.classList.toggle("chosen", row.dataset.site === state.chosen);
     };
@@ -44,13 +45,13 @@ export function resultsPanel(state, correct) {
     if (!hasMap) {
       state.addEventListener("chosen", markRow);
       forget = () => state.removeEventListener("chosen", markRow);
-      place.replaceChildren(element("p", { class: "notice problem" }, map.message), table, files);
+      place.replaceChildren(element("p", { class: "notice problem" }, map.message), ...lost, table, files);
       place.dataset.job = job.id;
       return markRow();
     }
     const look = new MapLook(map);
     const catheters = state.study.catheters.map((each) => each.name);
-    const chamber = mapPanel(look, points.points, catheters, `${state.study.label}: ${map.simulated ? "simulated data, " : ""}for research`);
+    const chamber = mapPanel(look, points, catheters, `${state.study.label}: ${map.simulated ? "simulated data, " : ""}for research`);
     const overFluoroscopy = element("div", {}, element("p", { class: "card" }, "The map over fluoroscopy follows at the end of the computation."));
     /** @type {import("../fused/panel.js").FusedPanel|null} */
     let fused = null;
@@ -77,8 +78,12 @@ export function resultsPanel(state, correct) {
       chamber.scene.addEventListener("chosen", (/** @type {CustomEvent} */ event) => state.choose(event.detail));
       choose();
     });
-    const warnings = map.warnings.map((/** @type {string} */ code) => element("li", {}, sentences.get(code) ?? warningWords(code)));
-    place.replaceChildren(chamber, warnings.length ? element("ul", { class: "notice problem" }, ...warnings) : "", overFluoroscopy, table, files);
+    const warnings = map.warnings.map((/** @type {string} */ code) => {
+      const where = tips.filter((tip) => tip.reasons.includes(code)).map((tip) => tip.site);
+      const sites = where.length === tips.length ? "All sites: " : where.length ? `Site ${listed(where)}: ` : "";
+      return element("li", {}, `${sites}${sentences.get(code) ?? warningWords(code)}`);
+    });
+    place.replaceChildren(...lost, chamber, warnings.length ? element("ul", { class: "notice problem" }, ...warnings) : "", overFluoroscopy, table, files);
     place.dataset.job = job.id;
     choose();
     if (job.state === "succeeded") await complete(job);

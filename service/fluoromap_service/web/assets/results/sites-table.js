@@ -5,6 +5,13 @@ import { tipDistance } from "./tip-distance.js";
 
 /** @typedef {import("../shared/types.js").Point} Point */
 
+/** A line for each site that is not located: why, and the way to its electrodes. @param {Point[]} tips @param {Map<string, string>} sentences @param {(site: string) => void} onCorrect */
+export function lostSites(tips, sentences, onCorrect) {
+  return tips.filter((tip) => tip.grade === "rejected").map((tip) => element("p", { class: "notice problem", "data-lost": tip.site },
+    element("strong", {}, `Site ${tip.site} is not located. `), tip.reasons.map((code) => sentences.get(code) ?? code).join(" "), " ",
+    button(`Correct site ${tip.site}`, () => onCorrect(tip.site))));
+}
+
 /**
  * @param {Point[]} tips
  * @param {string|null} earliest

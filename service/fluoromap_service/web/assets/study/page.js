@@ -28,6 +28,10 @@ export class StudyState extends EventTarget {
     this.mapped = null;
     /** @type {string|null} The site that a person looks at. */
     this.chosen = null;
+    /** @type {{job: string, points: Promise<import("../shared/types.js").Point[]>}|null} */
+    this.latest = null;
+    /** @type {Promise<Map<string, string>>|null} */
+    this.reasons = null;
   }
 
   async load() {
@@ -41,6 +45,29 @@ export class StudyState extends EventTarget {
   /** The newest job with results. */
   get finished() {
     return this.jobs.find((job) => job.state === "succeeded") ?? null;
+  }
+
+  /** Electrodes of all sites; those of the newest job are asked for once. @param {string} job @returns {Promise<import("../shared/types.js").Point[]>} */
+  points(job) {
+    if (this.latest?.job === job) return this.latest.points;
+    const points = get(`/v1/jobs/${job}/points`).then((answer) => answer.points);
+    this.latest = { job, points };
+    points.catch(() => (this.latest = null));
+    return points;
+  }
+
+  /** The tip of the mapping catheter at each site. @param {string} job */
+  async tips(job) {
+    return (await this.points(job)).filter((each) => each.catheter === this.study.mapping && each.electrode === 1);
+  }
+
+  /** Reason code -> sentence. */
+  sentences() {
+    if (this.reasons) return this.reasons;
+    const reasons = get("/v1/reasons").then((all) => new Map(all.map((/** @type {any} */ each) => [each.code, each.sentence])));
+    this.reasons = reasons;
+    reasons.catch(() => (this.reasons = null));
+    return reasons;
   }
 
   /** Take the map of a job that still runs. @param {import("../shared/types.js").Job} job */
@@ -70,11 +97,15 @@ export async function start() {
     show("compute");
     state.dispatchEvent(new Event("compute"));
   };
+  const correct = () => {
+    show("electrodes");
+    document.querySelector("#panel-electrodes .views")?.scrollIntoView({ block: "nearest" });
+  };
   const show = tabs(byId("content"), [
     ["runs", "1 Runs and times", () => runsPanel(state, () => show("electrodes"), () => show("compute"))],
     ["electrodes", "2 Look and correct", () => viewerPanel(state, compute)],
     ["compute", "3 Compute", () => jobPanel(state, () => show("map"))],
-    ["map", "4 Map and results", () => resultsPanel(state, () => show("electrodes"))],
+    ["map", "4 Map and results", () => resultsPanel(state, correct)],
   ]);
   await state.load();
 }

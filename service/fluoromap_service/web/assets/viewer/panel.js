@@ -22,8 +22,11 @@ export function viewerPanel(state, compute) {
   /** @type {Map<string, number>} Run -> the frame that the newest map uses. */
   let mapFrames = new Map();
   let framesOf = "";
+  /** @type {Map<string, string[]>} Site that the newest job could not locate -> reasons. */
+  let lost = new Map();
+  const problem = element("p", { class: "notice problem", hidden: true });
   const place = element("div", { class: "views" });
-  const hint = element("p", { class: "soft", "aria-live": "polite" });
+  const hint = element("p", { class: "soft hint", "aria-live": "polite" });
   const site = select([], "", { "aria-label": "Site" });
   const catheter = select([], "", {});
   const legend = element("p", { class: "row" });
@@ -36,7 +39,7 @@ export function viewerPanel(state, compute) {
     hint.textContent = {
       edit: "Drag an electrode to move it; click it and press Delete to remove it. Circle: found by the service. Square: set by hand. A change counts from this frame on: the next computation tracks the run again from here. A change in the frame \"used for the map\" moves the map most.",
       add: `Click the place of an electrode that the catheter "${name}" lacks in this frame. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
-      mark: `Click electrode ${next} of ${count} of the catheter "${name}"${next === 1 ? ", which is its tip" : ""}. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
+      mark: `Click electrode ${next} of ${count} of the catheter "${name}"${next === 1 ? ", which is its tip" : ""}. The wheel zooms. Without a mouse: arrows move the cross, Enter sets the electrode. Esc ends.`,
       contrast: "Drag left and right for the width, up and down for the centre of the grey levels.",
       pan: "Drag to move the picture; the wheel zooms.",
     }[tool];
@@ -62,14 +65,29 @@ export function viewerPanel(state, compute) {
     }
   };
 
+  /** @param {import("../shared/types.js").Site} each */
+  const siteLabel = (each) => (each.site ? `site ${each.site}${lost.has(each.site) ? ", not located" : ""}` : `pair ${each.pair}`);
+
   const loadMapFrames = async () => {
     const job = state.finished;
     if (!job || job.id === framesOf) return;
     framesOf = job.id;
-    /** @type {{points: import("../shared/types.js").Point[]}} */
-    const { points } = await get(`/v1/jobs/${job.id}/points`);
+    const points = await state.points(job.id);
+    const tips = await state.tips(job.id);
+    lost = new Map(tips.filter((tip) => tip.grade === "rejected").map((tip) => [tip.site, tip.reasons]));
     mapFrames = new Map(points.flatMap(({ views: { a, b } }) => [a, b].flatMap((each) => (each?.frame ? [[each.sop_instance_uid, each.frame]] : []))));
     for (const view of views) view.setMapFrame(mapFrames.get(view.run.sop_instance_uid) ?? null);
+    state.sites.forEach((each, index) => { if (site.options[index]) site.options[index].textContent = siteLabel(each); });
+    await explain();
+  };
+
+  /** Say why the chosen site is not located. */
+  const explain = async () => {
+    const reasons = lost.get(state.chosen ?? "");
+    problem.hidden = !reasons;
+    if (!reasons) return;
+    const sentences = await state.sentences();
+    problem.textContent = [`Site ${state.chosen} is not located.`, ...reasons.map((code) => sentences.get(code) ?? code), "Any frame serves in which the whole catheter is seen clearly."].join(" ");
   };
 
   const open = () => {
@@ -94,6 +112,7 @@ export function viewerPanel(state, compute) {
     place.replaceChildren(...views.map((view) => view.element));
     if (!views.length) place.replaceChildren(element("p", { class: "card" }, "There is nothing to look at yet. Drop runs into the first step."));
     state.choose(chosen?.site ?? null);
+    attempt(explain);
   };
 
   const fill = () => {
@@ -107,7 +126,7 @@ export function viewerPanel(state, compute) {
     }));
     const bound = new Set(state.sites.flatMap((each) => [each.view_a, each.view_b]));
     /** @type {[string, string][]} */
-    const choices = state.sites.map((each, index) => [String(index), each.site ? `site ${each.site}` : `pair ${each.pair}`]);
+    const choices = state.sites.map((each, index) => [String(index), siteLabel(each)]);
     state.runs.forEach((run, index) => bound.has(run.sop_instance_uid) || choices.push([String(-1 - index), `run ${index + 1} without site`]));
     const wanted = state.sites.findIndex((each) => each.site !== null && each.site === state.chosen);
     const before = site.value || (wanted < 0 ? "" : String(wanted));
@@ -135,12 +154,12 @@ export function viewerPanel(state, compute) {
     element("p", { class: "soft" }, "After a computation, a frame with electrodes set by hand shows only their catheters. The other frames show all."), keys);
   place.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => { if (event.key.toLowerCase() === "h") help.open = !help.open; });
   return element("div", {},
-    element("div", { class: "fields" }, field("Site", site), field("Catheter to mark", catheter),
+    element("div", { class: "tools" }, element("div", { class: "fields" }, field("Site", site), field("Catheter to mark", catheter),
       element("div", { class: "row", role: "group", "aria-label": "Tool" }, ...tools),
       button("Delete", () => current()?.removeChosen(), { title: "Delete the chosen electrode: click it first" }),
       button("Undo", () => current()?.step(-1)), button("Redo", () => current()?.step(1)),
       button("Automatic again", () => current()?.resetFrame(), { title: "Forget the electrodes set by hand in this frame" }),
       button("Track again from here", trackAgain, { title: "The catheter is right in this frame: follow it through the run from here, and compute the map" }),
-      button("Compute the map again", compute, { class: "main" })),
-    legend, hint, place, help);
+      button("Compute the map again", compute, { class: "main" })), hint),
+    problem, legend, place, help);
 }
