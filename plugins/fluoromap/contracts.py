@@ -489,8 +489,8 @@ class StudyVariation:
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry_angle: float = 1.458
-    gantry_offset: float = 2.269
+    gantry_angle: float = 1.124
+    gantry_offset: float = 2.169
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from fluoromap.contracts import (
 from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
+from fluoromap.triangulator.beat_scatter import BeatScatter, beat_scatter
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
 from fluoromap.triangulator.reference_origin import ReferenceOrigin, common_origin, deviates
 from fluoromap.triangulator.self_calibration import (
@@ -38,6 +39,7 @@ from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
 from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
+from fluoromap.triangulator.study_equations import CalibrationSite
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
@@ -48,13 +50,16 @@ from fluoromap.triangulator.uncertainty import (
 )
 
 _SAME_GANTRY_DEG = 3.0
+_SAME_BEAT_MS = 200.0
+"""Frames of simultaneous runs that are nearer than this show the same beat: half of the shortest beat."""
 
 
 @dataclass(frozen=True, eq=False)
 class SiteLook:
     """The part of a site that the checks of the whole study need.
 
-    points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. reasons : why the site
+    points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. same_beat : whether
+    the two frames show the same beat if the runs began together. scatter : of the beats in its runs. reasons : why the site
     cannot be located; then there are no points. note : a sentence about these reasons, or none.
     """
 
@@ -64,12 +69,18 @@ class SiteLook:
     pixels: TwoViewPixels
     points_mm: Array
     covariance_mm2: Array
+    same_beat: bool
+    scatter: tuple[BeatScatter, ...] = ()
     reasons: tuple[Reason, ...] = ()
     note: str | None = None
 
     @property
     def cameras(self) -> Cameras:
         return self.camera_a, self.camera_b
+
+    @property
+    def for_calibration(self) -> CalibrationSite:
+        return CalibrationSite(self.cameras, self.pixels, self.same_beat, self.scatter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +169,7 @@ def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: Uncert
         return StudyChecks(jumps, gaps[0], gaps[1])
     same_gantry = _same_gantry(looks)
     is_certain = [jump is not None and jump.is_certain for jump in jumps]
-    unmoved = [(looks[i].cameras, looks[i].pixels) for i in same_gantry if not is_certain[i]]
+    unmoved = [looks[i].for_calibration for i in same_gantry if not is_certain[i]]
     calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
     return StudyChecks(
         jumps, gaps[0], gaps[1], tuple(same_gantry), calibration, belief.gantry, belief.variation, belief.doubt
@@ -187,7 +198,7 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     The result says why a site cannot be located.
     """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)))
+    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)), _same_beat(site))
     angle = ray_angle_deg(*cameras)
     if angle < PARALLEL_BELOW_DEG:
         note = f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed."
@@ -200,7 +211,18 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))
     covariance = alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
-    return replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance)
+    return replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance, scatter=beat_scatter(site))
+
+
+def _same_beat(site: MatchedSite) -> bool:
+    """Return True where the diastolic frames show the same beat.
+
+    This holds if both runs began together.
+    """
+    frame_a, frame_b = site.diastole.a.frame, site.diastole.b.frame
+    if frame_a >= len(site.frame_times_a_ms) or frame_b >= len(site.frame_times_b_ms):
+        return False
+    return bool(abs(site.frame_times_a_ms[frame_a] - site.frame_times_b_ms[frame_b]) < _SAME_BEAT_MS)
 
 
 _Work = tuple[MatchedSite, Jump | None, SiteLocator]

@@ -26,11 +26,13 @@ from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
-from fluoromap.triangulator.study_equations import site_equations
+from fluoromap.triangulator.study_equations import CalibrationSite, site_equations
 from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
+ANOTHER_BEAT_MS = 800.0
+"""Time of the frame of view b: the two runs of a site show different beats."""
 CAMERAS = camera_from_gantry(LATERAL), camera_from_gantry(FRONTAL)
 Points = dict[str, Array]
 
@@ -71,7 +73,7 @@ def matched_sites(
         moved = {name: at + (shifts or {}).get(index, np.zeros(3)) for name, at in points.items()}
         a, b = observation(CAMERAS[0], points, rng, noise_px), observation(true_b, moved, rng, noise_px)
         pair = PhasePair(0.8, a, b)
-        sites.append(MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+        sites.append(MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS)))
     return tuple(sites)
 
 
@@ -160,7 +162,7 @@ def test_a_wrong_gantry_is_shared_by_both_views() -> None:
         for index, points in enumerate(by_site):
             a, b = (observation(camera, points, rng) for camera in cameras)
             pair = PhasePair(0.8, a, b)
-            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS)))
         answer = located(tuple(sites))
         assert answer.calibration is not None
         assert answer.calibration.applied
@@ -296,7 +298,8 @@ def test_an_electrodes_own_bend_is_no_beat() -> None:
     """It does not grow with the beats, else precise pixels would show calm beats where whole catheters move."""
     (site,) = matched_sites(electrodes(74, sites=1), np.random.default_rng(74))
     params = UncertaintyParams(beat_sd_mm=0.0)
-    equations = site_equations(CAMERAS, pixels_in_both_views(site.diastole), DEFAULT_CATALOGUE, (), params)
+    pixels = pixels_in_both_views(site.diastole)
+    equations = site_equations(CalibrationSite(CAMERAS, pixels), CAMERAS, DEFAULT_CATALOGUE, (), params)
     assert (equations.beats == 0).all()
     assert np.linalg.eigvalsh(equations.fixed - np.diag(equations.pixel_variance)).min() > 0
     assert params.scaled(1.0, 2.0).bend_sd_mm == params.bend_sd_mm
@@ -412,7 +415,7 @@ def test_a_gantry_that_no_electrode_shows_is_in_the_ellipsoids() -> None:
                 for camera, of_view in zip(CAMERAS, turns, strict=True)
             )
             pair = PhasePair(0.8, a, b)
-            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS)))
         answer = located(tuple(sites))
         found, true = errors(answer, by_site)
         covariances = np.array([point.covariance_mm2 for site in answer.sites for point in site.points])
