@@ -6,6 +6,7 @@ restless the heart is also where both views are recorded at the same time.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -85,14 +86,14 @@ def _unevenness(track: Sequence[Observation]) -> float:
 def _resting_beats(track: Sequence[Observation], rest: float) -> list[dict[str, tuple[Array, float]]]:
     """Return the catheters' places in each beat's diastole.
 
-    A place is the mean pixel (2,) of the electrodes, with its variance an axis. Only catheters count that show the same electrodes in all frames.
+    A place is the mean pixel (2,) of the electrodes, with its variance an axis. Only frames count that show all electrodes of their
+    catheter.
     """
     beats: list[dict[str, list[tuple[Array, float]]]] = []
-    whole = {
-        chain.catheter: max((c.electrodes for o in track for c in o.chains if c.catheter == chain.catheter), key=len)
-        for observation in track
-        for chain in observation.chains
-    }
+    whole: dict[str, tuple[int, ...]] = {}
+    for chain in itertools.chain.from_iterable(observation.chains for observation in track):
+        if len(chain.electrodes) > len(whole.setdefault(chain.catheter, chain.electrodes)):
+            whole[chain.catheter] = chain.electrodes
     before = None
     for observation in track:
         if observation.phase is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Calibration, StudyVariation
+from fluoromap.contracts import Array, Calibration, Context, StudyVariation
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.study_equations import (
     GANTRY_UNKNOWNS,
@@ -121,6 +122,7 @@ def calibrate(
     catalogue: Catalogue,
     trusted: frozenset[str],
     params: UncertaintyParams,
+    context: Context,
 ) -> tuple[Calibration | None, StudyBelief]:
     """Estimate the gantry's error from all sites, and decide whether to apply it.
 
@@ -138,6 +140,8 @@ def calibrate(
         Sites taken with the same two gantry positions.
     trusted : frozenset of str
         Catheters whose spacings agree with the catalogue's.
+    context : Context
+        Recalls the equations of sites that did not change.
 
     Returns
     -------
@@ -153,7 +157,12 @@ def calibrate(
         return [site_equations(site, gantry.cameras(site.cameras), catalogue, gaps, params) for site in sites]
 
     unknowns = GANTRY_UNKNOWNS + len(gaps)
-    rows = equations(GantryBelief(_AS_HEADER, usual))
+    rows = [
+        context.recall(
+            SiteEquations, (site, catalogue, gaps), partial(site_equations, site, site.cameras, catalogue, gaps, params)
+        )
+        for site in sites
+    ]
     agree = [_is_explained(one, usual, len(gaps)) for one in rows]
     if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
         # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.

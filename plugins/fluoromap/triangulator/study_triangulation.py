@@ -124,7 +124,7 @@ def calibrate_and_locate(
     """
     usable, rejected, notes = _usable_sites(sites, _looks(sites, catalogue, context, params))
     looks = tuple(look for _, look in usable)
-    found = context.recall(StudyChecks, (looks, catalogue), partial(_check_study, looks, catalogue, params))
+    found = context.recall(StudyChecks, (looks, catalogue), partial(_check_study, looks, catalogue, context, params))
     wrong, contradicted = dict(found.wrong), dict(found.contradicted)
     notes += table_notes([look.site for look in looks], found.jumps)
     notes += _spacing_notes(wrong, catalogue) + _contradiction_notes(contradicted)
@@ -155,7 +155,9 @@ def calibrate_and_locate(
     return _locate_sites(work, catalogue, context, rejected, notes, found.calibration)
 
 
-def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: UncertaintyParams) -> StudyChecks:
+def _check_study(
+    looks: Sequence[SiteLook], catalogue: Catalogue, context: Context, params: UncertaintyParams
+) -> StudyChecks:
     """Check the study for moved tables and wrong spacings, and calibrate its gantry."""
     resting = frozenset(catalogue.names) - {catalogue.mapping}
     jumps = tuple(table_jumps([(look.cameras, look.pixels, look.points_mm) for look in looks], resting, params))
@@ -170,7 +172,7 @@ def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: Uncert
     same_gantry = _same_gantry(looks)
     is_certain = [jump is not None and jump.is_certain for jump in jumps]
     unmoved = [looks[i].for_calibration for i in same_gantry if not is_certain[i]]
-    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
+    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params, context)
     return StudyChecks(
         jumps, gaps[0], gaps[1], tuple(same_gantry), calibration, belief.gantry, belief.variation, belief.doubt
     )
