@@ -73,7 +73,9 @@ def matched_sites(
         moved = {name: at + (shifts or {}).get(index, np.zeros(3)) for name, at in points.items()}
         a, b = observation(CAMERAS[0], points, rng, noise_px), observation(true_b, moved, rng, noise_px)
         pair = PhasePair(0.8, a, b)
-        sites.append(MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS)))
+        sites.append(
+            MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+        )
     return tuple(sites)
 
 
@@ -162,7 +164,9 @@ def test_a_wrong_gantry_is_shared_by_both_views() -> None:
         for index, points in enumerate(by_site):
             a, b = (observation(camera, points, rng) for camera in cameras)
             pair = PhasePair(0.8, a, b)
-            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS)))
+            sites.append(
+                MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+            )
         answer = located(tuple(sites))
         assert answer.calibration is not None
         assert answer.calibration.applied
@@ -415,7 +419,9 @@ def test_a_gantry_that_no_electrode_shows_is_in_the_ellipsoids() -> None:
                 for camera, of_view in zip(CAMERAS, turns, strict=True)
             )
             pair = PhasePair(0.8, a, b)
-            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS)))
+            sites.append(
+                MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+            )
         answer = located(tuple(sites))
         found, true = errors(answer, by_site)
         covariances = np.array([point.covariance_mm2 for site in answer.sites for point in site.points])
