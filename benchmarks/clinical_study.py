@@ -387,7 +387,10 @@ def _first_run(http: httpx.Client, study: str) -> tuple[str, int]:
 
 
 def _corrections(http: httpx.Client, study: str, job: str, segmenter: str, count: int) -> None:
-    """Correct an electrode at one site after another, in any frame and in the frame that the map uses."""
+    """Correct an electrode at one site after another.
+
+    First in any frame, then in the frame that the map uses.
+    """
     sites = [site for site in http.get(f"/v1/studies/{study}/sites?limit=500").json()["items"] if site["site"]]
     used = {
         point["site"]: point["views"]["a"]["frame"]

@@ -87,7 +87,9 @@ class SiteLocator:
     def locate(
         self, site: MatchedSite, jump: Jump | None, first: Moment, other: Moment | None, cycle: SiteCycle | None
     ) -> tuple[LocatedSite, SiteErrors]:
-        """Return a site in 3D, with the errors that the study shows, and its share in the report of the study.
+        """Return a site in 3D and its share in the study's report.
+
+        The covariances contain the errors that the study shows.
 
         Parameters
         ----------
@@ -333,7 +335,7 @@ def _squares_mm2(gain: Array, noise_px2: Array, sources: Sequence[ErrorSource]) 
 
 
 def _phase(pair: PhasePair) -> float | None:
-    """Return the phase of a pair: that of view a, or where it is unknown that of view b."""
+    """Return the phase of view a, else that of view b."""
     return pair.a.phase if pair.a.phase is not None else pair.b.phase
 
 

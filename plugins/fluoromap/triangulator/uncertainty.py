@@ -384,7 +384,10 @@ def site_sources(
     params: UncertaintyParams,
     motion: Motion | None,
 ) -> tuple[ErrorSource, ...]:
-    """Return the other sources that displace several electrodes alike: centres of tips, and the motion of the heart."""
+    """Return the common sources whose size no study shows.
+
+    These are the centres of the tips and the motion of the heart.
+    """
     jacobian = jacobians(cameras, points_world_mm)
     sources = []
     for name in sorted({catheter for catheter, _ in labels}):

@@ -41,9 +41,10 @@ def limit_threads() -> None:
 
 
 def return_freed_memory() -> None:
-    """Let the C library give freed memory back to the system; call it before the first thread starts.
+    """Let the C library give freed memory back to the system.
 
-    By default each of the API's threads keeps the memory of its largest answer. Other C libraries than glibc decide by themselves.
+    Call it before the first thread starts: by default each thread keeps the memory of its largest answer. C libraries without these
+    options decide by themselves.
     """
     with suppress(AttributeError, OSError):
         for option, value in _ALLOCATOR_LIMITS:
