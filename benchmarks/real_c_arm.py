@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
-from fluoromap.contracts import Calibration, Silent
+from fluoromap.contracts import Calibration
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry, ray_angle_deg
 from fluoromap.triangulator.estimate import JointLeastSquares
 from fluoromap.triangulator.self_calibration import StudyBelief, calibrate
@@ -210,7 +210,7 @@ def _calibrate(
 ) -> tuple[Calibration | None, StudyBelief]:
     """Calibrate a pair of runs; each landmark counts as a site."""
     sites = [CalibrationSite(cameras, _pixels(a, b, [name])) for name in names]
-    return calibrate(sites, DEFAULT_CATALOGUE, frozenset(), PARAMS, Silent())
+    return calibrate(sites, DEFAULT_CATALOGUE, frozenset(), PARAMS)
 
 
 def main(folder: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,7 +15,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Calibration, Context, StudyVariation
+from fluoromap.contracts import Array, Calibration, StudyVariation
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.study_equations import (
     GANTRY_UNKNOWNS,
@@ -122,7 +121,7 @@ def calibrate(
     catalogue: Catalogue,
     trusted: frozenset[str],
     params: UncertaintyParams,
-    context: Context,
+    as_stated: Sequence[SiteEquations] | None = None,
 ) -> tuple[Calibration | None, StudyBelief]:
     """Estimate the gantry's error from all sites, and decide whether to apply it.
 
@@ -140,8 +139,8 @@ def calibrate(
         Sites taken with the same two gantry positions.
     trusted : frozenset of str
         Catheters whose spacings agree with the catalogue's.
-    context : Context
-        Recalls the equations of sites that did not change.
+    as_stated : sequence of SiteEquations, optional
+        Equations of the sites with the gantry that the headers state, where they are known.
 
     Returns
     -------
@@ -157,12 +156,7 @@ def calibrate(
         return [site_equations(site, gantry.cameras(site.cameras), catalogue, gaps, params) for site in sites]
 
     unknowns = GANTRY_UNKNOWNS + len(gaps)
-    rows = [
-        context.recall(
-            SiteEquations, (site, catalogue, gaps), partial(site_equations, site, site.cameras, catalogue, gaps, params)
-        )
-        for site in sites
-    ]
+    rows = list(as_stated) if as_stated is not None else equations(GantryBelief(_AS_HEADER, usual))
     agree = [_is_explained(one, usual, len(gaps)) for one in rows]
     if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
         # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.

@@ -39,7 +39,7 @@ from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
 from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
-from fluoromap.triangulator.study_equations import CalibrationSite
+from fluoromap.triangulator.study_equations import CalibrationSite, SiteEquations, gap_labels, site_equations
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
@@ -60,7 +60,8 @@ class SiteLook:
 
     points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. same_beat : whether
     the two frames show the same beat if the runs began together. scatter : of the beats in its runs. reasons : why the site
-    cannot be located; then there are no points. note : a sentence about these reasons, or none.
+    cannot be located; then there are no points. note : a sentence about these reasons, or none. equations : of the site for the
+    calibration, with the gantry that the headers state and the gaps of all catheters.
     """
 
     site: str
@@ -73,6 +74,7 @@ class SiteLook:
     scatter: tuple[BeatScatter, ...] = ()
     reasons: tuple[Reason, ...] = ()
     note: str | None = None
+    equations: SiteEquations | None = None
 
     @property
     def cameras(self) -> Cameras:
@@ -124,7 +126,7 @@ def calibrate_and_locate(
     """
     usable, rejected, notes = _usable_sites(sites, _looks(sites, catalogue, context, params))
     looks = tuple(look for _, look in usable)
-    found = context.recall(StudyChecks, (looks, catalogue), partial(_check_study, looks, catalogue, context, params))
+    found = context.recall(StudyChecks, (looks, catalogue), partial(_check_study, looks, catalogue, params))
     wrong, contradicted = dict(found.wrong), dict(found.contradicted)
     notes += table_notes([look.site for look in looks], found.jumps)
     notes += _spacing_notes(wrong, catalogue) + _contradiction_notes(contradicted)
@@ -155,9 +157,7 @@ def calibrate_and_locate(
     return _locate_sites(work, catalogue, context, rejected, notes, found.calibration)
 
 
-def _check_study(
-    looks: Sequence[SiteLook], catalogue: Catalogue, context: Context, params: UncertaintyParams
-) -> StudyChecks:
+def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: UncertaintyParams) -> StudyChecks:
     """Check the study for moved tables and wrong spacings, and calibrate its gantry."""
     resting = frozenset(catalogue.names) - {catalogue.mapping}
     jumps = tuple(table_jumps([(look.cameras, look.pixels, look.points_mm) for look in looks], resting, params))
@@ -171,8 +171,12 @@ def _check_study(
         return StudyChecks(jumps, gaps[0], gaps[1])
     same_gantry = _same_gantry(looks)
     is_certain = [jump is not None and jump.is_certain for jump in jumps]
-    unmoved = [looks[i].for_calibration for i in same_gantry if not is_certain[i]]
-    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params, context)
+    unmoved = [looks[i] for i in same_gantry if not is_certain[i]]
+    # The looks have the equations of all catheters.
+    known = [look.equations for look in unmoved if look.equations is not None] if not wrong else None
+    calibration, belief = calibrate(
+        [look.for_calibration for look in unmoved], catalogue, frozenset(catalogue.names) - set(wrong), params, known
+    )
     return StudyChecks(
         jumps, gaps[0], gaps[1], tuple(same_gantry), calibration, belief.gantry, belief.variation, belief.doubt
     )
@@ -213,7 +217,9 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))
     covariance = alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
-    return replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance, scatter=beat_scatter(site))
+    look = replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance, scatter=beat_scatter(site))
+    gaps = gap_labels(catalogue, frozenset(catalogue.names))
+    return replace(look, equations=site_equations(look.for_calibration, cameras, catalogue, gaps, params))
 
 
 def _same_beat(site: MatchedSite) -> bool:
