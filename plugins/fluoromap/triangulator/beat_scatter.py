@@ -6,7 +6,6 @@ restless the heart is also where both views are recorded at the same time.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -86,14 +85,15 @@ def _unevenness(track: Sequence[Observation]) -> float:
 def _resting_beats(track: Sequence[Observation], rest: float) -> list[dict[str, tuple[Array, float]]]:
     """Return the catheters' places in each beat's diastole.
 
-    A place is the mean pixel (2,) of the electrodes, with its variance an axis. Only frames count that show all electrodes of their
-    catheter.
+    A place is the mean pixel (2,) of the electrodes, with its variance an axis. A frame counts for a catheter only where it shows
+    all electrodes that the run shows of it.
     """
     beats: list[dict[str, list[tuple[Array, float]]]] = []
     whole: dict[str, tuple[int, ...]] = {}
-    for chain in itertools.chain.from_iterable(observation.chains for observation in track):
-        if len(chain.electrodes) > len(whole.setdefault(chain.catheter, chain.electrodes)):
-            whole[chain.catheter] = chain.electrodes
+    for observation in track:
+        for chain in observation.chains:
+            if len(chain.electrodes) > len(whole.get(chain.catheter, ())):
+                whole[chain.catheter] = chain.electrodes
     before = None
     for observation in track:
         if observation.phase is None:
