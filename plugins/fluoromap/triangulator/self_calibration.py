@@ -121,6 +121,7 @@ def calibrate(
     catalogue: Catalogue,
     trusted: frozenset[str],
     params: UncertaintyParams,
+    as_stated: Sequence[SiteEquations] | None = None,
 ) -> tuple[Calibration | None, StudyBelief]:
     """Estimate the gantry's error from all sites, and decide whether to apply it.
 
@@ -138,6 +139,8 @@ def calibrate(
         Sites taken with the same two gantry positions.
     trusted : frozenset of str
         Catheters whose spacings agree with the catalogue's.
+    as_stated : sequence of SiteEquations, optional
+        Equations of the sites with the gantry that the headers state, where they are known.
 
     Returns
     -------
@@ -153,7 +156,7 @@ def calibrate(
         return [site_equations(site, gantry.cameras(site.cameras), catalogue, gaps, params) for site in sites]
 
     unknowns = GANTRY_UNKNOWNS + len(gaps)
-    rows = equations(GantryBelief(_AS_HEADER, usual))
+    rows = list(as_stated) if as_stated is not None else equations(GantryBelief(_AS_HEADER, usual))
     agree = [_is_explained(one, usual, len(gaps)) for one in rows]
     if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
         # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.

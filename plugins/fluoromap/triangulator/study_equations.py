@@ -225,9 +225,12 @@ def information(rows: Sequence[SiteEquations], linearised_at: Array, log_likelih
     u = len(linearised_at)
     matrices, vectors = np.zeros((len(HEART_SCALES), u, u)), np.zeros((len(HEART_SCALES), u))
     constants = np.array(log_likelihoods)
+    breathing, beats = (np.array([getattr(scale, of) ** 2 for scale in HEART_SCALES]) for of in ("breathing", "beats"))
     for one in rows:
         residual = one.residual + one.slope @ linearised_at
-        covariance = np.stack([one.covariance(scale) for scale in HEART_SCALES])
+        shown = np.array([one.shows_beats(scale) for scale in HEART_SCALES])
+        of_breathing, of_beats = ((shown * squares)[:, None, None] for squares in (breathing, beats))
+        covariance = one.fixed + of_breathing * one.breathing + of_beats * one.beats
         factor = np.linalg.cholesky(covariance)
         both = np.linalg.solve(factor, np.column_stack([one.slope, residual]))
         products = np.swapaxes(both, -1, -2) @ both

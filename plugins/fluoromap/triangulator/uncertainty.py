@@ -338,13 +338,58 @@ def common_sources(
 
     These are the sources of :func:`error_sources` without the electrodes' own bends.
     """
+    return (
+        *study_sources(cameras, points_world_mm, labels, catalogue, params, gantry_covariance),
+        *site_sources(cameras, points_world_mm, labels, params, motion),
+    )
+
+
+def study_sources(
+    cameras: Cameras,
+    points_world_mm: Array,
+    labels: Sequence[tuple[str, int]],
+    catalogue: Catalogue,
+    params: UncertaintyParams,
+    gantry_covariance: Array,
+) -> tuple[ErrorSource, ...]:
+    """Return the sources whose size a study shows: gantry, breathing and beats.
+
+    Their effects on the pixels depend neither on ``params`` nor on ``gantry_covariance``.
+    """
     jacobian = jacobians(cameras, points_world_mm)
     gantry: tuple[Share, ...] = (*(*("angles",) * 3, *("source_distances",) * 3) * 2, *("source_distances",) * 2)
-    sources = [
+    return (
         ErrorSource(gantry_effect_px(cameras, jacobian, points_world_mm), gantry_covariance, gantry),
         *breathing_sources(jacobian, params),
         *beat_sources(jacobian, points_world_mm, labels, catalogue, params),
-    ]
+    )
+
+
+def study_covariance(params: UncertaintyParams, gantry_covariance: Array, catheters: int) -> Array:
+    """Return the covariance (k, k) of the parameters of all :func:`study_sources`, in their order."""
+    k = len(gantry_covariance)
+    variances = np.zeros(k + 5 + 6 * catheters)
+    variances[k + 3 : k + 5] = params.respiration_drift_sd_mm**2
+    variances[k + 5 :] = params.beat_sd_mm**2
+    covariance: Array = np.diag(variances)
+    covariance[:k, :k] = gantry_covariance
+    covariance[k : k + 3, k : k + 3] = params.respiration_covariance_mm2() / 2
+    return covariance
+
+
+def site_sources(
+    cameras: Cameras,
+    points_world_mm: Array,
+    labels: Sequence[tuple[str, int]],
+    params: UncertaintyParams,
+    motion: Motion | None,
+) -> tuple[ErrorSource, ...]:
+    """Return the common sources whose size no study shows.
+
+    These are the centres of the tips and the motion of the heart.
+    """
+    jacobian = jacobians(cameras, points_world_mm)
+    sources = []
     for name in sorted({catheter for catheter, _ in labels}):
         tip = _tip_along_shaft(points_world_mm, labels, name)
         if tip is not None:
@@ -444,21 +489,20 @@ def pixel_noise_px2(covariances_px2: tuple[Array, Array]) -> Array:
     return noise.reshape(*moments, 4 * n, 4 * n)
 
 
-def relative_covariance_mm2(joint_mm2: Array, index: int, reference: list[int]) -> Array:
-    """Return the covariance (3, 3) of a point relative to the reference catheter's mean.
+def relative_covariances_mm2(joint_mm2: Array, reference: list[int]) -> Array:
+    """Return the covariances (N, 3, 3) of all points relative to the reference catheter's mean.
 
     Parameters
     ----------
     joint_mm2 : ndarray, shape (N, 3, N, 3)
         Joint covariance of all points.
-    index : int
-        The point.
     reference : list of int
         The reference catheter's points.
     """
-    weights = np.zeros(len(joint_mm2))
-    weights[index] += 1.0
-    weights[reference] -= 1.0 / len(reference)
-    covariance: Array = np.einsum("i,iajb,j->ab", weights, joint_mm2, weights)
-    # The variance of the reference's own electrodes can be nearly 0; this keeps the covariance positive definite.
-    return covariance + 1e-9 * np.eye(3)
+    n = len(joint_mm2)
+    weights = np.eye(n)
+    weights[:, reference] -= 1.0 / len(reference)
+    left = (weights @ joint_mm2.reshape(n, -1)).reshape(n, 3, n, 3)
+    covariances: Array = np.einsum("iajb,ij->iab", left, weights)
+    # The variance of the reference's own electrodes can be nearly 0; this keeps the covariances positive definite.
+    return covariances + 1e-9 * np.eye(3)

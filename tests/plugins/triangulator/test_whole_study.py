@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
@@ -28,7 +30,7 @@ from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.study_equations import CalibrationSite, site_equations
 from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import UncertaintyParams, study_covariance, study_sources
 
 NOISE_PX = 0.5
 ANOTHER_BEAT_MS = 800.0
@@ -496,3 +498,48 @@ def test_offsets_of_some_electrodes_add_their_own_error_and_those_of_all_add_non
     np.testing.assert_allclose(place, [13.0, 1.0, 1.0])
     np.testing.assert_allclose(added, 0.25 * 2 / 3 * np.eye(3))
     assert origin.from_electrodes((7,), at[:1]) is None
+
+
+class _Remembering(Silent):
+    """A context with a memory: ``computed`` are the kinds of the partial results that it had to compute."""
+
+    def __init__(self) -> None:
+        self.computed: list[str] = []
+        self._known: dict[str, Any] = {}
+
+    def recall(self, kind, inputs, compute):  # type: ignore[no-untyped-def]
+        with np.printoptions(threshold=100_000, precision=17):
+            key = repr((kind, inputs))
+        if key not in self._known:
+            self._known[key] = compute()
+            self.computed.append(kind.__name__)
+        return self._known[key]
+
+
+def test_a_corrected_diastole_locates_its_own_site_again() -> None:
+    first, *others = matched_sites(electrodes(3), np.random.default_rng(3))
+    triangulator, context = MaximumLikelihood(UncertaintyParams()), _Remembering()
+    triangulator.triangulate((first, *others), DEFAULT_CATALOGUE, context)
+    each = ["SiteLook", "Diastole", "SiteCycle"]
+    assert sorted(context.computed) == sorted((1 + len(others)) * each + ["StudyChecks"])
+
+    context.computed.clear()
+    chains = first.diastole.a.chains
+    moved = replace(chains[0], pixels_uv=chains[0].pixels_uv + 0.5)
+    pair = replace(first.diastole, a=replace(first.diastole.a, chains=(moved, *chains[1:])))
+    corrected = (replace(first, diastole=pair), *others)
+    again = triangulator.triangulate(corrected, DEFAULT_CATALOGUE, context)
+    assert sorted(context.computed) == sorted([*each, "StudyChecks"])
+    assert repr(again) == repr(located(corrected))
+
+
+@pytest.mark.parametrize(("breathing", "beats"), [(1.0, 1.0), (0.3, 1.6)])
+def test_the_size_of_the_study_errors_is_that_of_their_sources(breathing: float, beats: float) -> None:
+    points = electrodes(4)[0]
+    (site, *_) = matched_sites([points], np.random.default_rng(4))
+    labels = pixels_in_both_views(site.diastole).labels
+    params = UncertaintyParams().scaled(breathing, beats)
+    gantry = np.cov(np.random.default_rng(0).normal(size=(14, 40)))
+    sources = study_sources(CAMERAS, np.concatenate(list(points.values())), labels, DEFAULT_CATALOGUE, params, gantry)
+    whole = study_covariance(params, gantry, len(points))
+    np.testing.assert_allclose(whole, block_diag(*(source.covariance for source in sources)), rtol=1e-15)

@@ -14,7 +14,12 @@ from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.connections import TimedConnection
 from fluoromap_service.cli.database_failures import explain_database_failures
-from fluoromap_service.cli.environment import apply_options, end_with_supervisor, keep_compiled_kernels
+from fluoromap_service.cli.environment import (
+    apply_options,
+    end_with_supervisor,
+    keep_compiled_kernels,
+    return_freed_memory,
+)
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir, Host, Port
 from fluoromap_service.deliveries import outbox
@@ -38,6 +43,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     end_with_supervisor()
     apply_options(host, port, data_dir)
     keep_compiled_kernels()
+    return_freed_memory()
     logs.configure()
     with explain_database_failures():
         schema.check()
