@@ -30,7 +30,7 @@ class Page(BaseModel, Generic[Item]):
 class NewestFirst:
     """The query of a list, the newest rows first.
 
-    A module builds it once, because SQLAlchemy needs longer to build a query than to run it.
+    A module builds it once, because SQLAlchemy needs about as long to build a query as to run it.
 
     Parameters
     ----------
