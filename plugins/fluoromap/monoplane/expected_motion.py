@@ -8,6 +8,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView, SiteCycle
+from fluoromap.matching.beats import cycle_spread
 from fluoromap.monoplane.a_priori_lm import motion_variance_share
 from fluoromap.monoplane.cycle_prior import CycleCurve, fit_cycle
 from fluoromap.monoplane.motion_field import displacements
@@ -60,9 +61,7 @@ def pace_of(phases: Array) -> Pace:
     if len(steps) == 0 or not (steps > 0).any():
         return Pace(1.0, 1.0, 0.0)
     middle = float(np.median(steps[steps > 0]))
-    beat = np.cumsum(np.concatenate([[0], np.diff(phases) < -0.5]))
-    rates = [steps[beat[1:] == number].mean() for number in np.unique(beat) if (beat[1:] == number).sum() > 2]
-    spread = float(np.std(rates, ddof=1) / np.mean(rates)) if len(rates) > 1 else 0.0
+    spread = cycle_spread(phases)
     # A cycle lasts from one R wave to the next; each is timed to the nearest frame.
     reading = np.sqrt(2) * READING_SD_FRAMES * middle
     return Pace(max(float(steps.sum()), 1.0), 1.0 / middle, float(np.sqrt(max(spread**2 - reading**2, 0.0))))

@@ -13,6 +13,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, MatchedSite, Observation
 from fluoromap.geometry import Camera
+from fluoromap.matching.beats import cycle_spread
 
 _NEAR_REST = 0.06
 """Largest distance from the diastolic phase, in cycles."""
@@ -60,7 +61,8 @@ def beat_scatter(site: MatchedSite) -> tuple[BeatScatter, ...]:
 def _scatter(track: Sequence[Observation], camera: Camera, rest: float) -> BeatScatter | None:
     beats = _resting_beats(track, rest)
     catheters = sorted(set.intersection(*({*beat} for beat in beats))) if beats else []
-    if len(beats) < 2 or len(catheters) < 2 or _unevenness(track) > _MOST_UNEVEN:
+    phases = np.array([observation.phase for observation in track if observation.phase is not None])
+    if len(beats) < 2 or len(catheters) < 2 or cycle_spread(phases) > _MOST_UNEVEN:
         return None
     places = np.array([[beat[name][0] for name in catheters] for beat in beats])
     noise = np.mean([[beat[name][1] for name in catheters] for beat in beats])
@@ -68,18 +70,6 @@ def _scatter(track: Sequence[Observation], camera: Camera, rest: float) -> BeatS
     deviations = apart - apart.mean(axis=0)
     degrees = 2 * (len(beats) - 1) * (len(catheters) - 1)
     return BeatScatter(float((deviations**2).sum()), degrees, float(noise), camera.px_per_mm)
-
-
-def _unevenness(track: Sequence[Observation]) -> float:
-    """Return the standard deviation of the cycles' lengths, as a share.
-
-    It is 0 where fewer than two cycles can be compared.
-    """
-    phases = np.array([observation.phase for observation in track if observation.phase is not None])
-    steps = np.diff(phases) % 1.0
-    beat = np.cumsum(np.diff(phases) < -0.5)
-    rates = [steps[beat == number].mean() for number in np.unique(beat) if (beat == number).sum() > 2]
-    return float(np.std(rates, ddof=1) / np.mean(rates)) if len(rates) > 1 else 0.0
 
 
 def _resting_beats(track: Sequence[Observation], rest: float) -> list[dict[str, tuple[Array, float]]]:

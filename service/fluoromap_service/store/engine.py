@@ -62,7 +62,7 @@ def _on_sqlite_begin(connection: Connection) -> None:
     if connection.get_execution_options().get("writes", False):
         connection.exec_driver_sql("BEGIN IMMEDIATE")
         return
-    # By the driver, which needs a tenth of the time: this BEGIN takes no lock, so it cannot fail.
+    # By the driver, past the work of SQLAlchemy: this BEGIN takes no lock, so it cannot fail.
     raw = connection.connection.driver_connection
     assert raw is not None
     raw.execute("BEGIN")

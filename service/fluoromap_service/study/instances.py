@@ -164,8 +164,7 @@ def link_of(session: Session, study_id: str, uid: str) -> StudyInstance:
     return link
 
 
-# Built once, because SQLAlchemy needs about as long to build a query as to run it. Columns instead of whole rows: each request on a
-# study reads its runs.
+# Built once, and columns instead of whole rows: each request on a study reads its runs.
 _RUNS = (
     select(
         StudyInstance.id,

@@ -30,7 +30,7 @@ class Page(BaseModel, Generic[Item]):
 class NewestFirst:
     """The query of a list, the newest rows first.
 
-    A module builds it once, because SQLAlchemy needs about as long to build a query as to run it.
+    A module builds it once: SQLAlchemy would build it anew for each request.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ async def _paging(
     limit: Annotated[int, Query(ge=1, le=500, description="Most items on a page.")] = 50,
     cursor: Annotated[str | None, Query(max_length=500, description="`next` of the page before.")] = None,
 ) -> Paging:
-    # Not the class itself: FastAPI would run it in a thread, which costs more than the class.
+    # Not the class itself: FastAPI would run it in a thread.
     return Paging(request, response, limit, cursor)
 
 

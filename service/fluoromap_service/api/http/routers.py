@@ -18,8 +18,7 @@ from fluoromap_service.api.http.query_names import check_query_names
 class OneThreadRoute(APIRoute):
     """A route whose ordinary function runs in a thread, and nothing else of the request.
 
-    FastAPI would check the answer of such a function in a second thread. The change of threads costs more than the check.
-    Coroutines and streams stay as they are.
+    FastAPI would check the answer of such a function in a second thread, and wait for it. Coroutines and streams stay as they are.
     """
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:

@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import anyio.to_thread
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import event
-
-from fluoromap_service.store.engine import engine
+from sql_statements import sql_statements
 
 
 @pytest.fixture
-def statements(data_dir: object) -> Any:
+def statements(data_dir: object) -> Iterator[list[str]]:
     """The SQL that the service runs."""
-    found: list[str] = []
-
-    def add(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
-        found.append(statement)
-
-    event.listen(engine(), "before_cursor_execute", add)
-    yield found
-    event.remove(engine(), "before_cursor_execute", add)
+    with sql_statements() as found:
+        yield found
 
 
 @pytest.fixture
@@ -44,10 +37,11 @@ def threads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_read_of_a_study(
     service: TestClient, study_path: str, statements: list[str], threads: list[str], below: str
 ) -> None:
+    service.put(f"{study_path}/sites/S1", json={"lat_ms": 12.5}).raise_for_status()
     service.get(study_path)
     statements.clear()
     threads.clear()
-    service.get(f"{study_path}{below}")
+    assert service.get(f"{study_path}{below}").status_code == 200
     assert len(threads) == 1
     assert max(Counter(statements).values()) == 1
 

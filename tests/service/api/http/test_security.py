@@ -5,14 +5,11 @@ from __future__ import annotations
 import re
 import sqlite3
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import event
+from sql_statements import sql_statements
 
 from fluoromap_service import auth
 from fluoromap_service.api.app import create_app
@@ -20,7 +17,6 @@ from fluoromap_service.api.http.security import OPEN_PATHS
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import schema
-from fluoromap_service.store.engine import engine
 
 
 def _bearer(token: str) -> dict[str, str]:
@@ -74,23 +70,8 @@ def test_the_first_token_closes_the_service_at_once(service: TestClient) -> None
     assert service.get("/v1/studies").status_code == 401
 
 
-@contextmanager
-def _statements() -> Iterator[list[str]]:
-    """Gather the SQL that the service runs."""
-    found: list[str] = []
-
-    def add(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
-        found.append(statement)
-
-    event.listen(engine(), "before_cursor_execute", add)
-    try:
-        yield found
-    finally:
-        event.remove(engine(), "before_cursor_execute", add)
-
-
 def _asks_for_tokens(service: TestClient, headers: dict[str, str]) -> bool:
-    with _statements() as statements:
+    with sql_statements() as statements:
         assert service.get("/v1/studies", headers=headers).status_code == 200
     return any("FROM token" in statement for statement in statements)
 
