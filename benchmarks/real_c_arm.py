@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import Calibration
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry, ray_angle_deg
+from fluoromap.triangulator.error_sources import error_sources, pixel_noise_px2
 from fluoromap.triangulator.estimate import JointLeastSquares
 from fluoromap.triangulator.self_calibration import StudyBelief, calibrate
 from fluoromap.triangulator.study_equations import CalibrationSite
 from fluoromap.triangulator.two_view_pixels import TwoViewPixels
-from fluoromap.triangulator.uncertainty import UncertaintyParams, error_sources, pixel_noise_px2
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import numpy as np
 from fluoromap.contracts import Array
 from fluoromap.geometry import Camera
 from fluoromap.matching.two_view import triangulate_linear
+from fluoromap.triangulator.error_sources import ErrorSource, jacobians
 from fluoromap.triangulator.moments import SETTLED_MM, STEPS, MomentEstimates, joint_moments, separate_moments
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import ErrorSource, jacobians
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.contracts import Array
+from fluoromap.triangulator.error_sources import ErrorSource, jacobians
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import ErrorSource, jacobians
 
 STEPS = 8
 SETTLED_MM = 1e-6

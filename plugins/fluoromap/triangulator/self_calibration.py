@@ -17,6 +17,7 @@ from scipy.stats import chi2
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Calibration, StudyVariation
 from fluoromap.reasons import Reason
+from fluoromap.triangulator.gantry_kinds import GANTRY_KINDS, LARGEST_MULTIPLE, credible_covariance
 from fluoromap.triangulator.study_equations import (
     GANTRY_UNKNOWNS,
     GAP_SD_MM,
@@ -32,12 +33,7 @@ from fluoromap.triangulator.study_equations import (
     site_equations,
 )
 from fluoromap.triangulator.two_view_pixels import Cameras
-from fluoromap.triangulator.uncertainty import (
-    GANTRY_KINDS,
-    LARGEST_MULTIPLE,
-    UncertaintyParams,
-    credible_covariance,
-)
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 GATE_EPIPOLAR_RATIO = 1.3
 """Ratio of epipolar RMS to pixel noise below which the header is believed."""
@@ -67,7 +63,7 @@ class GantryBelief:
     """The gantry's estimated error and its remaining uncertainty.
 
     displacements : (4, 4) of the world as view a and view b see it; the identity where the header is believed.
-    covariance : (14, 14) of the remaining errors, see :func:`~fluoromap.triangulator.uncertainty.gantry_effect_px`.
+    covariance : (14, 14) of the remaining errors, see :func:`~fluoromap.triangulator.error_sources.gantry_effect_px`.
     """
 
     displacements: tuple[Array, Array]

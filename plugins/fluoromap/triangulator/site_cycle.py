@@ -10,17 +10,17 @@ from numpy.typing import ArrayLike
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, PhasePair, SiteCycle
-from fluoromap.triangulator.estimate import Method
-from fluoromap.triangulator.table_motion import Jump, jump_source
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_of_pairs
-from fluoromap.triangulator.uncertainty import (
+from fluoromap.triangulator.error_sources import (
     Motion,
-    UncertaintyParams,
     bend_covariances_px2,
     common_sources,
     jacobians,
     visible_breathing,
 )
+from fluoromap.triangulator.estimate import Method
+from fluoromap.triangulator.table_motion import Jump, jump_source
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_of_pairs
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 IN_MOST_PAIRS = 0.8
 """Share of the moments at which both views must show an electrode for it to belong to the site's cycle."""

@@ -13,15 +13,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
-from fluoromap.triangulator.estimate import Method
-from fluoromap.triangulator.reference_origin import ReferenceOrigin
-from fluoromap.triangulator.self_calibration import StudyBelief
-from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
-from fluoromap.triangulator.spacing import spacing_mismatches
-from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
-from fluoromap.triangulator.table_motion import Jump, jump_source
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
-from fluoromap.triangulator.uncertainty import (
+from fluoromap.triangulator.error_sources import (
     ErrorSource,
     Share,
     bend_source,
@@ -33,6 +25,14 @@ from fluoromap.triangulator.uncertainty import (
     study_sources,
     visible_breathing,
 )
+from fluoromap.triangulator.estimate import Method
+from fluoromap.triangulator.reference_origin import ReferenceOrigin
+from fluoromap.triangulator.self_calibration import StudyBelief
+from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
+from fluoromap.triangulator.spacing import spacing_mismatches
+from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
+from fluoromap.triangulator.table_motion import Jump, jump_source
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 
 FAR_MM = 500.0
 """Largest plausible distance from the isocentre: two views that exceed it do not belong together."""
@@ -263,7 +263,7 @@ class MomentErrors:
 class Moment:
     """A site at diastole: N electrodes in 3D, and how errors displace them.
 
-    The k study errors are those of :func:`~fluoromap.triangulator.uncertainty.study_sources`: only their size depends on the
+    The k study errors are those of :func:`~fluoromap.triangulator.error_sources.study_sources`: only their size depends on the
     study. So a correction at another site changes no moment unless it changes the cameras.
 
     labels : (catheter, electrode) of each electrode. points_mm : (N, 3) world. residuals_px : (N, 2 views, 2), without the

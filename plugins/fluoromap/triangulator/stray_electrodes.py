@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array
+from fluoromap.triangulator.error_sources import ErrorSource, jacobians, pixel_noise_px2
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import ErrorSource, jacobians, pixel_noise_px2
 
 STRAY_BEYOND_SD = 4.0
 _MOST_STRAYS = 0.34

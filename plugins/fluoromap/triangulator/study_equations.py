@@ -14,13 +14,8 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array
 from fluoromap.triangulator.beat_scatter import BeatScatter
-from fluoromap.triangulator.estimate import separate_gain, triangulate_unweighted
-from fluoromap.triangulator.spacing import neighbours
-from fluoromap.triangulator.stray_electrodes import epipolar_rows
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import (
+from fluoromap.triangulator.error_sources import (
     ErrorSource,
-    UncertaintyParams,
     beat_sources,
     bend_covariances_px2,
     breathing_effect_px,
@@ -29,6 +24,11 @@ from fluoromap.triangulator.uncertainty import (
     jacobians,
     pixel_noise_px2,
 )
+from fluoromap.triangulator.estimate import separate_gain, triangulate_unweighted
+from fluoromap.triangulator.spacing import neighbours
+from fluoromap.triangulator.stray_electrodes import epipolar_rows
+from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 GANTRY_UNKNOWNS = 14
 GAP_SD_MM = 0.3

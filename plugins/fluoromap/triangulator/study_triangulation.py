@@ -26,7 +26,9 @@ from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.beat_scatter import BeatScatter, beat_scatter
+from fluoromap.triangulator.error_sources import error_sources, pixel_noise_px2
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
+from fluoromap.triangulator.gantry_kinds import LARGEST_MULTIPLE
 from fluoromap.triangulator.reference_origin import ReferenceOrigin, common_origin, deviates
 from fluoromap.triangulator.self_calibration import (
     GantryBelief,
@@ -42,12 +44,7 @@ from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.study_equations import CalibrationSite, SiteEquations, gap_labels, site_equations
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
-from fluoromap.triangulator.uncertainty import (
-    LARGEST_MULTIPLE,
-    UncertaintyParams,
-    error_sources,
-    pixel_noise_px2,
-)
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 _SAME_GANTRY_DEG = 3.0
 _SAME_BEAT_MS = 200.0

@@ -11,9 +11,10 @@ from scipy.stats import norm
 
 from fluoromap.contracts import Array, View
 from fluoromap.geometry import Camera
+from fluoromap.triangulator.error_sources import ErrorSource, effect_px, jacobians
 from fluoromap.triangulator.study_equations import HeartScale
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
-from fluoromap.triangulator.uncertainty import ErrorSource, UncertaintyParams, effect_px, jacobians
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 FEWEST_SITES = 3
 """Fewest sites from which the heart's usual place can be estimated."""

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from fluoromap.contracts import CHI2_95_3D, Array
+from fluoromap.triangulator.gantry_kinds import GANTRY_KINDS, credible_covariance
 from fluoromap.triangulator.self_calibration import any_study_belief, header_belief
-from fluoromap.triangulator.uncertainty import GANTRY_KINDS, UncertaintyParams, credible_covariance
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 OFFSET_OF_A = slice(3, 6)
 

@@ -18,9 +18,10 @@ from fluoromap.contracts import (
 )
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
+from fluoromap.triangulator.gantry_kinds import GANTRY_KINDS
 from fluoromap.triangulator.linear import Linear
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
-from fluoromap.triangulator.uncertainty import GANTRY_KINDS, UncertaintyParams
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
 BOTH = pytest.mark.parametrize("plugin", [Linear, MaximumLikelihood])

@@ -26,11 +26,12 @@ from fluoromap.contracts import (
 from fluoromap.geometry import Camera, camera_from_gantry
 from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
+from fluoromap.triangulator.error_sources import study_covariance, study_sources
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.study_equations import CalibrationSite, site_equations
 from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
-from fluoromap.triangulator.uncertainty import UncertaintyParams, study_covariance, study_sources
+from fluoromap.triangulator.uncertainty import UncertaintyParams
 
 NOISE_PX = 0.5
 ANOTHER_BEAT_MS = 800.0
