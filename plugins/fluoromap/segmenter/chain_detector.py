@@ -169,7 +169,8 @@ class ChainDetector:
         proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
         families = catheter_families(self.catalogue)
         result = self._search(x, seen, proposed, families)
-        if result.explained < electrodes:
+        # Split pairs must not make a part of an unlisted catheter a listed one.
+        if result.explained < electrodes and not result.unlisted:
             halves = seen.halves_of_pairs(self.field.candidates)
             if len(halves):
                 split = self._search(x, seen, proposed.with_more(halves), families, len(halves))
@@ -184,7 +185,10 @@ class ChainDetector:
         families: tuple[CatheterFamily, ...],
         halves: int = 0,
     ) -> _FittedSet:
-        """Return the accepted chains of these proposals, of which the last ``halves`` are electrodes of split pairs."""
+        """Return the accepted chains of these proposals.
+
+        The last ``halves`` of them are electrodes of split pairs.
+        """
         linking = self._link(seen, proposed, families, halves)
         result = self._fit(x, seen, proposed, linking, families)
         if self.acceptance.strict and len(result.candidates) < len(linking.chains):
@@ -295,9 +299,9 @@ class ChainDetector:
         """Return which chains can be catheters of the catalogue, (n,).
 
         Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
-        alike, so proposals in less than half of the gaps may be clutter or parts of a dark shaft if they are less probable:
-        less than half of a long chain's electrodes, or clearly less than all electrodes of a short one and 0.77 at most.
-        Electrodes of a long chain in a chain's line belong to the long one.
+        alike, so proposals in less than half of the gaps may be parts of a dark shaft if they are less probable: less than a
+        long chain's weaker electrodes, or clearly less than all electrodes of a short one and 0.77 at most. Electrodes of a
+        long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         odds_of_free, odds = log_odds(seen.probability_at(free)), log_odds(proposed.probability)
@@ -309,8 +313,7 @@ class ChainDetector:
             own = log_odds(seen.probability_at(chain.pixels_uv))
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
-                onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
-                like = max(EVEN_ODDS, float(np.median(own)))
+                like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:
                 like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
             sure, alike = (

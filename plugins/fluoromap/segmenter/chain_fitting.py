@@ -127,7 +127,7 @@ def fit_chains(
 
 
 def _tip_shows(catheter: Catheter) -> bool:
-    """Return whether a tip electrode differs from a ring by more than its shaft, or its row is long enough to compare.
+    """Return whether the network can see which end is the tip.
 
     The tip of a quadripolar catheter is as long as its rings.
     """

@@ -96,10 +96,16 @@ class ImageEvidence(Protocol):
         """
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
-        """Return the electrodes of pairs that were proposed as one, where ``allowed``."""
+        """Return both electrodes of pairs that were proposed as one.
+
+        They lie where ``allowed``.
+        """
 
     def tip_logits_at(self, points_uv: Array) -> Array:
-        """Return the log-odds that electrodes at points are tips, (n,); 0 from a proposer that cannot see it."""
+        """Return the log-odds that electrodes at points are tips, (n,).
+
+        It is 0 from a proposer that cannot see it.
+        """
 
     def probability_at(self, points_uv: Array) -> Array:
         """Return the probability that electrodes are at points, (n,)."""

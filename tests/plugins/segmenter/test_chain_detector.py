@@ -122,14 +122,6 @@ def test_a_long_chain_is_unlisted_only_where_what_lies_between_is_like_its_elect
     assert any(lies_on(chain, catheter) for chain in found) == listed
 
 
-def test_clutter_as_likely_as_a_long_chain_s_weak_electrodes_does_not_make_it_unlisted():
-    catheter = row_of("cs", (60, 60), 0.4)
-    clutter = 0.5 * (catheter[3:4] + catheter[4:5])
-    probability = [0.99] * 6 + [0.7] * 4 + [0.9]
-    found = chains_found(drawn([catheter]), np.concatenate([catheter, clutter]), probability, [0.9] * 11)
-    assert any(lies_on(chain, catheter) for chain in found)
-
-
 def test_electrodes_of_a_long_catheter_in_its_line_do_not_make_a_short_chain_unlisted():
     ablation, cs = row_of("ablation", (200, 100), 0.0), row_of("cs", (170, 100), np.pi)
     points = np.concatenate([ablation, cs])

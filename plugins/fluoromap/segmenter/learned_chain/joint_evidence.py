@@ -92,7 +92,10 @@ class JointEvidence:
         return _taken(together, np.argsort(-probability, kind="stable"))
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
-        """Return the electrodes of pairs that were proposed as one, away from all proposals."""
+        """Return both electrodes of pairs that were proposed as one.
+
+        They lie where ``allowed``, and away from all proposals.
+        """
         points = self.network.halves_of_pairs() if self.reach_cells == 1 else np.zeros((0, 2))
         column, row = np.rint(points).astype(np.int64).T
         within = (column >= 0) & (row >= 0) & (column < allowed.shape[1]) & (row < allowed.shape[0])

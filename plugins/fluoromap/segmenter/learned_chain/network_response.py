@@ -82,10 +82,10 @@ class NetworkResponse:
         return Proposals(self.found.points_uv[kept], self.found.probability[kept], self.found.covariance_px2[kept])
 
     def halves_of_pairs(self) -> Array:
-        """Return both electrodes of each pair that may have been found as one, (n, 2) pixels.
+        """Return both electrodes of pairs that were found as one.
 
-        Each cell near an electrode points to the electrode nearest to it. Cells that point to different places see two
-        electrodes that lie too close together for a peak each.
+        The result has the shape (n, 2), pixels. Each cell near an electrode points to the electrode nearest to it. Cells that
+        point to different places see two electrodes that lie too close together for a peak each.
         """
         likely = self.found.points_uv[self.found.probability >= _PAIR_PROBABILITY]
         if not len(likely):
@@ -119,7 +119,10 @@ class NetworkResponse:
         return halves * self.cell_px + self.first_px
 
     def tip_logits_at(self, points_uv: Array, reach_cells: int = 1) -> Array:
-        """Return the logit of a tip electrode in the most probable cell within reach of each point, (n,)."""
+        """Return the logits of tip electrodes at points, (n,).
+
+        The most probable cell within reach of a point answers.
+        """
         v, u = self._cells_near(points_uv, reach_cells)
         best = np.argmax(self.probability[v, u].reshape(len(points_uv), -1), axis=1)
         logits = self.answers[v, u, _TIP].reshape(len(points_uv), -1)
@@ -133,7 +136,10 @@ class NetworkResponse:
         return highest
 
     def _cells_near(self, points_uv: Array, reach_cells: int) -> tuple[IntArray, IntArray]:
-        """Return rows and columns of the cells within reach of each point, (n, 2 reach + 1, 2 reach + 1) together."""
+        """Return rows and columns of the cells near points.
+
+        Both broadcast to (n, 2 reach + 1, 2 reach + 1).
+        """
         rows, columns = self.probability.shape
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
         steps = np.arange(-reach_cells, reach_cells + 1)
