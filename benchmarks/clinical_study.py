@@ -224,7 +224,7 @@ def _all_workers(folder: Path, segmenter: str, corrections: int, one: JobTimes |
             print(f"  segmenting {one.segmented / times.segmented:.2f} times as fast as with one worker process")
         _results(http, job)
         _frames(http, study)
-        _corrections(http, study, segmenter, corrections)
+        _corrections(http, study, job, segmenter, corrections)
         print(
             f"peak memory of the largest process: worker {figures.largest_mib('worker'):.0f} MiB, "
             f"API {figures.largest_mib('api'):.0f} MiB"
@@ -386,12 +386,30 @@ def _first_run(http: httpx.Client, study: str) -> tuple[str, int]:
 # --- corrections -------------------------------------------------------------------------------------------------------------
 
 
-def _corrections(http: httpx.Client, study: str, segmenter: str, count: int) -> None:
+def _corrections(http: httpx.Client, study: str, job: str, segmenter: str, count: int) -> None:
+    """Correct an electrode at one site after another.
+
+    First in any frame, then in the frame that the map uses.
+    """
     sites = [site for site in http.get(f"/v1/studies/{study}/sites?limit=500").json()["items"] if site["site"]]
+    used = {
+        point["site"]: point["views"]["a"]["frame"]
+        for point in http.get(f"/v1/jobs/{job}/points").raise_for_status().json()["points"]
+        if point["grade"] != "rejected"
+    }
+    anywhere = [(sites[number % len(sites)], 1 + number) for number in range(count)]
+    located = [(site, used[site["site"]]) for site in sites if site["site"] in used]
+    at_diastole = [located[number % len(located)] for number in range(count)]
+    for title, corrected in (("in any frame", anywhere), ("in the frame that the map uses", at_diastole)):
+        _print_corrections(http, study, segmenter, title, corrected)
+
+
+def _print_corrections(
+    http: httpx.Client, study: str, segmenter: str, title: str, corrected: list[tuple[dict[str, Any], int]]
+) -> None:
     seconds, computed = [], Counter[str]()
-    for number in range(count):
-        site = sites[number % len(sites)]
-        path, electrodes = electrodes_to_put(http, study, site["view_a"], frame=1 + number)
+    for site, frame in corrected:
+        path, electrodes = electrodes_to_put(http, study, site["view_a"], frame)
         start = time.perf_counter()
         http.put(path, json=electrodes).raise_for_status()
         job = start_job(http, study, segmenter)
@@ -406,8 +424,10 @@ def _corrections(http: httpx.Client, study: str, segmenter: str, count: int) -> 
         computed.update(stage["name"] for stage in state["stages"] if not stage["reused"])
     if seconds:
         p50, p95 = np.percentile(seconds, (50, 95))
-        again = ", ".join(f"{number / count:.1f} {name}" for name, number in computed.items())
-        print(f"{count} corrections -> map: p50 {p50:.2f} s, p95 {p95:.2f} s; computed again for each: {again}")
+        again = ", ".join(f"{number / len(seconds):.1f} {name}" for name, number in computed.items())
+        print(
+            f"{len(seconds)} corrections {title} -> map: p50 {p50:.2f} s, p95 {p95:.2f} s; computed again for each: {again}"
+        )
 
 
 def _seconds(http: httpx.Client, method: str, path: str, **more: Any) -> float:

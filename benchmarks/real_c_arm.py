@@ -25,6 +25,7 @@ from fluoromap.contracts import Calibration
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry, ray_angle_deg
 from fluoromap.triangulator.estimate import JointLeastSquares
 from fluoromap.triangulator.self_calibration import StudyBelief, calibrate
+from fluoromap.triangulator.study_equations import CalibrationSite
 from fluoromap.triangulator.two_view_pixels import TwoViewPixels
 from fluoromap.triangulator.uncertainty import UncertaintyParams, error_sources, pixel_noise_px2
 
@@ -208,7 +209,7 @@ def _calibrate(
     cameras: tuple[Camera, Camera], a: StaticRun, b: StaticRun, names: Sequence[str]
 ) -> tuple[Calibration | None, StudyBelief]:
     """Calibrate a pair of runs; each landmark counts as a site."""
-    sites = [(cameras, _pixels(a, b, [name])) for name in names]
+    sites = [CalibrationSite(cameras, _pixels(a, b, [name])) for name in names]
     return calibrate(sites, DEFAULT_CATALOGUE, frozenset(), PARAMS)
 
 

@@ -464,6 +464,9 @@ class SiteCycle:
     positions_mm : (p, m, 3). covariance_mm2 : (p, m, 3, 3).
     """
 
+    stored_apart: ClassVar[bool] = True
+    """Each cycle is stored by itself: it is long, and a correction at another site does not change it."""
+
     phases: Array
     labels: tuple[tuple[str, int], ...]
     positions_mm: Array
@@ -486,8 +489,8 @@ class StudyVariation:
 
     breathing: float = 1.0
     beats: float = 1.0
-    gantry_angle: float = 1.458
-    gantry_offset: float = 2.269
+    gantry_angle: float = 1.124
+    gantry_offset: float = 2.169
 
 
 @dataclass(frozen=True, eq=False)
@@ -498,9 +501,6 @@ class LocatedSite:
     variation : of the study that contains the site. a_priori : the points with the covariances of any gantry and any heart;
     cycle has these too. A correction at another site changes neither, so that no track has to be computed again.
     """
-
-    stored_apart: ClassVar[bool] = True
-    """Each site is stored by itself, like :class:`MatchedSite`."""
 
     site: str
     camera_a: Camera

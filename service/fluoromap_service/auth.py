@@ -6,19 +6,22 @@ address only. A revoked or expired token still counts, so that revoking a token 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import ipaddress
 import secrets
+import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
-from sqlalchemy import or_, select
+from sqlalchemy import bindparam, or_, select
 from sqlalchemy.exc import IntegrityError
 
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import audit
 from fluoromap_service.store.audit import Act
+from fluoromap_service.store.changes import Change, last_change
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Token
@@ -104,7 +107,7 @@ def create_token(
             session.add(
                 Token(
                     name=name,
-                    sha256=_hash(text),
+                    sha256=token_hash(text),
                     scopes=[str(scope) for scope in _ORDER if scope in wanted],
                     created=now,
                     expires=None if expires_seconds is None else now + expires_seconds,
@@ -146,21 +149,88 @@ def revoke_token(name: str) -> None:
 def any_token() -> bool:
     """Return whether there is any token, valid or not."""
     with reading() as session:
-        return session.scalar(select(Token.id).limit(1)) is not None
+        return session.scalar(_A_TOKEN) is not None
+
+
+_A_TOKEN = select(Token.id).limit(1)
 
 
 def verify(text: str) -> Caller | None:
     """Return the caller of a token; None when the token is unknown, expired or revoked."""
-    query = select(Token).where(
-        Token.sha256 == _hash(text),
-        Token.revoked.is_(None),
-        or_(Token.expires.is_(None), Token.expires > db_now()),
-    )
+    found = _valid(token_hash(text))
+    return None if found is None else found[0]
+
+
+def _valid(token: str) -> tuple[Caller, float | None] | None:
     with reading() as session:
-        row = session.scalar(query)
-    return None if row is None else Caller(row.name, frozenset(Scope(scope) for scope in row.scopes))
+        row = session.execute(_VALID_TOKEN, {"sha256": token}).first()
+    return None if row is None else (Caller(row.name, frozenset(Scope(scope) for scope in row.scopes)), row.expires)
 
 
+_VALID_TOKEN = select(Token.name, Token.scopes, Token.expires).where(
+    Token.sha256 == bindparam("sha256"),
+    Token.revoked.is_(None),
+    or_(Token.expires.is_(None), Token.expires > db_now()),
+)
+
+
+class Callers:
+    """The callers of requests, remembered until the database changes.
+
+    Each request asks for the last change first. So a token ends with the commit that revokes it, and an open service with
+    the commit of its first token, as if each request queried the tokens. A token is given by its hash.
+    """
+
+    def __init__(self) -> None:
+        self._memory = _Memory(None)
+
+    def remembered(self, token: str | None) -> Caller | None:
+        """Return the caller of a token; None when only a query can find it.
+
+        ``token`` None is a request without a token.
+        """
+        memory = self._memory
+        if memory.change is None or memory.change != last_change():
+            return None
+        if memory.open:
+            return OPEN
+        caller, expires = (None, None) if token is None else memory.callers.get(token, (None, None))
+        # Only SQLite has a last change, and its clock is the clock of this machine.
+        return caller if expires is None or time.time() < expires else None
+
+    def look_up(self, token: str | None) -> Caller | None:
+        """Return the caller of a token; None when nobody may be let in.
+
+        ``token`` None is a request without a token. While no token was ever made, the caller is :data:`OPEN`.
+        """
+        # Before the queries: a change between here and them makes the memory old, never wrong.
+        change = last_change()
+        found = None if token is None else _valid(token)
+        is_open = found is None and not any_token()
+        if change is not None:
+            memory = self._memory
+            if memory.change != change:
+                memory = self._memory = _Memory(change, is_open)
+            if token is not None and found is not None:
+                memory.callers[token] = found
+        if is_open:
+            return OPEN
+        return None if found is None else found[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _Memory:
+    """The callers of valid tokens, and when these expire, as of one change of the database.
+
+    open : whether there was no token at all.
+    """
+
+    change: Change | None
+    open: bool = False
+    callers: dict[str, tuple[Caller, float | None]] = field(default_factory=dict)
+
+
+@functools.lru_cache(maxsize=1024)
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach an address or name."""
     if host == "localhost":
@@ -192,6 +262,7 @@ def _invalid(detail: str) -> Problem:
     return Problem(422, "invalid_token", detail)
 
 
-def _hash(text: str) -> str:
+def token_hash(text: str) -> str:
+    """Return the SHA-256 of a token's text, in hexadecimal digits."""
     # A token is 256 random bits: a plain hash cannot be searched backwards, a slow one would only cost time.
     return hashlib.sha256(text.encode()).hexdigest()

@@ -43,3 +43,18 @@ def test_the_table_has_two_lines_a_stratum() -> None:
     assert len(lines) == 2
     assert "points" in lines[0]
     assert "tracks" in lines[1]
+
+
+def test_ellipsoids_of_calm_hearts_are_not_too_wide() -> None:
+    """A calm heart on a C-arm as measured: ellipsoids from the reference neither doubt it nor boast."""
+    found = [silent_wrongs.score_study(Conditions.draw(seed, (), sites=5)) for seed in range(200, 212)]
+    for kind in ("points", "tracks"):
+        sums = [getattr(score, kind) for score in found]
+        chi2 = sum(one.chi2[1] for one in sums) / sum(one.counted[1] for one in sums)
+        assert 0.7 < chi2 < 1.3
+
+
+def test_ellipsoids_hold_the_points_of_a_restless_heart_seen_at_one_time() -> None:
+    calm = [Conditions.draw(seed, ("biplane",), sites=5) for seed in SEEDS]
+    sums = [silent_wrongs.score_study(replace(one, beat_scale=1.4)).points for one in calm]
+    assert sum(one.inside[1] for one in sums) >= 0.9 * sum(one.counted[1] for one in sums)

@@ -32,7 +32,7 @@ COUNTED: tuple[tuple[Any, str], ...] = (
     (study_matching, "compare_views"),
     (study_matching, "_matched"),
     (study_triangulation, "_check_study"),
-    (SiteLocator, "locate"),
+    (SiteLocator, "diastole"),
 )
 _ANOTHER_PROCESS = """
 import json, runpy, sys
@@ -114,7 +114,7 @@ def test_a_corrected_frame_computes_its_own_site_again_in_another_process(
         counts = count(patched.setattr)
         _send(service, study_path, simulated_study)
         job = _job(service, study_path)
-    assert counts == {"_detect": 10, "compare_views": 5, "_matched": 5, "_check_study": 1, "locate": 5}
+    assert counts == {"_detect": 10, "compare_views": 5, "_matched": 5, "_check_study": 1, "diastole": 5}
     _correct(service, study_path, job, 2.0)
     ended = subprocess.run(
         [sys.executable, "-c", _ANOTHER_PROCESS, __file__, study_path], capture_output=True, text=True, check=False
@@ -122,7 +122,7 @@ def test_a_corrected_frame_computes_its_own_site_again_in_another_process(
     assert ended.returncode == 0, ended.stderr
     counts, again, state = json.loads(ended.stdout.splitlines()[-1])
     assert state == "succeeded"
-    assert counts == {"_detect": 0, "compare_views": 1, "_matched": 1, "_check_study": 0, "locate": 1}
+    assert counts == {"_detect": 0, "compare_views": 1, "_matched": 1, "_check_study": 0, "diastole": 1}
 
     _damage_results()
     whole = _job(service, study_path)

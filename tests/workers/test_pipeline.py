@@ -207,9 +207,9 @@ def test_doubts_reach_points_tracks_map_overlays_and_report(
 
     locate = SiteLocator.locate
 
-    def doubted_geometry(self: SiteLocator, site: Any, jump: Any) -> Any:
+    def doubted_geometry(self: SiteLocator, site: Any, *of: Any) -> Any:
         belief = replace(self.belief, doubt=Reason.GEOMETRY_DOUBTFUL if site.site == "S04" else self.belief.doubt)
-        return locate(replace(self, belief=belief), site, jump)
+        return locate(replace(self, belief=belief), site, *of)
 
     monkeypatch.setattr(stage_inputs, "match_study", doubting)
     monkeypatch.setattr(study_triangulation, "table_jumps", jumping)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import numpy as np
@@ -132,10 +133,14 @@ def chamber_map(
     field = SurfaceField(vertices_mm, faces)
     context.progress(0.5)
 
-    def times_of(used: BoolArray) -> ActivationTimes:
+    @functools.cache
+    def times_of_sites(used: tuple[bool, ...]) -> ActivationTimes:
         context.check()
-        points = _select(on_surface, used)
-        return ActivationTimes(field, vertices_mm, points, lat[used], sd[used], covariance[used], cycle)
+        of = np.array(used)
+        return ActivationTimes(field, vertices_mm, _select(on_surface, of), lat[of], sd[of], covariance[of], cycle)
+
+    def times_of(used: BoolArray) -> ActivationTimes:
+        return times_of_sites(tuple(used.tolist()))
 
     def without_each(used: BoolArray) -> LeaveOneOut:
         return times_of(used).leave_one_out()

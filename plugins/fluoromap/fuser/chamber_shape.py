@@ -9,6 +9,7 @@ Gaussian processes: Williams & Fitzgibbon, Gaussian Process Implicit Surfaces, 2
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ def wall_surface(points_mm: Array, covariance_mm2: Array, edge_mm: float) -> tup
     it never cuts itself. Its edges are about ``edge_mm`` at most.
     """
     shape = _ChamberShape(points_mm, covariance_mm2)
-    directions, faces = hull_surface(_even_directions(_DIRECTIONS))
+    directions, faces = _even_sphere()
     vertices, faces = refine(shape.at(directions), faces, edge_mm)
     scaled = shape.ellipsoid.to_sphere(vertices)
     return shape.at(scaled / np.linalg.norm(scaled, axis=1, keepdims=True)), faces
@@ -174,6 +175,12 @@ def _matern(a_mm: Array, b_mm: Array, length_mm: float) -> Array:
     distance = np.sqrt(5.0) * np.linalg.norm(a_mm[:, None] - b_mm[None], axis=2) / length_mm
     correlation: Array = (1 + distance + distance**2 / 3) * np.exp(-distance)
     return correlation
+
+
+@functools.cache
+def _even_sphere() -> tuple[Array, IntArray]:
+    """Return the unit sphere as a surface of evenly spread vertices."""
+    return hull_surface(_even_directions(_DIRECTIONS))
 
 
 def _even_directions(count: int) -> Array:

@@ -8,11 +8,13 @@ wave with a wide prior.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh, qr
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import splu
 from scipy.special import logsumexp
 
 from fluoromap.contracts import Array, IntArray
@@ -24,9 +26,13 @@ LENGTH_PRIOR = (25.0, 0.6)
 _SHIFT = -1e-4
 _LEAST_WEIGHT = 1e-4
 _TOLERANCE = 1e-8
-"""Relative error of an eigenvalue: far below the uncertainty of the times. Machine precision, the default, takes longer."""
-_BASIS = 1.4
-"""Size of the Krylov space, as a multiple of the number of eigenfunctions."""
+"""Relative residual of an eigenvalue: far below the uncertainty of the times."""
+_BLOCK = 4
+"""Vectors in a block of the Krylov space. A block of one costs more time a vector; large blocks need more vectors."""
+_BASIS = 3.0
+"""Size of the Krylov space at the first test, as a multiple of the number of eigenfunctions."""
+_LARGEST_BASIS = 8
+"""The largest size of the Krylov space, as such a multiple."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,19 +188,56 @@ def _laplace_beltrami(vertices_mm: Array, faces: IntArray, modes: int) -> tuple[
     mass = np.bincount(faces.ravel(), np.repeat(doubled / 6, 3), minlength=n)
     scale = 1 / np.sqrt(mass)
     symmetric = csc_array(diags_array(scale) @ matrix @ diags_array(scale))
-    # An ordering for symmetric matrices has half the fill-in of the general ordering in eigsh.
+    # An ordering for symmetric matrices has half the fill-in of the general ordering.
     factor = splu(
         csc_array(symmetric - _SHIFT * diags_array(np.ones(n))),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    inverse = LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
-    # Neighbouring eigenvalues lie far apart, so that few extra vectors suffice; each costs a pass over all others.
-    basis = min(int(_BASIS * modes) + 1, n)
-    # A fixed start vector, so that the same sites always give the same map.
-    values, vectors = eigsh(
-        symmetric, k=modes, ncv=basis, sigma=_SHIFT, which="LM", v0=np.sqrt(mass), tol=_TOLERANCE, OPinv=inverse
-    )  # fmt: skip
-    order = np.argsort(values)
-    return np.maximum(values[order], 0.0), vectors[:, order] * scale[:, None]
+    values, vectors = _largest_eigenpairs(factor.solve, np.sqrt(mass), modes)
+    return np.maximum(1 / values + _SHIFT, 0.0), vectors * scale[:, None]
+
+
+def _largest_eigenpairs(apply: Callable[[Array], Array], start: Array, count: int) -> tuple[Array, Array]:
+    """Return the largest eigenvalues (m,), falling, and eigenvectors (n, m) of a positive definite matrix.
+
+    The block Lanczos method with full orthogonalisation: Golub & Van Loan, Matrix Computations, 4th ed., section 10.3.6. Blocks
+    make one matrix product of many products of vectors, which ARPACK computes one by one.
+
+    Parameters
+    ----------
+    apply : callable
+        Multiplies the matrix and vectors (n, b).
+    start : (n,)
+        First vector; the others of its block are random, and the same each time.
+    count : int
+        Number m of the eigenvalues.
+    """
+    n = len(start)
+    if n < 4 * count + _BLOCK:
+        found, axes = eigh(apply(np.eye(n)))
+        return found[::-1][:count], axes[:, ::-1][:, :count]
+    room = min(n, _LARGEST_BASIS * count)
+    basis, projected = np.empty((n, room), order="F"), np.zeros((room, room))
+    block = np.column_stack([start, np.random.default_rng(0).normal(size=(n, _BLOCK - 1))])
+    basis[:, :_BLOCK] = qr(block, mode="economic")[0]
+    size, enough = 0, int(_BASIS * count)
+    while size + 2 * _BLOCK <= room:
+        old, own = slice(max(size - _BLOCK, 0), size), slice(size, size + _BLOCK)
+        size += _BLOCK
+        new = apply(basis[:, own])
+        new -= basis[:, old] @ projected[own, old].T
+        projected[own, own] = basis[:, own].T @ new
+        new -= basis[:, own] @ projected[own, own]
+        # Rounding brings back directions of earlier blocks.
+        new -= basis[:, :size] @ (basis[:, :size].T @ new)
+        following, coupling = qr(new, mode="economic", check_finite=False)
+        if size >= enough:
+            values, axes = eigh(projected[:size, :size], lower=True, subset_by_index=[size - count, size - 1])
+            if (np.linalg.norm(coupling @ axes[-_BLOCK:], axis=0) < _TOLERANCE * values).all():
+                return values[::-1], (basis[:, :size] @ axes)[:, ::-1]
+            enough = size + count // 8
+        own = slice(size, size + _BLOCK)
+        basis[:, own], projected[own, size - _BLOCK : size] = following, coupling
+    raise np.linalg.LinAlgError("the eigenfunctions of the surface do not converge")

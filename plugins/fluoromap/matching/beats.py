@@ -26,6 +26,22 @@ def is_irregular(marks_ms: Array) -> bool:
     return len(lengths) >= 2 and float(np.ptp(lengths)) > IRREGULAR_ABOVE * float(lengths.mean())
 
 
+def cycle_spread(phases: Array) -> float:
+    """Return the standard deviation of the cycles' lengths, as a share of their mean.
+
+    It is 0 where fewer than two cycles can be compared.
+
+    Parameters
+    ----------
+    phases : ndarray, shape (n,)
+        Phases of the frames of a run, all known.
+    """
+    steps = np.diff(phases) % 1.0
+    beat = np.cumsum(np.diff(phases) < -0.5)
+    rates = [steps[beat == number].mean() for number in np.unique(beat) if (beat == number).sum() > 2]
+    return float(np.std(rates, ddof=1) / np.mean(rates)) if len(rates) > 1 else 0.0
+
+
 def systole_starts_ms(places: Array, step_ms: float) -> Array:
     """Return the times of the starts of systole, from the first place on.
 

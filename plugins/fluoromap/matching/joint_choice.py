@@ -173,15 +173,12 @@ def _choose(study: _Study, own_cost: Array, centres_mm: Array, variance_mm2: Arr
     """Choose each site's best row, given the gantry and the places."""
     each = own_cost[:, None] + _place_cost(study, centres_mm, variance_mm2)
     by_row = each.min(axis=1)
-    chosen, cost = [], 0.0
-    for site in range(len(study.sites)):
-        rows = study.rows(site)
-        row = int(np.argmin(by_row[rows])) + rows.start
-        chosen.append(row)
-        least = float(by_row[row])
-        cost += least - float(np.log(np.exp(least - by_row[rows]).sum()))
+    least = np.minimum.reduceat(by_row, study.starts)
+    cheapest = np.flatnonzero(by_row == least[study.site])
+    chosen = cheapest[np.searchsorted(study.site[cheapest], np.arange(len(least)))]
+    cost = float((least - np.log(np.add.reduceat(np.exp(least[study.site] - by_row), study.starts))).sum())
     order = np.argmin(each[chosen], axis=1)
-    return _Configuration(np.array(chosen), order, own_cost, centres_mm, variance_mm2, cost)
+    return _Configuration(chosen, order, own_cost, centres_mm, variance_mm2, cost)
 
 
 def _refine(study: _Study, configuration: _Configuration) -> _Configuration:

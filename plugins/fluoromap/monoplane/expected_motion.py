@@ -8,11 +8,17 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView, SiteCycle
+from fluoromap.matching.beats import cycle_spread
 from fluoromap.monoplane.a_priori_lm import motion_variance_share
 from fluoromap.monoplane.cycle_prior import CycleCurve, fit_cycle
 from fluoromap.monoplane.motion_field import displacements
 from fluoromap.monoplane.view_electrodes import ViewElectrodes, gantry_angle_covariance_mm2
 from fluoromap.reasons import Reason
+
+READING_SD_FRAMES = 0.29
+"""An R wave is timed to the nearest frame: standard deviation of a uniform distribution one frame wide."""
+SYSTOLE_PHASE = 0.3
+"""Phase of systole. In irregular cycles it keeps its time after the R wave, so that its phase varies with their lengths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,15 +26,17 @@ class ExpectedMotion:
     """Expected positions of m electrodes in the n frames of a run.
 
     mean_mm : (n, m, 3) world. moved_mm : (n, m, 3) displacement from diastole; a stronger beat enlarges it. velocity_mm :
-    (n, m, 3) by phase, mm a cycle. offset_sd_mm : (n, m) an axis, of a catheter as a whole, without beat-to-beat variation.
-    common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times. beats : number of cardiac cycles in
-    the mean; 0 where no cycle is known. own_cycle : the mean is the site's own cycle. frames_per_cycle : of the run.
-    cycle_spread : of the cycles' lengths, as a share. reasons : doubts about the expectation.
+    (n, m, 3) by phase, mm a cycle. curved_mm : (n, m, 3) second-order displacement where systole shifts in phase because the
+    cycles differ in length; 0 in a regular rhythm. offset_sd_mm : (n, m) an axis, of a catheter as a whole, without
+    beat-to-beat variation. common_mm2 : (3, 3) covariance of a displacement of all electrodes at all times. beats : number of
+    cardiac cycles in the mean; 0 where no cycle is known. own_cycle : the mean is the site's own cycle. frames_per_cycle : of the
+    run. cycle_spread : of the cycles' lengths, as a share. reasons : doubts about the expectation.
     """
 
     mean_mm: Array
     moved_mm: Array
     velocity_mm: Array
+    curved_mm: Array
     offset_sd_mm: Array
     common_mm2: Array
     beats: float
@@ -53,10 +61,10 @@ def pace_of(phases: Array) -> Pace:
     if len(steps) == 0 or not (steps > 0).any():
         return Pace(1.0, 1.0, 0.0)
     middle = float(np.median(steps[steps > 0]))
-    beat = np.cumsum(np.concatenate([[0], np.diff(phases) < -0.5]))
-    rates = [steps[beat[1:] == number].mean() for number in np.unique(beat) if (beat[1:] == number).sum() > 2]
-    spread = float(np.std(rates) / np.mean(rates)) if len(rates) > 1 else 0.0
-    return Pace(max(float(steps.sum()), 1.0), 1.0 / middle, spread)
+    spread = cycle_spread(phases)
+    # A cycle lasts from one R wave to the next; each is timed to the nearest frame.
+    reading = np.sqrt(2) * READING_SD_FRAMES * middle
+    return Pace(max(float(steps.sum()), 1.0), 1.0 / middle, float(np.sqrt(max(spread**2 - reading**2, 0.0))))
 
 
 def expected_motion(
@@ -104,12 +112,12 @@ def expected_motion(
         )
         offset = np.where(np.isfinite(field.sd_mm), field.sd_mm, unknown_sd)
         return ExpectedMotion(
-            electrodes.a_priori_mm + field.moved_mm, field.moved_mm, field.velocity_mm, offset, common, 1.0, False,
+            electrodes.a_priori_mm + field.moved_mm, field.moved_mm, field.velocity_mm, still, offset, common, 1.0, False,
             pace.frames_per_cycle, pace.spread, (Reason.MOTION_FROM_OTHERS,),
         )  # fmt: skip
     reasons = (Reason.DEPTH_ASSUMED,) if known else (Reason.DEPTH_ASSUMED, Reason.PHASE_UNKNOWN)
     return ExpectedMotion(
-        electrodes.a_priori_mm + still, still, still, unknown_sd, common, 0.0, False, pace.frames_per_cycle, 0.0,
+        electrodes.a_priori_mm + still, still, still, still, unknown_sd, common, 0.0, False, pace.frames_per_cycle, 0.0,
         reasons,
     )  # fmt: skip
 
@@ -128,8 +136,9 @@ def _from_own_cycle(
     start = electrodes.phases[view.a_priori_frame : view.a_priori_frame + 1]
     rest, places = curve.positions_mm(start)[0], curve.positions_mm(electrodes.phases)
     slopes = curve.velocities_mm(electrodes.phases)
+    bends = _curvature_mm(curve, electrodes.phases, SYSTOLE_PHASE * pace.spread)
     n, m = electrodes.visible.shape
-    mean, velocity = np.empty((n, m, 3)), np.empty((n, m, 3))
+    mean, velocity, curved = np.empty((n, m, 3)), np.empty((n, m, 3)), np.empty((n, m, 3))
     moved, offset = np.empty((n, m, 3)), np.empty((n, m))
     share = np.sqrt(motion_variance_share(electrodes.phases, view.a_priori_frame))
     # The beats' scatter is a part of its own in the prior; only gaps in the cycle remain here.
@@ -137,10 +146,12 @@ def _from_own_cycle(
     for index, label in enumerate(electrodes.labels):
         row = _nearest(curve, label)
         if row is None:
-            mean[:, index], moved[:, index], velocity[:, index] = electrodes.a_priori_mm[index], 0.0, 0.0
+            mean[:, index] = electrodes.a_priori_mm[index]
+            moved[:, index], velocity[:, index], curved[:, index] = 0.0, 0.0, 0.0
             offset[:, index] = share * (mapping_sd_mm if label[0] == view.catalogue.mapping else other_sd_mm)
             continue
         moved[:, index], velocity[:, index] = places[:, row] - rest[row], slopes[:, row]
+        curved[:, index] = bends[:, row]
         known = curve.labels[row] == label
         mean[:, index] = places[:, row] if known else electrodes.a_priori_mm[index] + moved[:, index]
         offset[:, index] = unsure
@@ -154,8 +165,20 @@ def _from_own_cycle(
     )
     common = _common_covariance((cycle.covariance_mm2 - others).reshape(-1, 3, 3))
     return ExpectedMotion(
-        mean, moved, velocity, offset, common, pace.cycles, True, pace.frames_per_cycle, pace.spread, ()
+        mean, moved, velocity, curved, offset, common, pace.cycles, True, pace.frames_per_cycle, pace.spread, ()
     )
+
+
+def _curvature_mm(curve: CycleCurve, phases: Array, shift_sd: float) -> Array:
+    """Return the second-order displacement (n, m, 3) of a shift in phase.
+
+    It is the root mean square over normal shifts with the standard deviation ``shift_sd``.
+    """
+    # The fourth moment of a normal distribution is 3 sd^4.
+    shift = 3**0.25 * shift_sd
+    earlier, later = (curve.positions_mm(phases + one) for one in (-shift, shift))
+    curvature: Array = (earlier + later) / 2 - curve.positions_mm(phases)
+    return curvature
 
 
 def _nearest(curve: CycleCurve, label: tuple[str, int]) -> int | None:

@@ -10,16 +10,13 @@ from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue, follows_tip
 from fluoromap.contracts import Array, MonoplaneView, StudyVariation
-from fluoromap.monoplane.expected_motion import ExpectedMotion
+from fluoromap.monoplane.expected_motion import READING_SD_FRAMES, SYSTOLE_PHASE, ExpectedMotion
 from fluoromap.monoplane.gaussian_path import PathPrior
 from fluoromap.monoplane.view_electrodes import isocentre_covariance_mm2
 
 FIXED, OFFSET, TILT, BEND = range(4)
 BREATHING, BEATS, ANGLE, ISOCENTRE, OTHER = range(5)
 """Causes of deviations: the first four in the order of :class:`~fluoromap.contracts.StudyVariation`."""
-_READING_SD_FRAMES = 0.29
-"""An R wave is timed to the nearest frame: standard deviation of a uniform distribution one frame wide."""
-_SYSTOLE_PHASE = 0.3
 _FOLLOWS_INTERVAL = 0.5
 """Change of a beat's amplitude with the interval before it, both as shares."""
 _ALIGNED_SD_CYCLE = 0.01
@@ -49,6 +46,12 @@ class MotionParams(BaseModel, extra="forbid"):
     )
     beat_sd_mm: float = Field(
         0.25, ge=0, le=10, description="Variation of a catheter's place from beat to beat, mm an axis."
+    )
+    tip_centre_sd_mm: float = Field(
+        0.2,
+        ge=0,
+        le=5,
+        description="Distance along the shaft from the tip electrode's middle to its centre in the image, mm.",
     )
     mapping_motion_sd_mm: float = Field(
         2.9, ge=0, le=30, description="Motion of the mapping catheter over the cycle where no cycle is known, mm."
@@ -183,9 +186,9 @@ class MotionCovariance:
         if not expected.beats:
             return
         moved, velocity = expected.moved_mm[frames, ..., None], expected.velocity_mm[frames, ..., None]
-        reading = _READING_SD_FRAMES / expected.frames_per_cycle
+        reading = READING_SD_FRAMES / expected.frames_per_cycle
         timing = np.hypot(p.beat_timing_sd, reading)
-        uneven = _SYSTOLE_PHASE * expected.cycle_spread
+        uneven = SYSTOLE_PHASE * expected.cycle_spread
         # A long interval fills the heart: the beat after it is stronger.
         amplitude = np.hypot(p.beat_amplitude_sd, _FOLLOWS_INTERVAL * expected.cycle_spread)
         yield FIXED, OTHER, True, moved * amplitude
@@ -194,6 +197,8 @@ class MotionCovariance:
         for name in self._catheters:
             yield FIXED, BEATS, False, self._of(name) * self._follows[frames] * p.beat_sd_mm * averaged
         if expected.own_cycle:
+            # A shift in phase is more than its first order where the cycles differ much, here and in the cycle itself.
+            yield FIXED, OTHER, False, np.sqrt(2) * _along(rays, expected.curved_mm[frames, ..., None])
             # Depth comes from the other view's run, and this view cannot show how that run's beats differ.
             yield FIXED, OTHER, False, _along(rays, moved * amplitude * averaged)
             yield (

@@ -62,7 +62,7 @@ class MotionPrior:
         )
 
     name: ClassVar[str] = "motion-prior"
-    version: ClassVar[str] = "6"
+    version: ClassVar[str] = "7"
 
     def __init__(self, params: MotionPrior.Params) -> None:
         self._params = params.with_any_gantry()
@@ -177,6 +177,7 @@ class MotionPrior:
     ) -> Track:
         electrodes = run.electrodes
         n, m = electrodes.visible.shape
+        joint = joint + _tip_centres_mm2(electrodes, positions, self._params.tip_centre_sd_mm)
         blocks = np.einsum("nmimj->nmij", joint.reshape(n, m, 3, m, 3))
         across = np.eye(3) - run.rays[..., :, None] * run.rays[..., None, :]
         # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
@@ -282,6 +283,22 @@ def _from_reference(electrodes: ViewElectrodes, reference: str | None) -> tuple[
     count = visible.sum(axis=1)
     mean = visible / np.maximum(count, 1)[:, None]
     return np.eye(len(is_reference)) - mean[:, None, :], count > 0
+
+
+def _tip_centres_mm2(electrodes: ViewElectrodes, positions: Array, sd_mm: float) -> Array:
+    """Return the joint covariance (n, 3 m, 3 m) from the tips' radiographic centres.
+
+    The centre of a tip in the image is not the middle of its metal. All views show the same centre, so that no pixel reveals
+    the distance along the shaft.
+    """
+    n, m = electrodes.visible.shape
+    covariance = np.zeros((n, m, 3, m, 3))
+    for tip, (catheter, electrode) in enumerate(electrodes.labels):
+        if electrode == 1 and (catheter, 2) in electrodes.labels:
+            along = positions[:, tip] - positions[:, electrodes.labels.index((catheter, 2))]
+            along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+            covariance[:, tip, :, tip] = sd_mm**2 * along[:, :, None] * along[:, None, :]
+    return covariance.reshape(n, 3 * m, 3 * m)
 
 
 def _depth_by_cause(prior: PathPrior, gains: Array, rays: Array, outside: BoolArray) -> Array:

@@ -17,7 +17,7 @@ class Linear:
     """Triangulator ``linear``: algebraic least squares of equations (8), each electrode separately."""
 
     name: ClassVar[str] = "linear"
-    version: ClassVar[str] = "7"
+    version: ClassVar[str] = "8"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:

@@ -24,7 +24,7 @@ class MaximumLikelihood:
     """
 
     name: ClassVar[str] = "maximum-likelihood"
-    version: ClassVar[str] = "9"
+    version: ClassVar[str] = "10"
     Params: ClassVar[type[BaseModel]] = UncertaintyParams
 
     def __init__(self, params: UncertaintyParams) -> None:

@@ -21,15 +21,17 @@ from fluoromap.triangulator.study_equations import (
     GANTRY_UNKNOWNS,
     GAP_SD_MM,
     HEART_SCALES,
+    CalibrationSite,
     HeartScale,
     Information,
     SiteEquations,
     gap_labels,
     information,
     log_evidences,
+    scatter_log_likelihoods,
     site_equations,
 )
-from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels
+from fluoromap.triangulator.two_view_pixels import Cameras
 from fluoromap.triangulator.uncertainty import (
     GANTRY_KINDS,
     LARGEST_MULTIPLE,
@@ -115,10 +117,11 @@ def study_belief(
 
 
 def calibrate(
-    sites: Sequence[tuple[Cameras, TwoViewPixels]],
+    sites: Sequence[CalibrationSite],
     catalogue: Catalogue,
     trusted: frozenset[str],
     params: UncertaintyParams,
+    as_stated: Sequence[SiteEquations] | None = None,
 ) -> tuple[Calibration | None, StudyBelief]:
     """Estimate the gantry's error from all sites, and decide whether to apply it.
 
@@ -132,10 +135,12 @@ def calibrate(
 
     Parameters
     ----------
-    sites : sequence
-        Nominal cameras and diastolic pixels of sites taken with the same two gantry positions.
+    sites : sequence of CalibrationSite
+        Sites taken with the same two gantry positions.
     trusted : frozenset of str
         Catheters whose spacings agree with the catalogue's.
+    as_stated : sequence of SiteEquations, optional
+        Equations of the sites with the gantry that the headers state, where they are known.
 
     Returns
     -------
@@ -148,16 +153,17 @@ def calibrate(
     gaps = gap_labels(catalogue, trusted)
 
     def equations(gantry: GantryBelief) -> list[SiteEquations]:
-        return [site_equations(gantry.cameras(nominal), pixels, catalogue, gaps, params) for nominal, pixels in sites]
+        return [site_equations(site, gantry.cameras(site.cameras), catalogue, gaps, params) for site in sites]
 
     unknowns = GANTRY_UNKNOWNS + len(gaps)
-    rows = equations(GantryBelief(_AS_HEADER, usual))
+    rows = list(as_stated) if as_stated is not None else equations(GantryBelief(_AS_HEADER, usual))
     agree = [_is_explained(one, usual, len(gaps)) for one in rows]
     if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
         # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.
         sites = [site for site, explained in zip(sites, agree, strict=True) if explained]
         rows = [one for one, explained in zip(rows, agree, strict=True) if explained]
-    mixture = _weigh(information(rows, np.zeros(unknowns)), usual, len(gaps))
+    scatter = scatter_log_likelihoods(sites, params)
+    mixture = _weigh(information(rows, np.zeros(unknowns), scatter), usual, len(gaps))
     noise = float(np.sqrt(np.mean(np.concatenate([one.pixel_variance for one in rows]))))
     before = _epipolar_rms_px(rows, mixture, np.zeros(unknowns), params)
     as_header = GantryBelief(_AS_HEADER, mixture.gantry_covariance(np.zeros(GANTRY_UNKNOWNS)))
@@ -170,7 +176,7 @@ def calibrate(
         found = mixture.mean[6:12] - mixture.mean[:6]
         at = np.concatenate([np.zeros(6), found, np.zeros(unknowns - 12)])
         rows = equations(GantryBelief((np.eye(4), _displacement(found)), usual))
-        mixture = _weigh(information(rows, at), usual, len(gaps))
+        mixture = _weigh(information(rows, at, scatter), usual, len(gaps))
     after = _epipolar_rms_px(rows, mixture, at, params)
     # No electrode shows which view is wrong: each takes its expected share of the difference.
     in_a = mixture.mean[:6]
@@ -275,7 +281,9 @@ def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:
         float(np.sqrt(sum(weight / total * getattr(heart.scale, of) ** 2 for (heart, *_), weight in likely)))
         for of in ("breathing", "beats")
     )
-    return _Mixture(mean, covariance, HeartScale(breathing, beats), float(logsumexp(evidence) - exact))
+    simultaneous = sum(weight / total for (heart, *_), weight in likely if heart.scale.simultaneous)
+    scale = HeartScale(breathing, beats, bool(simultaneous > 0.5))
+    return _Mixture(mean, covariance, scale, float(logsumexp(evidence) - exact))
 
 
 def _misfit(rows: Sequence[SiteEquations], scale: HeartScale) -> float:
@@ -298,6 +306,9 @@ def _epipolar_rms_px(
     prior = mixture.scale.breathing**2 * params.respiration_covariance_mm2() / 2
     for one in rows:
         k = slice(one.epipolar)
+        if not one.shows_beats(mixture.scale):
+            left.append(one.residual[k])
+            continue
         unexplained = one.residual[k] - one.slope[k] @ (mixture.mean - linearised_at)
         breath = prior @ one.breath[k].T @ np.linalg.solve(one.covariance(mixture.scale)[k, k], unexplained)
         left.append(one.residual[k] - one.breath[k] @ breath)

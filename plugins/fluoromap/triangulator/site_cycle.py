@@ -25,6 +25,8 @@ from fluoromap.triangulator.uncertainty import (
 IN_MOST_PAIRS = 0.8
 """Share of the moments at which both views must show an electrode for it to belong to the site's cycle."""
 FEWEST_MOMENTS = 4
+NO_CYCLE = SiteCycle(np.zeros(0), (), np.zeros((0, 0, 3)), np.zeros((0, 0, 3, 3)))
+"""The cycle of a site whose views show too few moments."""
 _HARMONICS = 5
 _SMOOTHNESS = 1e-3
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import numpy as np
 from scipy.stats import chi2
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair
+from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
-from fluoromap.triangulator.estimate import Estimate, Method
+from fluoromap.triangulator.estimate import Method
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.self_calibration import StudyBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
@@ -22,10 +23,14 @@ from fluoromap.triangulator.table_motion import Jump, jump_source
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     ErrorSource,
-    Motion,
-    error_sources,
+    Share,
+    bend_source,
+    jacobians,
     pixel_noise_px2,
-    relative_covariance_mm2,
+    relative_covariances_mm2,
+    site_sources,
+    study_covariance,
+    study_sources,
     visible_breathing,
 )
 
@@ -54,51 +59,73 @@ class SiteLocator:
     gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
     origin: ReferenceOrigin | None = None
 
-    def locate(self, site: MatchedSite, jump: Jump | None) -> tuple[LocatedSite, Moment, list[str]] | None:
-        """Locate a site in 3D.
+    def cameras(self, site: MatchedSite) -> Cameras:
+        """Return the cameras of a site as the study shows them."""
+        return self.belief.gantry.cameras((site.camera_a, site.camera_b))
 
-        Returns
-        -------
-        tuple or None
-            The site, its diastole for the error budget, and sentences for the report. None where no plausible position
-            agrees with both views.
-        """
-        cameras = self.belief.gantry.cameras((site.camera_a, site.camera_b))
-        rest = site.diastole.a.phase if site.diastole.a.phase is not None else site.diastole.b.phase
-        moments = cycle_moments(site.cycle, cameras, self.method) if rest is not None else None
-        moment = self._moment(site.diastole, cameras, moments, jump)
-        if moment is None:
-            return None
-        doubts = tuple(dict.fromkeys(reason for reason, holds in (
-            (Reason.TABLE_MOVED, (jump is not None and jump.is_certain) or self.belief.doubt is Reason.TABLE_MOVED),
-            (Reason.GEOMETRY_DOUBTFUL, moment.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
-        ) if holds))  # fmt: skip
+    def moments(self, site: MatchedSite) -> CycleMoments | None:
+        """Return the moments of a site's cycle; None where the views show too few."""
+        known = _phase(site.diastole) is not None
+        return cycle_moments(site.cycle, self.cameras(site), self.method) if known else None
+
+    def cycle(self, site: MatchedSite, jump: Jump | None, moments: CycleMoments) -> SiteCycle:
+        """Locate a site at the moments of its cycle."""
+        rest = _phase(site.diastole)
+        assert rest is not None, "the site has moments"
+        return locate_cycle(
+            moments, rest, self.cameras(site), self.catalogue, self.any_study.params, self.method,
+            self.any_study.gantry.covariance, jump,
+        )  # fmt: skip
+
+    def diastole(self, site: MatchedSite, jump: Jump | None, moments: CycleMoments | None) -> Diastole:
+        """Locate a site at diastole, under both pairings of its catheters."""
+        cameras = self.cameras(site)
+        first = self._moment(site.diastole, cameras, moments, jump)
         other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
-        points, reference_mm = self._points(site, moment, moment.joint_mm2, cameras, doubts)
+        return Diastole(first, other)
+
+    def locate(
+        self, site: MatchedSite, jump: Jump | None, first: Moment, other: Moment | None, cycle: SiteCycle | None
+    ) -> tuple[LocatedSite, SiteErrors]:
+        """Return a site in 3D and its share in the study's report.
+
+        The covariances contain the errors that the study shows.
+
+        Parameters
+        ----------
+        site : MatchedSite
+        jump : Jump or None
+        first, other : Moment
+            The site at diastole, from :meth:`diastole`; ``other`` under the alternative pairing, or None.
+        cycle : SiteCycle or None
+            From :meth:`cycle`.
+        """
+        cameras = self.cameras(site)
+        own = first.errors(self.belief)
+        is_certain = jump is not None and jump.is_certain
+        doubts = tuple(dict.fromkeys(reason for reason, holds in (
+            (Reason.TABLE_MOVED, is_certain or self.belief.doubt is Reason.TABLE_MOVED),
+            (Reason.GEOMETRY_DOUBTFUL, own.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
+        ) if holds))  # fmt: skip
+        points, reference_mm = self._points(site, first, own.joint_mm2, doubts)
         # The study's origin depends on the other sites.
         alone = replace(self, origin=None)
-        a_priori, _ = alone._points(site, moment, moment.any_joint_mm2, cameras, doubts)
+        a_priori, _ = alone._points(site, first, first.errors(self.any_study).joint_mm2, doubts)
         if site.alternative is not None and other is not None:
-            others, other_mm = self._points(site, other, other.joint_mm2, cameras, doubts)
-            any_others, _ = alone._points(site, other, other.any_joint_mm2, cameras, doubts)
+            others, other_mm = self._points(site, other, other.errors(self.belief).joint_mm2, doubts)
+            any_others, _ = alone._points(site, other, other.errors(self.any_study).joint_mm2, doubts)
             shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
             p = site.alternative.probability
             points, a_priori = (
                 add_alternative(points, others, shift, p),
                 add_alternative(a_priori, any_others, shift, p),
             )
-        cycle = None
-        if moments is not None and rest is not None:
-            cycle = locate_cycle(
-                moments, rest, cameras, self.catalogue, self.any_study.params, self.method,
-                self.any_study.gantry.covariance, jump,
-            )  # fmt: skip
         reasons = [reason for reason, holds in (
             (Reason.NO_RESTING_CATHETER, self.catalogue.reference is None),
             (Reason.NO_REFERENCE, reference_mm is None),
             (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
         ) if holds]  # fmt: skip
-        answer = LocatedSite(
+        located = LocatedSite(
             site=site.site,
             camera_a=cameras[0],
             camera_b=cameras[1],
@@ -111,7 +138,8 @@ class SiteLocator:
             variation=self.belief.variation,
             a_priori=a_priori,
         )
-        return answer, moment, [] if jump is not None and jump.is_certain else _breathing_note(site.site, moment)
+        notes = () if is_certain or own.inflation > 1 else _breathing_note(site.site, first)
+        return located, SiteErrors(len(first.labels), own.squares_mm2, notes)
 
     def _moment(
         self, pair: PhasePair, cameras: Cameras, cycle: CycleMoments | None, jump: Jump | None
@@ -120,70 +148,69 @@ class SiteLocator:
         start = self.method.start(cameras, pixels)
         if not _plausible(start):
             return None
-        phase = pair.a.phase if pair.a.phase is not None else pair.b.phase
+        phase = _phase(pair)
         motion = (
             cycle.motion(np.array(phase), phase, pixels.labels) if cycle is not None and phase is not None else None
         )
-        sources, any_sources = (
-            self._sources(belief, cameras, start, pixels.labels, motion, jump)
-            for belief in (self.belief, self.any_study)
+        any_study = self.any_study
+        of_study = study_sources(
+            cameras, start, pixels.labels, self.catalogue, any_study.params, any_study.gantry.covariance
         )
+        of_site = [
+            *site_sources(cameras, start, pixels.labels, any_study.params, motion),
+            bend_source(jacobians(cameras, start), any_study.params),
+        ]
+        if jump is not None:
+            of_site.append(jump_source(cameras, start, jump))
         if self.method.estimates_breathing:
-            pixels = widen_strays(cameras, pixels, start, any_sources)
+            pixels = widen_strays(cameras, pixels, start, (*of_study, *of_site))
         noise = pixel_noise_px2(pixels.covariances)
-        errors, any_errors = (
-            noise + sum(source.pixels_px2() for source in own) for own in (sources, any_sources)
-        )  # fmt: skip
-        breathing = visible_breathing(cameras, start, self.any_study.params)
-        found = self.method.estimate(cameras, pixels, start, noise + breathing.pixels_px2())
+        breathing = visible_breathing(cameras, start, any_study.params)
+        weights = noise + breathing.pixels_px2()
+        found = self.method.estimate(cameras, pixels, start, weights)
         if not _plausible(found.points_mm):
             return None
         residuals = pixels.residuals_px(cameras, found.points_mm)
-        breathing_mm, inflation, any_inflation = 0.0, 1.0, 1.0
+        # Epipolar residuals do not depend on the pixels' weights: no displacement of an electrode changes them.
+        rows = epipolar_rows(cameras, found.points_mm) if self.method.estimates_breathing else np.zeros((0, len(noise)))
+        apart, breathing_mm = rows @ residuals, 0.0
         if self.method.estimates_breathing:
-            # Epipolar residuals do not depend on the pixels' weights: no displacement of an electrode changes them.
-            rows = epipolar_rows(cameras, found.points_mm)
-            inflation, any_inflation = (_inflation(rows, residuals, own) for own in (errors, any_errors))
-            gain = breathing.covariance @ breathing.effect_px.T @ np.linalg.inv(noise + breathing.pixels_px2())
-            breathing_mm = float((gain @ residuals)[0])
+            breathing_mm = float(
+                (breathing.covariance @ breathing.effect_px.T @ np.linalg.solve(weights, residuals))[0]
+            )
             residuals = residuals - breathing.effect_px[:, 0] * breathing_mm
+        effects = np.concatenate([source.effect_px for source in of_study], axis=1)
+        own = noise + sum(source.pixels_px2() for source in of_site)
+        gain = found.gain
         return Moment(
-            pixels, found, sources, noise, residuals.reshape(-1, 2, 2), breathing_mm, inflation,
-            inflation * found.covariance_mm2(errors), any_inflation * found.covariance_mm2(any_errors),
+            pixels.labels, found.points_mm, residuals.reshape(-1, 2, 2), _ray_angles_deg(cameras, pixels), breathing_mm,
+            gain @ own @ gain.T, gain @ effects, tuple(share for source in of_study for share in source.shares),
+            _squares_mm2(gain, noise, of_site), apart, rows @ own @ rows.T, rows @ effects,
         )  # fmt: skip
 
-    def _sources(
-        self, belief: StudyBelief, cameras: Cameras, points_mm: Array, labels: Sequence[tuple[str, int]],
-        motion: Motion | None, jump: Jump | None,
-    ) -> tuple[ErrorSource, ...]:  # fmt: skip
-        sources = error_sources(
-            cameras, points_mm, labels, self.catalogue, belief.params, belief.gantry.covariance, motion
-        )
-        return sources if jump is None else (*sources, jump_source(cameras, points_mm, jump))
-
     def _points(
-        self, site: MatchedSite, moment: Moment, joint: Array, cameras: Cameras, site_doubts: tuple[Reason, ...]
+        self, site: MatchedSite, moment: Moment, joint: Array, site_doubts: tuple[Reason, ...]
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
         """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located.
 
         ``joint`` (N, 3, N, 3) is the covariance of all electrodes.
         """
-        pixels, points = moment.pixels, moment.found.points_mm
+        labels, points = moment.labels, moment.points_mm
         reference = [
             i
-            for i, (catheter, electrode) in enumerate(pixels.labels)
+            for i, (catheter, electrode) in enumerate(labels)
             if catheter == self.catalogue.reference and (self.origin is None or electrode in self.origin.offsets_mm)
         ]
         reference_mm, added_mm2 = (points[reference].mean(axis=0) if reference else None), np.zeros((3, 3))
         if self.origin is not None and reference:
-            by_offsets = self.origin.from_electrodes([pixels.labels[i][1] for i in reference], points[reference])
+            by_offsets = self.origin.from_electrodes([labels[i][1] for i in reference], points[reference])
             assert by_offsets is not None, "these electrodes have offsets"
             reference_mm, added_mm2 = by_offsets
-        mismatched = spacing_mismatches(points, pixels.labels, self.catalogue, self.spacing_limit_mm)
+        mismatched = spacing_mismatches(points, labels, self.catalogue, self.spacing_limit_mm)
         doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
             doubts.setdefault(catheter, []).append(reason)
-        angles = _ray_angles_deg(cameras, pixels)
+        relative_mm2 = relative_covariances_mm2(joint, reference) + added_mm2 if reference else None
         residuals = np.linalg.norm(moment.residuals_px, axis=2)
         found = tuple(
             ElectrodePoint(
@@ -192,65 +219,138 @@ class SiteLocator:
                 position_mm=points[i],
                 covariance_mm2=joint[i, :, i],
                 relative_mm=None if reference_mm is None else points[i] - reference_mm,
-                relative_covariance_mm2=(
-                    relative_covariance_mm2(joint, i, reference) + added_mm2 if reference else None
-                ),
+                relative_covariance_mm2=None if relative_mm2 is None else relative_mm2[i],
                 residual_px=(float(residuals[i, 0]), float(residuals[i, 1])),
-                ray_angle_deg=float(angles[i]),
+                ray_angle_deg=float(moment.ray_angles_deg[i]),
                 reasons=tuple(
                     dict.fromkeys((
                         *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
                     ))
                 ),
             )
-            for i, (catheter, electrode) in enumerate(pixels.labels)
+            for i, (catheter, electrode) in enumerate(labels)
         )  # fmt: skip
         return found, reference_mm
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """A site at diastole: N electrodes in 3D with their sources of error.
+@dataclass(frozen=True, slots=True)
+class SiteErrors:
+    """What the report of the study needs to know about a site's location.
 
-    noise_px2 : (4 N, 4 N) covariance from pixel noise. residuals_px : (N, 2 views, 2), without the displacement of the heart
-    between the runs. breathing_mm : half of that displacement, as far as the views show it. inflation : misfit over its
-    expected value where chance does not explain it, else 1. joint_mm2, any_joint_mm2 : (N, 3, N, 3) covariance of all
-    electrodes, in this study and in any study.
+    electrodes : number of located electrodes. squares_mm2 : sum of their variances from each source of error, in the order of
+    :class:`~fluoromap.contracts.ErrorBudget`.
     """
 
-    pixels: TwoViewPixels
-    found: Estimate
-    sources: tuple[ErrorSource, ...]
-    noise_px2: Array
-    residuals_px: Array
-    breathing_mm: float
+    electrodes: int
+    squares_mm2: tuple[float, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MomentErrors:
+    """The errors of a moment in one study.
+
+    inflation : misfit over its expected value where chance does not explain it, else 1. joint_mm2 : (N, 3, N, 3) covariance of all
+    electrodes. squares_mm2 : sum of the electrodes' variances from each source, in the order of the error budget.
+    """
+
     inflation: float
     joint_mm2: Array
-    any_joint_mm2: Array
+    squares_mm2: tuple[float, ...]
 
 
-def _inflation(rows: Array, residuals_px: Array, errors_px2: Array) -> float:
-    """Return the misfit of the epipolar distances over its expected value.
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A site at diastole: N electrodes in 3D, and how errors displace them.
 
-    It is 1 where chance explains the misfit. ``rows`` (N, 4 N) combine the pixels to epipolar distances.
+    The k study errors are those of :func:`~fluoromap.triangulator.uncertainty.study_sources`: only their size depends on the
+    study. So a correction at another site changes no moment unless it changes the cameras.
+
+    labels : (catheter, electrode) of each electrode. points_mm : (N, 3) world. residuals_px : (N, 2 views, 2), without the
+    displacement of the heart between the runs. ray_angles_deg : (N,). breathing_mm : half of that displacement, as far as the
+    views show it.
+    own_mm2 : (3 N, 3 N) covariance of the points from pixels and from errors whose size no study shows. study_mm : (3 N, k)
+    effect of one unit of each study error. shares : (k,) their entries of the error budget. squares_mm2 : the budget of
+    ``own_mm2``.
+    apart_px : (e,) epipolar distances; empty where the method does not compare them. own_px2 : (e, e), study_px : (e, k), as above.
     """
-    apart = rows @ residuals_px
-    misfit = float(apart @ np.linalg.solve(rows @ errors_px2 @ rows.T, apart))
-    return misfit / len(rows) if chi2.sf(misfit, len(rows)) < DOUBTFUL_BELOW else 1.0
+
+    labels: tuple[tuple[str, int], ...]
+    points_mm: Array
+    residuals_px: Array
+    ray_angles_deg: Array
+    breathing_mm: float
+    own_mm2: Array
+    study_mm: Array
+    shares: tuple[str, ...]
+    squares_mm2: tuple[float, ...]
+    apart_px: Array
+    own_px2: Array
+    study_px: Array
+
+    def errors(self, belief: StudyBelief) -> MomentErrors:
+        """Return the errors in a study of this belief."""
+        catheters = len({catheter for catheter, _ in self.labels})
+        errors = study_covariance(belief.params, belief.gantry.covariance, catheters)
+        inflation = 1.0
+        if len(self.apart_px):
+            expected = self.own_px2 + self.study_px @ errors @ self.study_px.T
+            misfit = float(self.apart_px @ np.linalg.solve(expected, self.apart_px))
+            inflation = misfit / len(expected) if chi2.sf(misfit, len(expected)) < DOUBTFUL_BELOW else 1.0
+        displaced = self.study_mm @ errors
+        joint = self.own_mm2 + displaced @ self.study_mm.T
+        squares = dict(zip(BUDGET, self.squares_mm2, strict=True))
+        for share in set(self.shares):
+            of = np.array([own == share for own in self.shares])
+            both = errors * (of[:, None] & of)
+            squares[share] += float(((self.study_mm @ both) * self.study_mm).sum())
+        n = len(self.labels)
+        return MomentErrors(inflation, (inflation * (joint + joint.T) / 2).reshape(n, 3, n, 3), tuple(squares.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class Diastole:
+    """A site at diastole under the chosen pairing of its catheters, and under the alternative one.
+
+    Each is None where no plausible position agrees with both views, or where there is no such pairing.
+    """
+
+    chosen: Moment | None
+    alternative: Moment | None
+
+
+BUDGET = get_args(Share)
+"""Entries of the :class:`~fluoromap.contracts.ErrorBudget`, in its order."""
+
+
+def _squares_mm2(gain: Array, noise_px2: Array, sources: Sequence[ErrorSource]) -> tuple[float, ...]:
+    """Return the sum of the electrodes' variances from pixel noise and from each source."""
+    squares = dict.fromkeys(BUDGET, 0.0)
+    squares["pixels"] += float(((gain @ noise_px2) * gain).sum())
+    for source in sources:
+        (share,) = set(source.shares)
+        effect = gain @ source.effect_px
+        squares[share] += float(((effect @ source.covariance) * effect).sum())
+    return tuple(squares.values())
+
+
+def _phase(pair: PhasePair) -> float | None:
+    """Return the phase of view a, else that of view b."""
+    return pair.a.phase if pair.a.phase is not None else pair.b.phase
 
 
 def _plausible(points_mm: Array) -> bool:
     return bool(np.isfinite(points_mm).all() and np.abs(points_mm).max() < FAR_MM)
 
 
-def _breathing_note(site: str, moment: Moment) -> list[str]:
+def _breathing_note(site: str, moment: Moment) -> tuple[str, ...]:
     apart_mm = 2 * abs(moment.breathing_mm)
-    if apart_mm <= 2.0 or moment.inflation > 1:
-        return []
-    return [
+    if apart_mm <= 2.0:
+        return ()
+    return (
         f"{site}: the whole heart is {apart_mm:.0f} mm apart between the two runs (breathing, a moved table or the "
-        "gantry's angles). Positions relative to the reference catheter are hardly affected."
-    ]
+        "gantry's angles). Positions relative to the reference catheter are hardly affected.",
+    )
 
 
 def _ray_angles_deg(cameras: Cameras, pixels: TwoViewPixels) -> Array:

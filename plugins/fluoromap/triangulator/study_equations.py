@@ -13,6 +13,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array
+from fluoromap.triangulator.beat_scatter import BeatScatter
 from fluoromap.triangulator.estimate import separate_gain, triangulate_unweighted
 from fluoromap.triangulator.spacing import neighbours
 from fluoromap.triangulator.stray_electrodes import epipolar_rows
@@ -35,28 +36,60 @@ GAP_SD_MM = 0.3
 _SPACING_SD_MM = 0.1
 """Difference of a gap between sites."""
 _BREATHING_LOG_SD, _BEATS_LOG_SD = 1.1, 0.7
+_BREATHING = (0.07, 0.15, 0.3, 0.55, 1.0, 1.6)
+_BEATS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5, 2.4)
+_SIMULTANEOUS_SHARE = 0.1
+"""Share of the studies whose two views are recorded at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeartScale:
-    """A study's breathing and beat variation, as multiples of the parameters' values."""
+    """A study's breathing and beat variation, as multiples of the parameters' values.
+
+    simultaneous : the two views are recorded at the same time. Then a site whose frames show the same beat shows nothing about
+    other beats.
+    """
 
     breathing: float = 1.0
     beats: float = 1.0
+    simultaneous: bool = False
 
     @property
     def log_prior(self) -> float:
         """Logarithm of the log-normal prior density, up to a constant."""
-        return -0.5 * float(
-            (np.log(self.breathing) / _BREATHING_LOG_SD) ** 2 + (np.log(self.beats) / _BEATS_LOG_SD) ** 2
-        )
+        beats = -0.5 * float(np.log(self.beats) / _BEATS_LOG_SD) ** 2
+        if self.simultaneous:
+            return beats + _SIMULTANEOUS_LOG_WEIGHT
+        return beats + _log_density_of_breathing(self.breathing)
 
 
-HEART_SCALES = tuple(
-    HeartScale(breathing, beats)
-    for breathing in (0.07, 0.15, 0.3, 0.55, 1.0, 1.6)
-    for beats in (0.3, 0.6, 1.0, 1.6, 2.4)
+def _log_density_of_breathing(breathing: float) -> float:
+    return -0.5 * float(np.log(breathing) / _BREATHING_LOG_SD) ** 2
+
+
+_SIMULTANEOUS_LOG_WEIGHT = float(
+    np.log(_SIMULTANEOUS_SHARE / (1 - _SIMULTANEOUS_SHARE))
+    + np.log(np.sum([np.exp(_log_density_of_breathing(breathing)) for breathing in _BREATHING]))
 )
+HEART_SCALES = (
+    *(HeartScale(breathing, beats) for breathing in _BREATHING for beats in _BEATS),
+    *(HeartScale(min(_BREATHING), beats, simultaneous=True) for beats in _BEATS),
+)
+"""Hearts of which one is the study's. Breathing displaces nothing between views that are recorded at the same time."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationSite:
+    """All that a site says about gantry and heart.
+
+    cameras : nominal. pixels : at diastole. same_beat : whether the two frames show the same beat if the views are simultaneous.
+    scatter : of the beats in its runs.
+    """
+
+    cameras: Cameras
+    pixels: TwoViewPixels
+    same_beat: bool = False
+    scatter: tuple[BeatScatter, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +100,7 @@ class SiteEquations:
 
     residual : (k,). slope : (k, u). fixed : (k, k) covariance of the error from pixels and from the gaps' scatter.
     breathing, beats : (k, k) covariances from breathing and from beats. breath : (k, 3) effect of breathing, an mm.
-    pixel_variance : (epipolar,) px^2.
+    pixel_variance : (epipolar,) px^2. same_beat : whether the frames show the same beat if the views were simultaneous.
     """
 
     residual: Array
@@ -78,9 +111,16 @@ class SiteEquations:
     breath: Array
     epipolar: int
     pixel_variance: Array
+    same_beat: bool
+
+    def shows_beats(self, scale: HeartScale) -> bool:
+        """Return False where both views show the same moment of such a heart."""
+        return not (scale.simultaneous and self.same_beat)
 
     def covariance(self, scale: HeartScale) -> Array:
         """Return the covariance (k, k) of the error in a heart of this scale."""
+        if not self.shows_beats(scale):
+            return self.fixed
         total: Array = self.fixed + scale.breathing**2 * self.breathing + scale.beats**2 * self.beats
         return total
 
@@ -115,13 +155,17 @@ def gap_labels(catalogue: Catalogue, trusted: frozenset[str]) -> tuple[tuple[str
 
 
 def site_equations(
+    site: CalibrationSite,
     cameras: Cameras,
-    pixels: TwoViewPixels,
     catalogue: Catalogue,
     gaps: Sequence[tuple[str, int, int]],
     params: UncertaintyParams,
 ) -> SiteEquations:
-    """Return a site's equations: epipolar distances, then those of the ``gaps`` that the site shows."""
+    """Return a site's equations with these cameras.
+
+    Epipolar distances come first, then those of the ``gaps`` that the site shows.
+    """
+    pixels = site.pixels
     points = triangulate_unweighted(cameras, pixels)
     n = len(points)
     combine = epipolar_rows(cameras, points)
@@ -158,22 +202,35 @@ def site_equations(
     slope = np.concatenate([combine @ gantry_effect_px(cameras, jacobian, points), errors], axis=1)
     return SiteEquations(
         residual, slope, fixed, breathing, beats, combine @ breathing_effect_px(jacobian), n,
-        np.diagonal(combine @ noise @ combine.T)[:n],
+        np.diagonal(combine @ noise @ combine.T)[:n], site.same_beat,
     )  # fmt: skip
 
 
-def information(rows: Sequence[SiteEquations], linearised_at: Array) -> list[Information]:
+def scatter_log_likelihoods(sites: Sequence[CalibrationSite], params: UncertaintyParams) -> Array:
+    """Return the log likelihoods (h,) of all hearts from beats in single runs."""
+    beats_sd_mm = params.beat_sd_mm * np.array([scale.beats for scale in HEART_SCALES])
+    likelihoods = np.zeros(len(HEART_SCALES))
+    for site in sites:
+        for run in site.scatter:
+            likelihoods += run.log_likelihood(beats_sd_mm)
+    return likelihoods
+
+
+def information(rows: Sequence[SiteEquations], linearised_at: Array, log_likelihoods: Array) -> list[Information]:
     """Return what the equations say, for each scale of the heart.
 
-    The equations were linearised at the unknowns ``linearised_at`` (u,).
+    The equations were linearised at the unknowns ``linearised_at`` (u,). ``log_likelihoods`` (h,) of the hearts come from other
+    data.
     """
     u = len(linearised_at)
     matrices, vectors = np.zeros((len(HEART_SCALES), u, u)), np.zeros((len(HEART_SCALES), u))
-    constants = np.zeros(len(HEART_SCALES))
+    constants = np.array(log_likelihoods)
     breathing, beats = (np.array([getattr(scale, of) ** 2 for scale in HEART_SCALES]) for of in ("breathing", "beats"))
     for one in rows:
         residual = one.residual + one.slope @ linearised_at
-        covariance = one.fixed + breathing[:, None, None] * one.breathing + beats[:, None, None] * one.beats
+        shown = np.array([one.shows_beats(scale) for scale in HEART_SCALES])
+        of_breathing, of_beats = ((shown * squares)[:, None, None] for squares in (breathing, beats))
+        covariance = one.fixed + of_breathing * one.breathing + of_beats * one.beats
         factor = np.linalg.cholesky(covariance)
         both = np.linalg.solve(factor, np.column_stack([one.slope, residual]))
         products = np.swapaxes(both, -1, -2) @ both

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import get_args
 
 import numpy as np
 
@@ -19,14 +18,16 @@ from fluoromap.contracts import (
     LocatedSite,
     MatchedSite,
     RejectedSite,
+    SiteCycle,
     StudyVariation,
     Triangulation,
 )
 from fluoromap.geometry import Camera, ray_angle_deg
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
 from fluoromap.reasons import Reason
+from fluoromap.triangulator.beat_scatter import BeatScatter, beat_scatter
 from fluoromap.triangulator.estimate import Estimate, Method, separate_gain, triangulate_unweighted
-from fluoromap.triangulator.reference_origin import common_origin, deviates
+from fluoromap.triangulator.reference_origin import ReferenceOrigin, common_origin, deviates
 from fluoromap.triangulator.self_calibration import (
     GantryBelief,
     any_study_belief,
@@ -34,28 +35,33 @@ from fluoromap.triangulator.self_calibration import (
     header_belief,
     study_belief,
 )
-from fluoromap.triangulator.site_locator import Moment, SiteLocator
+from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
+from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
 from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
+from fluoromap.triangulator.study_equations import CalibrationSite, SiteEquations, gap_labels, site_equations
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
 from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixels_in_both_views
 from fluoromap.triangulator.uncertainty import (
     LARGEST_MULTIPLE,
-    Share,
     UncertaintyParams,
     error_sources,
     pixel_noise_px2,
 )
 
 _SAME_GANTRY_DEG = 3.0
+_SAME_BEAT_MS = 200.0
+"""Frames of simultaneous runs that are nearer than this show the same beat: half of the shortest beat."""
 
 
 @dataclass(frozen=True, eq=False)
 class SiteLook:
     """The part of a site that the checks of the whole study need.
 
-    points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. reasons : why the site
-    cannot be located; then there are no points. note : a sentence about these reasons, or none.
+    points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. same_beat : whether
+    the two frames show the same beat if the runs began together. scatter : of the beats in its runs. reasons : why the site
+    cannot be located; then there are no points. note : a sentence about these reasons, or none. equations : of the site for the
+    calibration, with the gantry that the headers state and the gaps of all catheters.
     """
 
     site: str
@@ -64,12 +70,19 @@ class SiteLook:
     pixels: TwoViewPixels
     points_mm: Array
     covariance_mm2: Array
+    same_beat: bool
+    scatter: tuple[BeatScatter, ...] = ()
     reasons: tuple[Reason, ...] = ()
     note: str | None = None
+    equations: SiteEquations | None = None
 
     @property
     def cameras(self) -> Cameras:
         return self.camera_a, self.camera_b
+
+    @property
+    def for_calibration(self) -> CalibrationSite:
+        return CalibrationSite(self.cameras, self.pixels, self.same_beat, self.scatter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,20 +101,6 @@ class StudyChecks:
     gantry: GantryBelief | None = None
     variation: StudyVariation | None = None
     doubt: Reason | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class SiteErrors:
-    """What the report of the study needs to know about a site's location.
-
-    located : whether a plausible position agrees with both views. electrodes : number of located electrodes. squares_mm2 : sum
-    of their variances from each source of error, in the order of :class:`~fluoromap.contracts.ErrorBudget`.
-    """
-
-    located: bool
-    electrodes: int
-    squares_mm2: tuple[float, ...]
-    notes: tuple[str, ...]
 
 
 def locate_study(
@@ -172,8 +171,12 @@ def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: Uncert
         return StudyChecks(jumps, gaps[0], gaps[1])
     same_gantry = _same_gantry(looks)
     is_certain = [jump is not None and jump.is_certain for jump in jumps]
-    unmoved = [(looks[i].cameras, looks[i].pixels) for i in same_gantry if not is_certain[i]]
-    calibration, belief = calibrate(unmoved, catalogue, frozenset(catalogue.names) - set(wrong), params)
+    unmoved = [looks[i] for i in same_gantry if not is_certain[i]]
+    # The looks have the equations of all catheters.
+    known = [look.equations for look in unmoved if look.equations is not None] if not wrong else None
+    calibration, belief = calibrate(
+        [look.for_calibration for look in unmoved], catalogue, frozenset(catalogue.names) - set(wrong), params, known
+    )
     return StudyChecks(
         jumps, gaps[0], gaps[1], tuple(same_gantry), calibration, belief.gantry, belief.variation, belief.doubt
     )
@@ -201,7 +204,7 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     The result says why a site cannot be located.
     """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)))
+    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)), _same_beat(site))
     angle = ray_angle_deg(*cameras)
     if angle < PARALLEL_BELOW_DEG:
         note = f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed."
@@ -214,7 +217,20 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))
     covariance = alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
-    return replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance)
+    look = replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance, scatter=beat_scatter(site))
+    gaps = gap_labels(catalogue, frozenset(catalogue.names))
+    return replace(look, equations=site_equations(look.for_calibration, cameras, catalogue, gaps, params))
+
+
+def _same_beat(site: MatchedSite) -> bool:
+    """Return True where the diastolic frames show the same beat.
+
+    This holds if both runs began together.
+    """
+    frame_a, frame_b = site.diastole.a.frame, site.diastole.b.frame
+    if frame_a >= len(site.frame_times_a_ms) or frame_b >= len(site.frame_times_b_ms):
+        return False
+    return bool(abs(site.frame_times_a_ms[frame_a] - site.frame_times_b_ms[frame_b]) < _SAME_BEAT_MS)
 
 
 _Work = tuple[MatchedSite, Jump | None, SiteLocator]
@@ -230,43 +246,62 @@ def _locate_sites(
 ) -> Triangulation:
     located: list[LocatedSite] = []
     errors: list[SiteErrors] = []
-    used: list[_Work] = []
+    locations: list[_Location] = []
     for index, one in enumerate(work):
         context.check()
-        location = _Location(*one)
-        of_site = context.recall(SiteErrors, location.inputs, partial(_errors, location))
-        if of_site.located:
-            located.append(context.recall(LocatedSite, location.inputs, location.located_site))
-            used.append(one)
-            errors.append(of_site)
-            notes += of_site.notes
+        location = _Location(*one, context)
+        found = location.locate(None)
+        if found is not None:
+            located.append(found[0])
+            locations.append(location)
+            errors.append(found[1])
+            notes += found[1].notes
         else:
             rejected.append(RejectedSite(one[0].site, (Reason.PAIRING_FAILED,)))
         context.progress((index + 1) / len(work))
-    located = _from_one_origin(located, used, catalogue, context)
+    located = _from_one_origin(located, locations, catalogue)
     return Triangulation(tuple(located), tuple(rejected), tuple(notes), calibration, _budget(errors))
 
 
 class _Location:
-    """The location of one site, computed when it is first needed."""
+    """The location of one site.
 
-    def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator) -> None:
-        self.inputs = (site, jump, locator.catalogue, locator.belief, locator.gap_doubts, locator.origin)
-        self._work = site, jump, locator
+    Its diastole and its cycle depend on the site and its cameras alone; they are recalled where these did not change. Other sites
+    change only the size of the errors, from which the covariances follow quickly.
+    """
+
+    def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator, context: Context) -> None:
+        self._site, self._jump, self._locator = site, jump, locator
+        inputs = (site, jump, locator.catalogue, *locator.cameras(site))
+        self._diastole = context.recall(Diastole, inputs, self._locate_diastole)
+        self._cycle = context.recall(SiteCycle, inputs, self._locate_cycle)
+
+    def locate(self, origin: ReferenceOrigin | None) -> tuple[LocatedSite, SiteErrors] | None:
+        """Return the site in 3D, see :meth:`SiteLocator.locate`.
+
+        None where no plausible position agrees with both views.
+        """
+        first, other = self._diastole.chosen, self._diastole.alternative
+        if first is None:
+            return None
+        locator = self._locator if origin is None else replace(self._locator, origin=origin)
+        return locator.locate(self._site, self._jump, first, other, self._cycle if self._cycle.labels else None)
 
     @functools.cached_property
-    def answer(self) -> tuple[LocatedSite, Moment, list[str]] | None:
-        site, jump, locator = self._work
-        return locator.locate(site, jump)
+    def _moments(self) -> CycleMoments | None:
+        return self._locator.moments(self._site)
 
-    def located_site(self) -> LocatedSite:
-        """Return the site in 3D."""
-        assert self.answer is not None, "the site was located before"
-        return self.answer[0]
+    def _locate_diastole(self) -> Diastole:
+        return self._locator.diastole(self._site, self._jump, self._moments)
+
+    def _locate_cycle(self) -> SiteCycle:
+        if self._moments is None or self._diastole.chosen is None:
+            return NO_CYCLE
+        return self._locator.cycle(self._site, self._jump, self._moments)
 
 
 def _from_one_origin(
-    located: Sequence[LocatedSite], work: Sequence[_Work], catalogue: Catalogue, context: Context
+    located: Sequence[LocatedSite], locations: Sequence[_Location], catalogue: Catalogue
 ) -> list[LocatedSite]:
     """Give all sites the same origin.
 
@@ -276,11 +311,9 @@ def _from_one_origin(
     if reference is None or (origin := common_origin(located, reference)) is None:
         return list(located)
     same: list[LocatedSite] = []
-    for first, (site, jump, locator) in zip(located, work, strict=True):
-        if deviates(first, reference, origin):
-            again = _Location(site, jump, replace(locator, origin=origin))
-            first = context.recall(LocatedSite, again.inputs, again.located_site)
-        same.append(first)
+    for first, location in zip(located, locations, strict=True):
+        again = location.locate(origin) if deviates(first, reference, origin) else None
+        same.append(first if again is None else again[0])
     return same
 
 
@@ -289,19 +322,13 @@ def _same_gantry(sites: Sequence[SiteLook]) -> list[int]:
 
     Only such sites share the gantry's errors.
     """
-    best: list[int] = []
-    for one in sites:
-        alike = [
-            i for i, site in enumerate(sites)
-            if _angle_deg(one.camera_a, site.camera_a) < _SAME_GANTRY_DEG
-            and _angle_deg(one.camera_b, site.camera_b) < _SAME_GANTRY_DEG
-        ]  # fmt: skip
-        best = max(best, alike, key=len)
-    return best
-
-
-def _angle_deg(first: Camera, second: Camera) -> float:
-    return float(np.degrees(np.arccos(np.clip(first.axis_world @ second.axis_world, -1, 1))))
+    if not sites:
+        return []
+    alike = np.ones((len(sites), len(sites)), dtype=np.bool_)
+    for view in (0, 1):
+        axes = np.array([site.cameras[view].axis_world for site in sites])
+        alike &= np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1))) < _SAME_GANTRY_DEG
+    return [int(i) for i in np.flatnonzero(alike[np.argmax(alike.sum(axis=1))])]
 
 
 def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue) -> list[str]:
@@ -352,25 +379,6 @@ def _calibration_note(calibration: Calibration) -> str:
     )
 
 
-_BUDGET = get_args(Share)
-
-
-def _errors(location: _Location) -> SiteErrors:
-    """Return the share of a site in the report of the study."""
-    if location.answer is None:
-        return SiteErrors(False, 0, (), ())
-    _, moment, notes = location.answer
-    gain = moment.found.gain
-    squares = dict.fromkeys(_BUDGET, 0.0)
-    squares["pixels"] += float(np.trace(gain @ moment.noise_px2 @ gain.T))
-    for source in moment.sources:
-        for share in set(source.shares):
-            of = [k for k, own in enumerate(source.shares) if own == share]
-            effect = gain @ source.effect_px[:, of]
-            squares[share] += float(np.trace(effect @ source.covariance[np.ix_(of, of)] @ effect.T))
-    return SiteErrors(True, len(moment.found.points_mm), tuple(squares.values()), tuple(notes))
-
-
 def _budget(sites: Sequence[SiteErrors]) -> ErrorBudget | None:
     """Return the RMS of each source of error over all located electrodes.
 
@@ -380,4 +388,4 @@ def _budget(sites: Sequence[SiteErrors]) -> ErrorBudget | None:
     if not count:
         return None
     totals = np.sum([site.squares_mm2 for site in sites], axis=0)
-    return ErrorBudget(**{f"{name}_mm": float(np.sqrt(of / count)) for name, of in zip(_BUDGET, totals, strict=True)})
+    return ErrorBudget(**{f"{name}_mm": float(np.sqrt(of / count)) for name, of in zip(BUDGET, totals, strict=True)})

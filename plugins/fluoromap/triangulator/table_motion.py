@@ -142,16 +142,17 @@ def _displacements(
 
     Each is (3,), from their usual places and across the view's rays. None where the site shows no resting catheter.
     """
+    rows = [row for row, label in enumerate(pixels.labels) if label in usual]
+    if not rows:
+        return None
+    places = np.array([usual[pixels.labels[row]] for row in rows])
+    catheters = [pixels.labels[row][0] for row in rows]
     found: list[Array] = []
     for camera, uv in zip(cameras, pixels.pixels, strict=True):
-        moved: dict[str, list[Array]] = {}
-        for label, pixel in zip(pixels.labels, uv, strict=True):
-            if label in usual:
-                inverse = np.linalg.pinv(camera.jacobian(usual[label]))
-                moved.setdefault(label[0], []).append(inverse @ (pixel - camera.project(usual[label])))
-        if not moved:
-            return None
-        found.append(_common_displacement(np.array([np.mean(own, axis=0) for own in moved.values()])))
+        inverse = np.linalg.pinv(camera.jacobian(places))
+        moved = (inverse @ (uv[rows] - camera.project(places))[..., None])[..., 0]
+        own = [[name == catheter for name in catheters] for catheter in dict.fromkeys(catheters)]
+        found.append(_common_displacement(np.array([moved[of].mean(axis=0) for of in own])))
     return found[0], found[1]
 
 

@@ -8,9 +8,8 @@ from contextlib import asynccontextmanager, suppress
 
 import structlog
 from anyio import CapacityLimiter, to_thread
-from fastapi import Depends, FastAPI
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import HTMLResponse, JSONResponse
-from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
@@ -22,7 +21,7 @@ from fluoromap_service.api.http.middleware.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.disk_space import DiskSpace
 from fluoromap_service.api.http.middleware.request_body import RequestBody
 from fluoromap_service.api.http.middleware.security_headers import SecurityHeaders
-from fluoromap_service.api.http.query_names import check_query_names
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
@@ -120,8 +119,8 @@ def create_app() -> FastAPI:
         redoc_url=None,
         openapi_url=None,
         redirect_slashes=False,
-        dependencies=[Depends(check_query_names)],
-        generate_unique_id_function=_operation_id,
+        # Not by include_router: it matches all routes of each router in turn, and those of the right router twice.
+        routes=[route for router in (*ROUTERS, _description()) for route in router.routes],
         lifespan=_lifespan,
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
@@ -129,17 +128,6 @@ def create_app() -> FastAPI:
     rules = read_rules()
     app.state.rules = RuleWatch(rules) if rules else None
     problems.install(app)
-    for router in ROUTERS:
-        app.include_router(router)
-
-    @app.get("/v1/openapi.json", include_in_schema=False)
-    def openapi(caller: Reader) -> JSONResponse:
-        return JSONResponse(document(app))
-
-    @app.get("/docs", include_in_schema=False)
-    def docs(caller: Reader) -> HTMLResponse:
-        return HTMLResponse(api_page(document(app)))
-
     # The last one added is the outermost.
     app.add_middleware(BodyLimit)
     app.add_middleware(DiskSpace)
@@ -160,12 +148,19 @@ def create_app() -> FastAPI:
     return app
 
 
-def _operation_id(route: APIRoute) -> str:
-    """Return the name of a route's function.
+def _description() -> APIRouter:
+    """Return the routes of the application's own description."""
+    router = new_router(include_in_schema=False)
 
-    Generators of clients name their calls after it.
-    """
-    return route.name
+    @router.get("/v1/openapi.json")
+    def openapi(request: Request, caller: Reader) -> JSONResponse:
+        return JSONResponse(document(request.app))
+
+    @router.get("/docs")
+    def docs(request: Request, caller: Reader) -> HTMLResponse:
+        return HTMLResponse(api_page(document(request.app)))
+
+    return router
 
 
 @asynccontextmanager

@@ -204,8 +204,10 @@ class Header:
         element : int
             Number within the block; the service reads 21, 22 and 23 (hexadecimal) only.
         """
-        for block in _PRIVATE_BLOCKS:
-            if self._texts(self._dataset, Tag(_PRIVATE_GROUP, block)) == (creator,):
+        # By the elements that are there: most files have none of the 240 blocks.
+        for tag in sorted(tag for tag in self._dataset.keys() if tag.group == _PRIVATE_GROUP):  # noqa: SIM118
+            block = tag.element
+            if block in _PRIVATE_BLOCKS and self._texts(self._dataset, tag) == (creator,):
                 values = self._numbers(self._dataset, Tag(_PRIVATE_GROUP, block << 8 | element))
                 return values[0] if values else None
         return None

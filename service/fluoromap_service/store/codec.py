@@ -12,6 +12,7 @@ when they are first read.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import functools
 import gc
@@ -38,6 +39,8 @@ T = typing.TypeVar("T")
 LAYOUT = 3
 """The number of the layout of stored bytes. It is part of every form, so that results of another one are computed again."""
 
+_FEW_ARRAYS = 32
+"""Most arrays that are looked up one by one. For more of them, all arrays of the content are taken apart at once."""
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
 _SOURCE = "_stored_form"
 _pack, _unpack = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder()
@@ -149,7 +152,7 @@ def partial_results(content: bytes) -> Mapping[str, Block]:
 def form_of(kind: type[Any]) -> str:
     """Return the hash of a type's form, which changes when a contract or the layout does.
 
-    The form is the layout, the names and types of its fields, and those of all dataclasses in it.
+    The form is the layout, the names and types of its fields, whether it is stored apart, and the same of all dataclasses in it.
     """
     return _form_of(cast(Hashable, kind))
 
@@ -164,7 +167,7 @@ def _form_of(kind: Any) -> str:
         if dataclasses.is_dataclass(hint) and isinstance(hint, type) and hint.__qualname__ not in found:
             hints = typing.get_type_hints(hint)
             fields = [(field.name, str(hints[field.name])) for field in dataclasses.fields(hint)]
-            found[hint.__qualname__] = fields
+            found[hint.__qualname__] = [*fields, ("stored apart", "")] if _is_apart(hint) else fields
             for field in dataclasses.fields(hint):
                 visit(hints[field.name])
 
@@ -249,19 +252,38 @@ class _Content:
         (value,) = column.decode(_unpack.decode(self.columns[name]), self)
         return value
 
-    def __getitem__(self, number: int) -> NDArray[Any]:
-        """Return an array by its number."""
-        return self._arrays[number]
+    def take(self, numbers: Sequence[int]) -> list[NDArray[Any]]:
+        """Return arrays by their numbers."""
+        if len(numbers) <= _FEW_ARRAYS and "_all_arrays" not in self.__dict__:
+            return list(map(self._array, numbers))
+        every = self._all_arrays
+        return [every[number] for number in numbers]
+
+    def _array(self, number: int) -> NDArray[Any]:
+        for numbers, pool in self._pools:
+            # Arrays are numbered as they come, so that the numbers of each pool rise.
+            place = bisect.bisect_left(numbers, number)
+            if place < len(numbers) and numbers[place] == number:
+                found: NDArray[Any] = pool[place]
+                return found
+        raise StoredOtherwise(f"there is no array of the number {number}")
 
     @functools.cached_property
-    def _arrays(self) -> list[NDArray[Any]]:
+    def _all_arrays(self) -> list[NDArray[Any]]:
         by_number: dict[int, NDArray[Any]] = {}
+        for numbers, pool in self._pools:
+            by_number.update(zip(numbers, pool, strict=True))
+        return [by_number[number] for number in range(len(by_number))]
+
+    @functools.cached_property
+    def _pools(self) -> list[tuple[list[int], NDArray[Any]]]:
+        pools = []
         start = self._start
         for dtype, shape, numbers in self._described:
             pool = np.frombuffer(self._content, dtype, len(numbers) * math.prod(shape), start)
-            by_number.update(zip(numbers, pool.reshape(len(numbers), *shape), strict=True))
+            pools.append((numbers, pool.reshape(len(numbers), *shape)))
             start += whole(pool.nbytes)
-        return [by_number[number] for number in range(len(by_number))]
+        return pools
 
     @functools.cached_property
     def _starts_of_blocks(self) -> list[int]:
@@ -412,7 +434,7 @@ class _ArrayColumn:
         return list(map(arrays.add, values))
 
     def decode(self, stored: Any, arrays: _Content) -> list[Any]:
-        return [arrays[number] for number in stored]
+        return arrays.take(stored)
 
 
 class _OptionalColumn:

@@ -20,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sqlalchemy import delete, exists, select, text
+from sqlalchemy import bindparam, delete, exists, select, text
 from sqlalchemy.orm import Session
 
 from fluoromap_service.settings import settings
@@ -244,10 +244,13 @@ def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
         os.close(folder)
     # This process has just read or written the whole content.
     _remember_check(sha256, _state_of(target))
-    if session.get(File, sha256) is None:
+    if session.scalar(_ROW, {"sha256": sha256}) is None:
         session.add(File(sha256=sha256))
         session.flush()
     return sha256
+
+
+_ROW = select(File.sha256).where(File.sha256 == bindparam("sha256"))
 
 
 def keep_bytes(session: Session, content: bytes) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Row, bindparam, select
 from sqlalchemy.orm import Session
 
 from fluoromap.matching.two_view import PARALLEL_BELOW_DEG
@@ -104,8 +104,10 @@ def binding_of(
     that has read the runs of the study gives them as ``runs``.
     """
     runs = runs_of(session, study_id) if runs is None else runs
-    with_runs = {run.link.site for run in runs} | {also}
-    rows = [row for row in rows_of(session, study_id) if row.name in with_runs or not _is_empty(row)]
+    with_runs = {run.site for run in runs} | {also}
+    rows = [
+        row for row in session.execute(_SITES, {"study_id": study_id}) if row.name in with_runs or not _is_empty(row)
+    ]
     gantries = [run.gantry for run in runs]
     values = [_run_value(run, gantry) for run, gantry in zip(runs, gantries, strict=True)]
     paired = pairing.pair_runs([_site_value(row) for row in rows], values)
@@ -118,7 +120,18 @@ def binding_of(
     return Binding(sites, pairs)
 
 
-def _site_value(row: Site) -> pairing.Site:
+# Built once, and columns instead of whole rows: each request on a study reads its sites.
+_SITES = (
+    select(
+        Site.name, Site.lat_ms, Site.lat_sd_ms, Site.csv_row, Site.explicit_a, Site.explicit_b, Site.csv_a, Site.csv_b,
+        Site.ordered_a, Site.ordered_b,
+    )
+    .where(Site.study_id == bindparam("study_id"))
+    .order_by(Site.id)
+)  # fmt: skip
+
+
+def _site_value(row: Row[*tuple[Any, ...]]) -> pairing.Site:
     return pairing.Site(
         name=row.name,
         csv_row=row.csv_row,
@@ -135,20 +148,20 @@ def _run_value(run: StudyRun, gantry: Mapping[str, Any]) -> pairing.Run:
     primary, secondary = gantry["primary_deg"], gantry["secondary_deg"]
     return pairing.Run(
         uid=run.uid,
-        arrival=run.link.id,
+        arrival=run.arrival,
         direction=None if primary is None or secondary is None else pairing.central_ray(primary, secondary),
         acquired=run.facts.acquired,
         table_origin=run.facts.table_origin,
         series_number=run.facts.series_number,
-        file_name=run.link.file_name,
-        site=run.link.site,
-        site_by=run.link.site_by,
+        file_name=run.file_name,
+        site=run.site,
+        site_by=run.site_by,
         gantry_turned=HeaderWarning.POSITIONER_MOVED in run.facts.warnings,
         table_moved=HeaderWarning.TABLE_MOVED in run.facts.warnings,
     )
 
 
-def _bound(row: Site, runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
+def _bound(row: Row[*tuple[Any, ...]], runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
     missing = () if row.lat_ms is not None else ("lat_ms",)
     unusable, angle_deg = _pair_check(runs)
     doubts = _doubts(runs)
@@ -189,7 +202,7 @@ def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundS
     )
 
 
-def _is_empty(row: Site) -> bool:
+def _is_empty(row: Row[*tuple[Any, ...]]) -> bool:
     """Return whether nothing is known of a site but its name.
 
     Such a row stays when a table that named the site was replaced.

@@ -202,7 +202,7 @@ def _run_snapshot(
     assert gantry is not None, "a ready site's runs have their geometry"
     if table_offset_mm is not None:
         gantry = gantry.model_copy(update={"table_offset_mm": table_offset_mm})
-    return RunSnapshot(sha256=run.instance.sha256, facts=run.facts.to_json(), gantry=gantry, corrections=by_hand)
+    return RunSnapshot(sha256=run.sha256, facts=run.facts.to_json(), gantry=gantry, corrections=by_hand)
 
 
 def _site_snapshot(site: BoundSite) -> SiteSnapshot:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Select, Text, cast, delete, select
-from sqlalchemy.orm import Session, defer
+from sqlalchemy import Row, Text, bindparam, cast, delete, select
+from sqlalchemy.orm import Session
 
 from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom.facts import InstanceFacts
@@ -53,10 +53,32 @@ def is_behind_detector(gantry: dict[str, Any]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class StudyRun:
-    """One run of a study: the study's reference to it, the instance, its facts, and the study's own gantry values."""
+    """One run of a study.
 
-    link: StudyInstance
-    instance: Instance
+    Parameters
+    ----------
+    arrival : int
+        Rises in the order in which the runs came into the study.
+    file_name : str or None
+        As uploaded; may name the patient: never in a log, path or error.
+    site, site_by : str or None
+        Site that an upload or a person gave, and "upload" or "explicit".
+    own_gantry : dict
+        Gantry values that the study sets for this run.
+    sha256 : str
+        Content address of the file.
+    facts : InstanceFacts
+        Facts of the file's header.
+    defaults : dict
+        Gantry values of the study for all runs.
+    """
+
+    arrival: int
+    file_name: str | None
+    site: str | None
+    site_by: str | None
+    own_gantry: dict[str, Any]
+    sha256: str
     facts: InstanceFacts
     defaults: dict[str, Any]
 
@@ -78,7 +100,7 @@ class StudyRun:
 
     def gantry_with(self, defaults: dict[str, Any]) -> dict[str, Any]:
         """Return the gantry values with these defaults for the values that the run lacks."""
-        own, values = self.link.gantry, {}
+        own, values = self.own_gantry, {}
         for field in GANTRY_KEYWORDS:
             value = own.get(field)
             if value is None:
@@ -111,7 +133,7 @@ def _image_axes(facts: InstanceFacts, values: dict[str, Any]) -> ImageAxes:
 
 def runs_of(session: Session, study_id: str) -> list[StudyRun]:
     """Return all runs of a study in the order of arrival."""
-    return [_run(*row) for row in session.execute(_runs_query(study_id).order_by(StudyInstance.id))]
+    return [_run(row) for row in session.execute(_RUNS, {"study_id": study_id})]
 
 
 def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
@@ -122,24 +144,53 @@ def run_of(session: Session, study_id: str, uid: str) -> StudyRun:
     Problem
         404 when the study has no such run.
     """
-    row = session.execute(_runs_query(study_id).where(StudyInstance.sop_instance_uid == uid)).first()
+    row = session.execute(_ONE_RUN, {"study_id": study_id, "uid": uid}).first()
     if row is None:
         raise not_found("instance in this study")
-    return _run(*row)
+    return _run(row)
 
 
-def _runs_query(study_id: str) -> Select[StudyInstance, Instance, str, dict[str, Any]]:
-    return (
-        select(StudyInstance, Instance, cast(Instance.facts, Text), Study.gantry)
-        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
-        .join(Study, Study.id == StudyInstance.study_id)
-        .where(StudyInstance.study_id == study_id)
-        .options(defer(Instance.facts))
+def link_of(session: Session, study_id: str, uid: str) -> StudyInstance:
+    """Return the row of a study's reference to a run, for a change.
+
+    Raises
+    ------
+    Problem
+        404 when the study has no such run.
+    """
+    link = session.scalar(_LINK, {"study_id": study_id, "uid": uid})
+    if link is None:
+        raise not_found("instance in this study")
+    return link
+
+
+# Built once, and columns instead of whole rows: each request on a study reads its runs.
+_RUNS = (
+    select(
+        StudyInstance.id,
+        StudyInstance.file_name,
+        StudyInstance.site,
+        StudyInstance.site_by,
+        StudyInstance.gantry,
+        Instance.sha256,
+        cast(Instance.facts, Text),
+        Study.gantry,
     )
+    .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
+    .join(Study, Study.id == StudyInstance.study_id)
+    .where(StudyInstance.study_id == bindparam("study_id"))
+    .order_by(StudyInstance.id)
+)
+_ONE_RUN = _RUNS.where(StudyInstance.sop_instance_uid == bindparam("uid"))
+_LINK = select(StudyInstance).where(
+    StudyInstance.study_id == bindparam("study_id"), StudyInstance.sop_instance_uid == bindparam("uid")
+)
+_STORED_HASH = select(Instance.sha256).where(Instance.sop_instance_uid == bindparam("uid"))
 
 
-def _run(link: StudyInstance, instance: Instance, facts: str, defaults: dict[str, Any]) -> StudyRun:
-    return StudyRun(link, instance, _facts(facts), defaults)
+def _run(row: Row[int, str | None, str | None, str | None, dict[str, Any], str, str, dict[str, Any]]) -> StudyRun:
+    arrival, file_name, site, site_by, gantry, sha256, facts, defaults = row
+    return StudyRun(arrival, file_name, site, site_by, gantry, sha256, _facts(facts), defaults)
 
 
 @functools.lru_cache(maxsize=2048)
@@ -173,8 +224,8 @@ def add(
         409 when the store has another data set under the same SOP Instance UID.
     """
     files.lock(session)
-    known = session.get(Instance, facts.sop_instance_uid)
-    copy = known is not None and known.sha256 != sha256
+    known = session.scalar(_STORED_HASH, {"uid": facts.sop_instance_uid})
+    copy = known is not None and known != sha256
     if known is not None and copy and not _has_stored_data_set(path, known):
         raise Problem(
             409,
@@ -195,11 +246,7 @@ def add(
             )
         )
         session.flush()
-    link = session.scalar(
-        select(StudyInstance).where(
-            StudyInstance.study_id == study_id, StudyInstance.sop_instance_uid == facts.sop_instance_uid
-        )
-    )
+    link = session.scalar(_LINK, {"study_id": study_id, "uid": facts.sop_instance_uid})
     if link is not None:
         if site is not None and link.site_by != "explicit":
             link.site, link.site_by = site, "upload"
@@ -218,9 +265,9 @@ def add(
     return True
 
 
-def _has_stored_data_set(path: Path, known: Instance) -> bool:
+def _has_stored_data_set(path: Path, known: str) -> bool:
     try:
-        return have_same_data_set(path, files.checked_path(known.sha256))
+        return have_same_data_set(path, files.checked_path(known))
     except files.BrokenFile:
         return False
 
@@ -240,11 +287,11 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
     Problem
         404 when there is no such run, 409 while a job works on it.
     """
-    run = run_of(session, study_id, uid)
+    link = link_of(session, study_id, uid)
     active = session.scalars(select(Job.snapshot).where(Job.study_id == study_id, Job.state.not_in(list(ENDED_JOB))))
     if any(uid in snapshot["runs"] for snapshot in active):
         raise Problem(409, "job_running", "A job is working on this run; cancel it or wait for its end.")
-    session.delete(run.link)
+    session.delete(link)
     session.execute(delete(Correction).where(Correction.study_id == study_id, Correction.sop_instance_uid == uid))
     for site in session.scalars(select(Site).where(Site.study_id == study_id)):
         site.explicit_a = None if site.explicit_a == uid else site.explicit_a

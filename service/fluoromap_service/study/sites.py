@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Site, Study
 from fluoromap_service.study.binding import BoundSite, binding_of, rows_of
-from fluoromap_service.study.instances import StudyRun, runs_of
+from fluoromap_service.study.instances import link_of, runs_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,15 +146,21 @@ def put_views(session: Session, study: Study, name: str, views: dict[str, str | 
     session.flush()
 
 
-def move_run(session: Session, study: Study, run: StudyRun, site: str | None) -> None:
+def move_run(session: Session, study: Study, uid: str, site: str | None) -> None:
     """Put a run into a site by hand.
 
     None takes it out of every site, and the rules apply again.
+
+    Raises
+    ------
+    Problem
+        404 when the study has no such run.
     """
     for row in rows_of(session, study.id):
-        row.explicit_a = None if row.explicit_a == run.uid else row.explicit_a
-        row.explicit_b = None if row.explicit_b == run.uid else row.explicit_b
+        row.explicit_a = None if row.explicit_a == uid else row.explicit_a
+        row.explicit_b = None if row.explicit_b == uid else row.explicit_b
     if site is not None:
         mention(session, study.id, site)
-    run.link.site, run.link.site_by = site, None if site is None else "explicit"
+    link = link_of(session, study.id, uid)
+    link.site, link.site_by = site, None if site is None else "explicit"
     session.flush()

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import uuid
 
-from sqlalchemy import delete, select
+from sqlalchemy import bindparam, delete, select
 from sqlalchemy.orm import Session
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.models import ENDED_JOB, Job, Rendering, StageRow, Study, StudyInstance
+from fluoromap_service.study import instances
 from fluoromap_service.study.catheters import set_catalogue
-from fluoromap_service.study.instances import forget_instances
+from fluoromap_service.study.instances import StudyRun, forget_instances
 
 
 def create(
@@ -40,10 +41,30 @@ def get(session: Session, study_id: str) -> Study:
     Problem
         404 when there is none.
     """
-    study = session.get(Study, study_id)
+    study = session.scalars(_STUDY, {"study_id": study_id}).one_or_none()
     if study is None:
         raise not_found("study")
     return study
+
+
+_STUDY = select(Study).where(Study.id == bindparam("study_id"))
+# Read it again under the lock: it may have changed since this session read it.
+_LOCKED_STUDY = _STUDY.with_for_update().execution_options(populate_existing=True)
+_NOW = select(db_now())
+
+
+def runs_of(session: Session, study_id: str) -> list[StudyRun]:
+    """Return the runs of a study in the order of arrival.
+
+    Raises
+    ------
+    Problem
+        404 when there is no such study.
+    """
+    runs = instances.runs_of(session, study_id)
+    if not runs:
+        get(session, study_id)
+    return runs
 
 
 def lock(session: Session, study_id: str) -> Study:
@@ -51,13 +72,11 @@ def lock(session: Session, study_id: str) -> Study:
 
     Other transactions cannot change it until this one ends. The time of the change is stored.
     """
-    query = select(Study).where(Study.id == study_id).with_for_update()
-    # Read it again under the lock: it may have changed since this session read it.
-    study = session.scalars(query.execution_options(populate_existing=True)).one_or_none()
+    study = session.scalars(_LOCKED_STUDY, {"study_id": study_id}).one_or_none()
     if study is None:
         raise not_found("study")
     # Its runs, sites and corrections have no times of their own.
-    study.updated = session.scalars(select(db_now())).one()
+    study.updated = session.scalars(_NOW).one()
     return study
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
@@ -26,11 +28,13 @@ from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
-from fluoromap.triangulator.study_equations import site_equations
+from fluoromap.triangulator.study_equations import CalibrationSite, site_equations
 from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
-from fluoromap.triangulator.uncertainty import UncertaintyParams
+from fluoromap.triangulator.uncertainty import UncertaintyParams, study_covariance, study_sources
 
 NOISE_PX = 0.5
+ANOTHER_BEAT_MS = 800.0
+"""Time of the frame of view b: the two runs of a site show different beats."""
 CAMERAS = camera_from_gantry(LATERAL), camera_from_gantry(FRONTAL)
 Points = dict[str, Array]
 
@@ -71,7 +75,9 @@ def matched_sites(
         moved = {name: at + (shifts or {}).get(index, np.zeros(3)) for name, at in points.items()}
         a, b = observation(CAMERAS[0], points, rng, noise_px), observation(true_b, moved, rng, noise_px)
         pair = PhasePair(0.8, a, b)
-        sites.append(MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+        sites.append(
+            MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+        )
     return tuple(sites)
 
 
@@ -160,7 +166,9 @@ def test_a_wrong_gantry_is_shared_by_both_views() -> None:
         for index, points in enumerate(by_site):
             a, b = (observation(camera, points, rng) for camera in cameras)
             pair = PhasePair(0.8, a, b)
-            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+            sites.append(
+                MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+            )
         answer = located(tuple(sites))
         assert answer.calibration is not None
         assert answer.calibration.applied
@@ -296,7 +304,8 @@ def test_an_electrodes_own_bend_is_no_beat() -> None:
     """It does not grow with the beats, else precise pixels would show calm beats where whole catheters move."""
     (site,) = matched_sites(electrodes(74, sites=1), np.random.default_rng(74))
     params = UncertaintyParams(beat_sd_mm=0.0)
-    equations = site_equations(CAMERAS, pixels_in_both_views(site.diastole), DEFAULT_CATALOGUE, (), params)
+    pixels = pixels_in_both_views(site.diastole)
+    equations = site_equations(CalibrationSite(CAMERAS, pixels), CAMERAS, DEFAULT_CATALOGUE, (), params)
     assert (equations.beats == 0).all()
     assert np.linalg.eigvalsh(equations.fixed - np.diag(equations.pixel_variance)).min() > 0
     assert params.scaled(1.0, 2.0).bend_sd_mm == params.bend_sd_mm
@@ -412,7 +421,9 @@ def test_a_gantry_that_no_electrode_shows_is_in_the_ellipsoids() -> None:
                 for camera, of_view in zip(CAMERAS, turns, strict=True)
             )
             pair = PhasePair(0.8, a, b)
-            sites.append(MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.zeros(1)))
+            sites.append(
+                MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+            )
         answer = located(tuple(sites))
         found, true = errors(answer, by_site)
         covariances = np.array([point.covariance_mm2 for site in answer.sites for point in site.points])
@@ -487,3 +498,48 @@ def test_offsets_of_some_electrodes_add_their_own_error_and_those_of_all_add_non
     np.testing.assert_allclose(place, [13.0, 1.0, 1.0])
     np.testing.assert_allclose(added, 0.25 * 2 / 3 * np.eye(3))
     assert origin.from_electrodes((7,), at[:1]) is None
+
+
+class _Remembering(Silent):
+    """A context with a memory: ``computed`` are the kinds of the partial results that it had to compute."""
+
+    def __init__(self) -> None:
+        self.computed: list[str] = []
+        self._known: dict[str, Any] = {}
+
+    def recall(self, kind, inputs, compute):  # type: ignore[no-untyped-def]
+        with np.printoptions(threshold=100_000, precision=17):
+            key = repr((kind, inputs))
+        if key not in self._known:
+            self._known[key] = compute()
+            self.computed.append(kind.__name__)
+        return self._known[key]
+
+
+def test_a_corrected_diastole_locates_its_own_site_again() -> None:
+    first, *others = matched_sites(electrodes(3), np.random.default_rng(3))
+    triangulator, context = MaximumLikelihood(UncertaintyParams()), _Remembering()
+    triangulator.triangulate((first, *others), DEFAULT_CATALOGUE, context)
+    each = ["SiteLook", "Diastole", "SiteCycle"]
+    assert sorted(context.computed) == sorted((1 + len(others)) * each + ["StudyChecks"])
+
+    context.computed.clear()
+    chains = first.diastole.a.chains
+    moved = replace(chains[0], pixels_uv=chains[0].pixels_uv + 0.5)
+    pair = replace(first.diastole, a=replace(first.diastole.a, chains=(moved, *chains[1:])))
+    corrected = (replace(first, diastole=pair), *others)
+    again = triangulator.triangulate(corrected, DEFAULT_CATALOGUE, context)
+    assert sorted(context.computed) == sorted([*each, "StudyChecks"])
+    assert repr(again) == repr(located(corrected))
+
+
+@pytest.mark.parametrize(("breathing", "beats"), [(1.0, 1.0), (0.3, 1.6)])
+def test_the_size_of_the_study_errors_is_that_of_their_sources(breathing: float, beats: float) -> None:
+    points = electrodes(4)[0]
+    (site, *_) = matched_sites([points], np.random.default_rng(4))
+    labels = pixels_in_both_views(site.diastole).labels
+    params = UncertaintyParams().scaled(breathing, beats)
+    gantry = np.cov(np.random.default_rng(0).normal(size=(14, 40)))
+    sources = study_sources(CAMERAS, np.concatenate(list(points.values())), labels, DEFAULT_CATALOGUE, params, gantry)
+    whole = study_covariance(params, gantry, len(points))
+    np.testing.assert_allclose(whole, block_diag(*(source.covariance for source in sources)), rtol=1e-15)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from fluoromap_service.api.dicomweb.accept import not_acceptable
 from fluoromap_service.api.dicomweb.display import (
@@ -20,10 +20,11 @@ from fluoromap_service.api.dicomweb.display import (
     WindowFunction,
 )
 from fluoromap_service.api.dicomweb.stored import existing
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
 
-router = APIRouter(prefix="/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", include_in_schema=False)
 
 _MEDIA_TYPES: dict[str, MediaType] = {
     "image/jpeg": "image/jpeg", "image/png": "image/png", "image/*": "image/jpeg", "*/*": "image/jpeg",

@@ -5,16 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
-from fastapi import APIRouter, Request
+from fastapi import Request
 from fastapi.responses import JSONResponse, StreamingResponse
 
 from fluoromap_service.api.dicomweb.accept import accepted_types, asked_syntaxes, not_acceptable
 from fluoromap_service.api.dicomweb.store import DICOM_JSON
 from fluoromap_service.api.dicomweb.stored import StoredInstance, existing
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
 
-router = APIRouter(prefix="/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", include_in_schema=False)
 
 _BOUNDARY = "fluoromap-part-7d2f4c9e81b34a06"
 _EXPLICIT_LITTLE_ENDIAN = "1.2.840.10008.1.2.1"

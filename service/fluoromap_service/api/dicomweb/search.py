@@ -7,17 +7,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from fastapi.responses import JSONResponse
 from pydicom.datadict import dictionary_VR, tag_for_keyword
 
 from fluoromap_service.api.dicomweb.addresses import instance_url, series_url, study_url
 from fluoromap_service.api.dicomweb.store import DICOM_JSON
 from fluoromap_service.api.dicomweb.stored import StoredInstance, instances_of
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 
-router = APIRouter(prefix="/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", include_in_schema=False)
 
 DEFAULT_LIMIT, MOST_RESULTS = 100, 500
 STUDY_KEYWORDS = (

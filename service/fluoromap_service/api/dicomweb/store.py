@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Any
 
-from fastapi import APIRouter, Request
+from fastapi import Request
 from fastapi.responses import JSONResponse
 from python_multipart.multipart import parse_options_header
 from starlette.requests import ClientDisconnect
@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect
 from fluoromap_service.api.dicomweb.addresses import instance_url, study_url
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.multipart import MultipartBody, malformed
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.uploads import ArrivingPart, Part, arriving_file, in_upload_thread, write_all
 from fluoromap_service.dicom import InstanceFacts, read_instance
@@ -22,7 +23,7 @@ from fluoromap_service.store.audit import Act
 from fluoromap_service.store.engine import writing
 from fluoromap_service.study.arrivals import add_arrival
 
-router = APIRouter(prefix="/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", include_in_schema=False)
 
 DICOM_JSON = "application/dicom+json"
 

@@ -10,15 +10,14 @@ from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, Field
-from sqlalchemy import ColumnElement, select, tuple_
-from sqlalchemy.orm import Session, defer
+from sqlalchemy import ColumnElement, bindparam, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Delivery, Job, Study
 
 Item = TypeVar("Item")
 Model = TypeVar("Model")
-Created = TypeVar("Created", Study, Job, Delivery)
 
 
 class Page(BaseModel, Generic[Item]):
@@ -28,6 +27,26 @@ class Page(BaseModel, Generic[Item]):
     next: str | None = Field(description="Cursor of the next page; null on the last one.", examples=[None])
 
 
+class NewestFirst:
+    """The query of a list, the newest rows first.
+
+    A module builds it once: SQLAlchemy would build it anew for each request.
+
+    Parameters
+    ----------
+    kind : type
+        Table of the list.
+    *columns
+        Columns that the list shows, among them ``id`` and ``created``; by default whole rows.
+    """
+
+    def __init__(self, kind: type[Study | Job | Delivery], *columns: InstrumentedAttribute[Any]) -> None:
+        self.whole_rows = not columns
+        self.sort_key = tuple_(kind.created, kind.id)
+        query = select(*columns) if columns else select(kind)
+        self.query = query.order_by(kind.created.desc(), kind.id.desc()).limit(bindparam("rows"))
+
+
 class Paging:
     """The page that a client asks for.
 
@@ -35,21 +54,13 @@ class Paging:
     shows that another page follows.
     """
 
-    def __init__(
-        self,
-        request: Request,
-        response: Response,
-        limit: Annotated[int, Query(ge=1, le=500, description="Most items on a page.")] = 50,
-        cursor: Annotated[str | None, Query(max_length=500, description="`next` of the page before.")] = None,
-    ) -> None:
+    def __init__(self, request: Request, response: Response, limit: int, cursor: str | None) -> None:
         self._request = request
         self._response = response
         self.limit = limit
         self._after: Any = None if cursor is None else _decode(cursor)
 
-    def newest_first(
-        self, session: Session, kind: type[Created], *conditions: ColumnElement[bool]
-    ) -> Sequence[Created]:
+    def newest_first(self, session: Session, newest: NewestFirst, *conditions: ColumnElement[bool]) -> Sequence[Any]:
         """Return the rows of the page and one more, the newest first.
 
         Raises
@@ -57,16 +68,15 @@ class Paging:
         Problem
             400 when the cursor belongs to another list.
         """
-        query = select(kind).where(*conditions).order_by(kind.created.desc(), kind.id.desc()).limit(self.limit + 1)
-        if kind is Job:
-            # A snapshot has hundreds of kilobytes, and no list shows it.
-            query = query.options(defer(Job.snapshot))
-        after = self._key(float, str)
+        query, after = newest.query, self._key(float, str)
+        if conditions:
+            query = query.where(*conditions)
         if after is not None:
-            query = query.where(tuple_(kind.created, kind.id) < after)
-        return session.scalars(query).all()
+            query = query.where(newest.sort_key < after)
+        rows = session.execute(query, {"rows": self.limit + 1})
+        return rows.scalars().all() if newest.whole_rows else rows.all()
 
-    def page_of_newest(self, rows: Sequence[Created], shape: Callable[[Created], Item]) -> Page[Item]:
+    def page_of_newest(self, rows: Sequence[Any], shape: Callable[[Any], Item]) -> Page[Item]:
         """Return the page of the rows that :meth:`newest_first` found."""
         return self._page(rows, shape, lambda row: [row.created, row.id])
 
@@ -105,7 +115,17 @@ class Paging:
         return Page(items=[shape(item) for item in shown], next=following)
 
 
-Pages = Annotated[Paging, Depends()]
+async def _paging(
+    request: Request,
+    response: Response,
+    limit: Annotated[int, Query(ge=1, le=500, description="Most items on a page.")] = 50,
+    cursor: Annotated[str | None, Query(max_length=500, description="`next` of the page before.")] = None,
+) -> Paging:
+    # Not the class itself: FastAPI would run it in a thread.
+    return Paging(request, response, limit, cursor)
+
+
+Pages = Annotated[Paging, Depends(_paging)]
 
 
 def _encode(key: list[Any]) -> str:

@@ -10,7 +10,7 @@ from fastapi.dependencies.models import Dependant
 from fluoromap_service.problem import Problem
 
 
-def check_query_names(request: Request) -> None:
+async def check_query_names(request: Request) -> None:
     """Check that the route has every query parameter of the request.
 
     The application gives this dependency to all of its routes. The routes of DICOMweb check theirs themselves: their
@@ -21,7 +21,7 @@ def check_query_names(request: Request) -> None:
     Problem
         422 ``unknown_parameter`` with each unknown name.
     """
-    if request.scope["route"].path.startswith("/dicom-web/"):
+    if not request.scope["query_string"] or request.scope["route"].path.startswith("/dicom-web/"):
         return
     known = sorted(set(_names(request.scope["route"].dependant)))
     unknown = [name for name in dict.fromkeys(request.query_params) if name not in known]

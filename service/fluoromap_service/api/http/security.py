@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -20,7 +19,7 @@ from fluoromap_service import auth
 from fluoromap_service.api.http.problems import answer, database_away
 from fluoromap_service.api.http.session import session_token
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
-from fluoromap_service.auth import Caller, Scope
+from fluoromap_service.auth import Caller, Callers, Scope
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import DATABASE_AWAY
@@ -46,6 +45,7 @@ class Doorkeeper:
     def __init__(self, app: ASGIApp, sign_ins: SignInLimit) -> None:
         self._app = app
         self._sign_ins = sign_ins
+        self._callers = Callers()
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket") or scope["path"] in OPEN_PATHS:
@@ -53,7 +53,7 @@ class Doorkeeper:
             return
         connection = HTTPConnection(scope)
         try:
-            caller = await to_thread.run_sync(_identify, connection, self._sign_ins, limiter=_threads())
+            caller = await self._identify(connection)
             _demand(caller, Scope.READ if _only_reads(scope) else Scope.WRITE)
         except Problem as problem:
             if problem.status == 401 and _opens_page(connection):
@@ -66,6 +66,29 @@ class Doorkeeper:
             return
         scope.setdefault("state", {})["caller"] = caller
         await self._app(scope, receive, send)
+
+    async def _identify(self, connection: HTTPConnection) -> Caller:
+        text = bearer_token(connection) or session_token(connection)
+        token = None if text is None else auth.token_hash(text)
+        address = connection.client.host if connection.client else ""
+        if token is not None:
+            self._sign_ins.check(address, token)
+        caller = self._callers.remembered(token)
+        if caller is None:
+            caller = await to_thread.run_sync(self._callers.look_up, token, limiter=_threads())
+        if caller is None and token is None:
+            raise _unauthorised("This service needs an access token: send 'Authorization: Bearer <token>'.")
+        if caller is None:
+            self._sign_ins.failed(address)
+            log.warning("sign_in_failed", address=address)
+            raise _unauthorised(
+                "This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"'
+            )
+        if caller is auth.OPEN:
+            _check_local(connection)
+        elif token is not None:
+            self._sign_ins.succeeded(address, token)
+        return caller
 
 
 def _only_reads(scope: AsgiScope) -> bool:
@@ -83,28 +106,6 @@ def bearer_token(connection: HTTPConnection) -> str | None:
     """Return the token of the header ``Authorization``; None without one."""
     scheme, _, credentials = connection.headers.get("authorization", "").partition(" ")
     return (credentials.strip() or None) if scheme.lower() == "bearer" else None
-
-
-def _identify(connection: HTTPConnection, sign_ins: SignInLimit) -> Caller:
-    credentials = bearer_token(connection) or session_token(connection)
-    if credentials is not None:
-        token = hashlib.sha256(credentials.encode()).hexdigest()
-        address = connection.client.host if connection.client else ""
-        sign_ins.check(address, token)
-        caller = auth.verify(credentials)
-        if caller is not None:
-            sign_ins.succeeded(address, token)
-            return caller
-        if auth.any_token():
-            sign_ins.failed(address)
-            log.warning("sign_in_failed", address=address)
-            raise _unauthorised(
-                "This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"'
-            )
-    elif auth.any_token():
-        raise _unauthorised("This service needs an access token: send 'Authorization: Bearer <token>'.")
-    _check_local(connection)
-    return auth.OPEN
 
 
 def _unauthorised(detail: str, challenge: str = "") -> Problem:

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterable
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header
+from fastapi import Depends, Header
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
@@ -14,15 +14,20 @@ from starlette.concurrency import run_in_threadpool
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import job_of
+from fluoromap_service.store.changes import Change, last_change
 from fluoromap_service.store.engine import DATABASE_AWAY, reading
 from fluoromap_service.store.models import ENDED_JOB, Event
 
-router = APIRouter(tags=["jobs"])
+router = new_router(tags=["jobs"])
 
 POLL_SECONDS = 0.25
+"""Longest time between two queries for new events."""
+LOOKS = 5
+"""How often within that time a stream looks whether the database has changed, where this costs no query."""
 OVERLAP = 100
 """Events get their ids before their commit, so an id lower than the newest by up to this number may still appear."""
 
@@ -73,6 +78,7 @@ async def follow_job(
     sent: set[int] = set()
     newest = after
     while True:
+        change = last_change()
         try:
             ended, found = await run_in_threadpool(_new_events, job_id, max(after, newest - OVERLAP))
         except DATABASE_AWAY:
@@ -85,7 +91,14 @@ async def follow_job(
                 yield ServerSentEvent(data=event.data, event=event.kind, id=str(event.id))
         if ended or stopping.begun():
             return
-        await asyncio.sleep(POLL_SECONDS)
+        await _until_changed(change)
+
+
+async def _until_changed(change: Change | None) -> None:
+    for _ in range(LOOKS):
+        await asyncio.sleep(POLL_SECONDS / LOOKS)
+        if change is not None and change != last_change():
+            return
 
 
 def _new_events(job_id: str, after: int) -> tuple[bool, list[Event]]:

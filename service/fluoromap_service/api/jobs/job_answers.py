@@ -7,7 +7,7 @@ from http import HTTPStatus
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import case, func, select
+from sqlalchemy import Row, bindparam, case, func, select
 from sqlalchemy.orm import Session
 
 from fluoromap.reasons import Reason
@@ -115,7 +115,7 @@ def job_answer(job: Job, stages: Sequence[StageRow], warnings: Sequence[Reason] 
         created=rfc3339(job.created),
         started=rfc3339_or_none(job.started),
         finished=rfc3339_or_none(job.finished),
-        links=_links(job),
+        links=_links(job.id),
     )
 
 
@@ -124,17 +124,32 @@ def read_job(session: Session, job: Job) -> JobAnswer:
     return job_answer(job, stages_of(session, job.id), warnings_of(session, job))
 
 
-def job_summaries(session: Session, jobs: Sequence[Job]) -> dict[str, JobSummary]:
+SUMMARY_COLUMNS = (Job.id, Job.study_id, Job.state, Job.error, Job.created, Job.started, Job.finished)
+"""Columns that the entry of a job in a list shows. A snapshot has hundreds of kilobytes."""
+
+_PROGRESS_PART = case((StageRow.state.in_(list(ENDED_STAGE)), 1.0), else_=StageRow.progress)
+_PROGRESS = (
+    select(StageRow.job_id, func.avg(_PROGRESS_PART))
+    .where(StageRow.job_id.in_(bindparam("jobs", expanding=True)))
+    .group_by(StageRow.job_id)
+)
+
+
+def job_summaries(session: Session, jobs: Sequence[Row[*tuple[Any, ...]]]) -> dict[str, JobSummary]:
     """Return the entries of several jobs in a list, by their ids.
 
     The database computes the progress of the running jobs; no stage of a queued job has begun. No stage and no snapshot is read.
+
+    Parameters
+    ----------
+    session : Session
+    jobs : sequence of Row
+        With :data:`SUMMARY_COLUMNS`.
     """
     progress = {job.id: 0.0 for job in jobs if job.state == JobState.QUEUED}
     active = [job.id for job in jobs if job.state == JobState.RUNNING]
-    part = case((StageRow.state.in_(list(ENDED_STAGE)), 1.0), else_=StageRow.progress)
-    means = select(StageRow.job_id, func.avg(part)).where(StageRow.job_id.in_(active)).group_by(StageRow.job_id)
     if active:
-        progress |= {job_id: round(mean, 4) for job_id, mean in session.execute(means)}
+        progress |= {job_id: round(mean, 4) for job_id, mean in session.execute(_PROGRESS, {"jobs": active})}
     return {
         job.id: JobSummary(
             id=job.id,
@@ -145,14 +160,14 @@ def job_summaries(session: Session, jobs: Sequence[Job]) -> dict[str, JobSummary
             created=rfc3339(job.created),
             started=rfc3339_or_none(job.started),
             finished=rfc3339_or_none(job.finished),
-            links=_links(job),
+            links=_links(job.id),
         )
         for job in jobs
     }
 
 
-def _links(job: Job) -> Links:
-    root = f"/v1/jobs/{job.id}"
+def _links(job_id: str) -> Links:
+    root = f"/v1/jobs/{job_id}"
     return Links(
         points=f"{root}/points",
         tracks=f"{root}/tracks",

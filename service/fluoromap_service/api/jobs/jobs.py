@@ -6,7 +6,7 @@ import asyncio
 import time
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -15,11 +15,19 @@ from starlette.concurrency import run_in_threadpool
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.idempotency import OnceJson
-from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paging import NewestFirst, Page, Pages
 from fluoromap_service.api.http.paths import JobId, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
-from fluoromap_service.api.jobs.job_answers import JobAnswer, JobSummary, etag_of, job_summaries, read_job
+from fluoromap_service.api.jobs.job_answers import (
+    SUMMARY_COLUMNS,
+    JobAnswer,
+    JobSummary,
+    etag_of,
+    job_summaries,
+    read_job,
+)
 from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.results.finished import job_of
@@ -27,7 +35,9 @@ from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import ENDED_JOB, Job, Study
 from fluoromap_service.study.freeze import PipelineRequest, freeze
 
-router = APIRouter(tags=["jobs"])
+router = new_router(tags=["jobs"])
+
+_JOBS = NewestFirst(Job, *SUMMARY_COLUMNS)
 
 POLL_SECONDS = 0.25
 """Time between two queries of the database while a client waits."""
@@ -107,7 +117,7 @@ def list_jobs(
 ) -> Page[JobSummary]:
     """List all jobs, the newest first, without their stages and warnings."""
     with reading() as session:
-        found = pages.newest_first(session, Job, *([] if study is None else [Job.study_id == study]))
+        found = pages.newest_first(session, _JOBS, *([] if study is None else [Job.study_id == study]))
         answers = job_summaries(session, found)
     return pages.page_of_newest(found, lambda job: answers[job.id])
 

@@ -7,15 +7,15 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from typing import IO, cast
 
-from fastapi import APIRouter
 from fastapi.responses import StreamingResponse
 
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.archive_files import ArchiveFile, archive_files
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 _DATE = (1980, 1, 1, 0, 0, 0)
 """The date of every file in the archive, so that the same results give the same bytes."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Annotated
 
 import pydicom
-from fastapi import APIRouter, Query
+from fastapi import Query
 from fastapi.responses import StreamingResponse
 from starlette.background import BackgroundTask
 
@@ -21,6 +21,7 @@ from fluoromap_service.api.http.csv_answers import csv_text
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.points import points_csv, points_of
 from fluoromap_service.api.results.result_objects import JobObjects, plan_objects
@@ -35,7 +36,7 @@ from fluoromap_service.store import files, reidentification
 from fluoromap_service.store.engine import reading
 from fluoromap_service.study.snapshot import SiteSnapshot
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 _DATE = (1980, 1, 1, 0, 0, 0)
 """The date of every file in the zip."""

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Response
+from fastapi import Query, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http.idempotency import OnceJson
-from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paging import NewestFirst, Page, Pages
 from fluoromap_service.api.http.paths import DeliveryId, JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339, rfc3339_or_none
 from fluoromap_service.api.results.result_objects import plan_objects
@@ -21,7 +22,9 @@ from fluoromap_service.problem import not_found
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Delivery, DeliveryObject, DeliveryState, ObjectState
 
-router = APIRouter(tags=["deliveries"])
+router = new_router(tags=["deliveries"])
+
+_DELIVERIES = NewestFirst(Delivery)
 
 State = Literal["pending", "delivered", "failed"]
 _STATES: dict[State, tuple[DeliveryState, ...]] = {
@@ -106,7 +109,7 @@ def list_deliveries(
     if state is not None:
         conditions.append(Delivery.state.in_(_STATES[state]))
     with reading() as session:
-        found = pages.newest_first(session, Delivery, *conditions)
+        found = pages.newest_first(session, _DELIVERIES, *conditions)
     return pages.page_of_newest(found, _summary)
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from fluoromap_service.api.http.etags import file_response
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.result_objects import objects_zip
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 
 @router.get(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap.contracts import Array, ChamberMap, SurfaceSite
@@ -15,6 +15,7 @@ from fluoromap_service.api.http.etags import file_response, is_known, not_modifi
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position
 from fluoromap_service.results.dependencies import map_picture_dependencies
@@ -25,7 +26,7 @@ from fluoromap_service.results.origins import Origin
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 
 class MapSite(BaseModel):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap.drawing.colours import Palette
@@ -18,6 +18,7 @@ from fluoromap_service.api.http.file_names import plain_name
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import InstanceUid, JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import overlay_dependencies
@@ -29,7 +30,7 @@ from fluoromap_service.store.engine import reading
 from fluoromap_service.store.renderings import KeptFile, kept_rendering
 from fluoromap_service.study.run_files import checked_run
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 
 class Overlay(BaseModel):

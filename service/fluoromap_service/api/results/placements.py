@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap.contracts import Array, NamedChain
 from fluoromap_service.api.http.paths import InstanceUid, JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import Position
 from fluoromap_service.dicom import InstanceFacts
@@ -18,7 +18,7 @@ from fluoromap_service.results.finished import job_of
 from fluoromap_service.results.placement import placement_of
 from fluoromap_service.store.engine import reading
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 

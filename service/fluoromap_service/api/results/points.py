@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
@@ -14,6 +14,7 @@ from fluoromap.reasons import Reason
 from fluoromap_service.api.http.csv_answers import csv_entry, csv_response, csv_text, wants_csv
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Six
 from fluoromap_service.api.results.study_geometry import StudyGeometry, study_geometry
@@ -26,7 +27,7 @@ from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 from fluoromap_service.store.models import Point as PointRow
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 
 class PointView(BaseModel):

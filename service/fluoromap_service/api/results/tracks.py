@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -27,6 +27,7 @@ from fluoromap_service.api.http.csv_answers import (
 )
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position, Six
 from fluoromap_service.results.dependencies import tracks_table_dependencies
@@ -37,7 +38,7 @@ from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 from fluoromap_service.store.renderings import KeptFile, kept_rendering
 
-router = APIRouter(tags=["results"])
+router = new_router(tags=["results"])
 
 _UPPER = np.triu_indices(3)
 

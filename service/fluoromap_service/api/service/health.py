@@ -6,10 +6,11 @@ from collections.abc import Callable
 from typing import Literal
 
 import structlog
-from fastapi import APIRouter, Response
+from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import select
 
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.jobs import living_workers, queue
 from fluoromap_service.jobs.stall import StallWatch, stall_seconds
 from fluoromap_service.settings import settings
@@ -17,7 +18,7 @@ from fluoromap_service.store import disk, files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 
-router = APIRouter(tags=["service"])
+router = new_router(tags=["service"])
 
 _stall = StallWatch()
 

@@ -7,12 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http.middleware.access_log import RequestCounts
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.jobs.job_life import SECONDS_BUCKETS
 from fluoromap_service.jobs.pipeline import STAGES
@@ -32,7 +33,7 @@ from fluoromap_service.store.models import (
 )
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-router = APIRouter(tags=["service"])
+router = new_router(tags=["service"])
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,16 +10,17 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 import fluoromap_service
 from fluoromap_service.api.http.etags import is_known
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import SESSION, SIGN_IN, Reader, bearer_token
 from fluoromap_service.api.http.session import begin_session, end_session
 from fluoromap_service.auth import OPEN
 from fluoromap_service.problem import not_found
 
-router = APIRouter(include_in_schema=False)
+router = new_router(include_in_schema=False)
 
 ASSETS = Path(fluoromap_service.__file__).resolve().parent / "web" / "assets"
 PAGE = "page.html"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap import registry
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 
-router = APIRouter(tags=["plugins"])
+router = new_router(tags=["plugins"])
 
 
 class Plugin(BaseModel):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from fluoromap.reasons import Reason
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 
-router = APIRouter(tags=["service"])
+router = new_router(tags=["service"])
 
 
 class ReasonOut(BaseModel):

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
+from fastapi import Request
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.csv_input import activation_times, csv_body, csv_text
 from fluoromap_service.store.engine import writing
 from fluoromap_service.study import sites, studies
 
-router = APIRouter(prefix="/v1/studies/{study_id}", tags=["sites"])
+router = new_router("/v1/studies/{study_id}", tags=["sites"])
 
 
 class TableOut(BaseModel):

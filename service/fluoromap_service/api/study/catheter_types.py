@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap.catheters import CATHETER_TYPES, catheter_type
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 
-router = APIRouter(tags=["studies"])
+router = new_router(tags=["studies"])
 
 
 class CatheterType(BaseModel):

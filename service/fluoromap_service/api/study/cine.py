@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.dicom import cine_8bit
 from fluoromap_service.problem import not_found
@@ -17,7 +18,7 @@ from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.study import instances
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
 MOST_BYTES = 16 * 2**20
 """Size of an answer, unless a single frame is larger."""
@@ -51,10 +52,10 @@ def get_frames(
     if first > facts.frames:
         raise not_found("frame")
     sent = min(count, facts.frames - first + 1, max(1, MOST_BYTES // (facts.rows * facts.columns)))
-    etag = f'"{run.instance.sha256[:32]}-{first}-{sent}"'
+    etag = f'"{run.sha256[:32]}-{first}-{sent}"'
     if is_known(request, etag):
         return not_modified(etag)
-    path = files.path_of(run.instance.sha256)
+    path = files.path_of(run.sha256)
     content = run_in_pool(Task.DRAW_PICTURE, cine_8bit, path, facts, first - 1, sent)
     return Response(
         content,

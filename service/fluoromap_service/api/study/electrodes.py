@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Body, Response
+from fastapi import Body, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.results.detections import detected_electrodes
@@ -21,7 +22,7 @@ from fluoromap_service.study.catheters import catalogue_of
 from fluoromap_service.study.instances import StudyRun
 from fluoromap_service.study.snapshot import CorrectedElectrode
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances/{uid}/frames/{n}/electrodes", tags=["electrodes"])
+router = new_router("/v1/studies/{study_id}/instances/{uid}/frames/{n}/electrodes", tags=["electrodes"])
 
 
 class ElectrodeIn(BaseModel):

@@ -5,16 +5,17 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Query
+from fastapi import Query
 from pydantic import BaseModel, Field
 
 from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.results.epipolar import epipolar_line
 from fluoromap_service.store.engine import reading
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["electrodes"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["electrodes"])
 
 Pixel = Annotated[float, Query(ge=-10_000, le=10_000)]
 

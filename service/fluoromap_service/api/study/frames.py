@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
@@ -14,6 +14,7 @@ from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.dicom import frame_png
 from fluoromap_service.problem import Problem, not_found
@@ -24,7 +25,7 @@ from fluoromap_service.study.catheters import catalogue_of
 from fluoromap_service.study.instances import StudyRun
 from fluoromap_service.study.preview import ScaleSource
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
 
 class PreviewElectrodeOut(BaseModel):
@@ -79,16 +80,16 @@ def get_frame(
     chosen = None if window is None else _window(window)
     run, catalogue = _run_with_frame(study_id, uid, n)
     if electrodes:
-        path, px_per_mm = files.checked_path(run.instance.sha256), _px_per_mm(run)
+        path, px_per_mm = files.checked_path(run.sha256), _px_per_mm(run)
         marked = run_in_pool(
             Task.FIND_ELECTRODES, preview.preview_png, path, run.facts, catalogue, n - 1, px_per_mm, chosen
         )
         return Response(marked, media_type="image/png", headers={"Cache-Control": "no-store"})
     shown = "" if chosen is None else f"-{chosen[0]:g}-{chosen[1]:g}"
-    etag = f'"{run.instance.sha256[:32]}-{n}{shown}"'
+    etag = f'"{run.sha256[:32]}-{n}{shown}"'
     if is_known(request, etag):
         return not_modified(etag)
-    path = files.checked_path(run.instance.sha256)
+    path = files.checked_path(run.sha256)
     picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
     # A stored file never changes, so a browser may keep the picture.
     return Response(
@@ -103,7 +104,7 @@ def get_preview(study_id: StudyId, uid: InstanceUid, n: FrameNumber, caller: Rea
     The run's geometry may be incomplete: then the scale is found from the study's catheters, and `scale` says so.
     """
     run, catalogue = _run_with_frame(study_id, uid, n)
-    path = files.checked_path(run.instance.sha256)
+    path = files.checked_path(run.sha256)
     found = run_in_pool(
         Task.FIND_ELECTRODES, preview.preview_electrodes, path, run.facts, catalogue, n - 1, _px_per_mm(run)
     )

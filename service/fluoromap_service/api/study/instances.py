@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -15,19 +15,20 @@ from fluoromap_service.api.http.idempotency import Once, OnceUpload
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import ProblemDocument, document, responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
 from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
 from fluoromap_service.api.study.uploads import Part, in_upload_thread, receive
 from fluoromap_service.dicom import InstanceFacts, read_instance
-from fluoromap_service.problem import Problem
+from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
 from fluoromap_service.study import instances, sites, studies
 from fluoromap_service.study.binding import BoundSite, binding_of, views_of
 from fluoromap_service.study.instances import StudyRun
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["instances"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
 SITE = "Mapping site of all runs of the request."
 
@@ -217,22 +218,24 @@ def _shapes(session: Session, study: Study, uids: list[str]) -> list[dict[str, A
 def list_instances(study_id: StudyId, pages: Pages, caller: Reader) -> Page[InstanceOut]:
     """List the study's runs in the order of arrival."""
     with reading() as session:
-        study = studies.get(session, study_id)
-        runs = instances.runs_of(session, study_id)
-        views = views_of(binding_of(session, study.id, runs=runs))
+        runs = studies.runs_of(session, study_id)
+        views = views_of(binding_of(session, study_id, runs=runs))
         return pages.page_of_all(runs, lambda run: instance_shape(run, views), lambda run: run.uid)
 
 
-def _one(session: Session, study: Study, uid: str) -> InstanceOut:
-    run = instances.run_of(session, study.id, uid)
-    return instance_shape(run, views_of(binding_of(session, study.id)))
+def _one(session: Session, study_id: str, uid: str) -> InstanceOut:
+    runs = studies.runs_of(session, study_id)
+    run = next((run for run in runs if run.uid == uid), None)
+    if run is None:
+        raise not_found("instance in this study")
+    return instance_shape(run, views_of(binding_of(session, study_id, runs=runs)))
 
 
 @router.get("/{uid}", responses=responses(401, 403, 404, 422))
 def get_instance(study_id: StudyId, uid: InstanceUid, caller: Reader) -> InstanceOut:
     """Return one run."""
     with reading() as session:
-        return _one(session, studies.get(session, study_id), uid)
+        return _one(session, study_id, uid)
 
 
 @router.patch("/{uid}", responses=responses(400, 401, 403, 404, 422))
@@ -240,14 +243,15 @@ def change_instance(study_id: StudyId, uid: InstanceUid, body: InstancePatch, ca
     """Complete or override the gantry of the header, or move the run to another site."""
     with writing() as session:
         study = studies.lock(session, study_id)
-        run = instances.run_of(session, study_id, uid)
+        link = instances.link_of(session, study_id, uid)
         if "site" in body.model_fields_set:
-            sites.move_run(session, study, run, body.site)
+            sites.move_run(session, study, uid, body.site)
         if "gantry" in body.model_fields_set:
-            run.link.gantry = changed_gantry(run.link.gantry, body.gantry)
-            check_gantry(run.gantry_with({}))
+            link.gantry = changed_gantry(link.gantry, body.gantry)
+            session.flush()
+            check_gantry(instances.run_of(session, study_id, uid).gantry_with({}))
         session.flush()
-        return _one(session, study, uid)
+        return _one(session, study_id, uid)
 
 
 @router.delete("/{uid}", status_code=204, response_class=Response, responses=responses(401, 403, 404, 409, 422))

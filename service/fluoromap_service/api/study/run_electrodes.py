@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from fluoromap_service.api.http.paths import InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.study.electrodes import ElectrodeOut
 from fluoromap_service.results.detections import detections_of_run
 from fluoromap_service.store.engine import reading
 from fluoromap_service.study import corrections, instances
 
-router = APIRouter(prefix="/v1/studies/{study_id}/instances", tags=["electrodes"])
+router = new_router("/v1/studies/{study_id}/instances", tags=["electrodes"])
 
 
 class FrameElectrodes(BaseModel):

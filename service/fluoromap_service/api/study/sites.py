@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from fluoromap_service.api.http.paging import Page, Pages
 from fluoromap_service.api.http.paths import SiteName, StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.study import sites, studies
 from fluoromap_service.study.binding import BoundSite, binding_of, site_of
 
-router = APIRouter(prefix="/v1/studies/{study_id}/sites", tags=["sites"])
+router = new_router("/v1/studies/{study_id}/sites", tags=["sites"])
 
 
 class SiteOut(BaseModel):
@@ -80,7 +80,7 @@ def list_sites(study_id: StudyId, pages: Pages, caller: Reader) -> Page[SiteOut]
     The pairs of runs that have no name yet follow.
     """
     with reading() as session:
-        binding = binding_of(session, studies.get(session, study_id).id)
+        binding = binding_of(session, study_id, runs=studies.runs_of(session, study_id))
         return pages.page_of_all((*binding.sites, *binding.pairs), _shape, lambda site: site.site or f"/{site.pair}")
 
 

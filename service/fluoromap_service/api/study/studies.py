@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from fastapi import Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap_service.api.http.idempotency import OnceJson
-from fluoromap_service.api.http.paging import Page, Pages
+from fluoromap_service.api.http.paging import NewestFirst, Page, Pages
 from fluoromap_service.api.http.paths import StudyId
 from fluoromap_service.api.http.problems import responses
+from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339
 from fluoromap_service.api.study.catheters import MOST_CATHETERS, CatheterIn, Line
@@ -29,7 +30,10 @@ from fluoromap_service.study.catheters import (
 )
 from fluoromap_service.study.instances import runs_of, unlink_unreferenced
 
-router = APIRouter(prefix="/v1/studies", tags=["studies"])
+router = new_router("/v1/studies", tags=["studies"])
+
+
+_STUDIES = NewestFirst(Study)
 
 
 class StudyIn(BaseModel):
@@ -113,7 +117,7 @@ def create_study(body: StudyIn, once: OnceJson, caller: Writer) -> Response:
 def list_studies(pages: Pages, caller: Reader) -> Page[StudyOut]:
     """List the studies, the newest first."""
     with reading() as session:
-        return pages.page_of_newest(pages.newest_first(session, Study), _shape)
+        return pages.page_of_newest(pages.newest_first(session, _STUDIES), _shape)
 
 
 @router.get("/{study_id}", responses=responses(401, 403, 404))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from types import FrameType
 
@@ -13,7 +14,12 @@ from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.connections import TimedConnection
 from fluoromap_service.cli.database_failures import explain_database_failures
-from fluoromap_service.cli.environment import apply_options, end_with_supervisor, keep_compiled_kernels
+from fluoromap_service.cli.environment import (
+    apply_options,
+    end_with_supervisor,
+    keep_compiled_kernels,
+    return_freed_memory,
+)
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir, Host, Port
 from fluoromap_service.deliveries import outbox
@@ -25,6 +31,9 @@ from fluoromap_service.store.engine import writing
 STOP_SECONDS = 5
 """Time that open requests get at the end."""
 
+SWITCH_SECONDS = 0.001
+"""Longest time that a thread computes while the event loop waits for the interpreter; Python's own default is 5 ms."""
+
 app = typer.Typer(add_completion=False)
 
 
@@ -34,6 +43,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     end_with_supervisor()
     apply_options(host, port, data_dir)
     keep_compiled_kernels()
+    return_freed_memory()
     logs.configure()
     with explain_database_failures():
         schema.check()
@@ -41,6 +51,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
         # A request may name a target before the sender has started.
         with writing() as session:
             outbox.register(session, read_targets())
+    sys.setswitchinterval(SWITCH_SECONDS)
     service = create_app()
     config = uvicorn.Config(
         service,

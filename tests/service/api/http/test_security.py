@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import re
+import sqlite3
+import time
+from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from sql_statements import sql_statements
 
 from fluoromap_service import auth
 from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http.security import OPEN_PATHS
 from fluoromap_service.problem import Problem
+from fluoromap_service.settings import settings
+from fluoromap_service.store import schema
 
 
 def _bearer(token: str) -> dict[str, str]:
@@ -62,6 +68,59 @@ def test_the_first_token_closes_the_service_at_once(service: TestClient) -> None
     auth.revoke_token("first")
     assert service.get("/v1/studies", headers=_bearer(token)).status_code == 401
     assert service.get("/v1/studies").status_code == 401
+
+
+def _asks_for_tokens(service: TestClient, headers: dict[str, str]) -> bool:
+    with sql_statements() as statements:
+        assert service.get("/v1/studies", headers=headers).status_code == 200
+    return any("FROM token" in statement for statement in statements)
+
+
+def test_a_sign_in_is_remembered_until_the_database_changes(service: TestClient) -> None:
+    assert [_asks_for_tokens(service, {}) for _ in range(2)] == [True, False]
+    first, second = auth.create_token("first", ["read"]), auth.create_token("second", ["write"])
+    for token in (first, second):
+        assert [_asks_for_tokens(service, _bearer(token)) for _ in range(2)] == [True, False]
+    service.post("/v1/studies", json={"label": "x"}, headers=_bearer(second))
+    assert [_asks_for_tokens(service, _bearer(first)) for _ in range(2)] == [True, False]
+    # A token that is remembered gives another one no rights.
+    assert service.post("/v1/studies", json={"label": "x"}, headers=_bearer(first)).status_code == 403
+    for headers in ({}, _bearer("wrong"), _bearer(f"{first}x")):
+        assert service.get("/v1/studies", headers=headers).status_code == 401
+
+
+def test_another_program_revokes_a_remembered_token(service: TestClient, data_dir: Path) -> None:
+    token = auth.create_token("x", ["read"])
+    for _ in range(2):
+        assert service.get("/v1/studies", headers=_bearer(token)).status_code == 200
+    program = sqlite3.connect(data_dir / "fluoromap.sqlite")
+    program.execute("UPDATE token SET revoked = 1")
+    assert service.get("/v1/studies", headers=_bearer(token)).status_code == 200
+    program.commit()
+    program.close()
+    assert service.get("/v1/studies", headers=_bearer(token)).status_code == 401
+
+
+def test_a_remembered_token_expires(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    token = auth.create_token("brief", ["read"], expires_seconds=3600)
+    assert [_asks_for_tokens(service, _bearer(token)) for _ in range(2)] == [True, False]
+    later = time.time() + 3601
+    monkeypatch.setattr(auth.time, "time", lambda: later)
+    # Only the memory believes that the hour is over; the database's clock says that the token is valid.
+    assert _asks_for_tokens(service, _bearer(token))
+
+
+def test_postgresql_is_asked_each_time(postgres_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLUOROMAP_DATABASE_URL", postgres_url)
+    settings.cache_clear()
+    schema.upgrade()
+    service = TestClient(create_app(), base_url="http://127.0.0.1")
+    assert service.get("/v1/studies").status_code == 200
+    token = auth.create_token("x", ["read"])
+    assert service.get("/v1/studies").status_code == 401
+    assert [_asks_for_tokens(service, _bearer(token)) for _ in range(2)] == [True, True]
+    auth.revoke_token("x")
+    assert service.get("/v1/studies", headers=_bearer(token)).status_code == 401
 
 
 @pytest.mark.parametrize("header", ["Bearer", "Bearer ", "Bearer wrong", "Basic dXNlcjpwYXNz", "wrong", "Bearer \xe4"])

@@ -1,0 +1,59 @@
+"""Routers of the service: all routes check the names of their parameters, and a request takes one thread."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from enum import Enum
+from typing import Any
+
+from fastapi import APIRouter, Depends
+from fastapi.routing import APIRoute
+from starlette.concurrency import run_in_threadpool
+
+from fluoromap_service.api.http.query_names import check_query_names
+
+
+class OneThreadRoute(APIRoute):
+    """A route whose ordinary function runs in a thread, and nothing else of the request.
+
+    FastAPI would check the answer of such a function in a second thread, and wait for it. Coroutines and streams stay as they are.
+    """
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        super().__init__(path, _in_thread(endpoint), **options)
+
+
+_NOT_ORDINARY = (inspect.iscoroutinefunction, inspect.isasyncgenfunction, inspect.isgeneratorfunction)
+
+
+def _in_thread(function: Callable[..., Any]) -> Callable[..., Any]:
+    if any(kind(function) for kind in _NOT_ORDINARY):
+        return function
+
+    @functools.wraps(function)
+    async def run(**values: Any) -> Any:
+        return await run_in_threadpool(function, **values)
+
+    return run
+
+
+def new_router(prefix: str = "", *, tags: list[str | Enum] | None = None, include_in_schema: bool = True) -> APIRouter:
+    """Return an empty router whose routes the application takes over as they are."""
+    return APIRouter(
+        prefix=prefix,
+        tags=tags,
+        include_in_schema=include_in_schema,
+        dependencies=[Depends(check_query_names)],
+        generate_unique_id_function=_operation_id,
+        route_class=OneThreadRoute,
+    )
+
+
+def _operation_id(route: APIRoute) -> str:
+    """Return the name of a route's function.
+
+    Generators of clients name their calls after it.
+    """
+    return route.name
