@@ -123,10 +123,28 @@ class _FittedSet:
     unlisted: tuple[CandidateChain, ...]
     sure: bool
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchedImage:
+    """A log image, what the proposer says about it, and the chains that were found in it.
+
+    proposed : the candidates of the search.
+    """
+
+    x: Image
+    seen: ImageEvidence
+    proposed: Proposals
+    found: _FittedSet
+
     @property
     def explained(self) -> int:
         """Number of the chains' electrodes."""
-        return sum(len(chain.electrodes) for chain in self.chains)
+        return sum(len(chain.electrodes) for chain in self.found.chains)
+
+    def entry(self, frame: int) -> FrameChains:
+        """Return the chains, or the reason why there are none."""
+        sure = self.found.sure and self.found.chains
+        return FrameChains(frame, self.found.chains, None if sure else Reason.MANUAL_NEEDED)
 
 
 @dataclass(slots=True, eq=False)
@@ -157,38 +175,44 @@ class ChainDetector:
         return evidence(probability, self.acceptance.trust)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
-        """Return the chains of one log image, or the reason why there are none.
+        """Return the chains of one log image, or the reason why there are none."""
+        return self.search(x).entry(frame)
+
+    def search(self, x: Image) -> SearchedImage:
+        """Search the chains of one log image.
 
         One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
         accepted too. Weaker chains alone come with ``manual_needed``.
         """
-        if min(x.shape) < 16:
-            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         seen = self.image_evidence(x)
-        electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
-        proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
-        families = catheter_families(self.catalogue)
-        result = self._search(x, seen, proposed, families)
-        # Split pairs must not make a part of an unlisted catheter a listed one.
-        if result.explained < electrodes and not result.unlisted:
-            halves = seen.halves_of_pairs(self.field.candidates)
-            if len(halves):
-                split = self._search(x, seen, proposed.with_more(halves), families, len(halves))
-                result = split if split.explained > result.explained else result
-        return FrameChains(frame, result.chains, None if result.sure and result.chains else Reason.MANUAL_NEEDED)
+        proposed = seen.proposals(self.field.candidates, max(2, self._electrodes // 2))
+        return SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
 
-    def _search(
-        self,
-        x: Image,
-        seen: ImageEvidence,
-        proposed: Proposals,
-        families: tuple[CatheterFamily, ...],
-        halves: int = 0,
-    ) -> _FittedSet:
+    def split_pairs(self, searched: SearchedImage) -> SearchedImage:
+        """Search an image again with both electrodes of pairs that were proposed as one.
+
+        The result is the image as it was searched before, where the split explains no more electrodes.
+        """
+        # Split pairs must not make a part of an unlisted catheter a listed one.
+        if searched.explained >= self._electrodes or searched.found.unlisted:
+            return searched
+        halves = searched.seen.halves_of_pairs(self.field.candidates)
+        if not len(halves):
+            return searched
+        proposed = searched.proposed.with_more(halves)
+        split = replace(searched, found=self._chains_of(searched.x, searched.seen, proposed, len(halves)))
+        return split if split.explained > searched.explained else searched
+
+    @property
+    def _electrodes(self) -> int:
+        return sum(catheter.electrodes for catheter in self.catalogue.catheters)
+
+    def _chains_of(self, x: Image, seen: ImageEvidence, proposed: Proposals, halves: int = 0) -> _FittedSet:
         """Return the accepted chains of these proposals.
 
         The last ``halves`` of them are electrodes of split pairs.
         """
+        families = catheter_families(self.catalogue)
         linking = self._link(seen, proposed, families, halves)
         result = self._fit(x, seen, proposed, linking, families)
         if self.acceptance.strict and len(result.candidates) < len(linking.chains):

@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 
 _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
@@ -64,7 +65,8 @@ class _Track:
 def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
     """Return mean shift and largest remaining distance between two chains, pixels.
 
-    Only electrodes that both chains have are compared. Both numbers are infinite where there are none.
+    Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
+    more electrodes does not count: clutter and merged pairs displace some of a long catheter.
     """
     if one.electrodes == other.electrodes:
         mine, theirs = one.pixels_uv, other.pixels_uv
@@ -77,7 +79,9 @@ def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tupl
     difference = theirs - mine if shift is None else theirs - mine - shift
     mean = difference.sum(axis=0) / len(difference)
     rest = difference - mean
-    return float(np.sqrt(mean @ mean)), float(np.sqrt((rest * rest).sum(axis=1).max()))
+    squares = np.sort((rest * rest).sum(axis=1))
+    worst = squares[-1 - len(squares) // 5] if len(squares) >= MANY_ELECTRODES else squares[-1]
+    return float(np.sqrt(mean @ mean)), float(np.sqrt(worst))
 
 
 def kind_overlap(one: Chain, other: Chain) -> float:

@@ -97,7 +97,7 @@ def chains_found(image, points, probability, scores, **more):
     field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
     evidence = Evidence(image, points, probability, scores, **more)
     detector = ChainDetector(CATALOGUE, field, PX, lambda x: evidence, IN_A_RUN)
-    return detector.find_chains(image, 0).chains
+    return detector.split_pairs(detector.search(image)).entry(0).chains
 
 
 def lies_on(chain, row):
