@@ -47,6 +47,7 @@ _WEAKER = 0.25
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
 _LEAST_PLACES = 4
+_SAME_PLACE_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,8 +201,26 @@ class ChainDetector:
         if not len(halves):
             return searched
         proposed = searched.proposed.with_more(halves)
-        split = replace(searched, found=self._chains_of(searched.x, searched.seen, proposed, len(halves)))
+        found = self._chains_of(searched.x, searched.seen, proposed, len(halves))
+        split = replace(searched, found=self._with_known_places(found, searched.found.chains))
         return split if split.explained > searched.explained else searched
+
+    def _with_known_places(self, found: _FittedSet, known: Sequence[Chain]) -> _FittedSet:
+        """Return the chains as they were known where half of as many electrodes lie at the same places.
+
+        The places of split pairs are less exact.
+        """
+        reach = _SAME_PLACE_MM * self.px_per_mm
+        chains = []
+        for chain in found.chains:
+            alike = [
+                other
+                for other in known
+                if other.electrodes == chain.electrodes
+                and 2 * np.count_nonzero(_away(chain.pixels_uv, other.pixels_uv) < reach) >= len(chain.electrodes)
+            ]
+            chains.append(alike[0] if alike else chain)
+        return replace(found, chains=tuple(chains))
 
     @property
     def _electrodes(self) -> int:
@@ -450,6 +469,12 @@ class ChainDetector:
     def _shafts(self, seen: ImageEvidence) -> ShaftImage:
         clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
         return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)
+
+
+def _away(points_uv: Array, from_uv: Array) -> Array:
+    """Return the distance of each point to the nearest of others, (n,)."""
+    nearest: Array = np.linalg.norm(points_uv[:, None] - from_uv[None], axis=2).min(axis=1)
+    return nearest
 
 
 def _with_enough_places(possible: PossibleChains, first_half: int, last_half: int) -> PossibleChains:
