@@ -190,9 +190,10 @@ class ChainDetector:
         return SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
 
     def split_pairs(self, searched: SearchedImage) -> SearchedImage:
-        """Search an image again with both electrodes of pairs that were proposed as one.
+        """Search an image again with pairs split into two electrodes.
 
-        The result is the image as it was searched before, where the split explains no more electrodes.
+        Such pairs were proposed as one electrode. The result is the image as it was searched before, where the split explains no
+        more electrodes.
         """
         # Split pairs must not make a part of an unlisted catheter a listed one.
         if searched.explained >= self._electrodes or searched.found.unlisted:
@@ -206,9 +207,10 @@ class ChainDetector:
         return split if split.explained > searched.explained else searched
 
     def _with_known_places(self, found: _FittedSet, known: Sequence[Chain]) -> _FittedSet:
-        """Return the chains as they were known where half of as many electrodes lie at the same places.
+        """Return the chains, but known ones at their places.
 
-        The places of split pairs are less exact.
+        A known chain has as many electrodes, and half of the chain's electrodes lie on its own. The places of split pairs are
+        less exact.
         """
         reach = _SAME_PLACE_MM * self.px_per_mm
         chains = []

@@ -100,7 +100,10 @@ class FrameSearch:
         return searched, self._in_frame(x, searched, 1 + len(beside), frame, reach_cells)
 
     def _in_frame(self, x: Image, searched: SearchedImage, averaged: int, frame: int, reach_cells: int) -> FrameChains:
-        """Return the chains of an image, or of the mean of ``averaged`` images, at their places in the image."""
+        """Return the chains at their places in the image.
+
+        They were searched in the image, or in the mean of ``averaged`` images.
+        """
         entry = searched.entry(frame)
         if searched.x is x:
             return entry
