@@ -33,6 +33,7 @@ _REVERSED_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
+_DISPLACED_WEIGHT = 0.5
 
 ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
@@ -66,7 +67,7 @@ def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tupl
     """Return mean shift and largest remaining distance between two chains, pixels.
 
     Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
-    more electrodes does not count: clutter and merged pairs displace some of a long catheter.
+    more electrodes counts half: clutter and merged pairs displace some of a long catheter.
     """
     if one.electrodes == other.electrodes:
         mine, theirs = one.pixels_uv, other.pixels_uv
@@ -79,9 +80,10 @@ def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tupl
     difference = theirs - mine if shift is None else theirs - mine - shift
     mean = difference.sum(axis=0) / len(difference)
     rest = difference - mean
-    squares = np.sort((rest * rest).sum(axis=1))
-    worst = squares[-1 - len(squares) // 5] if len(squares) >= MANY_ELECTRODES else squares[-1]
-    return float(np.sqrt(mean @ mean)), float(np.sqrt(worst))
+    away = np.sort(np.sqrt((rest * rest).sum(axis=1)))
+    if len(away) >= MANY_ELECTRODES:
+        away[-(len(away) // 5) :] *= _DISPLACED_WEIGHT
+    return float(np.sqrt(mean @ mean)), float(away.max())
 
 
 def kind_overlap(one: Chain, other: Chain) -> float:

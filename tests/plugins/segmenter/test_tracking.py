@@ -130,7 +130,7 @@ def test_misplaced_electrodes_of_a_long_catheter_do_not_interrupt_its_track():
     row = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
     places = [row + frame for frame in range(6)]
     for frame, electrode in ((2, 7), (3, 8), (4, 7)):
-        places[frame][electrode] += 12.0
+        places[frame][electrode] += 10.0
     entries = track_chains(run([[chain(points, "cs")] for points in places]), np.arange(6) * 60.0, 1)
     assert [[one.track for one in entry.chains] for entry in entries] == [[0]] * 6
     for points in places[2:5]:
