@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 
 _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
@@ -32,6 +33,7 @@ _REVERSED_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
+_DISPLACED_WEIGHT = 0.5
 
 ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
@@ -64,7 +66,8 @@ class _Track:
 def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
     """Return mean shift and largest remaining distance between two chains, pixels.
 
-    Only electrodes that both chains have are compared. Both numbers are infinite where there are none.
+    Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
+    more electrodes counts half: clutter and merged pairs displace some of a long catheter.
     """
     if one.electrodes == other.electrodes:
         mine, theirs = one.pixels_uv, other.pixels_uv
@@ -77,7 +80,10 @@ def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tupl
     difference = theirs - mine if shift is None else theirs - mine - shift
     mean = difference.sum(axis=0) / len(difference)
     rest = difference - mean
-    return float(np.sqrt(mean @ mean)), float(np.sqrt((rest * rest).sum(axis=1).max()))
+    away = np.sort(np.sqrt((rest * rest).sum(axis=1)))
+    if len(away) >= MANY_ELECTRODES:
+        away[-(len(away) // 5) :] *= _DISPLACED_WEIGHT
+    return float(np.sqrt(mean @ mean)), float(away.max())
 
 
 def kind_overlap(one: Chain, other: Chain) -> float:
@@ -255,7 +261,11 @@ def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
         chains=tuple(
             chain
             for chain in entry.chains
-            if chain.manual or all(sum(chain_distance(chain, place)) > _SAME_PLACE_PX for place in places)
+            if chain.manual
+            or all(
+                chain.electrodes != place.electrodes or sum(chain_distance(chain, place)) > _SAME_PLACE_PX
+                for place in places
+            )
         ),
     )
 
