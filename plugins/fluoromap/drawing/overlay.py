@@ -15,7 +15,7 @@ from fluoromap.drawing.colour_bar import bar_box, draw_colour_bar
 from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
 from fluoromap.drawing.electrodes import draw_electrodes
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Box, Labels, Point, halo_text
+from fluoromap.drawing.lettering import BLACK, PHRASE_GAP, RGB, WHITE, Box, Labels, Point, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
 from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, colour_table, line_parts, outline_edges, pixel_bands
@@ -128,9 +128,9 @@ def draw_overlay(
 
     facing = canvas.facing(chamber)
     raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
-    _tint(image, pixel_bands(raster, chamber, times, canvas.unit, look.until_ms), times)
+    _tint(image, pixel_bands(raster, chamber, times, canvas.unit, look.until_ms), times, raster.box)
     _draw_lines(image, canvas, chamber, facing, times, look)
-    caption = f"{highlight_site}    {direction_text(camera)}    {purpose_text(simulated=look.simulated)}"
+    caption = PHRASE_GAP.join([highlight_site, direction_text(camera), purpose_text(simulated=look.simulated)])
     words = annotation_boxes(image.size, canvas.letters, caption)
     draw_electrodes(image, {name: canvas.to_picture(uv) for name, uv in look.electrodes_uv.items()}, canvas.unit)
     _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms, words)
@@ -188,13 +188,21 @@ class _Canvas:
         return outward
 
 
-def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale) -> None:
+def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale, box: tuple[slice, slice]) -> None:
+    """Blend the colours of the bands into the picture.
+
+    ``box`` contains all pixels with a colour.
+    """
+    rows, columns = box
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        return
+    bands = bands[box]
     shares = np.full(times.bands + 3, TINT)
     shares[[NOTHING, HATCH, NO_DATA]] = 0.0, HATCH_TINT, 0.0
     table = np.column_stack([colour_table(times, BLACK), (255 * shares).round().astype(np.uint8)])
     # Indexing one number a pixel is several times faster than indexing four.
     layer = Image.fromarray(table.view(np.uint32)[:, 0][bands].view(np.uint8).reshape(*bands.shape, 4))
-    image.paste(layer, mask=layer)
+    image.paste(layer, (columns.start, rows.start), layer)
 
 
 def _draw_lines(
