@@ -31,6 +31,4 @@ def warm_up() -> None:
     )  # fmt: skip
     frame = np.zeros((_PIXELS, _PIXELS), dtype=np.uint8)
     for scale in (1, 2):
-        for simulated in (False, True):
-            look = Look(scale=scale, simulated=simulated)
-            encode_png(draw_overlay(frame, camera, chamber, np.zeros(3), sites[0].site, None, look))
+        encode_png(draw_overlay(frame, camera, chamber, np.zeros(3), sites[0].site, None, Look(scale=scale)))

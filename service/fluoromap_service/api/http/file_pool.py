@@ -140,7 +140,8 @@ def _kill(pool: ProcessPoolExecutor) -> None:
 def _prepare_process(mib: int) -> None:
     _limit_memory(mib)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    draw_first_picture()
+    # Beside the first task, which may be the upload of a run.
+    threading.Thread(target=draw_first_picture, daemon=True).start()
 
 
 def _end_with_parent() -> None:
