@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -235,9 +236,11 @@ def _draw_lines(
             return
         mask = Image.new("L", tuple((2 * (high - low)).tolist()))
         pen = ImageDraw.Draw(mask)
-        for line in lines:
-            # Pillow truncates coordinates; adding half a pixel rounds them.
-            pen.line(((line - low + 0.5) * 2).ravel().tolist(), fill=round(255 * share), width=width, joint="curve")
+        # Pillow truncates coordinates; adding half a pixel rounds them.
+        coordinates = ((points - low + 0.5) * 2).ravel().tolist()
+        ends = np.cumsum([line.size for line in lines]).tolist()
+        for start, end in itertools.pairwise([0, *ends]):
+            pen.line(coordinates[start:end], fill=round(255 * share), width=width, joint="curve")
         image.paste(colour, (*low.tolist(), *high.tolist()), mask.reduce(2))
 
     def near(levels_ms: Array) -> list[Array]:
