@@ -653,6 +653,13 @@ class StudyShares:
         object.__setattr__(self, "relative_depth_mm2", relative)
 
 
+def _symmetric(value: ArrayLike, shape: tuple[int, ...], name: str) -> NDArray[Any]:
+    """Return a read-only copy of covariances, each the mean of itself and its transpose."""
+    checked = frozen(value, shape, name)
+    transposed = np.swapaxes(checked, -1, -2)
+    return checked if (checked == transposed).all() else frozen(0.5 * (checked + transposed), shape, name)
+
+
 @dataclass(frozen=True, eq=False)
 class Track:
     """Electrodes in 3D in every frame of one view.
@@ -663,6 +670,7 @@ class Track:
     less the mean of the reference catheter's electrodes in the same frame; None where the solver does not compute it.
     pixels_uv : (n, m, 2) observed. reasons : one tuple for each electrode. shares : None where the solver does not state them.
     The covariances have the default variation; :func:`fluoromap.monoplane.track_samples.in_study` brings them to the study's.
+    They are made symmetric bit for bit, which rounding in a solver may prevent; the store keeps their upper halves only.
     """
 
     labels: tuple[tuple[str, int], ...]
@@ -681,10 +689,11 @@ class Track:
         n = self.located.shape[0]
         object.__setattr__(self, "positions_mm", frozen(self.positions_mm, (n, m, 3), "positions_mm"))
         object.__setattr__(self, "baseline_mm", frozen(self.baseline_mm, (n, m, 3), "baseline_mm"))
-        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (n, m, 3, 3), "covariance_mm2"))
+        covariance = _symmetric(self.covariance_mm2, (n, m, 3, 3), "covariance_mm2")
+        object.__setattr__(self, "covariance_mm2", covariance)
         object.__setattr__(self, "pixels_uv", frozen(self.pixels_uv, (n, m, 2), "pixels_uv"))
         if self.relative_covariance_mm2 is not None:
-            relative = frozen(self.relative_covariance_mm2, (n, m, 3, 3), "relative_covariance_mm2")
+            relative = _symmetric(self.relative_covariance_mm2, (n, m, 3, 3), "relative_covariance_mm2")
             object.__setattr__(self, "relative_covariance_mm2", relative)
         if len(self.reasons) != m:
             raise ValueError(

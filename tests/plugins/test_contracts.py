@@ -90,6 +90,20 @@ def test_cycles_and_tracks_agree_with_their_labels() -> None:
         Track(labels, np.ones((n, 1), dtype=bool), *arrays, reasons=())
 
 
+def test_the_covariances_of_a_track_are_symmetric_bit_for_bit() -> None:
+    n, rounded = 4, np.array([[2.0, np.nextafter(0.3, 1), 0.1], [0.3, 3.0, 0.2], [0.1, 0.2, 4.0]])
+    covariances = np.broadcast_to(rounded, (n, 1, 3, 3))
+    track = Track(
+        (("mapping", 1),), np.ones((n, 1), dtype=bool), np.zeros((n, 1, 3)), np.zeros((n, 1, 3)), covariances,
+        np.zeros((n, 1, 2)), reasons=((),), relative_covariance_mm2=covariances,
+    )  # fmt: skip
+    for stored in (track.covariance_mm2, track.relative_covariance_mm2):
+        assert stored is not None
+        np.testing.assert_array_equal(stored, stored.transpose(0, 1, 3, 2))
+        np.testing.assert_allclose(stored, covariances, rtol=1e-15)
+        assert not stored.flags.writeable
+
+
 def test_a_refusal_says_its_reason_s_sentence_unless_given_a_better_one() -> None:
     assert str(Refusal(Reason.NO_A_PRIORI)) == Reason.NO_A_PRIORI.sentence
     assert str(Refusal(Reason.DEPTH_UNOBSERVABLE, "17 mm")) == "17 mm"

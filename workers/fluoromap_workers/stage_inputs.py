@@ -42,7 +42,7 @@ from fluoromap_service.dicom import InstanceFacts, open_frames
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.jobs.pipeline import STAGES, Stage, StageName, installed_version, plugin_of
 from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrack, load, load_later, stage_of, stages_of
-from fluoromap_service.store.codec import encode, form_of
+from fluoromap_service.store.codec import form_of, plain_form
 from fluoromap_service.store.models import Json, StageRow
 from fluoromap_service.study.run_files import checked_run
 from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
@@ -215,7 +215,7 @@ def _match(job: StoredJob, study: str) -> Work:
         return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
 
     # A result's hash says whether it changed: the result itself is not read for the key.
-    results = ((site, encode(cameras[uid]), segments[uid].result) for site, uid in views)
+    results = ((site, plain_form(cameras[uid]), segments[uid].result) for site, uid in views)
     key = _key(job, "match", asdict(catalogue), *(part for view in results for part in view))
     return Work(key, Matching, compute, refused)
 
@@ -265,7 +265,7 @@ def _fuse(job: StoredJob, study: str) -> Work:
     def refused(refusal: Refusal) -> MapResult:
         return MapResult(None, refusal.reason, str(refusal), origin)
 
-    key = _key(job, "fuse", list(origin or ()), *(encode(site) for site in sites))
+    key = _key(job, "fuse", list(origin or ()), *(plain_form(site) for site in sites))
     return Work(key, MapResult, compute, refused)
 
 
@@ -295,7 +295,7 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     def refused(refusal: Refusal) -> SiteTracks:
         return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
 
-    key = _key(job, "monoplane", name, *(encode(view) for view in rejected), *(encode(view) for view in views))
+    key = _key(job, "monoplane", name, *(plain_form(view) for view in rejected), *(plain_form(view) for view in views))
     return Work(key, SiteTracks, compute, refused)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from fluoromap.contracts import Array
-from fluoromap.drawing.lettering import BLACK, WHITE, Box, halo_text, text_size
+from fluoromap.drawing.lettering import BLACK, PHRASE_GAP, WHITE, Box, halo_text, text_size
 from fluoromap.geometry import Camera
 
-LEGEND = "star: tip of this site    dot: near wall    ring: far wall"
+LEGEND = PHRASE_GAP.join(["star: tip of this site", "dot: near wall", "ring: far wall"])
 _ENDS = (("L", "R"), ("P", "A"), ("H", "F"))
 """Letters of the positive and negative ends of the axes of LPS."""
 _LEAST_SHARE = 0.35

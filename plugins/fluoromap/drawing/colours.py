@@ -7,6 +7,7 @@ near site get a hatched neutral grey, which is not the colour of any band.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -76,11 +77,18 @@ class Scale:
 
     def band_colours(self) -> Colours:
         """Return the RGB of each band, (bands, 3)."""
-        return colour_map((np.arange(self.bands) + 0.5) / self.bands, self.palette)
+        return _band_colours(self.bands, self.palette)
 
     def colours(self, lat_ms: Array) -> Colours:
         """Return continuous RGB (k, 3) of times (k,), without bands, as mesh files need it."""
         return colour_map((lat_ms - self.start_ms) / (self.stop_ms - self.start_ms), self.palette)
+
+
+@functools.lru_cache(maxsize=64)
+def _band_colours(bands: int, palette: Palette) -> Colours:
+    colours = colour_map((np.arange(bands) + 0.5) / bands, palette)
+    colours.setflags(write=False)
+    return colours
 
 
 def colour_map(fraction: Array, palette: Palette = "safe") -> Colours:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -13,6 +14,9 @@ from fluoromap.contracts import Array
 Point = tuple[float, float]
 Box = tuple[float, float, float, float]
 RGB = tuple[int, int, int]
+PHRASE_GAP = "    "
+"""Between the phrases of a long text."""
+
 WHITE: RGB = (255, 255, 255)
 BLACK: RGB = (0, 0, 0)
 
@@ -48,15 +52,33 @@ def _masks(text: str, size: int) -> tuple[Image.Image, Image.Image]:
     Its middle is the middle of the masks. The pictures of a job show the same texts, and drawing letters takes longer than
     pasting them.
     """
-    stroke = max(1, size // 9)
     width, height = text_size(text, size)
     # Two sizes of room: letters may reach beyond the box about which they are centred.
     shape = (2 * (width // 2 + size) + 1, 2 * (height // 2 + size) + 1)
     masks = Image.new("L", shape), Image.new("L", shape)
-    for mask, rim in zip(masks, (0, stroke), strict=True):
-        middle = shape[0] // 2, shape[1] // 2
-        ImageDraw.Draw(mask).text(middle, text, fill=255, font=font(size), anchor="mm", stroke_width=rim)
+    left, middle = math.floor(shape[0] // 2 - font(size).getlength(text) / 2), shape[1] // 2
+    before = ""
+    for phrase in text.split(PHRASE_GAP):
+        phrase_masks, origin = _phrase_masks(phrase, size)
+        corner = left + round(font(size).getlength(before)) - origin[0], middle - origin[1]
+        for mask, phrase_mask in zip(masks, phrase_masks, strict=True):
+            mask.paste(phrase_mask, corner)
+        before += phrase + PHRASE_GAP
     return masks
+
+
+@functools.lru_cache(maxsize=4096)
+def _phrase_masks(phrase: str, size: int) -> tuple[tuple[Image.Image, Image.Image], tuple[int, int]]:
+    """Return the masks of a phrase, without and with a rim.
+
+    The second value is the left middle of the phrase in them. Captions differ in a few words: the other phrases are drawn once.
+    """
+    origin = size // 2, 2 * size
+    shape = math.ceil(font(size).getlength(phrase)) + 2 * origin[0], 2 * origin[1] + 1
+    masks = Image.new("L", shape), Image.new("L", shape)
+    for mask, rim in zip(masks, (0, max(1, size // 9)), strict=True):
+        ImageDraw.Draw(mask).text(origin, phrase, fill=255, font=font(size), anchor="lm", stroke_width=rim)
+    return masks, origin
 
 
 def line_with_squares(draw: ImageDraw.ImageDraw, middle: Point, text: str, size: int, ink: RGB) -> None:

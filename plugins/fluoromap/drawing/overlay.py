@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +17,7 @@ from fluoromap.drawing.colour_bar import bar_box, draw_colour_bar
 from fluoromap.drawing.colours import Palette, Scale, milliseconds, scale_of
 from fluoromap.drawing.electrodes import draw_electrodes
 from fluoromap.drawing.isochrones import isochrones
-from fluoromap.drawing.lettering import BLACK, RGB, WHITE, Box, Labels, Point, halo_text
+from fluoromap.drawing.lettering import BLACK, PHRASE_GAP, RGB, WHITE, Box, Labels, Point, halo_text
 from fluoromap.drawing.raster import Raster, rasterise
 from fluoromap.drawing.symbols import draw_dot, draw_star, draw_time, is_outlier, time_text
 from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, colour_table, line_parts, outline_edges, pixel_bands
@@ -123,14 +125,16 @@ def draw_overlay(
     canvas = _Canvas(camera.translated(shift_world_mm), look.scale)
     times = look.times or scale_of(chamber, look.step_ms, look.palette)
     size = (camera.columns * look.scale, camera.rows * look.scale)
-    grey = Image.fromarray(frame)
-    image = (grey if look.scale == 1 else grey.resize(size, Image.Resampling.BICUBIC)).convert("RGB")
-
-    facing = canvas.facing(chamber)
-    raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
-    _tint(image, pixel_bands(raster, chamber, times, canvas.unit, look.until_ms), times)
+    # Enlarging the frame takes a sixth of the time, and another processor may do it meanwhile.
+    with ThreadPoolExecutor(1) as thread:
+        enlarged = thread.submit(_enlarged, frame, size)
+        facing = canvas.facing(chamber)
+        raster = rasterise(*canvas.project(chamber.vertices_mm), chamber.faces, facing, size[::-1])
+        bands = pixel_bands(raster, chamber, times, canvas.unit, look.until_ms)
+        image = enlarged.result()
+    _tint(image, bands, times, raster.box)
     _draw_lines(image, canvas, chamber, facing, times, look)
-    caption = f"{highlight_site}    {direction_text(camera)}    {purpose_text(simulated=look.simulated)}"
+    caption = PHRASE_GAP.join([highlight_site, direction_text(camera), purpose_text(simulated=look.simulated)])
     words = annotation_boxes(image.size, canvas.letters, caption)
     draw_electrodes(image, {name: canvas.to_picture(uv) for name, uv in look.electrodes_uv.items()}, canvas.unit)
     _draw_sites(image, canvas, chamber, raster, highlight_site, tip_uv, times, look.until_ms, words)
@@ -139,6 +143,14 @@ def draw_overlay(
         text, size_px = f"{milliseconds(look.until_ms)} ms", round(1.6 * canvas.letters)
         halo_text(ImageDraw.Draw(image), (3.2 * size_px, 1.6 * size_px), text, size_px, WHITE, BLACK)
     return np.asarray(image)
+
+
+def _enlarged(frame: NDArray[np.uint8], size: tuple[int, int]) -> Image.Image:
+    """Return the frame as an RGB picture of ``size`` (columns, rows)."""
+    grey = Image.fromarray(frame)
+    if grey.size != size:
+        grey = grey.resize(size, Image.Resampling.BICUBIC)
+    return Image.merge("RGB", (grey, grey, grey))
 
 
 class _Canvas:
@@ -188,13 +200,21 @@ class _Canvas:
         return outward
 
 
-def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale) -> None:
+def _tint(image: Image.Image, bands: NDArray[np.int32], times: Scale, box: tuple[slice, slice]) -> None:
+    """Blend the colours of the bands into the picture.
+
+    ``box`` contains all pixels with a colour.
+    """
+    rows, columns = box
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        return
+    bands = bands[box]
     shares = np.full(times.bands + 3, TINT)
     shares[[NOTHING, HATCH, NO_DATA]] = 0.0, HATCH_TINT, 0.0
     table = np.column_stack([colour_table(times, BLACK), (255 * shares).round().astype(np.uint8)])
     # Indexing one number a pixel is several times faster than indexing four.
     layer = Image.fromarray(table.view(np.uint32)[:, 0][bands].view(np.uint8).reshape(*bands.shape, 4))
-    image.paste(layer, mask=layer)
+    image.paste(layer, (columns.start, rows.start), layer)
 
 
 def _draw_lines(
@@ -216,9 +236,11 @@ def _draw_lines(
             return
         mask = Image.new("L", tuple((2 * (high - low)).tolist()))
         pen = ImageDraw.Draw(mask)
-        for line in lines:
-            # Pillow truncates coordinates; adding half a pixel rounds them.
-            pen.line(((line - low + 0.5) * 2).ravel().tolist(), fill=round(255 * share), width=width, joint="curve")
+        # Pillow truncates coordinates; adding half a pixel rounds them.
+        coordinates = ((points - low + 0.5) * 2).ravel().tolist()
+        ends = np.cumsum([line.size for line in lines]).tolist()
+        for start, end in itertools.pairwise([0, *ends]):
+            pen.line(coordinates[start:end], fill=round(255 * share), width=width, joint="curve")
         image.paste(colour, (*low.tolist(), *high.tolist()), mask.reduce(2))
 
     def near(levels_ms: Array) -> list[Array]:

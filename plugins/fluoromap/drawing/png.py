@@ -20,7 +20,7 @@ GREY, RGB = 0, 2
 ZLIB_HEADER = b"\x78\x01"
 """Deflate with a window of 32 KiB, compressed fast (RFC 1950 section 2.2)."""
 
-HALVED_BYTES = 2 << 20
+HALVED_BYTES = 1 << 19
 """Size from which a second processor saves more than its start costs."""
 
 UP = 2

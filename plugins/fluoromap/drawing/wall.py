@@ -38,16 +38,25 @@ def pixel_bands(
     if cycle is not None:
         one_band &= np.ptp(lat[chamber.faces], axis=1) < cycle / 2
     of_face = np.where(one_band, at_corners[:, 0], np.where(corners_covered > 0, _WITHIN, NO_DATA))
-    bands = np.append(of_face, NOTHING).astype(np.int32)[raster.face]
+    rows, columns = raster.box
+    face = raster.face[rows, columns].ravel()
+    shown = np.append(of_face, NOTHING).astype(np.int32)[face]
 
-    flat = bands.ravel()
-    within = np.flatnonzero(flat == _WITHIN)
-    flat[within] = band(raster.sample(within, lat, cycle))
-    rim = within[corners_covered[raster.face.ravel()[within]] < 3]
-    flat[rim[raster.sample(rim, chamber.covered.astype(np.float64)) <= 0.5]] = NO_DATA
-    far = np.flatnonzero(flat == NO_DATA)
-    v, u = np.divmod(far, bands.shape[1])
-    flat[far[(u + v) % max(4, round(7 * unit)) < max(1, round(unit))]] = HATCH
+    def pixels(places: IntArray) -> IntArray:
+        """Return the pixels of the picture at places in the box, both in row-major order."""
+        v, u = np.divmod(places, max(1, columns.stop - columns.start))
+        in_picture: IntArray = (v + rows.start) * raster.face.shape[1] + (u + columns.start)
+        return in_picture
+
+    within = np.flatnonzero(shown == _WITHIN)
+    shown[within] = band(raster.sample(pixels(within), lat, cycle))
+    rim = within[corners_covered[face[within]] < 3]
+    shown[rim[raster.sample(pixels(rim), chamber.covered.astype(np.float64)) <= 0.5]] = NO_DATA
+    far = np.flatnonzero(shown == NO_DATA)
+    v, u = np.divmod(pixels(far), raster.face.shape[1])
+    shown[far[(u + v) % max(4, round(7 * unit)) < max(1, round(unit))]] = HATCH
+    bands = np.full(raster.face.shape, NOTHING, dtype=np.int32)
+    bands[rows, columns] = shown.reshape(bands[rows, columns].shape)
     return bands
 
 
@@ -90,12 +99,14 @@ def _times_past_rim(chamber: ChamberMap) -> Array:
 
 def outline_edges(faces: IntArray, facing: BoolArray) -> IntArray:
     """Return the edges (e, 2) between a face that faces the viewer and a face that does not."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    first, second, third = faces[facing].T
     vertices = int(faces.max()) + 1
     # Sorting one number an edge is several times faster than sorting pairs.
-    unique, of_edge = np.unique(edges[:, 0] * vertices + edges[:, 1], return_inverse=True)
-    rim = unique[np.bincount(of_edge, np.repeat(facing, 3), minlength=len(unique)) == 1]
-    return np.stack(np.divmod(rim, vertices), axis=1)
+    edges = [
+        np.minimum(a, b) * vertices + np.maximum(a, b) for a, b in ((first, second), (second, third), (third, first))
+    ]
+    unique, count = np.unique(np.concatenate(edges), return_counts=True)
+    return np.stack(np.divmod(unique[count == 1], vertices), axis=1)
 
 
 def line_parts(flags: BoolArray) -> list[slice]:

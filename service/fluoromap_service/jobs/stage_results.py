@@ -50,8 +50,8 @@ class SiteTracks:
     views: tuple[ViewTrack, ...]
 
 
-_REMEMBERED_BYTES = 32 << 20
-"""Size limit of the decoded results that a process remembers, counted as stored.
+_REMEMBERED_BYTES = 20 << 20
+"""Size limit of the decoded results that a process remembers, counted as stored; in memory they take about twice as much.
 
 Each stage reads the results of the stages before it, and a correction reads most of them again.
 """

@@ -7,7 +7,7 @@ version of the code that makes the file.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -38,7 +38,7 @@ def overlay_dependencies(fusion: Fusion, look: Look, *, moving: bool) -> Depende
     return {
         "kind": "propagation" if moving else "overlay",
         "drawing": drawing.VERSION,
-        "fusion": {name: value for name, value in _fields(fusion).items() if name not in _BY_HASH},
+        "fusion": _fields(fusion, _BY_HASH),
         "look": _fields(look),
     }
 
@@ -95,8 +95,12 @@ def tracks_table_dependencies(job_id: str, job_version: int) -> Dependencies:
     }
 
 
-def _fields(value: Any) -> dict[str, Any]:
-    return {field.name: _json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+def _fields(value: Any, without: Collection[str] = ()) -> dict[str, Any]:
+    return {
+        field.name: _json(getattr(value, field.name))
+        for field in dataclasses.fields(value)
+        if field.name not in without
+    }
 
 
 def _json(value: Any) -> Any:

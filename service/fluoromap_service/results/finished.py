@@ -16,6 +16,8 @@ from fluoromap_service.study.snapshot import Snapshot
 RETRY_SECONDS = 2
 _REMEMBERED_SNAPSHOTS = 8
 _snapshots: OrderedDict[str, Snapshot] = OrderedDict()
+_REMEMBERED_SIMULATED = 1024
+_simulated: OrderedDict[str, bool] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -69,6 +71,24 @@ def snapshot_of(job: Job) -> Snapshot:
         _snapshots.move_to_end(job.id)
         while len(_snapshots) > _REMEMBERED_SNAPSHOTS:
             _snapshots.popitem(last=False)
+    return known
+
+
+def is_simulated(job: Job) -> bool:
+    """Return whether all runs of a job are simulated.
+
+    The frozen input of a job never changes and is long, so a process looks once.
+    """
+    with _lock:
+        known = _simulated.get(job.id)
+    if known is None:
+        # Validating the whole snapshot would take longer than everything else in the answer with a map.
+        runs = job.snapshot["runs"].values()
+        known = bool(runs) and all(run["facts"].get("simulated", False) for run in runs)
+        with _lock:
+            _simulated[job.id] = known
+            while len(_simulated) > _REMEMBERED_SIMULATED:
+                _simulated.popitem(last=False)
     return known
 
 

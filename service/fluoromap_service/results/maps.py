@@ -11,7 +11,7 @@ from fluoromap.contracts import Array, ChamberMap
 from fluoromap.reasons import Reason
 from fluoromap_service.jobs.stage_results import MapResult, load
 from fluoromap_service.problem import Problem
-from fluoromap_service.results.finished import done_stage
+from fluoromap_service.results.finished import done_stage, is_simulated
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.results.row_order import warnings_of
 from fluoromap_service.store.models import Job
@@ -64,7 +64,4 @@ def map_of(session: Session, job: Job) -> FinishedMap:
         raise Problem(409, "no_map", outcome.message or "The sites of this study support no map.", extra=reasons)
     reference_mm = None if outcome.reference_mm is None else np.array(outcome.reference_mm)
     warnings = (*outcome.chamber.warnings, *warnings_of(session, job))
-    # Validating the whole snapshot would take longer than everything else here.
-    runs = job.snapshot["runs"].values()
-    simulated = bool(runs) and all(run["facts"].get("simulated", False) for run in runs)
-    return FinishedMap(outcome.chamber, reference_mm, str(stage.result), warnings, simulated)
+    return FinishedMap(outcome.chamber, reference_mm, str(stage.result), warnings, is_simulated(job))

@@ -1,13 +1,16 @@
 """Stage results as bytes and back, exactly: equal values give equal bytes.
 
-A stored result begins with three parts: eight bytes with the length of the second part, a MessagePack tree, and the numbers of all
-arrays. The tree holds columns: all values of one field of all dataclasses of one kind lie together, and an array is its
-number. Arrays of one type and shape lie together too, each different one once. So reading a value costs no Python call of
+A stored result begins with three parts: eight bytes with the length of the second part, a compressed MessagePack tree, and the
+numbers of all arrays. The tree holds columns: all values of one field of all dataclasses of one kind lie together, and an array is
+its number. Arrays of one type and shape lie together too, each different one once. So reading a value costs no Python call of
 its own, and thousands of small arrays cost little.
 
 Blocks follow the arrays. A block is the stored form of one value by itself: a dataclass that asks for it (``stored_apart``), or
 a partial result that a later job may use again. A block is copied into another stored result unchanged. Its fields are decoded
 when they are first read.
+
+A value also has a plain form, without compression and without the content of its blocks. Its hash identifies the value, so that
+another compressor changes no key. Earlier versions of fluoromap stored plain forms, with the blocks behind them. They are read too.
 """
 
 from __future__ import annotations
@@ -21,8 +24,9 @@ import itertools
 import math
 import types
 import typing
+import zlib
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from enum import Enum
 from operator import attrgetter
@@ -32,22 +36,45 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fluoromap_service.store.array_pools import ALIGNMENT, ArrayPools, Block, padded, whole
+from fluoromap_service.store.array_pools import (
+    ALIGNMENT,
+    ArrayPools,
+    Block,
+    PackedPool,
+    PlainPool,
+    Pool,
+    SharedArrays,
+    from_steps,
+    packed_arrays,
+    packed_length,
+    padded,
+    plain_arrays,
+    plain_length,
+    steps_between,
+    whole,
+)
 
 T = typing.TypeVar("T")
 
 LAYOUT = 3
-"""The number of the layout of stored bytes. It is part of every form, so that results of another one are computed again."""
+"""The number of the layout of plain forms. It is part of every form, so that results of another one are computed again."""
+
+_PACKED = 1 << 63
+"""Added to the length at the beginning of a packed form. A plain form begins with the length alone."""
+_LEVEL = 1
+"""Compression level of the tree."""
 
 _FEW_ARRAYS = 32
 """Most arrays that are looked up one by one. For more of them, all arrays of the content are taken apart at once."""
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
 _SOURCE = "_stored_form"
 _pack, _unpack = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder()
-_Described = list[tuple[str, tuple[int, ...], list[int]]]
-# form, arrays, blocks (hash, length), partial results (key, number of the block), one value with its fields as columns
-_unpack_head = msgspec.msgpack.Decoder(
-    tuple[str, _Described, list[tuple[str, int]], dict[str, int], tuple[int, list[msgspec.Raw]]]
+_Blocks = list[tuple[str, int]]  # hash, length
+_Partial = dict[str, int]  # key, number of the block
+_Tree = tuple[int, list[msgspec.Raw]]  # one value with its fields as columns
+_unpack_plain_head = msgspec.msgpack.Decoder(tuple[str, list[PlainPool], _Blocks, _Partial, _Tree])
+_unpack_packed_head = msgspec.msgpack.Decoder(
+    tuple[str, list[PackedPool], list[SharedArrays], _Blocks, _Partial, _Tree]
 )
 
 
@@ -73,17 +100,79 @@ def encode(value: Any, partial: Mapping[str, Block] = types.MappingProxyType({})
     TypeError
         When it holds anything else, which would not come back as it was.
     """
-    kind = type(value)
-    if not dataclasses.is_dataclass(kind):
-        _refuse(kind)
-    arrays = ArrayPools(finite)
-    with _without_collector():
-        tree = _fields_column(_plain_kind(kind)).encode([value], arrays)
-        numbers = {key: arrays.add_block(block) for key, block in sorted(partial.items())}
-        blocks = [(block.sha256, len(block.content)) for block in arrays.blocks]
-        head = _pack.encode((form_of(_plain_kind(kind)), arrays.described(), blocks, numbers, tree))
-    parts = [len(head).to_bytes(ALIGNMENT, "little"), padded(head), arrays.numbers()]
-    return b"".join([*parts, *(padded(block.content) for block in arrays.blocks)])
+    return _Encoded(value, finite).packed(partial)
+
+
+def plain_form(value: Any) -> bytes:
+    """Return the plain form of a value.
+
+    It belongs into the key of a result that depends on the value. Nothing decodes it.
+
+    Raises
+    ------
+    ValueError, TypeError
+        As :func:`encode`.
+    """
+    return _Encoded(value, finite=True).plain()
+
+
+class _Encoded:
+    """A value as a tree of columns and arrays."""
+
+    def __init__(self, value: Any, finite: bool) -> None:
+        kind = type(value)
+        if not dataclasses.is_dataclass(kind):
+            _refuse(kind)
+        self._form = form_of(_plain_kind(kind))
+        self._arrays = ArrayPools(finite)
+        with _without_collector():
+            tree = _fields_column(_plain_kind(kind)).encode([value], self._arrays)
+            self._tree = msgspec.Raw(_pack.encode(tree))
+        self._pools = self._arrays.pools
+
+    def plain(self) -> bytes:
+        """Return the plain form."""
+        pools = [pool.plain() for pool in self._pools]
+        blocks = [(block.sha256, 0) for block in self._arrays.blocks]
+        head = _pack.encode((self._form, pools, blocks, {}, self._tree))
+        parts = [len(head).to_bytes(ALIGNMENT, "little"), padded(head)]
+        return b"".join([*parts, *(padded(pool.content) for pool in self._pools)])
+
+    def packed(self, partial: Mapping[str, Block]) -> bytes:
+        """Return the stored form, with partial results."""
+        numbers = {key: self._arrays.add_block(block) for key, block in sorted(partial.items())}
+        pools, shared = self._pools, []
+        for number in dict.fromkeys(numbers.values()):
+            pools, own, known = _take_out(pools, self._arrays.blocks[number])
+            if own:
+                shared.append((number, steps_between(own), steps_between(known)))
+        described = [pool.packed() for pool in pools]
+        blocks = [(block.sha256, len(block.content)) for block in self._arrays.blocks]
+        head = _pack.encode((self._form, [pool for pool, _ in described], shared, blocks, numbers, self._tree))
+        head = zlib.compress(head, _LEVEL)
+        parts = [(len(head) | _PACKED).to_bytes(ALIGNMENT, "little"), head, *(content for _, content in described)]
+        return b"".join([*parts, *(block.content for block in self._arrays.blocks)])
+
+
+def _take_out(pools: list[Pool], block: Block) -> tuple[list[Pool], list[int], list[int]]:
+    """Take out the arrays that a block holds too.
+
+    Returns
+    -------
+    The other arrays; the numbers of the arrays that were taken out, rising; their numbers in the block.
+    """
+    searched = {(pool.dtype, pool.shape) for pool in pools if pool.may_share()}
+    if not searched:
+        return pools, [], []
+    known = _Content(None, block.content).arrays_of(searched)
+    others, numbers = list[Pool](), list[tuple[int, int]]()
+    for pool in pools:
+        rest, own, found = pool.without(known.get((pool.dtype, pool.shape), {}))
+        numbers += zip(own, found, strict=True)
+        if rest.numbers:
+            others.append(rest)
+    numbers.sort()
+    return others, [own for own, _ in numbers], [found for _, found in numbers]
 
 
 def decode(kind: type[T], content: bytes) -> T:
@@ -130,8 +219,9 @@ def block_of(value: Any, *, finite: bool = True) -> Block:
     source = _source_of(value)
     if source is not None:
         return Block(source.sha256, source.content)
-    content = encode(value, finite=finite)
-    block = Block(hashlib.sha256(content).hexdigest(), content)
+    encoded = _Encoded(value, finite)
+    content = encoded.packed({})
+    block = Block(hashlib.sha256(encoded.plain()).hexdigest(), content)
     if _is_apart(type(value)):
         value.__dict__[_SOURCE] = _Source(type(value), block.sha256, lambda: content)
     return block
@@ -208,7 +298,9 @@ def _stored_otherwise(kind: type) -> Iterator[None]:
         yield
     except StoredOtherwise:
         raise
-    except (msgspec.DecodeError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+    except (
+        msgspec.DecodeError, zlib.error, AttributeError, IndexError, KeyError, TypeError, ValueError,
+    ) as error:  # fmt: skip
         raise StoredOtherwise(f"these bytes are no stored {kind}") from error
 
 
@@ -228,22 +320,47 @@ def _check_finite(numbers: Iterable[float]) -> None:
 
 
 class _Content:
-    """The stored form of one value, taken apart. Its arrays are read when the first one is needed."""
+    """The stored form of one value, taken apart. The arrays of one type and shape are read when one of them is needed."""
 
     def __init__(self, kind: type | None, content: bytes) -> None:
         with _stored_otherwise(kind or object):
             self._kind, self._content = kind, content
-            end = ALIGNMENT + int.from_bytes(content[:ALIGNMENT], "little")
-            form, self._described, self._blocks, self._partial, (count, columns) = _unpack_head.decode(
-                content[ALIGNMENT:end]
-            )
-            self._start = whole(end)
+            length = int.from_bytes(content[:ALIGNMENT], "little")
+            read = self._read_packed if length & _PACKED else self._read_plain
+            form, (count, columns) = read(ALIGNMENT + (length & ~_PACKED))
             if kind is None:
                 return
             if form != form_of(kind) or count != 1:
                 raise StoredOtherwise(f"another version of the contracts stored this {kind}")
             names = [name for name, _ in _fields_column(kind).fields]
             self.columns = dict(zip(names, columns, strict=True))
+
+    def _read_packed(self, end: int) -> tuple[str, _Tree]:
+        head = zlib.decompress(self._content[ALIGNMENT:end])
+        form, pools, shared, blocks, self._partial, tree = _unpack_packed_head.decode(head)
+        self._pools: list[_StoredPool | _SharedPool] = []
+        for pool in pools:
+            read = functools.partial(packed_arrays, self._content, pool, end)
+            self._pools.append(_StoredPool(np.dtype(pool[0]), pool[1], from_steps(pool[2]), read))
+            end += packed_length(pool)
+        for number, own, known in shared:
+            self._pools.append(_SharedPool(self, number, from_steps(own), from_steps(known)))
+        self._locate_blocks(blocks, itertools.accumulate((length for _, length in blocks), initial=end))
+        return form, tree
+
+    def _read_plain(self, end: int) -> tuple[str, _Tree]:
+        form, pools, blocks, self._partial, tree = _unpack_plain_head.decode(self._content[ALIGNMENT:end])
+        start = whole(end)
+        self._pools = []
+        for pool in pools:
+            read = functools.partial(plain_arrays, self._content, pool, start)
+            self._pools.append(_StoredPool(np.dtype(pool[0]), pool[1], pool[2], read))
+            start += plain_length(pool)
+        self._locate_blocks(blocks, itertools.accumulate((whole(length) for _, length in blocks), initial=start))
+        return form, tree
+
+    def _locate_blocks(self, blocks: _Blocks, starts: Iterable[int]) -> None:
+        self._blocks = [(sha256, start, length) for (sha256, length), start in zip(blocks, starts, strict=False)]
 
     def field(self, name: str) -> Any:
         """Decode one field."""
@@ -260,47 +377,66 @@ class _Content:
         return [every[number] for number in numbers]
 
     def _array(self, number: int) -> NDArray[Any]:
-        for numbers, pool in self._pools:
+        for pool in self._pools:
             # Arrays are numbered as they come, so that the numbers of each pool rise.
-            place = bisect.bisect_left(numbers, number)
-            if place < len(numbers) and numbers[place] == number:
-                found: NDArray[Any] = pool[place]
-                return found
+            place = bisect.bisect_left(pool.numbers, number)
+            if place < len(pool.numbers) and pool.numbers[place] == number:
+                return pool.arrays[place]
         raise StoredOtherwise(f"there is no array of the number {number}")
 
     @functools.cached_property
     def _all_arrays(self) -> list[NDArray[Any]]:
         by_number: dict[int, NDArray[Any]] = {}
-        for numbers, pool in self._pools:
-            by_number.update(zip(numbers, pool, strict=True))
+        for pool in self._pools:
+            by_number.update(zip(pool.numbers, pool.arrays, strict=True))
         return [by_number[number] for number in range(len(by_number))]
 
-    @functools.cached_property
-    def _pools(self) -> list[tuple[list[int], NDArray[Any]]]:
-        pools = []
-        start = self._start
-        for dtype, shape, numbers in self._described:
-            pool = np.frombuffer(self._content, dtype, len(numbers) * math.prod(shape), start)
-            pools.append((numbers, pool.reshape(len(numbers), *shape)))
-            start += whole(pool.nbytes)
-        return pools
-
-    @functools.cached_property
-    def _starts_of_blocks(self) -> list[int]:
-        start = self._start
-        for dtype, shape, numbers in self._described:
-            start += whole(np.dtype(dtype).itemsize * math.prod(shape) * len(numbers))
-        return [start, *itertools.accumulate((whole(length) for _, length in self._blocks), initial=start)][1:]
+    def arrays_of(
+        self, wanted: Set[tuple[np.dtype[Any], tuple[int, ...]]]
+    ) -> dict[tuple[np.dtype[Any], tuple[int, ...]], dict[bytes, int]]:
+        """Return the numbers of the arrays of some types and shapes, by the arrays' bytes."""
+        found: dict[tuple[np.dtype[Any], tuple[int, ...]], dict[bytes, int]] = {}
+        for pool in self._pools:
+            if isinstance(pool, _StoredPool) and (pool.dtype, pool.shape) in wanted:
+                contents = [array.tobytes() for array in pool.arrays]
+                found[pool.dtype, pool.shape] = dict(zip(contents, pool.numbers, strict=True))
+        return found
 
     def block(self, number: int) -> Block:
         """Return a block by its number."""
-        sha256, length = self._blocks[number]
-        start = self._starts_of_blocks[number]
+        sha256, start, length = self._blocks[number]
         return Block(sha256, self._content[start : start + length])
 
     def partial_results(self) -> dict[str, Block]:
         """Return the partial results by their keys."""
         return {key: self.block(number) for key, number in self._partial.items()}
+
+
+class _StoredPool:
+    """Arrays of one type and shape by rising numbers, read when one of them is needed."""
+
+    def __init__(
+        self, dtype: np.dtype[Any], shape: tuple[int, ...], numbers: list[int], read: Callable[[], NDArray[Any]]
+    ) -> None:
+        self.dtype, self.shape, self.numbers, self._read = dtype, shape, numbers, read
+
+    @functools.cached_property
+    def arrays(self) -> list[NDArray[Any]]:
+        """The arrays, in the order of their numbers."""
+        return list(self._read())
+
+
+class _SharedPool:
+    """Arrays by rising numbers that a partial result of the same content holds."""
+
+    def __init__(self, content: _Content, block: int, numbers: list[int], known: list[int]) -> None:
+        self.numbers = numbers
+        self._content, self._block, self._known = content, block, known
+
+    @functools.cached_property
+    def arrays(self) -> list[NDArray[Any]]:
+        """The arrays, in the order of their numbers."""
+        return _Content(None, self._content.block(self._block).content).take(self._known)
 
 
 # --- values that are decoded when they are read ------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chambers import fused, sites_at, sphere
-from PIL import Image
+from PIL import Image, ImageDraw
 from scipy.spatial import Delaunay
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOImage import vtkPNGReader
@@ -16,11 +16,13 @@ from fluoromap.drawing.colour_bar import bar_box
 from fluoromap.drawing.colours import Scale, colour_map, milliseconds, scale_of, vertex_colours
 from fluoromap.drawing.electrodes import CATHETERS_RGB
 from fluoromap.drawing.isochrones import isochrones
+from fluoromap.drawing.lettering import PHRASE_GAP, _masks, font
 from fluoromap.drawing.map_picture import draw_map_views
 from fluoromap.drawing.overlay import Look, draw_overlay
 from fluoromap.drawing.png import encode_png
 from fluoromap.drawing.raster import rasterise
-from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, pixel_bands
+from fluoromap.drawing.wall import HATCH, NO_DATA, NOTHING, outline_edges, pixel_bands
+from fluoromap.drawing.warm_up import warm_up
 from fluoromap.fuser.surface import face_normals
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 
@@ -155,6 +157,39 @@ def test_faces_side_by_side_share_no_pixel_and_miss_none(seed):
     assert ((side >= -1e-6).all(axis=2) | (side <= 1e-6).all(axis=2)).all()
 
 
+@pytest.mark.parametrize(("across", "down"), [(0, 0), (-250, 0), (0, 230), (-230, -240), (600, 0), (0, -600)])
+def test_a_map_partly_or_wholly_outside_the_picture_is_the_same_map(sparse_ball, across, down):
+    uv = 250 + 4 * sparse_ball.vertices_mm[:, :2] + 700.0
+    facing, times = np.ones(len(sparse_ball.faces), bool), scale_of(sparse_ball)
+
+    def drawn(shift, side):
+        raster = rasterise(uv + shift, sparse_ball.vertices_mm[:, 2], sparse_ball.faces, facing, (side, side))
+        shown = pixel_bands(raster, sparse_ball, times, 1.0)
+        outside = np.ones((side, side), bool)
+        outside[raster.box] = False
+        assert (raster.face[outside] == -1).all()
+        assert (shown[outside] == NOTHING).all()
+        return raster.face, np.where(shown == HATCH, NO_DATA, shown)
+
+    whole = drawn(np.zeros(2), 1900)
+    shift = np.array([across, down])
+    part = drawn(shift - 700.0, 500)
+    left, upper = 700 - shift
+    for of_whole, of_part in zip(whole, part, strict=True):
+        # Rounding of the shifted coordinates may move single pixels on an edge.
+        assert (of_whole[upper : upper + 500, left : left + 500] != of_part).mean() < 1e-4
+
+
+def test_the_outline_lies_between_faces_that_face_the_viewer_and_others(ball):
+    facing = face_normals(ball.vertices_mm, ball.faces)[:, 2] > 0
+    faces_of = {}
+    for face, corners in enumerate(ball.faces.tolist()):
+        for edge in zip(corners, corners[1:] + corners[:1], strict=True):
+            faces_of.setdefault(tuple(sorted(edge)), []).append(facing[face])
+    wanted = sorted(edge for edge, sides in faces_of.items() if sum(sides) == 1)
+    assert [tuple(edge) for edge in outline_edges(ball.faces, facing).tolist()] == wanted
+
+
 def _bands_pixel_by_pixel(raster, chamber, times, until):
     """Return the content of every pixel by its own time.
 
@@ -240,6 +275,22 @@ def test_early_meets_late_without_running_through_all_bands():
     # Every pixel but those at its centre shows its own angle.
     assert off[away].max() < 25
     assert ((sampled >= reentry.lat_ms.min()) & (sampled < reentry.lat_ms.min() + cycle)).all()
+
+
+@pytest.mark.parametrize("size", [9, 11, 12, 15, 24, 36])
+@pytest.mark.parametrize("site", ["S03", "17 b", "Sitio Ñ", "RVOT-12_x"])
+@pytest.mark.parametrize("direction", ["AP", "LAO 45 CRA 20", "RAO 7 CAU 3"])
+def test_a_caption_of_phrases_is_the_caption_in_one_piece(size, site, direction):
+    text = PHRASE_GAP.join([site, direction, "simulated data, for research"])
+    for mask, rim in zip(_masks(text, size), (0, max(1, size // 9)), strict=True):
+        one_piece = Image.new("L", mask.size)
+        middle = mask.width // 2, mask.height // 2
+        ImageDraw.Draw(one_piece).text(middle, text, fill=255, font=font(size), anchor="mm", stroke_width=rim)
+        np.testing.assert_array_equal(np.asarray(mask), np.asarray(one_piece))
+
+
+def test_the_first_picture_of_a_process_can_be_drawn_ahead():
+    warm_up()
 
 
 class TestOverlay:

@@ -5,16 +5,27 @@ import datetime
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
-from fluoromap_service.store import codec
-from fluoromap_service.store.codec import StoredOtherwise, block_of, decode, deferred, encode, partial_results
+from fluoromap_service.store import array_pools, codec
+from fluoromap_service.store.codec import (
+    StoredOtherwise,
+    block_of,
+    decode,
+    deferred,
+    encode,
+    form_of,
+    partial_results,
+    plain_form,
+)
 from fluoromap_service.store.value_hash import digest
 
 
@@ -27,6 +38,11 @@ class _Number:
 @dataclasses.dataclass(frozen=True)
 class _Numbers:
     numbers: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class _Matrices:
+    matrices: tuple[Array, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,3 +230,125 @@ def test_a_digest_distinguishes_types_and_places() -> None:
     assert digest(_whole()) == digest(decode(_Whole, encode(_whole())))
     with pytest.raises(TypeError, match="never stored"):
         digest(object())
+
+
+def _covariances(count: int, side: int) -> Array:
+    roots = np.random.default_rng(5).normal(size=(count, side, side))
+    covariances = roots @ roots.transpose(0, 2, 1)
+    return 0.5 * (covariances + covariances.transpose(0, 2, 1))
+
+
+@pytest.mark.parametrize("side", [2, 3, 4])
+def test_only_the_upper_halves_of_symmetric_matrices_are_stored(side: int) -> None:
+    before = _covariances(500, side)
+    content = encode(_Numbers(before))
+    assert decode(_Numbers, content).numbers.tobytes() == before.tobytes()
+    assert len(content) < before.nbytes * (side + 1) / (2 * side) + 200
+
+
+def test_a_matrix_whose_halves_differ_by_a_bit_comes_back_with_both() -> None:
+    before = _covariances(500, 3)
+    before[7, 0, 1] = np.nextafter(before[7, 0, 1], np.inf)
+    before[8, 0, 1], before[8, 1, 0] = 0.0, -0.0
+    assert decode(_Numbers, encode(_Numbers(before))).numbers.tobytes() == before.tobytes()
+
+
+def test_tracks_need_less_than_their_numbers() -> None:
+    phases = np.linspace(0, 20, 120)[:, None, None] + np.arange(12)[:, None] / 7
+    before = 60 + 5 * np.sin(phases) * np.array([1.0, 0.7, 0.3])
+    assert len(encode(_Numbers(before))) < 0.9 * before.nbytes
+    assert len(encode(_Numbers(before.astype(np.float32).astype(np.float64)))) < 0.55 * before.nbytes
+
+
+@given(
+    arrays.array_shapes(min_dims=1, max_dims=4, min_side=0, max_side=6).flatmap(
+        lambda shape: arrays.arrays(
+            st.sampled_from(["<f8", "<f4", ">f8", "<i8", "<i4", "|u1", "|b1"]),
+            shape,
+            elements={"allow_nan": False, "allow_infinity": False},
+        )
+    )
+)
+def test_arrays_of_any_type_and_shape_come_back_bit_for_bit(before: np.ndarray[Any, Any]) -> None:
+    values = _Matrices((before, np.concatenate([before] * 40), np.swapaxes(before, 0, -1)))
+    for stored, after in zip(values.matrices, decode(_Matrices, encode(values)).matrices, strict=True):
+        assert (after.dtype, after.shape, after.tobytes()) == (stored.dtype, stored.shape, stored.tobytes())
+
+
+@pytest.mark.parametrize("count", [40, 400])
+def test_arrays_of_a_partial_result_are_stored_once(count: int) -> None:
+    shared = tuple(np.random.default_rng(6).normal(size=(count, 8, 3)))
+    part = block_of(_Matrices(shared))
+    before = _Matrices((np.zeros((8, 3)), *shared[1::2], np.arange(3.0), *shared[::2]))
+    content = encode(before, {"key": part})
+    assert len(content) < len(part.content) + 6 * count + 300
+    after = decode(_Matrices, content)
+    assert [array.tobytes() for array in after.matrices] == [array.tobytes() for array in before.matrices]
+    assert partial_results(content) == {"key": part}
+
+
+def test_a_single_field_with_shared_arrays_is_read_alone() -> None:
+    numbers = np.random.default_rng(6).normal(size=1000)
+    part = block_of(_Numbers(numbers))
+    content = encode(_Apart("a", numbers), {"key": part})
+    assert len(content) < len(part.content) + 300
+    value = deferred(_Apart, "hash", lambda: content)
+    np.testing.assert_array_equal(value.numbers, numbers)
+
+
+def test_nobody_can_write_to_an_array_that_was_read() -> None:
+    for numbers in (np.arange(3.0), np.arange(500.0), _covariances(50, 3)):
+        after = decode(_Numbers, encode(_Numbers(numbers))).numbers
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            after.setflags(write=True)
+
+
+@pytest.mark.parametrize("part", range(12))
+def test_damaged_bytes_are_no_stored_result_or_other_numbers(part: int) -> None:
+    before = _Matrices((np.sin(np.arange(2000.0)), _covariances(100, 3), np.arange(3)))
+    content = encode(before, {"key": block_of(_Numbers(np.arange(100.0)))})
+    for place in range(part, len(content), 97):
+        damaged = content[:place] + bytes([content[place] ^ 0x55]) + content[place + 1 :]
+        try:
+            after = decode(_Matrices, damaged)
+        except StoredOtherwise:
+            continue
+        assert [array.shape for array in after.matrices] == [array.shape for array in before.matrices]
+    for place in range(part, len(content) - len(block_of(_Numbers(np.arange(100.0))).content), 97):
+        with pytest.raises(StoredOtherwise):
+            decode(_Matrices, content[:place])
+
+
+def test_a_result_of_an_earlier_version_is_read() -> None:
+    """Results without compression: a head, the numbers of the arrays, and blocks, each padded to whole words."""
+
+    def stored(*parts: bytes) -> bytes:
+        return b"".join(part + bytes(-len(part) % 8) for part in parts)
+
+    def plain(kind: type, pools: list[Any], numbers: bytes, fields: list[Any], *blocks: bytes) -> bytes:
+        described = [(str(number), len(block)) for number, block in enumerate(blocks)]
+        partial = {f"key {number}": number for number in range(len(blocks))}
+        head = msgspec.msgpack.encode((form_of(kind), pools, described, partial, (1, fields)))
+        return stored(len(head).to_bytes(8, "little"), head, numbers, *blocks)
+
+    covariances = _covariances(5, 3)
+    block = plain(_Texts, [], b"", [[[2], ["a", "b"]]])
+    content = plain(_Apart, [("<f8", [5, 3, 3], [0])], covariances.tobytes(), [["name"], [0], [None]], block)
+    after = decode(_Apart, content)
+    assert (after.name, after.note, after.numbers.tobytes()) == ("name", None, covariances.tobytes())
+    (part,) = partial_results(content).values()
+    assert decode(_Texts, part.content) == _Texts(("a", "b"))
+    again = encode(after, {"key": part})
+    assert decode(_Texts, partial_results(again)["key"].content) == _Texts(("a", "b"))
+    assert decode(_Apart, again).numbers.tobytes() == covariances.tobytes()
+    assert plain_form(after) == plain(_Apart, [("<f8", [5, 3, 3], [0])], covariances.tobytes(), [["name"], [0], [None]])
+
+
+def test_another_compressor_changes_no_hash(monkeypatch: pytest.MonkeyPatch) -> None:
+    value = _Numbers(np.sin(np.arange(2000.0)))
+    before = block_of(value)
+    monkeypatch.setattr(array_pools, "_MOST_BITS", 0.0)
+    after = block_of(value)
+    assert after.sha256 == before.sha256
+    assert after.content != before.content
+    assert plain_form(_whole()) == plain_form(decode(_Whole, encode(_whole())))

@@ -8,6 +8,12 @@ from fastapi import Request, Response
 from fastapi.responses import FileResponse
 
 
+class _StoredFile(FileResponse):
+    """A stored file. Most of them are sent in one piece, because each piece waits for a thread."""
+
+    chunk_size = 1 << 20
+
+
 def is_known(request: Request, etag: str) -> bool:
     """Return whether the client has this version already.
 
@@ -34,6 +40,6 @@ def file_response(
     if is_known(request, etag):
         return Response(status_code=304, headers=headers)
     disposition = "inline" if inline else "attachment"
-    return FileResponse(
+    return _StoredFile(
         path, media_type=media_type, filename=file_name, headers=headers, content_disposition_type=disposition
     )

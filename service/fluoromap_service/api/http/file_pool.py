@@ -15,6 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from enum import StrEnum
 from typing import ParamSpec, TypeVar
 
+from fluoromap.drawing.warm_up import warm_up as draw_first_picture
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 
@@ -139,6 +140,8 @@ def _kill(pool: ProcessPoolExecutor) -> None:
 def _prepare_process(mib: int) -> None:
     _limit_memory(mib)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Beside the first task, which may be the upload of a run.
+    threading.Thread(target=draw_first_picture, daemon=True).start()
 
 
 def _end_with_parent() -> None:

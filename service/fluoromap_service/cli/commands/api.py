@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from contextlib import suppress
 from types import FrameType
@@ -53,6 +54,8 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
             outbox.register(session, read_targets())
     sys.setswitchinterval(SWITCH_SECONDS)
     service = create_app()
+    # The loaded code stays. Else the collector would walk through it, and a request would wait for a tenth of a second.
+    gc.freeze()
     config = uvicorn.Config(
         service,
         http=TimedConnection,
