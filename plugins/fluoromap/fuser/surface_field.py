@@ -144,8 +144,8 @@ class Regression:
             chosen = [(w, fit) for w, fit in zip(weights, self._fits, strict=True) if w and fit.length_index == index]
             if not chosen:
                 continue
-            # Spectrum and trend side by side: the covariance with the sites is ``both @ scales @ known.T`` for every amplitude, so that
-            # the variances of all amplitudes need one product of the size of the surface.
+            # The covariance with the sites is ``both @ known`` for every amplitude. So the variances of all amplitudes need one
+            # product of the size of the surface.
             covariance = (modes * spectrum) @ self._at_sites.T
             both = np.concatenate([covariance, trend], axis=1)
             k = len(self._values)
@@ -236,8 +236,8 @@ def _largest_eigenpairs(apply: Callable[[Array], Array], start: Array, count: in
         new -= basis[:, old] @ projected[own, old].T
         projected[own, own] = basis[:, own].T @ new
         new -= basis[:, own] @ projected[own, own]
-        # Rounding brings back directions of earlier blocks: by a factor of 1300 a step at most, the ratio of the largest eigenvalue to
-        # the smallest of interest. Every third block may keep that, because it stays far below the tolerance.
+        # Rounding brings back directions of earlier blocks. A step enlarges them by 1300 at most: the ratio of the largest
+        # eigenvalue to the smallest of interest. Every third block keeps them, because they stay far below the tolerance.
         if size // _BLOCK % 3 or size >= enough:
             new -= basis[:, :size] @ (basis[:, :size].T @ new)
         following, coupling = qr(new, mode="economic", check_finite=False)

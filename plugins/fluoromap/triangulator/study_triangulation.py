@@ -37,7 +37,7 @@ from fluoromap.triangulator.self_calibration import (
 )
 from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
 from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
-from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
+from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, Gap, study_gaps, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.study_equations import CalibrationSite, SiteEquations, gap_labels, site_equations
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
@@ -94,8 +94,8 @@ class StudyChecks:
     """
 
     jumps: tuple[Jump | None, ...]
-    wrong: tuple[tuple[str, tuple[WrongGap, ...]], ...]
-    contradicted: tuple[tuple[str, tuple[WrongGap, ...]], ...]
+    wrong: tuple[tuple[str, tuple[Gap, ...]], ...]
+    contradicted: tuple[tuple[str, tuple[Gap, ...]], ...]
     same_gantry: tuple[int, ...] = ()
     calibration: Calibration | None = None
     gantry: GantryBelief | None = None
@@ -161,11 +161,9 @@ def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: Uncert
     """Check the study for moved tables and wrong spacings, and calibrate its gantry."""
     resting = frozenset(catalogue.names) - {catalogue.mapping}
     jumps = tuple(table_jumps([(look.cameras, look.pixels, look.points_mm) for look in looks], resting, params))
-    spacings = [(look.pixels, look.points_mm, look.covariance_mm2) for look in looks]
-    wrong = wrong_spacings(spacings, catalogue, STUDY_LIMIT_MM)
-    contradicted = {
-        name: gaps for name, gaps in wrong_spacings(spacings, catalogue, DOUBT_LIMIT_MM).items() if name not in wrong
-    }
+    of_study = study_gaps([(look.pixels, look.points_mm, look.covariance_mm2) for look in looks], catalogue)
+    wrong = wrong_spacings(of_study, STUDY_LIMIT_MM)
+    contradicted = {name: gaps for name, gaps in wrong_spacings(of_study, DOUBT_LIMIT_MM).items() if name not in wrong}
     gaps = [tuple((name, tuple(of)) for name, of in each.items()) for each in (wrong, contradicted)]
     if set(wrong) == set(catalogue.names):
         return StudyChecks(jumps, gaps[0], gaps[1])
@@ -331,7 +329,7 @@ def _same_gantry(sites: Sequence[SiteLook]) -> list[int]:
     return [int(i) for i in np.flatnonzero(alike[np.argmax(alike.sum(axis=1))])]
 
 
-def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue) -> list[str]:
+def _spacing_notes(wrong: Mapping[str, Sequence[Gap]], catalogue: Catalogue) -> list[str]:
     if set(wrong) == set(catalogue.names):
         return [
             "The electrode spacings of every catheter differ from its description. Check the pixel spacing and the source "
@@ -344,7 +342,7 @@ def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue
     ]
 
 
-def _contradiction_notes(contradicted: Mapping[str, Sequence[WrongGap]]) -> list[str]:
+def _contradiction_notes(contradicted: Mapping[str, Sequence[Gap]]) -> list[str]:
     return [
         f"The images contradict the description of the catheter {name!r} ({_differences(gaps)}). Check its electrode "
         "spacings and its tip."
@@ -352,7 +350,7 @@ def _contradiction_notes(contradicted: Mapping[str, Sequence[WrongGap]]) -> list
     ]
 
 
-def _differences(gaps: Sequence[WrongGap]) -> str:
+def _differences(gaps: Sequence[Gap]) -> str:
     return ", ".join(
         f"{gap.first} to {gap.second}: {gap.located_mm:.1f} mm instead of {gap.catalogue_mm:.1f}" for gap in gaps
     )
