@@ -6,6 +6,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -63,6 +64,9 @@ class SiteLook:
     cannot be located; then there are no points. note : a sentence about these reasons, or none. equations : of the site for the
     calibration, with the gantry that the headers state and the gaps of all catheters.
     """
+
+    stored_apart: ClassVar[bool] = True
+    """Each look is stored by itself. So the key of the study's checks needs no hash of the content of unchanged sites."""
 
     site: str
     camera_a: Camera
