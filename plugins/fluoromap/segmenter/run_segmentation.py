@@ -24,8 +24,11 @@ _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
 
-RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image]], bool]
-"""(frame -> chain of one track, frame -> log image) -> whether the run shows a catheter there."""
+Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
+"""(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
+
+RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], bool]
+"""(frame -> chain of one track, frame -> log image, recall) -> whether the run shows a catheter there."""
 
 
 class Detector(Protocol):
@@ -93,20 +96,24 @@ class FoundAgain:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """Whether a run shows a catheter, see :data:`RunJudge` and :meth:`Detector.shows_extra_catheter`."""
+class ExtraCatheter:
+    """The answer of :meth:`Detector.shows_extra_catheter` for the mean image."""
 
-    holds: bool
+    is_shown: bool
 
 
-Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
-"""(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
+def compute_always(kind: type[T], inputs: tuple[object, ...], compute: Callable[[], T]) -> T:
+    """Compute a partial result; the :data:`Recall` where nothing is stored."""
+    return compute()
 
 
 def _recall_for(run: Run, catalogue: Catalogue, context: Context) -> Recall[Any]:
-    """Return :meth:`Context.recall` for answers about one run; a run without a hash of its content is always asked."""
+    """Return :meth:`Context.recall` for partial results of one run.
+
+    A run without a hash of its content has none.
+    """
     if run.content is None:
-        return lambda kind, inputs, compute: compute()
+        return compute_always
     # One tuple for all answers: the context computes its hash once.
     shown = (run.content, run.frame_times_ms, run.px_per_mm, run.pixels, run.r_wave_frames, catalogue)
     return lambda kind, inputs, compute: context.recall(kind, (shown, *inputs), compute)
@@ -200,11 +207,11 @@ def segment_run(
     reason = None if chains else Reason.MANUAL_NEEDED
     if chains:
         extra = recall(
-            Verdict,
-            ("extra catheter", detections.averaged, *chains),
-            lambda: Verdict(detector.shows_extra_catheter(mean_x, chains)),
+            ExtraCatheter,
+            (detections.averaged, *chains),
+            lambda: ExtraCatheter(detector.shows_extra_catheter(mean_x, chains)),
         )
-        reason = Reason.EXTRA_CATHETER if extra.holds else None
+        reason = Reason.EXTRA_CATHETER if extra.is_shown else None
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
     return Segmentation(
@@ -263,12 +270,8 @@ def _beside(frame: int, images: Iterable[tuple[int, Image]], frame_times_ms: Arr
     ]
 
 
-def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image], recall: Recall[Verdict]) -> TrackJudge:
-    def accepts(chains: Mapping[int, Chain]) -> bool:
-        track = ("track", *chains.keys(), *chains.values())
-        return recall(Verdict, track, lambda: Verdict(shows_catheter(chains, log_image))).holds
-
-    return accepts
+def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image], recall: Recall[Any]) -> TrackJudge:
+    return lambda chains: shows_catheter(chains, log_image, recall)
 
 
 def _chain_search(
