@@ -111,14 +111,23 @@ def grade_of(covariance_mm2: ArrayLike, reasons: Iterable[Reason] = ()) -> Grade
 
 def grades_of(covariances_mm2: ArrayLike, reasons: Iterable[Reason] = ()) -> list[Grade]:
     """Return the grades of covariances (n, 3, 3) that have the same reasons; see :func:`grade_of`."""
-    covariances = np.asarray(covariances_mm2, dtype=np.float64)
+    own = tuple(reasons)
+    return [grade_of_axis(axis, own) for axis in largest_semi_axes_mm(covariances_mm2)]
+
+
+def largest_semi_axes_mm(covariances_mm2: ArrayLike) -> list[float]:
+    """Return the largest semi-axis of the 95 % ellipsoid of each covariance (n, 3, 3)."""
+    largest = np.maximum(np.linalg.eigvalsh(np.asarray(covariances_mm2, dtype=np.float64))[:, -1], 0.0)
+    semi_axes_mm: list[float] = np.sqrt(CHI2_95_3D * largest).tolist()
+    return semi_axes_mm
+
+
+def grade_of_axis(semi_axis_mm: float, reasons: Iterable[Reason]) -> Grade:
+    """Return the grade of a position by its largest semi-axis and its reasons; see :func:`grade_of`."""
     doubts = set(reasons)
-    if doubts & AT_BEST_C:
-        return [Grade.C] * len(covariances)
-    largest = np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)
-    semi_axes_mm = np.sqrt(CHI2_95_3D * largest).tolist()
-    best = Grade.B if doubts & AT_BEST_B else Grade.A
-    return [best if axis <= 2.0 else Grade.B if axis <= 4.0 else Grade.C for axis in semi_axes_mm]
+    if semi_axis_mm > 4.0 or doubts & AT_BEST_C:
+        return Grade.C
+    return Grade.B if semi_axis_mm > 2.0 or doubts & AT_BEST_B else Grade.A
 
 
 def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: type = np.float64) -> NDArray[Any]:
@@ -138,11 +147,12 @@ def frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: ty
     else:
         # The order in memory is always by rows, so that an array read from the store equals the original in memory too.
         array = np.array(value, dtype=dtype, order="C")
-    if array.ndim != len(shape) or any(
-        want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
+    if array.shape != shape and (
+        array.ndim != len(shape)
+        or any(want is not None and have != want for have, want in zip(array.shape, shape, strict=True))
     ):
         raise ValueError(f"{name} has shape {array.shape}; it must have shape {shape}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    if array.dtype.kind == "f" and np.count_nonzero(np.isfinite(array)) < array.size:
         raise ValueError(f"{name} contains numbers that are not finite")
     array.setflags(write=False)
     return array
@@ -157,7 +167,7 @@ def _is_frozen(array: NDArray[Any]) -> bool:
         return False
     owner = array.base
     while isinstance(owner, np.ndarray):
-        if owner.base is None:
+        if owner.flags.writeable:
             return False
         owner = owner.base
     return owner is None or isinstance(owner, bytes)

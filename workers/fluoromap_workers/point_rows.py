@@ -6,7 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from fluoromap.contracts import ElectrodePoint, Grade, LocatedSite, Matching, Triangulation, grade_of
+from fluoromap.contracts import (
+    ElectrodePoint,
+    Grade,
+    LocatedSite,
+    Matching,
+    Triangulation,
+    grade_of_axis,
+    largest_semi_axes_mm,
+)
 from fluoromap.reasons import Reason
 from fluoromap_service.store.models import Json
 from fluoromap_service.study.snapshot import RejectedSiteSnapshot, SiteSnapshot, Snapshot
@@ -23,6 +31,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
     notes = {site.site: site.notes for site in matching.sites}
     located = {site.site: site for site in triangulation.sites}
     refused = {site.site: site.reasons for site in triangulation.rejected}
+    axes_mm = _semi_axes_mm(triangulation)
     for planned in snapshot.sites:
         site = located.get(planned.site)
         reference_doubts = site.doubts_about(snapshot.reference) if site else ()
@@ -34,7 +43,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
                     reasons = refused.get(planned.site) or doubts or (Reason.CATHETER_NOT_FOUND,)
                     rows.append(_rejected(job_id, planned, catheter.name, electrode, reasons))
                 else:
-                    rows.append(_located(job_id, planned, site, point, doubts, reference_doubts))
+                    rows.append(_located(job_id, planned, site, point, doubts, reference_doubts, axes_mm[id(point)]))
     for not_ready in snapshot.rejected:
         for catheter in snapshot.catalogue.catheters:
             for electrode in range(1, catheter.electrodes + 1):
@@ -42,11 +51,28 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
     return rows
 
 
+def _semi_axes_mm(triangulation: Triangulation) -> dict[int, tuple[float, float | None]]:
+    """Return the largest semi-axes of each point's two ellipsoids, computed for all points together.
+
+    The keys are the ids of the points. The second axis, relative to the reference catheter, may be missing.
+    """
+    points = [point for site in triangulation.sites for point in site.points]
+    relative = [point for point in points if point.relative_covariance_mm2 is not None]
+    if not points:
+        return {}
+    axes_mm = largest_semi_axes_mm(
+        [point.covariance_mm2 for point in points] + [point.relative_covariance_mm2 for point in relative]
+    )
+    of_relative = dict(zip(map(id, relative), axes_mm[len(points) :], strict=True))
+    return {id(point): (axis, of_relative.get(id(point))) for point, axis in zip(points, axes_mm, strict=False)}
+
+
 def _located(
     job_id: str, planned: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...],
-    reference_doubts: tuple[Reason, ...],
+    reference_doubts: tuple[Reason, ...], semi_axes_mm: tuple[float, float | None],
 ) -> Json:  # fmt: skip
-    relative = point.relative_mm is not None and point.relative_covariance_mm2 is not None
+    semi_axis_mm, relative_semi_axis_mm = semi_axes_mm
+    relative = relative_semi_axis_mm is not None
     own = (*point.reasons, *site.reasons, *doubts)
     relative_own = (*own, *reference_doubts) if relative else own
     reasons = dict.fromkeys(relative_own)
@@ -69,8 +95,10 @@ def _located(
         "residual_b_px": point.residual_px[1],
         "ray_angle_deg": point.ray_angle_deg,
         "lat_ms": planned.lat_ms,
-        "grade": grade_of(point.covariance_mm2, own),
-        "relative_grade": grade_of(point.relative_covariance_mm2, relative_own) if relative else Grade.REJECTED,  # type: ignore[arg-type]
+        "grade": grade_of_axis(semi_axis_mm, own),
+        "relative_grade": Grade.REJECTED
+        if relative_semi_axis_mm is None
+        else grade_of_axis(relative_semi_axis_mm, relative_own),
         "reasons": [str(reason) for reason in reasons],
     }
 

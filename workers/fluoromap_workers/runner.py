@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import structlog
@@ -44,14 +44,20 @@ class PluginFailed(Exception):
 log = structlog.get_logger(__name__)
 
 
+Announce = Callable[[], None]
+
+
 class Place(Protocol):
     """A process in which stages run."""
 
     def is_ready(self) -> bool:
         """Return whether a stage may be claimed for this place."""
 
-    def run(self, held: Claim) -> None:
-        """Run a claimed stage until it has ended or waits for another attempt."""
+    def run(self, held: Claim, announce: Announce) -> None:
+        """Run a claimed stage until it has ended or waits for another attempt.
+
+        ``announce`` announces the other stages that are ready. It is called once, while the stage runs where that is possible.
+        """
 
     def finish_known(self, job_id: str) -> None:
         """End all ready stages of a job whose results are stored."""
@@ -63,12 +69,13 @@ class ThisProcess:
     def is_ready(self) -> bool:
         return True
 
-    def run(self, held: Claim) -> None:
+    def run(self, held: Claim, announce: Announce) -> None:
         with Heartbeat(held) as heartbeat:
             work(held, heartbeat)
             if heartbeat.cancelled:
                 with writing() as session:
                     job_life.stopped(session, held)
+        announce()
 
     def finish_known(self, job_id: str) -> None:
         finish_known(job_id)
@@ -77,15 +84,15 @@ class ThisProcess:
 THIS_PROCESS = ThisProcess()
 
 
-def run(stage_id: int, worker: str, place: Place = THIS_PROCESS) -> None:
+def run(stage_id: int, worker: str, place: Place = THIS_PROCESS, announce: Announce = lambda: None) -> None:
     """Claim a stage for a worker, run its plugin and store the result.
 
-    Do nothing when another worker was faster.
+    Do nothing when another worker was faster. For ``announce`` see :class:`Place`.
     """
     with writing() as session:
         held = job_life.claim(session, stage_id, worker)
     if held is not None:
-        place.run(held)
+        place.run(held, announce)
 
 
 def work(held: Claim, connection: Connection) -> None:
@@ -158,7 +165,7 @@ def _run(held: Claim, connection: Connection, bound: BoundLogger) -> None:
         if taken:
             bound.info("stage_done", reused=True)
             return
-    result, content = _computed(held, work, StageContext(connection, held, work.plugin))
+    result, content = _computed(held, work, StageContext(connection, held, work.plugin()))
     points = tuple(work.points(result)) if work.points else ()
     connection.check()
     sha256 = hashlib.sha256(content).hexdigest()

@@ -6,10 +6,12 @@ exactly the inputs that the stage reads, so that a correction repeats only the w
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -73,8 +75,8 @@ class Work:
         Makes the result that says why the plugin refused.
     points : callable, optional
         Makes the columns of the points that belong to a result.
-    plugin : str
-        Hash of the plugin with its version and parameters: of everything that all partial results depend on.
+    plugin : callable
+        Returns the hash of the plugin with its version and parameters. All partial results depend on these.
     """
 
     key: str
@@ -82,7 +84,7 @@ class Work:
     compute: Callable[[Context], Any]
     refused: Callable[[Refusal], Any]
     points: Callable[[Any], Iterable[Json]] | None = None
-    plugin: str = ""
+    plugin: Callable[[], str] = str
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +119,7 @@ def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
         _require_version(stage, snapshot)
         return work.compute(context)
 
-    return replace(work, compute=compute, plugin=_key(job, stage.name))
+    return replace(work, compute=compute, plugin=partial(_key, snapshot, stage.name))
 
 
 def _require_version(stage: Stage, snapshot: Snapshot) -> None:
@@ -170,9 +172,8 @@ def _segment(job: StoredJob, uid: str) -> Work:
 
     # After a correction the keys of all runs are compared: the facts count as they are stored, without being decoded.
     shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
-    key = _key(
-        job, "segment", run.sha256, *shown, px_per_mm, asdict(catalogue), run.model_dump(include={"corrections"})
-    )  # fmt: skip
+    marked = run.model_dump(include={"corrections"})
+    key = _key(job.snapshot, "segment", run.sha256, *shown, px_per_mm, _as_json(catalogue), marked)
     return Work(key, Segmentation, compute, refused)
 
 
@@ -216,7 +217,7 @@ def _match(job: StoredJob, study: str) -> Work:
 
     # A result's hash says whether it changed: the result itself is not read for the key.
     results = ((site, plain_form(cameras[uid]), segments[uid].result) for site, uid in views)
-    key = _key(job, "match", asdict(catalogue), *(part for view in results for part in view))
+    key = _key(snapshot, "match", _as_json(catalogue), *(part for view in results for part in view))
     return Work(key, Matching, compute, refused)
 
 
@@ -239,7 +240,7 @@ def _triangulate(job: StoredJob, study: str) -> Work:
     def points(located: Triangulation) -> Iterable[Json]:
         return point_rows(job.job_id, job.snapshot, load(Matching, match), located)
 
-    key = _key(job, "triangulate", asdict(catalogue), match.result, doubts)
+    key = _key(job.snapshot, "triangulate", _as_json(catalogue), match.result, doubts)
     return Work(key, Triangulation, compute, refused, points)
 
 
@@ -265,7 +266,7 @@ def _fuse(job: StoredJob, study: str) -> Work:
     def refused(refusal: Refusal) -> MapResult:
         return MapResult(None, refusal.reason, str(refusal), origin)
 
-    key = _key(job, "fuse", list(origin or ()), *(plain_form(site) for site in sites))
+    key = _key(job.snapshot, "fuse", list(origin or ()), *(plain_form(site) for site in sites))
     return Work(key, MapResult, compute, refused)
 
 
@@ -295,7 +296,9 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     def refused(refusal: Refusal) -> SiteTracks:
         return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
 
-    key = _key(job, "monoplane", name, *(plain_form(view) for view in rejected), *(plain_form(view) for view in views))
+    key = _key(
+        job.snapshot, "monoplane", name, *(plain_form(view) for view in rejected), *(plain_form(view) for view in views)
+    )
     return Work(key, SiteTracks, compute, refused)
 
 
@@ -340,10 +343,16 @@ _PREPARE: Mapping[StageName, Callable[[StoredJob, str], Work]] = {
 }
 
 
-def _key(job: StoredJob, name: StageName, *inputs: Any) -> str:
+@functools.lru_cache(maxsize=8)
+def _as_json(catalogue: Catalogue) -> bytes:
+    """Return a catalogue as JSON; the keys of hundreds of runs contain the same one."""
+    return json.dumps(asdict(catalogue), sort_keys=True, allow_nan=False).encode()
+
+
+def _key(snapshot: Snapshot, name: StageName, *inputs: Any) -> str:
     """Return the hash of a stage's plugin, the form of its result, and its inputs."""
     stage = STAGES[name]
-    plugin = plugin_of(stage, job.snapshot)
+    plugin = plugin_of(stage, snapshot)
     digest = hashlib.sha256()
     for item in (name, plugin.name, plugin.version, plugin.params, form_of(stage.result), *inputs):
         content = item if isinstance(item, bytes) else json.dumps(item, sort_keys=True, allow_nan=False).encode()

@@ -21,6 +21,7 @@ from fluoromap_service.store.engine import writing
 from fluoromap_workers import pool_child
 from fluoromap_workers.drain import Drain
 from fluoromap_workers.heartbeat import LOOK_SECONDS, Answer, Beats
+from fluoromap_workers.runner import Announce
 
 GRACE_SECONDS = 5.0
 """Time that a stage gets to stop after its job was cancelled or its claim was lost."""
@@ -96,10 +97,10 @@ class StageProcess:
         log.warning("process_not_ready")
         return False
 
-    def run(self, held: Claim) -> None:
+    def run(self, held: Claim, announce: Announce) -> None:
         """Run a claimed stage to its end, whatever its plugin does.
 
-        When this returns, the stage has ended, or it waits for another attempt.
+        When this returns, the stage has ended, or it waits for another attempt. The thread calls ``announce`` while the stage runs.
         """
         beats = Beats(held)
         now = time.monotonic()
@@ -107,6 +108,7 @@ class StageProcess:
         answer: Answer = "alive"
         try:
             self._send("stage", held)
+            announce()
             while True:
                 message = self._receive()
                 now = time.monotonic()

@@ -81,8 +81,22 @@ def _run_stages(place: Place) -> None:
             compared.add(kind)
             place.finish_known(urgent.job_id)
         else:
-            run(urgent.stage_id, worker, place)
+            run(urgent.stage_id, worker, place, _announce)
+    _announce()
+
+
+def _announce() -> None:
+    """Announce the stages that are ready.
+
+    The worker takes its own next stage without an announcement. So it claims that stage first, and wakes other workers meanwhile.
+    """
+    try:
         queue.publish_due()
+    except SQLAlchemyError as error:
+        if settings().eager:
+            raise
+        # The stages stay ready, and the sweep announces them.
+        log.warning("stages_not_announced", error=type(error).__name__)
 
 
 class Processes(bootsteps.StartStopStep):  # type: ignore[misc]

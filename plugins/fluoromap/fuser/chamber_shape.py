@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
+from scipy.spatial.distance import cdist
 from scipy.special import logsumexp
 
 from fluoromap.contracts import Array, IntArray
@@ -147,8 +148,9 @@ class _Departures:
         self._places = places_mm
         evidence, solved = [], []
         centre, spread = AMPLITUDE_PRIOR
+        apart_mm = cdist(places_mm, places_mm)
         for length in LENGTHS_MM:
-            shape = _matern(places_mm, places_mm, length)
+            shape = _matern(apart_mm, length)
             for amplitude in AMPLITUDES_MM:
                 factor = cho_factor(amplitude**2 * shape + np.diag(variances_mm2), lower=True)
                 weights = cho_solve(factor, values_mm)
@@ -164,16 +166,16 @@ class _Departures:
 
     def mean(self, places_mm: Array) -> Array:
         """Return the expected departure (n,), mm, at places (n, 3) on the ellipsoid, from its centre."""
-        total = np.zeros(len(places_mm))
+        total, apart_mm = np.zeros(len(places_mm)), cdist(places_mm, self._places)
         for length, weights in zip(LENGTHS_MM, self._weights, strict=True):
-            total += _matern(places_mm, self._places, length) @ weights
+            total += _matern(apart_mm, length) @ weights
         return total
 
 
-def _matern(a_mm: Array, b_mm: Array, length_mm: float) -> Array:
-    """Return the Matern 5/2 correlation (n, k), Rasmussen & Williams equation (4.17)."""
-    distance = np.sqrt(5.0) * np.linalg.norm(a_mm[:, None] - b_mm[None], axis=2) / length_mm
-    correlation: Array = (1 + distance + distance**2 / 3) * np.exp(-distance)
+def _matern(apart_mm: Array, length_mm: float) -> Array:
+    """Return the Matern 5/2 correlation at distances (n, k), Rasmussen & Williams equation (4.17)."""
+    distance = np.sqrt(5.0) / length_mm * apart_mm
+    correlation: Array = (1 + distance * (1 + distance / 3)) * np.exp(-distance)
     return correlation
 
 

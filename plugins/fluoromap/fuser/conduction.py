@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -124,11 +125,16 @@ def _plane_wave(flat_mm: Array, times_ms: Array, sd_ms: Array, sites: IntArray) 
     slowness, covariance = fitted[:2], (inverse @ inverse.T)[:2, :2]
     square = float(slowness @ slowness)
     # The slowness must exceed its error in every direction, not only along itself; else its length is mostly noise.
-    if misfit > chi2.ppf(MISFIT_LEVEL, len(sites) - 3) or not np.linalg.eigvalsh(covariance)[-1] < (
+    if misfit > _largest_misfit(len(sites) - 3) or not np.linalg.eigvalsh(covariance)[-1] < (
         LARGEST_RELATIVE_SD**2 * square
     ):
         return None
     return _PlaneWave(sites, slowness, inverse[:2] / sd_ms)
+
+
+@functools.cache
+def _largest_misfit(degrees_of_freedom: int) -> float:
+    return float(chi2.ppf(MISFIT_LEVEL, degrees_of_freedom))
 
 
 def _speed(square: Array, fitted_square: float) -> Array:

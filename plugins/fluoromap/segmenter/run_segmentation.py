@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -17,13 +17,18 @@ from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
 from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
 
+T = TypeVar("T")
+
 _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
 
-RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image]], bool]
-"""(frame -> chain of one track, frame -> log image) -> whether the run shows a catheter there."""
+Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
+"""(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
+
+RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], bool]
+"""(frame -> chain of one track, frame -> log image, recall) -> whether the run shows a catheter there."""
 
 
 class Detector(Protocol):
@@ -83,6 +88,37 @@ class RunDetections:
     mean: FrameChains
 
 
+@dataclass(frozen=True, eq=False)
+class FoundAgain:
+    """The answer of :meth:`Detector.find_again`."""
+
+    chain: Chain | None
+
+
+@dataclass(frozen=True, slots=True)
+class ExtraCatheter:
+    """The answer of :meth:`Detector.shows_extra_catheter` for the mean image."""
+
+    is_shown: bool
+
+
+def compute_always(kind: type[T], inputs: tuple[object, ...], compute: Callable[[], T]) -> T:
+    """Compute a partial result; the :data:`Recall` where nothing is stored."""
+    return compute()
+
+
+def _recall_for(run: Run, catalogue: Catalogue, context: Context) -> Recall[Any]:
+    """Return :meth:`Context.recall` for partial results of one run.
+
+    A run without a hash of its content has none.
+    """
+    if run.content is None:
+        return compute_always
+    # One tuple for all answers: the context computes its hash once.
+    shown = (run.content, run.frame_times_ms, run.px_per_mm, run.pixels, run.r_wave_frames, catalogue)
+    return lambda kind, inputs, compute: context.recall(kind, (shown, *inputs), compute)
+
+
 def segment_run(
     run: Run,
     catalogue: Catalogue,
@@ -130,15 +166,11 @@ def segment_run(
             total += run.frames[index].astype(np.float64)
         return field.fill(transform(total / len(averaged)))
 
-    def detect() -> RunDetections:
-        return _detect(run, detector_of(field), log_image, mean_image, field, context)
-
-    if run.content is None:
-        detections = detect()
-    else:
-        # Marks change the tracks, but not what the images show.
-        shown = (run.content, run.frame_times_ms, run.px_per_mm, run.pixels, run.r_wave_frames, catalogue)
-        detections = context.recall(RunDetections, shown, detect)
+    # Marks change the tracks, but not what the images show.
+    recall = _recall_for(run, catalogue, context)
+    detections = recall(
+        RunDetections, (), lambda: _detect(run, detector_of(field), log_image, mean_image, field, context)
+    )
     motion, averaged = detections.motion, detections.averaged
     automatic = {
         index: entry.chains if entry.manual_needed is None else ()
@@ -158,9 +190,9 @@ def segment_run(
     detector = detector_of(field)
     mean_x = mean_image(averaged)
     catheters = len(catalogue.catheters)
-    search = _chain_search(detector, log_image, context) if search_again else None
+    search = _chain_search(detector, log_image, context, recall) if search_again else None
     seed = mean if len(averaged) > 1 else None
-    accepts = None if shows_catheter is None else _judge(shows_catheter, log_image)
+    accepts = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
     entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
@@ -173,8 +205,13 @@ def segment_run(
         tracks = {chain.track for entry in entries for chain in entry.chains}
         chains = tuple(chain for chain in chains if chain.manual or chain.track in tracks)
     reason = None if chains else Reason.MANUAL_NEEDED
-    if chains and detector.shows_extra_catheter(mean_x, chains):
-        reason = Reason.EXTRA_CATHETER
+    if chains:
+        extra = recall(
+            ExtraCatheter,
+            (detections.averaged, *chains),
+            lambda: ExtraCatheter(detector.shows_extra_catheter(mean_x, chains)),
+        )
+        reason = Reason.EXTRA_CATHETER if extra.is_shown else None
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
     return Segmentation(
@@ -233,19 +270,25 @@ def _beside(frame: int, images: Iterable[tuple[int, Image]], frame_times_ms: Arr
     ]
 
 
-def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image]) -> TrackJudge:
-    return lambda chains: shows_catheter(chains, log_image)
+def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image], recall: Recall[Any]) -> TrackJudge:
+    return lambda chains: shows_catheter(chains, log_image, recall)
 
 
-def _chain_search(detector: Detector, log_image: Callable[[int], Image], context: Context) -> ChainSearch:
+def _chain_search(
+    detector: Detector, log_image: Callable[[int], Image], context: Context, recall: Recall[FoundAgain]
+) -> ChainSearch:
     kept: tuple[int, Image] | None = None
 
     def search(frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
-        nonlocal kept
-        if kept is None or kept[0] != frame:
-            context.check()
-            kept = frame, log_image(frame)
-        return detector.find_again(kept[1], chain, shift, reach_px, taken)
+        def find() -> FoundAgain:
+            nonlocal kept
+            if kept is None or kept[0] != frame:
+                context.check()
+                kept = frame, log_image(frame)
+            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken))
+
+        # A frame may be a number of NumPy, and ``taken`` may grow later.
+        return recall(FoundAgain, (int(frame), chain, shift, reach_px, len(taken), *taken), find).chain
 
     return search
 

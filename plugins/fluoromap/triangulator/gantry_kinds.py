@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from fluoromap.contracts import CHI2_95_3D, Array
 
@@ -97,4 +97,4 @@ def _outside(shares: Array, sizes: Array, size: float) -> float:
 
     The sphere is that of the variance ``size``.
     """
-    return float(shares @ chi2.sf(CHI2_95_3D * size / sizes, 3)) - 0.05
+    return float(shares @ chdtrc(3, CHI2_95_3D * size / sizes)) - 0.05

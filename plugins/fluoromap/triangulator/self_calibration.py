@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.special import chdtrc, logsumexp
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Calibration, StudyVariation
@@ -243,7 +242,7 @@ def _is_explained(row: SiteEquations, usual: Array, gaps: int) -> bool:
     worst = HeartScale(max(one.breathing for one in HEART_SCALES), max(one.beats for one in HEART_SCALES))
     covariance = row.covariance(worst) + row.slope @ prior @ row.slope.T
     misfit = float(row.residual @ np.linalg.solve(covariance, row.residual))
-    return bool(chi2.sf(misfit, len(row.residual)) >= UNEXPLAINED_BELOW)
+    return bool(chdtrc(len(row.residual), misfit) >= UNEXPLAINED_BELOW)
 
 
 def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:

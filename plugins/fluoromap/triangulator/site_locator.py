@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import get_args
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
@@ -210,18 +210,24 @@ class SiteLocator:
         doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
             doubts.setdefault(catheter, []).append(reason)
-        relative_mm2 = relative_covariances_mm2(joint, reference) + added_mm2 if reference else None
-        residuals = np.linalg.norm(moment.residuals_px, axis=2)
+        # Rows of read-only arrays need no copy for each electrode.
+        positions, covariances = _read_only(points), _read_only(np.einsum("iaib->iab", joint))
+        relative = relative_mm2 = None
+        if reference_mm is not None:
+            relative = _read_only(points - reference_mm)
+            relative_mm2 = _read_only(relative_covariances_mm2(joint, reference) + added_mm2)
+        residuals = np.linalg.norm(moment.residuals_px, axis=2).tolist()
+        angles = moment.ray_angles_deg.tolist()
         found = tuple(
             ElectrodePoint(
                 catheter=catheter,
                 electrode=electrode,
-                position_mm=points[i],
-                covariance_mm2=joint[i, :, i],
-                relative_mm=None if reference_mm is None else points[i] - reference_mm,
+                position_mm=positions[i],
+                covariance_mm2=covariances[i],
+                relative_mm=None if relative is None else relative[i],
                 relative_covariance_mm2=None if relative_mm2 is None else relative_mm2[i],
-                residual_px=(float(residuals[i, 0]), float(residuals[i, 1])),
-                ray_angle_deg=float(moment.ray_angles_deg[i]),
+                residual_px=(residuals[i][0], residuals[i][1]),
+                ray_angle_deg=angles[i],
                 reasons=tuple(
                     dict.fromkeys((
                         *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
@@ -296,14 +302,15 @@ class Moment:
         if len(self.apart_px):
             expected = self.own_px2 + self.study_px @ errors @ self.study_px.T
             misfit = float(self.apart_px @ np.linalg.solve(expected, self.apart_px))
-            inflation = misfit / len(expected) if chi2.sf(misfit, len(expected)) < DOUBTFUL_BELOW else 1.0
+            inflation = misfit / len(expected) if chdtrc(len(expected), misfit) < DOUBTFUL_BELOW else 1.0
         displaced = self.study_mm @ errors
         joint = self.own_mm2 + displaced @ self.study_mm.T
         squares = dict(zip(BUDGET, self.squares_mm2, strict=True))
-        for share in set(self.shares):
+        # The electrodes' variances from each pair of study errors.
+        of_pairs = errors * (self.study_mm.T @ self.study_mm)
+        for share in dict.fromkeys(self.shares):
             of = np.array([own == share for own in self.shares])
-            both = errors * (of[:, None] & of)
-            squares[share] += float(((self.study_mm @ both) * self.study_mm).sum())
+            squares[share] += float(of @ of_pairs @ of)
         n = len(self.labels)
         return MomentErrors(inflation, (inflation * (joint + joint.T) / 2).reshape(n, 3, n, 3), tuple(squares.values()))
 
@@ -321,6 +328,13 @@ class Diastole:
 
 BUDGET = get_args(Share)
 """Entries of the :class:`~fluoromap.contracts.ErrorBudget`, in its order."""
+
+
+def _read_only(values: Array) -> Array:
+    """Return a copy that nobody can write to."""
+    copy = np.array(values, order="C")
+    copy.setflags(write=False)
+    return copy
 
 
 def _squares_mm2(gain: Array, noise_px2: Array, sources: Sequence[ErrorSource]) -> tuple[float, ...]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,8 +22,8 @@ _CHANCE_SD = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class WrongGap:
-    """Two electrodes of a catheter whose distance in the study differs from the catalogue's."""
+class Gap:
+    """Two electrodes of a catheter, with their distance in the study and in the catalogue."""
 
     first: int
     second: int
@@ -29,12 +31,15 @@ class WrongGap:
     catalogue_mm: float
 
 
-def neighbours(labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> list[tuple[int, int, float]]:
+@functools.lru_cache(maxsize=256)
+def neighbours(labels: tuple[tuple[str, int], ...], catalogue: Catalogue) -> tuple[tuple[int, int, float], ...]:
     """Return pairs of successive electrodes of a catheter.
+
+    Most sites of a study show the same electrodes.
 
     Returns
     -------
-    list of (int, int, float)
+    tuple of (int, int, float)
         Indices of the two electrodes in ``labels``, and the catalogue's distance between them in mm.
     """
     found = []
@@ -46,11 +51,11 @@ def neighbours(labels: Sequence[tuple[str, int]], catalogue: Catalogue) -> list[
         )  # fmt: skip
         for (first, i), (second, j) in itertools.pairwise(own):
             found.append((i, j, float(along[second - 1] - along[first - 1])))
-    return found
+    return tuple(found)
 
 
 def spacing_mismatches(
-    points_mm: Array, labels: Sequence[tuple[str, int]], catalogue: Catalogue, limit_mm: float
+    points_mm: Array, labels: tuple[tuple[str, int], ...], catalogue: Catalogue, limit_mm: float
 ) -> set[int]:
     """Return the indices of electrodes whose distance from a neighbour is not the catalogue's.
 
@@ -58,15 +63,25 @@ def spacing_mismatches(
     """
     found: set[int] = set()
     for i, j, gap in neighbours(labels, catalogue):
-        if abs(float(np.linalg.norm(points_mm[i] - points_mm[j])) - gap) > limit_mm:
+        if abs(math.dist(points_mm[i], points_mm[j]) - gap) > limit_mm:
             found |= {i, j}
     return found
 
 
-def wrong_spacings(
-    sites: Sequence[tuple[TwoViewPixels, Array, Array]], catalogue: Catalogue, limit_mm: float
-) -> dict[str, list[WrongGap]]:
-    """Return the catheters with gaps that differ from the catalogue's by more than ``limit_mm``.
+@dataclass(frozen=True, slots=True)
+class StudyGap:
+    """The distance between two electrodes of a catheter over a study.
+
+    chance_mm : difference from the catalogue's distance that chance explains.
+    """
+
+    catheter: str
+    gap: Gap
+    chance_mm: float
+
+
+def study_gaps(sites: Sequence[tuple[TwoViewPixels, Array, Array]], catalogue: Catalogue) -> list[StudyGap]:
+    """Return the median of each gap over the sites of a study.
 
     Parameters
     ----------
@@ -75,18 +90,30 @@ def wrong_spacings(
     """
     found: dict[tuple[str, int, int], list[tuple[float, float, float]]] = {}
     for pixels, points, joint in sites:
-        for i, j, gap in neighbours(pixels.labels, catalogue):
-            apart = points[i] - points[j]
-            length = float(np.linalg.norm(apart))
-            spread = joint[i, :, i] + joint[j, :, j] - joint[i, :, j] - joint[j, :, i]
-            variance = float(apart @ spread @ apart) / max(length, 1e-9) ** 2
-            (name, first), (_, second) = pixels.labels[i], pixels.labels[j]
-            found.setdefault((name, first, second), []).append((length, variance, gap))
-    wrong: dict[str, list[WrongGap]] = {}
-    for (name, first, second), lengths in found.items():
-        values = np.array(lengths)
-        median, gap = float(np.median(values[:, 0])), float(values[0, 2])
-        chance_mm = _CHANCE_SD * float(np.sqrt(values[:, 1].mean() / len(values)))
-        if abs(median - gap) > max(limit_mm, chance_mm):
-            wrong.setdefault(name, []).append(WrongGap(first, second, median, gap))
+        pairs = neighbours(pixels.labels, catalogue)
+        if not pairs:
+            continue
+        i, j = np.array([pair[:2] for pair in pairs]).T
+        apart = points[i] - points[j]
+        lengths = np.linalg.norm(apart, axis=1)
+        spread = joint[i, :, i] + joint[j, :, j] - joint[i, :, j] - joint[j, :, i]
+        variances = np.einsum("ka,kab,kb->k", apart, spread, apart) / np.maximum(lengths, 1e-9) ** 2
+        for (first, second, gap), length, variance in zip(pairs, lengths.tolist(), variances.tolist(), strict=True):
+            label = (*pixels.labels[first], pixels.labels[second][1])
+            found.setdefault(label, []).append((length, variance, gap))
+    gaps = []
+    for (name, one, other), of_sites in found.items():
+        values = np.array(of_sites)
+        located = Gap(one, other, float(np.median(values[:, 0])), float(values[0, 2]))
+        gaps.append(StudyGap(name, located, _CHANCE_SD * float(np.sqrt(values[:, 1].mean() / len(values)))))
+    return gaps
+
+
+def wrong_spacings(gaps: Sequence[StudyGap], limit_mm: float) -> dict[str, list[Gap]]:
+    """Return the catheters with gaps that differ from the catalogue's by more than ``limit_mm``."""
+    wrong: dict[str, list[Gap]] = {}
+    for of_study in gaps:
+        gap = of_study.gap
+        if abs(gap.located_mm - gap.catalogue_mm) > max(limit_mm, of_study.chance_mm):
+            wrong.setdefault(of_study.catheter, []).append(gap)
     return wrong

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -39,7 +40,7 @@ from fluoromap.triangulator.self_calibration import (
 )
 from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
 from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
-from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, WrongGap, wrong_spacings
+from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, Gap, study_gaps, wrong_spacings
 from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.study_equations import CalibrationSite, SiteEquations, gap_labels, site_equations
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
@@ -60,6 +61,9 @@ class SiteLook:
     cannot be located; then there are no points. note : a sentence about these reasons, or none. equations : of the site for the
     calibration, with the gantry that the headers state and the gaps of all catheters.
     """
+
+    stored_apart: ClassVar[bool] = True
+    """Each look is stored by itself. So the key of the study's checks needs no hash of the content of unchanged sites."""
 
     site: str
     camera_a: Camera
@@ -91,8 +95,8 @@ class StudyChecks:
     """
 
     jumps: tuple[Jump | None, ...]
-    wrong: tuple[tuple[str, tuple[WrongGap, ...]], ...]
-    contradicted: tuple[tuple[str, tuple[WrongGap, ...]], ...]
+    wrong: tuple[tuple[str, tuple[Gap, ...]], ...]
+    contradicted: tuple[tuple[str, tuple[Gap, ...]], ...]
     same_gantry: tuple[int, ...] = ()
     calibration: Calibration | None = None
     gantry: GantryBelief | None = None
@@ -158,11 +162,9 @@ def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: Uncert
     """Check the study for moved tables and wrong spacings, and calibrate its gantry."""
     resting = frozenset(catalogue.names) - {catalogue.mapping}
     jumps = tuple(table_jumps([(look.cameras, look.pixels, look.points_mm) for look in looks], resting, params))
-    spacings = [(look.pixels, look.points_mm, look.covariance_mm2) for look in looks]
-    wrong = wrong_spacings(spacings, catalogue, STUDY_LIMIT_MM)
-    contradicted = {
-        name: gaps for name, gaps in wrong_spacings(spacings, catalogue, DOUBT_LIMIT_MM).items() if name not in wrong
-    }
+    of_study = study_gaps([(look.pixels, look.points_mm, look.covariance_mm2) for look in looks], catalogue)
+    wrong = wrong_spacings(of_study, STUDY_LIMIT_MM)
+    contradicted = {name: gaps for name, gaps in wrong_spacings(of_study, DOUBT_LIMIT_MM).items() if name not in wrong}
     gaps = [tuple((name, tuple(of)) for name, of in each.items()) for each in (wrong, contradicted)]
     if set(wrong) == set(catalogue.names):
         return StudyChecks(jumps, gaps[0], gaps[1])
@@ -328,7 +330,7 @@ def _same_gantry(sites: Sequence[SiteLook]) -> list[int]:
     return [int(i) for i in np.flatnonzero(alike[np.argmax(alike.sum(axis=1))])]
 
 
-def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue) -> list[str]:
+def _spacing_notes(wrong: Mapping[str, Sequence[Gap]], catalogue: Catalogue) -> list[str]:
     if set(wrong) == set(catalogue.names):
         return [
             "The electrode spacings of every catheter differ from its description. Check the pixel spacing and the source "
@@ -341,7 +343,7 @@ def _spacing_notes(wrong: Mapping[str, Sequence[WrongGap]], catalogue: Catalogue
     ]
 
 
-def _contradiction_notes(contradicted: Mapping[str, Sequence[WrongGap]]) -> list[str]:
+def _contradiction_notes(contradicted: Mapping[str, Sequence[Gap]]) -> list[str]:
     return [
         f"The images contradict the description of the catheter {name!r} ({_differences(gaps)}). Check its electrode "
         "spacings and its tip."
@@ -349,7 +351,7 @@ def _contradiction_notes(contradicted: Mapping[str, Sequence[WrongGap]]) -> list
     ]
 
 
-def _differences(gaps: Sequence[WrongGap]) -> str:
+def _differences(gaps: Sequence[Gap]) -> str:
     return ", ".join(
         f"{gap.first} to {gap.second}: {gap.located_mm:.1f} mm instead of {gap.catalogue_mm:.1f}" for gap in gaps
     )

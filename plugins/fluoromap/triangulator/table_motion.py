@@ -150,7 +150,9 @@ def _displacements(
     catheters = [pixels.labels[row][0] for row in rows]
     found: list[Array] = []
     for camera, uv in zip(cameras, pixels.pixels, strict=True):
-        inverse = np.linalg.pinv(camera.jacobian(places))
+        jacobian = camera.jacobian(places)
+        transposed = np.swapaxes(jacobian, -1, -2)
+        inverse = transposed @ np.linalg.inv(jacobian @ transposed)
         moved = (inverse @ (uv[rows] - camera.project(places))[..., None])[..., 0]
         own = [[name == catheter for name in catheters] for catheter in dict.fromkeys(catheters)]
         found.append(_common_displacement(np.array([moved[of].mean(axis=0) for of in own])))
@@ -238,6 +240,8 @@ def _exceeds_breathing(displacement_mm: Array, camera: Camera | None, params: Un
 
     With a camera, only the part across its central ray counts.
     """
+    if float(np.linalg.norm(displacement_mm)) <= _LEAST_MM:
+        return False
     # The usual place is a median over sites, so that its breathing is smaller: 1.25 instead of 2 variances.
     spread = 1.25 * params.respiration_covariance_mm2() + params.beat_sd_mm**2 * np.eye(3)
     if camera is not None:
@@ -246,4 +250,4 @@ def _exceeds_breathing(displacement_mm: Array, camera: Camera | None, params: Un
     else:
         inverse = np.linalg.inv(spread)
     sds = float(np.sqrt(displacement_mm @ inverse @ displacement_mm))
-    return sds > _BEYOND_SD and float(np.linalg.norm(displacement_mm)) > _LEAST_MM
+    return sds > _BEYOND_SD

@@ -138,10 +138,8 @@ def is_whole(sha256: str) -> bool:
     path = path_of(sha256)
     try:
         state = _state_of(path)
-        with _checked_lock:
-            if _checked.get(sha256) == state:
-                _checked.move_to_end(sha256)
-                return True
+        if _is_checked(sha256, state):
+            return True
         if sha256_of(path) != sha256:
             return False
     except FileNotFoundError:
@@ -153,6 +151,15 @@ def is_whole(sha256: str) -> bool:
 def _state_of(path: Path) -> tuple[int, ...]:
     facts = path.stat()
     return facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
+
+
+def _is_checked(sha256: str, state: tuple[int, ...]) -> bool:
+    """Return whether this process has checked the file in this state."""
+    with _checked_lock:
+        if _checked.get(sha256) != state:
+            return False
+        _checked.move_to_end(sha256)
+        return True
 
 
 def _remember_check(sha256: str, state: tuple[int, ...]) -> None:
@@ -201,17 +208,23 @@ def checked_meanwhile(sha256: str) -> Iterator[Path]:
 def read(sha256: str) -> bytes:
     """Return the content of a stored file after a check of its hash.
 
+    A process checks a file again only when the file has changed since it last did so.
+
     Raises
     ------
     BrokenFile
         When the file is missing or its content has another hash.
     """
+    path = path_of(sha256)
     try:
-        content = path_of(sha256).read_bytes()
+        state = _state_of(path)
+        content = path.read_bytes()
     except FileNotFoundError:
         raise BrokenFile(sha256) from None
-    if hashlib.sha256(content).hexdigest() != sha256:
-        raise BrokenFile(sha256)
+    if not _is_checked(sha256, state):
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise BrokenFile(sha256)
+        _remember_check(sha256, state)
     return content
 
 

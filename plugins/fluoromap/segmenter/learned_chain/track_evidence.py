@@ -20,6 +20,7 @@ from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import log_odds
+from fluoromap.segmenter.run_segmentation import Recall, compute_always
 
 _AVERAGED = 8
 _PICTURES = 2
@@ -34,6 +35,13 @@ _LEAST_LONG = 0.0
 _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
+@dataclass(frozen=True, eq=False)
+class SectionOdds:
+    """The log-odds (n,) of the electrodes of a part of a track, in the mean of some frames."""
+
+    log_odds: Array
+
+
 @dataclass(slots=True, eq=False)
 class TrackEvidence:
     """Judge of the tracks of one run.
@@ -46,16 +54,26 @@ class TrackEvidence:
     frames: int
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
-    def __call__(self, chains: Mapping[int, Chain], log_image: Callable[[int], Image]) -> bool:
+    def __call__(
+        self,
+        chains: Mapping[int, Chain],
+        log_image: Callable[[int], Image],
+        recall: Recall[SectionOdds] = compute_always,
+    ) -> bool:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
+
+        def odds_along(group: slice, path_uv: Array) -> Array:
+            def compute() -> SectionOdds:
+                return SectionOdds(self.log_odds_along(frames[group], path_uv, log_image))
+
+            return recall(SectionOdds, (tuple(frames[group]), path_uv), compute).log_odds
+
         usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
         frames = sorted(frame for frame, chain in chains.items() if chain.electrodes == usual)
         paths = np.array([chains[frame].pixels_uv for frame in frames])
         odds = np.array(
             [
-                np.concatenate(
-                    [self.log_odds_along(frames[group], part, log_image) for part in _sections(paths[group])]
-                )
+                np.concatenate([odds_along(group, part) for part in _sections(paths[group])])
                 for group in _groups(len(frames))
             ]
         )
