@@ -19,11 +19,12 @@ import argparse
 import json
 import os
 import re
+import sqlite3
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -186,19 +187,20 @@ def _pure(folder: Path, spec: StudySpec, segmenter: str) -> dict[str, float]:
 
 
 @contextmanager
-def _service(workers: int | None) -> Iterator[tuple[httpx.Client, ProcessFigures]]:
+def _service(workers: int | None) -> Iterator[tuple[httpx.Client, ProcessFigures, Path]]:
+    """Run a service; give its client, the figures of its processes and its folder."""
     with (
         tempfile.TemporaryDirectory() as name,
         process_figures() as figures,
         private_service(Path(name) / "service", workers=workers) as url,
         httpx.Client(base_url=url, timeout=600, trust_env=False) as http,
     ):
-        yield http, figures
+        yield http, figures, Path(name) / "service"
         figures.sample()
 
 
 def _one_worker(folder: Path, segmenter: str, pure: dict[str, float] | None) -> JobTimes:
-    with _service(1) as (http, figures):
+    with _service(1) as (http, figures, _):
         study, _ = upload_study(http, folder)
         _, times = _job(http, figures, study, segmenter)
     _show_job("one worker process", times)
@@ -213,13 +215,16 @@ def _one_worker(folder: Path, segmenter: str, pure: dict[str, float] | None) -> 
 
 def _all_workers(folder: Path, segmenter: str, corrections: int, one: JobTimes | None) -> None:
     processors = len(os.sched_getaffinity(0))
-    with _service(None) as (http, figures):
+    with _service(None) as (http, figures, data):
         study, uploads = upload_study(http, folder)
         print(
             f"upload: {sum(uploads):.2f} s; first {uploads[0]:.3f} s, median of the last ten {median(uploads[-10:]):.3f} s"
         )
         job, times = _job(http, figures, study, segmenter)
         _show_job(f"{processors} worker processes", times)
+        megabytes = _stored_megabytes(data, job)
+        of_stages = ", ".join(f"{name} {size:.2f}" for name, size in megabytes.items())
+        print(f"stored results with partial results: {sum(megabytes.values()):.2f} MB ({of_stages})")
         if one is not None:
             print(f"  segmenting {one.segmented / times.segmented:.2f} times as fast as with one worker process")
         _results(http, job)
@@ -231,9 +236,22 @@ def _all_workers(folder: Path, segmenter: str, corrections: int, one: JobTimes |
         )
 
 
+def _stored_megabytes(data: Path, job: str) -> dict[str, float]:
+    """Return the size of the stored results of each stage of a job."""
+    megabytes: dict[str, float] = {}
+    with closing(sqlite3.connect(f"file:{data / 'fluoromap.sqlite'}?mode=ro", uri=True)) as database:
+        rows = database.execute(
+            "SELECT DISTINCT name, result FROM stage WHERE job_id = ? AND result IS NOT NULL", (job,)
+        )
+        for name, sha256 in rows:
+            size = (data / "files" / sha256[:2] / sha256).stat().st_size
+            megabytes[name] = megabytes.get(name, 0.0) + size / 1e6
+    return megabytes
+
+
 def _turns(folder: Path, segmenter: str, queued: int) -> None:
     """Measure a job of two sites alone, and behind jobs of the whole study."""
-    with _service(None) as (http, _):
+    with _service(None) as (http, _, _):
         large, _ = upload_study(http, folder)
         small, _ = upload_study(http, folder, sites=2)
 

@@ -10,7 +10,8 @@ a partial result that a later job may use again. A block is copied into another 
 when they are first read.
 
 A value also has a plain form, without compression and without the content of its blocks. Its hash identifies the value, so that
-another compressor changes no key. Earlier versions of fluoromap stored plain forms, with the blocks behind them. They are read too.
+keys with values and blocks do not depend on the compressor. Earlier versions of fluoromap stored plain forms, with the blocks
+behind them. They are read too.
 """
 
 from __future__ import annotations
