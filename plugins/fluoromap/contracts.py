@@ -123,7 +123,10 @@ def largest_semi_axes_mm(covariances_mm2: ArrayLike) -> list[float]:
 
 
 def grade_of_axis(semi_axis_mm: float, reasons: Iterable[Reason]) -> Grade:
-    """Return the grade of a position by its largest semi-axis and its reasons; see :func:`grade_of`."""
+    """Return the grade for a largest semi-axis and reasons.
+
+    See :func:`grade_of`.
+    """
     doubts = set(reasons)
     if semi_axis_mm > 4.0 or doubts & AT_BEST_C:
         return Grade.C

@@ -52,9 +52,10 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
 
 
 def _semi_axes_mm(triangulation: Triangulation) -> dict[int, tuple[float, float | None]]:
-    """Return the largest semi-axes of each point's two ellipsoids, computed for all points together.
+    """Return the largest semi-axes of each point's two ellipsoids.
 
-    The keys are the ids of the points. The second axis, relative to the reference catheter, may be missing.
+    One decomposition serves all points. The keys are the ids of the points. The second axis, relative to the reference catheter,
+    may be missing.
     """
     points = [point for site in triangulation.sites for point in site.points]
     relative = [point for point in points if point.relative_covariance_mm2 is not None]

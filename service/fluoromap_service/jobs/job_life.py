@@ -428,7 +428,10 @@ def _settle(session: Session, job: Job) -> None:
 
 
 def _settled_columns(session: Session, job_id: str) -> Sequence[Row[*tuple[Any, ...]]]:
-    """Return the columns of a job's stages from which :func:`_settle` decides; a job may have a thousand stages."""
+    """Return the columns that :func:`_settle` reads of a job's stages.
+
+    A job may have a thousand stages.
+    """
     query = select(StageRow.id, StageRow.depends_on, StageRow.error, *_REPORTED).where(StageRow.job_id == job_id)
     return session.execute(query.order_by(StageRow.id)).all()
 

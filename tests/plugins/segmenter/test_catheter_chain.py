@@ -1,3 +1,6 @@
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -9,12 +12,13 @@ from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap_service.store.value_hash import digest
 
 PX_PER_MM = 512 / 178 * 2
 CHI2_95_2D = 5.991464547107979
 
 
-def segmented(frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, marks=None, frame_ms=1000 / 60):
+def run_of(frames, bits=12, monochrome1=False, frame_ms=1000 / 60):
     class Source:
         shape = np.asarray(frames[0]).shape
 
@@ -27,7 +31,11 @@ def segmented(frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, m
         def __iter__(self):
             return iter(frames)
 
-    run = Run(Source(), np.arange(len(frames)) * frame_ms, PX_PER_MM, PixelFacts(False, bits, monochrome1))
+    return Run(Source(), np.arange(len(frames)) * frame_ms, PX_PER_MM, PixelFacts(False, bits, monochrome1))
+
+
+def segmented(frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, marks=None, frame_ms=1000 / 60):
+    run = run_of(frames, bits, monochrome1, frame_ms)
     return CatheterChain().segment(run, catalogue, marks or {}, Silent())
 
 
@@ -249,6 +257,36 @@ def test_a_mark_replaces_its_frame_and_its_neighbours_follow_it(beating):
         followed = next(chain for chain in found.frames[frame].chains if chain.track == number)
         assert not followed.manual
         assert np.linalg.norm(followed.pixels_uv - truth.pixels_uv["mapping"][frame], axis=1).max() < 5
+
+
+class Remembering(Silent):
+    """A context that stores partial results by the kind and a hash of all inputs, and counts those that are computed."""
+
+    def __init__(self):
+        self.results, self.computed = {}, Counter()
+
+    def recall(self, kind, inputs, compute):
+        key = kind.__name__, digest(*inputs)
+        if key not in self.results:
+            self.computed[kind.__name__] += 1
+            self.results[key] = compute()
+        return self.results[key]
+
+
+def test_a_correction_repeats_only_what_its_mark_changes(beating):
+    frames, truth, _ = beating
+    run = replace(run_of(frames[:16]), content="0" * 64)
+    moved = truth.pixels_uv["mapping"][4] + [1.5, 0.0]
+    marks = {4: (manual(truth.pixels_uv["mapping"][4]),)}
+    context = Remembering()
+    first = CatheterChain().segment(run, DEFAULT_CATALOGUE, marks, context)
+    searched = Counter(context.computed)
+    again = CatheterChain().segment(run, DEFAULT_CATALOGUE, marks, context)
+    assert context.computed == searched
+    assert digest(again) == digest(first)
+    corrected = CatheterChain().segment(run, DEFAULT_CATALOGUE, {4: (manual(moved),)}, context)
+    assert context.computed["RunDetections"] == 1
+    assert digest(corrected) == digest(CatheterChain().segment(run, DEFAULT_CATALOGUE, {4: (manual(moved),)}, Silent()))
 
 
 def test_a_mark_of_some_electrodes_only_is_kept():
