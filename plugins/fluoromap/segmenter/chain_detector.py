@@ -46,6 +46,7 @@ _BESIDE_MM = 2.0
 _WEAKER = 0.25
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
+_LEAST_PLACES = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +123,11 @@ class _FittedSet:
     unlisted: tuple[CandidateChain, ...]
     sure: bool
 
+    @property
+    def explained(self) -> int:
+        """Number of the chains' electrodes."""
+        return sum(len(chain.electrodes) for chain in self.chains)
+
 
 @dataclass(slots=True, eq=False)
 class ChainDetector:
@@ -162,22 +168,44 @@ class ChainDetector:
         electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
         proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
         families = catheter_families(self.catalogue)
-        linking = self._link(seen, proposed, families)
-        if not linking.chains:
-            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
+        result = self._search(x, seen, proposed, families)
+        # Split pairs must not make a part of an unlisted catheter a listed one.
+        if result.explained < electrodes and not result.unlisted:
+            halves = seen.halves_of_pairs(self.field.candidates)
+            if len(halves):
+                split = self._search(x, seen, proposed.with_more(halves), families, len(halves))
+                result = split if split.explained > result.explained else result
+        return FrameChains(frame, result.chains, None if result.sure and result.chains else Reason.MANUAL_NEEDED)
+
+    def _search(
+        self,
+        x: Image,
+        seen: ImageEvidence,
+        proposed: Proposals,
+        families: tuple[CatheterFamily, ...],
+        halves: int = 0,
+    ) -> _FittedSet:
+        """Return the accepted chains of these proposals.
+
+        The last ``halves`` of them are electrodes of split pairs.
+        """
+        linking = self._link(seen, proposed, families, halves)
         result = self._fit(x, seen, proposed, linking, families)
         if self.acceptance.strict and len(result.candidates) < len(linking.chains):
             again = self._link_without_rejected(seen, linking, result, families)
             if not set(again.chains) <= set(result.candidates):
                 other = self._fit(x, seen, proposed, again, families)
                 result = other if len(other.chains) > len(result.chains) else result
-        return FrameChains(frame, result.chains, None if result.sure and result.chains else Reason.MANUAL_NEEDED)
+        return result
 
-    def _link(self, seen: ImageEvidence, proposed: Proposals, families: tuple[CatheterFamily, ...]) -> _Linking:
+    def _link(
+        self, seen: ImageEvidence, proposed: Proposals, families: tuple[CatheterFamily, ...], halves: int
+    ) -> _Linking:
         """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
         shaft_image = self._shafts(seen)
         points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
+        possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
             return _Linking(points, len(points), possible, linked)
@@ -200,6 +228,7 @@ class ChainDetector:
             _COMPANION_SLACK,
             completed.rows,
         )
+        possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
         return _Linking(completed.points_uv, len(points), possible, linked)
 
@@ -213,8 +242,9 @@ class ChainDetector:
     ) -> _FittedSet:
         """Fit linked chains to the image, and drop those that are not accepted."""
         fitted = fit_chains(
-            x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed
-        )
+            x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed,
+            seen.tip_logits_at,
+        )  # fmt: skip
         clear = [
             (candidates, one)
             for candidates, one in zip(linking.chains, fitted, strict=True)
@@ -270,7 +300,8 @@ class ChainDetector:
 
         Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
         alike, so proposals in less than half of the gaps may be parts of a dark shaft if they are less probable: less than a
-        long chain's weaker electrodes, or clearly less than all electrodes of a short one and 0.77 at most.
+        long chain's weaker electrodes, or clearly less than all electrodes of a short one and 0.77 at most. Electrodes of a
+        long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         odds_of_free, odds = log_odds(seen.probability_at(free)), log_odds(proposed.probability)
@@ -289,7 +320,8 @@ class ChainDetector:
                 unexplained_between(chain, free[odds_of_free >= limit], family.catheter, self.px_per_mm)
                 for limit in (EVEN_ODDS, like)
             )
-            row = proposed.points_uv[odds >= onwards]
+            long_ones = [other for other in chains if other is not chain and len(other.electrodes) >= MANY_ELECTRODES]
+            row = not_on(proposed.points_uv[odds >= onwards], long_ones, self.px_per_mm)
             listed[index] = (
                 2 * sure < len(own) and not alike and not continues(chain, row, family.catheter, self.px_per_mm)
             )
@@ -394,3 +426,18 @@ class ChainDetector:
     def _shafts(self, seen: ImageEvidence) -> ShaftImage:
         clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
         return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)
+
+
+def _with_enough_places(possible: PossibleChains, first_half: int, last_half: int) -> PossibleChains:
+    """Return the chains that show at least four separate places.
+
+    The candidates from ``first_half`` to before ``last_half`` are electrodes of split pairs: two of them are one place. Three
+    drops of contrast medium may lie like a pair and two rings.
+    """
+    return possible.where(
+        [
+            np.count_nonzero((rows >= first_half) & (rows < last_half), axis=1)
+            <= 2 * max(rows.shape[1] - _LEAST_PLACES, 0)
+            for rows in possible.rows
+        ]
+    )

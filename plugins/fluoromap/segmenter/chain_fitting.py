@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.linking import (
     CandidateChain,
@@ -17,11 +18,14 @@ from fluoromap.segmenter.linking import (
     spacing_fit,
 )
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.refinement import ElectrodeFit, predict_on_curve, refine
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 
 _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0
+_TIP_WEIGHT, _MOST_TIP = 1.0, 4.0
+_LONG_TIP_MM = 3.0
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
 
 
@@ -45,6 +49,7 @@ def fit_chains(
     families: tuple[CatheterFamily, ...],
     noise: float,
     sure: int | None = None,
+    tip_logits_at: Callable[[Array], Array] | None = None,
 ) -> tuple[FittedChain, ...]:
     """Fit each chain with every catheter of as many electrodes.
 
@@ -63,6 +68,8 @@ def fit_chains(
         Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
     sure : int
         Number of candidates with a blob of their own; they come first. All by default.
+    tip_logits_at : callable, optional
+        (n, 2) pixels -> (n,) log-odds that electrodes there are tips. No end looks more like a tip by default.
 
     Returns
     -------
@@ -90,6 +97,9 @@ def fit_chains(
         fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
         ends = _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter.tip_mm, shaft_image)
         directed = fit + ends
+        if tip_logits_at is not None and _tip_shows(family.catheter):
+            first, last = (tip_logits_at(electrode_fit.points_uv[:, end]) for end in (0, -1))
+            directed += _TIP_WEIGHT * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
         for index, row in enumerate(rows):
             best = index if directed[index] >= directed[index + len(rows)] else index + len(rows)
             likelihood[row, column] = fit[best]
@@ -114,6 +124,14 @@ def fit_chains(
             )
         )
     return tuple(chains)
+
+
+def _tip_shows(catheter: Catheter) -> bool:
+    """Return whether the network can see which end is the tip.
+
+    The tip of a quadripolar catheter is as long as its rings.
+    """
+    return catheter.tip_mm >= _LONG_TIP_MM or catheter.electrodes >= MANY_ELECTRODES
 
 
 def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) -> Array:

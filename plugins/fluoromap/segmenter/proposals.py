@@ -33,6 +33,14 @@ class Proposals:
     def __len__(self) -> int:
         return len(self.points_uv)
 
+    def with_more(self, other: Proposals) -> Proposals:
+        """Return these proposals, then the other ones."""
+        return Proposals(
+            np.concatenate([self.points_uv, other.points_uv]),
+            np.concatenate([self.probability, other.probability]),
+            np.concatenate([self.covariance_px2, other.covariance_px2]),
+        )
+
     @property
     def variance_px2(self) -> Array:
         """Mean variance of a coordinate, (n,) pixels squared."""
@@ -85,6 +93,18 @@ class ImageEvidence(Protocol):
         """Return the electrodes where ``allowed`` (rows, columns).
 
         Electrodes much weaker than the ``expected``-th best may be left out.
+        """
+
+    def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
+        """Return both electrodes of pairs that were proposed as one.
+
+        They lie where ``allowed``.
+        """
+
+    def tip_logits_at(self, points_uv: Array) -> Array:
+        """Return the log-odds that electrodes at points are tips, (n,).
+
+        It is 0 from a proposer that cannot see it.
         """
 
     def probability_at(self, points_uv: Array) -> Array:

@@ -255,7 +255,11 @@ def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
         chains=tuple(
             chain
             for chain in entry.chains
-            if chain.manual or all(sum(chain_distance(chain, place)) > _SAME_PLACE_PX for place in places)
+            if chain.manual
+            or all(
+                chain.electrodes != place.electrodes or sum(chain_distance(chain, place)) > _SAME_PLACE_PX
+                for place in places
+            )
         ),
     )
 

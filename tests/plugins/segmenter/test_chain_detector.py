@@ -22,9 +22,11 @@ class Evidence:
     reduction = 1
     pixel_noise = position_noise = 0.02
 
-    def __init__(self, image, points, probability, scores):
+    def __init__(self, image, points, probability, scores, halves=None, tips=()):
         self.smooth, self.points = image, points
         self.probability, self.scores = np.asarray(probability), np.asarray(scores)
+        self.halves = np.zeros((0, 2)) if halves is None else halves
+        self.tips = np.reshape(tips, (-1, 2))
 
     @property
     def likeness(self):
@@ -39,6 +41,14 @@ class Evidence:
         away = np.linalg.norm(points_uv[:, None] - self.points[None], axis=2)
         return np.where(away.min(axis=1) < 4.0, values[away.argmin(axis=1)], otherwise)
 
+    def halves_of_pairs(self, allowed):
+        count = len(self.halves)
+        return Proposals(self.halves, np.full(count, 0.9), np.tile(np.eye(2), (count, 1, 1)))
+
+    def tip_logits_at(self, points_uv):
+        away = np.linalg.norm(points_uv[:, None] - self.tips[None], axis=2).min(axis=1, initial=np.inf)
+        return np.where(away < 4.0, 2.0, -2.0)
+
     def probability_at(self, points_uv):
         return self._nearest(self.probability, points_uv, 0.01)
 
@@ -52,8 +62,8 @@ class Evidence:
         return self._nearest(self.scores, points_uv, 0.01)
 
 
-def row_of(name, tip, angle):
-    return np.asarray(tip) + np.outer(CATALOGUE[name].arc_lengths_mm * PX * 0.9, [np.cos(angle), np.sin(angle)])
+def row_of(name, tip, angle, shortened=0.9):
+    return np.asarray(tip) + np.outer(CATALOGUE[name].arc_lengths_mm * PX * shortened, [np.cos(angle), np.sin(angle)])
 
 
 def drawn(rows):
@@ -74,10 +84,18 @@ def drawn(rows):
     return image.astype(np.float32)
 
 
-def chains_found(image, points, probability, scores):
+def drawn_without_shaft(row):
+    v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    image = np.random.default_rng(3).normal(6.0, 0.02, (SIZE, SIZE))
+    for point in row:
+        image -= 0.8 * (np.hypot(u - point[0], v - point[1]) < 3.0)
+    return image.astype(np.float32)
+
+
+def chains_found(image, points, probability, scores, **more):
     everywhere = np.ones(image.shape, np.bool_)
     field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
-    evidence = Evidence(image, points, probability, scores)
+    evidence = Evidence(image, points, probability, scores, **more)
     detector = ChainDetector(CATALOGUE, field, PX, lambda x: evidence, IN_A_RUN)
     return detector.find_chains(image, 0).chains
 
@@ -102,6 +120,37 @@ def test_a_long_chain_is_unlisted_only_where_what_lies_between_is_like_its_elect
     points = np.concatenate([catheter, extra[None]])
     found = chains_found(drawn([catheter]), points, [0.99] * 10 + [between], [0.9] * 10 + [0.9])
     assert any(lies_on(chain, catheter) for chain in found) == listed
+
+
+def test_electrodes_of_a_long_catheter_in_its_line_do_not_make_a_short_chain_unlisted():
+    ablation, cs = row_of("ablation", (200, 100), 0.0), row_of("cs", (170, 100), np.pi)
+    points = np.concatenate([ablation, cs])
+    found = chains_found(drawn([ablation, cs]), points, [0.99] * 14, [0.9] * 14)
+    assert sorted(len(chain.electrodes) for chain in found) == [4, 10]
+
+
+def test_pairs_that_were_found_as_one_are_split_where_a_catheter_is_missing():
+    catheter = row_of("cs", (60, 60), 0.4, shortened=0.5)
+    merged = 0.5 * (catheter[0::2] + catheter[1::2])[:4]
+    points = np.concatenate([merged, catheter[8:]])
+    image, sure = drawn([catheter]), [0.95] * 6
+    assert not any(lies_on(chain, catheter) for chain in chains_found(image, points, sure, sure))
+    found = chains_found(image, points, sure, sure, halves=catheter[:8])
+    assert any(lies_on(chain, catheter) for chain in found)
+
+
+def test_three_blobs_are_no_quadripolar_catheter_with_a_split_pair():
+    catheter = row_of("ablation", (60, 60), 0.4, shortened=0.5)
+    points = np.concatenate([catheter[:2], 0.5 * (catheter[2:3] + catheter[3:])])
+    found = chains_found(drawn([catheter]), points, [0.95] * 3, [0.95] * 3, halves=catheter[2:])
+    assert not any(lies_on(chain, catheter) for chain in found)
+
+
+def test_an_end_that_looks_like_a_tip_is_the_tip():
+    catheter = row_of("cs", (60, 60), 0.4)
+    for end in (catheter[0], catheter[-1]):
+        (found,) = chains_found(drawn_without_shaft(catheter), catheter, [0.95] * 10, [0.9] * 10, tips=end)
+        np.testing.assert_allclose(found.pixels_uv[0], end, atol=2.0)
 
 
 def test_less_likely_points_between_half_of_the_electrodes_make_a_long_chain_unlisted():

@@ -126,6 +126,18 @@ def test_a_part_of_a_longer_catheter_does_not_keep_it_out():
     assert [[len(one.electrodes) for one in entry.chains] for entry in entries] == [[10]] * 6
 
 
+def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():
+    long = np.stack([np.arange(6) * 12.0, np.arange(6) * 3.0], axis=1) + 60
+    found = run([[chain(long + frame, "cs")] for frame in range(6)])
+    seed = FrameChains(2, (chain(long[:4] + 2, "rv"),))
+
+    def search(frame, known, shift, reach_px, taken):
+        return chain(long[:4] + frame, "rv") if len(known.electrodes) == 4 else chain(long + frame, "cs")
+
+    entries = track_chains(found, np.arange(6) * 100.0, 2, search, seed)
+    assert [[len(one.electrodes) for one in entry.chains] for entry in entries] == [[6]] * 6
+
+
 def test_a_short_catheter_stays_where_one_frame_shows_a_longer_one_at_its_place():
     long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
     found = run([[chain(long, "cs")] if frame == 3 else [chain(long[3:7], "rv")] for frame in range(6)])

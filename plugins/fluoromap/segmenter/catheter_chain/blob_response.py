@@ -135,6 +135,14 @@ class BlobResponse:
         tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
         return tops
 
+    def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
+        """Return none: a blob says nothing of a second electrode in it."""
+        return Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
+
+    def tip_logits_at(self, points_uv: Array) -> Array:
+        """Return zeros: a blob does not show which end it is."""
+        return np.zeros(len(points_uv))
+
     def probability_at(self, points_uv: Array) -> Array:
         """Return the probability of electrodes at points of the frame, (n,)."""
         return probability_of_contrast(self.scores_at(points_uv))

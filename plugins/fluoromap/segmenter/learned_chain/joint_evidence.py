@@ -20,6 +20,7 @@ from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probabi
 _EVEN_SHARE = 0.5
 _LEAST_PROBABILITY = 0.05
 _APART_MM = 0.6
+_HALF_APART_MM, _HALF_SD_MM = 0.3, 0.25
 _FAINT, _CLEAR = 5.0, 9.5
 FAINT_LOG_ODDS = 4.5
 """Of an electrode that is too faint for the network to be sure, where other frames confirm it."""
@@ -89,6 +90,26 @@ class JointEvidence:
             np.concatenate([blobs.covariance_px2, proposed.covariance_px2]),
         )
         return _taken(together, np.argsort(-probability, kind="stable"))
+
+    def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
+        """Return both electrodes of pairs that were proposed as one.
+
+        They lie where ``allowed``, and away from all proposals.
+        """
+        points = self.network.halves_of_pairs() if self.reach_cells == 1 else np.zeros((0, 2))
+        column, row = np.rint(points).astype(np.int64).T
+        within = (column >= 0) & (row >= 0) & (column < allowed.shape[1]) & (row < allowed.shape[0])
+        points = points[within]
+        points = points[allowed[row[within], column[within]]]
+        if len(points) and self._proposed is not None and len(self._proposed):
+            away, _ = cKDTree(self._proposed.points_uv).query(points)
+            points = points[away > _HALF_APART_MM * self.px_per_mm]
+        variance = (_HALF_SD_MM * self.px_per_mm) ** 2
+        return Proposals(points, self.probability_at(points), np.tile(variance * np.eye(2), (len(points), 1, 1)))
+
+    def tip_logits_at(self, points_uv: Array) -> Array:
+        """Return the network's logit of a tip electrode at points, (n,)."""
+        return self.network.tip_logits_at(points_uv, self.reach_cells)
 
     def _network_at(self, points_uv: Array) -> Array:
         return self.network.probability_at(points_uv, self.reach_cells)

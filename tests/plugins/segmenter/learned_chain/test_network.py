@@ -9,10 +9,16 @@ import pytest
 
 from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
 from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS, HEADS
-from fluoromap.segmenter.learned_chain.network_response import NETWORK_PX_PER_MM, answer, network_scale
+from fluoromap.segmenter.learned_chain.network_response import (
+    NETWORK_PX_PER_MM,
+    NetworkResponse,
+    answer,
+    network_scale,
+)
 from fluoromap.segmenter.learned_chain.normalisation import normalise
 from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.proposals import Proposals
 
 REFERENCE = Path(__file__).with_name("pytorch_answers.npz")
 """Made by ``python -m fluoromap.training --reference``."""
@@ -143,3 +149,33 @@ def test_weights_of_another_network_are_refused(tmp_path, weights):
     np.savez(path, **weights)
     with pytest.raises(ValueError, match="calibration"):
         read_weights(path)
+
+
+def answered(probability, offset_u):
+    """Return the network's response to cells that point ``offset_u`` cells aside."""
+    answers = np.zeros((*probability.shape, len(HEADS)), np.float32)
+    answers[..., HEADS.index("offset_u")] = offset_u
+    row, column = np.unravel_index(int(np.argmax(probability)), probability.shape)
+    places = np.array([[column + offset_u[row, column], row]], dtype=np.float64) * 2.0
+    found = Proposals(places, np.array([probability.max()], np.float64), np.eye(2)[None])
+    return NetworkResponse(probability.astype(np.float32), answers, found, 2.0, 0.0, 1.0)
+
+
+def test_cells_that_point_to_two_places_see_a_pair():
+    probability, offset = np.zeros((16, 16)), np.zeros((16, 16))
+    probability[8, 6:9] = 0.7, 0.9, 0.8
+    offset[8, 6:9] = 0.9, 0.0, -0.9
+    assert len(answered(probability, offset).halves_of_pairs()) == 0
+    offset[8, 6:9] = 0.3, 0.0, -0.3
+    one, other = sorted(answered(probability, offset).halves_of_pairs().tolist())
+    assert other[0] - one[0] > 4.0
+    assert one[1] == pytest.approx(16.0, abs=0.5) == other[1]
+
+
+def test_the_most_probable_cell_near_a_place_says_whether_it_is_a_tip():
+    probability = np.zeros((16, 16))
+    probability[8, 7:9] = 0.9, 0.3
+    response = answered(probability, np.zeros((16, 16)))
+    response.answers[8, 7, HEADS.index("tip")] = 3.0
+    response.answers[8, 8, HEADS.index("tip")] = -3.0
+    assert response.tip_logits_at(np.array([[16.0, 16.0]])) == pytest.approx([3.0])
