@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -21,6 +21,8 @@ _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
+_MOVING_MS, _LEAST_MOVING, _MOVING_AT = 70.0, 5, (0.25, 0.625)
+_SAME_ELECTRODE_MM, _SAME_CHAIN_PX = 1.2, 4.0
 
 RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image]], bool]
 """(frame -> chain of one track, frame -> log image) -> whether the run shows a catheter there."""
@@ -65,6 +67,12 @@ class Detector(Protocol):
             None where the image does not show the chain, and from a detector that searches whole frames only.
         """
 
+    def find_moving(
+        self, images: Sequence[Image], times_ms: Array, middle: int, frame: int
+    ) -> tuple[Chain, ...]:
+        """Return chains that only the mean of moved images shows, at their place in the middle one.
+        """
+
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""
 
@@ -90,6 +98,7 @@ def segment_run(
     context: Context,
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
+    search_moving: bool = False,
     shows_catheter: RunJudge | None = None,
 ) -> Segmentation:
     """Segment a run: tracked chains of all frames, and diastolic chains.
@@ -162,6 +171,14 @@ def segment_run(
     seed = mean if len(averaged) > 1 else None
     accepts = None if shows_catheter is None else _judge(shows_catheter, log_image)
     entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
+    if search_moving and not marks:
+
+        def follow(frame: int, chains: tuple[Chain, ...], wrong: Set[int]) -> tuple[FrameChains, ...]:
+            start = FrameChains(frame, chains)
+            left = [_without_tracks(entry, tracked, wrong) for entry, tracked in zip(found, entries, strict=True)]
+            return track_chains(left, run.frame_times_ms, catheters, search, start, accepts)
+
+        entries = _add_moving_catheters(run, detector, log_image, entries, catalogue, follow, context)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
@@ -269,6 +286,66 @@ def _add_missing_catheters(
                 carried = detector.find_again(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
                 chains += [] if carried is None else [replace(carried, track=-1)]
     return tuple(chains)
+
+
+def _add_moving_catheters(
+    run: Run,
+    detector: Detector,
+    log_image: Callable[[int], Image],
+    entries: tuple[FrameChains, ...],
+    catalogue: Catalogue,
+    follow: Callable[[int, tuple[Chain, ...], Set[int]], tuple[FrameChains, ...]],
+    context: Context,
+) -> tuple[FrameChains, ...]:
+    """Add tracks of missing catheters that noise hides in single frames."""
+    times_ms, count = run.frame_times_ms, len(run.frames)
+    of_catalogue = Counter(catheter.electrodes for catheter in catalogue.catheters)
+    for part in _MOVING_AT:
+        tracks = {chain.track: len(chain.electrodes) for entry in entries for chain in entry.chains}
+        if not of_catalogue - Counter(tracks.values()):
+            break
+        middle = int(part * count)
+        frames = np.flatnonzero(np.abs(times_ms - times_ms[middle]) <= _MOVING_MS)
+        if len(frames) < _LEAST_MOVING:
+            break
+        context.check()
+        images = [log_image(int(frame)) for frame in frames]
+        guesses = detector.find_moving(images, times_ms[frames], middle - int(frames[0]), middle)
+        chains = list(entries[middle].chains)
+        wrong: set[int] = set()
+        more = 0
+        for chain in sorted(guesses, key=lambda chain: -len(chain.electrodes)):
+            size = len(chain.electrodes)
+            shared = [other for other in chains if _shares_place(chain, other, run.px_per_mm)]
+            left = [number for track, number in tracks.items() if track not in wrong]
+            if any(len(other.electrodes) >= size for other in shared) or left.count(size) >= of_catalogue[size]:
+                continue
+            wrong |= {other.track for other in shared}
+            chains = [other for other in chains if other not in shared] + [chain]
+            more += 1
+            tracks[-more] = size
+        if more:
+            again = follow(middle, tuple(chains), wrong)
+            if _electrodes(again) > _electrodes(entries):
+                entries = again
+    return entries
+
+
+def _without_tracks(entry: FrameChains, tracked: FrameChains, wrong: Set[int]) -> FrameChains:
+    """Return a frame's chains without those of some tracks."""
+    places = [chain for chain in tracked.chains if chain.track in wrong]
+    kept = [chain for chain in entry.chains if all(sum(chain_distance(chain, place)) > _SAME_CHAIN_PX for place in places)]
+    return replace(entry, chains=tuple(kept))
+
+
+def _electrodes(entries: Sequence[FrameChains]) -> int:
+    return sum(len(chain.electrodes) for entry in entries for chain in entry.chains)
+
+
+def _shares_place(one: Chain, other: Chain, px_per_mm: float) -> bool:
+    """Return whether two or more electrodes lie on electrodes of another chain."""
+    away = np.linalg.norm(one.pixels_uv[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
+    return int(np.count_nonzero(away < _SAME_ELECTRODE_MM * px_per_mm)) >= 2
 
 
 def _mark_out_of_field(entries: Sequence[FrameChains], field: FieldMask) -> tuple[FrameChains, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector
+from fluoromap.segmenter.learned_chain.moving_search import moving_chains
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
 
@@ -102,6 +103,11 @@ class FrameSearch:
     def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
         """Return a chain of another frame at its place in this log image."""
         return self.detector.find_again(x, chain, shift, reach_px, taken)
+
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return chains that only the mean of moved images shows."""
+        self.network.reach_cells = _OWN_CELLS
+        return moving_chains(self.detector, images, times_ms, middle, frame)
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""

@@ -61,10 +61,12 @@ class TrackEvidence:
         )
         clear = sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames
         middle = np.median(odds, axis=1)
-        if len(usual) >= MANY_ELECTRODES:
-            return bool((middle >= (_LEAST_WHERE_CLEAR if clear else _LEAST_LONG)).all())
-        low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
-        return bool((middle >= (_LEAST_WHERE_CLEAR if clear else _LEAST_MEDIAN)).all() and low >= _LEAST_LOW)
+        is_long = len(usual) >= MANY_ELECTRODES
+        if clear:
+            shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
+        else:
+            shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
+        return shown and (is_long or bool(np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower") >= _LEAST_LOW))
 
     def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
