@@ -55,20 +55,16 @@ def moving_chains(detector: ChainDetector, images: Sequence[Image], times_ms: Ar
 def moved_means(images: Sequence[Image], times_ms: Array, middle: int, px_per_mm: float) -> Iterator[Image]:
     """Yield the mean of the images for each velocity, moved to the place of the middle one."""
     elapsed = times_ms - times_ms[middle]
+    shares = elapsed / np.abs(elapsed).max()
+    farthest = _RINGS * _RING_MM * px_per_mm
+    edge = int(np.ceil(farthest))
+    padded = [np.pad(x, edge, mode="edge") for x in images]
+    rows, columns = images[middle].shape
     for moved_px in _hexagons(_RINGS) * _RING_MM * px_per_mm:
-        total = np.zeros_like(images[middle])
-        for x, time in zip(images, elapsed, strict=True):
-            du, dv = np.rint(moved_px * time / np.abs(elapsed).max()).astype(np.int64)
-            total += _moved(x, int(du), int(dv))
-        yield total / len(images)
-
-
-def _moved(x: Image, du: int, dv: int) -> Image:
-    """Return an image whose pixel (u, v) is the pixel (u + du, v + dv) of ``x``; edges are repeated."""
-    rows, columns = x.shape
-    v, u = np.clip(np.arange(rows) + dv, 0, rows - 1), np.clip(np.arange(columns) + du, 0, columns - 1)
-    moved: Image = x[v[:, None], u]
-    return moved
+        total = np.zeros((rows, columns), np.float32)
+        for x, (du, dv) in zip(padded, np.rint(shares[:, None] * moved_px).astype(np.int64) + edge, strict=True):
+            total += x[dv : dv + rows, du : du + columns]
+        yield total / np.float32(len(images))
 
 
 def _hexagons(rings: int) -> Array:

@@ -26,11 +26,13 @@ _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
-_LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.07, -2.0
-"""Log-odds of the middle electrode in each mean; less where half of the single frames show the catheter; of the worst electrode."""
+_LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
+"""Log-odds of the middle electrode, on average over the pictures; of the worst electrode."""
+_LEAST_WHERE_CLEAR, _LEAST_MEAN_WHERE_CLEAR = -1.07, -0.3
+"""Where half of the single frames show the catheter: of the middle electrode in each picture, and on average."""
 _LOW_QUANTILE = 0.1
 _LEAST_LONG = 0.0
-"""Of the middle electrode of six or more. Clutter often hides one or two of them, so the worst electrodes do not count."""
+"""Of the middle electrode of six or more, on average. Clutter often hides one or two of them, so the worst electrodes do not count."""
 _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
@@ -63,7 +65,7 @@ class TrackEvidence:
         middle = np.median(odds, axis=1)
         is_long = len(usual) >= MANY_ELECTRODES
         if clear:
-            shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
+            shown = bool((middle >= _LEAST_WHERE_CLEAR).all() and middle.mean() >= _LEAST_MEAN_WHERE_CLEAR)
         else:
             shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
         return shown and (is_long or bool(np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower") >= _LEAST_LOW))
