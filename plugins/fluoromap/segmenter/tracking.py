@@ -163,6 +163,7 @@ def track_chains(
     for track in tracks_kept:
         if 2 * track.reversals > track.detections and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
+        track.chains = _with_kinds_of_track(track)
     usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
@@ -268,6 +269,22 @@ def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
             )
         ),
     )
+
+
+def _with_kinds_of_track(track: _Track) -> dict[int, Chain]:
+    """Return a track's chains with the mean of their kinds.
+
+    They are one catheter, and a single frame may be wrong about its name. Chains that were set by hand keep theirs.
+    """
+    names = dict.fromkeys(name for chain in track.chains.values() for name, _ in chain.kinds)
+    kinds = tuple(
+        (name, math.fsum(chain.probability(name) for chain in track.chains.values()) / len(track.chains))
+        for name in names
+    )
+    return {
+        frame: chain if track.manual or chain.manual else replace(chain, kinds=kinds)
+        for frame, chain in track.chains.items()
+    }
 
 
 def _start(found: Sequence[FrameChains], catheters: int) -> int:
