@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.chain_candidates import Candidates
 from fluoromap.segmenter.chain_fitting import fit_chains, widen_covariance
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import (
@@ -29,8 +30,10 @@ from fluoromap.segmenter.linking import (
 )
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.long_tips import tip_middles, with_long_tip
 from fluoromap.segmenter.missing_electrodes import complete_chains
-from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, log_odds
+from fluoromap.segmenter.moved_means import moved_means
+from fluoromap.segmenter.proposals import NO_PROPOSALS, ImageEvidence, Proposals, Proposer, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
@@ -46,7 +49,7 @@ _BESIDE_MM = 2.0
 _WEAKER = 0.25
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
-_LEAST_PLACES = 4
+_SAME_PLACE_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +126,25 @@ class _FittedSet:
     unlisted: tuple[CandidateChain, ...]
     sure: bool
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchedImage:
+    """A log image, what the proposer says about it, and the chains that were found in it."""
+
+    x: Image
+    seen: ImageEvidence
+    candidates: Candidates
+    found: _FittedSet
+
     @property
     def explained(self) -> int:
         """Number of the chains' electrodes."""
-        return sum(len(chain.electrodes) for chain in self.chains)
+        return sum(len(chain.electrodes) for chain in self.found.chains)
+
+    def entry(self, frame: int) -> FrameChains:
+        """Return the chains, or the reason why there are none."""
+        sure = self.found.sure and self.found.chains
+        return FrameChains(frame, self.found.chains, None if sure else Reason.MANUAL_NEEDED)
 
 
 @dataclass(slots=True, eq=False)
@@ -157,55 +175,80 @@ class ChainDetector:
         return evidence(probability, self.acceptance.trust)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
-        """Return the chains of one log image, or the reason why there are none.
+        """Return the chains of one log image, or the reason why there are none."""
+        return self.search(x).entry(frame)
+
+    def search(self, x: Image) -> SearchedImage:
+        """Search the chains of one log image.
 
         One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
         accepted too. Weaker chains alone come with ``manual_needed``.
         """
-        if min(x.shape) < 16:
-            return FrameChains(frame, (), Reason.MANUAL_NEEDED)
         seen = self.image_evidence(x)
-        electrodes = sum(catheter.electrodes for catheter in self.catalogue.catheters)
-        proposed = seen.proposals(self.field.candidates, max(2, electrodes // 2))
-        families = catheter_families(self.catalogue)
-        result = self._search(x, seen, proposed, families)
-        # Split pairs must not make a part of an unlisted catheter a listed one.
-        if result.explained < electrodes and not result.unlisted:
-            halves = seen.halves_of_pairs(self.field.candidates)
-            if len(halves):
-                split = self._search(x, seen, proposed.with_more(halves), families, len(halves))
-                result = split if split.explained > result.explained else result
-        return FrameChains(frame, result.chains, None if result.sure and result.chains else Reason.MANUAL_NEEDED)
+        proposed = seen.proposals(self.field.candidates, max(2, self._electrodes // 2))
+        middles = tip_middles(proposed, self.catalogue.catheters, self._shafts(seen))
+        candidates = Candidates(proposed, NO_PROPOSALS, middles)
+        return SearchedImage(x, seen, candidates, self._chains_of(x, seen, candidates))
 
-    def _search(
-        self,
-        x: Image,
-        seen: ImageEvidence,
-        proposed: Proposals,
-        families: tuple[CatheterFamily, ...],
-        halves: int = 0,
-    ) -> _FittedSet:
-        """Return the accepted chains of these proposals.
+    def split_pairs(self, searched: SearchedImage) -> SearchedImage:
+        """Search an image again with pairs split into two electrodes.
 
-        The last ``halves`` of them are electrodes of split pairs.
+        Such pairs were proposed as one electrode. The result is the image as it was searched before, where the split explains no
+        more electrodes.
         """
-        linking = self._link(seen, proposed, families, halves)
-        result = self._fit(x, seen, proposed, linking, families)
+        # Split pairs must not make a part of an unlisted catheter a listed one.
+        if searched.explained >= self._electrodes or searched.found.unlisted:
+            return searched
+        halves = searched.seen.halves_of_pairs(self.field.candidates)
+        if not len(halves):
+            return searched
+        candidates = replace(searched.candidates, halves=halves)
+        found = self._chains_of(searched.x, searched.seen, candidates)
+        split = replace(searched, found=self._with_known_places(found, searched.found.chains))
+        return split if split.explained > searched.explained else searched
+
+    def _with_known_places(self, found: _FittedSet, known: Sequence[Chain]) -> _FittedSet:
+        """Return the chains, but known ones at their places.
+
+        A known chain has as many electrodes, and half of the chain's electrodes lie on its own. The places of split pairs are
+        less exact.
+        """
+        reach = _SAME_PLACE_MM * self.px_per_mm
+        chains = []
+        for chain in found.chains:
+            alike = [
+                other
+                for other in known
+                if other.electrodes == chain.electrodes
+                and 2 * np.count_nonzero(_away(chain.pixels_uv, other.pixels_uv) < reach) >= len(chain.electrodes)
+            ]
+            chains.append(alike[0] if alike else chain)
+        return replace(found, chains=tuple(chains))
+
+    @property
+    def _electrodes(self) -> int:
+        return sum(catheter.electrodes for catheter in self.catalogue.catheters)
+
+    def _chains_of(self, x: Image, seen: ImageEvidence, candidates: Candidates) -> _FittedSet:
+        """Return the accepted chains of these candidates."""
+        families = catheter_families(self.catalogue)
+        linking = self._link(seen, candidates, families)
+        result = self._fit(x, seen, candidates, linking, families)
         if self.acceptance.strict and len(result.candidates) < len(linking.chains):
-            again = self._link_without_rejected(seen, linking, result, families)
+            again = self._link_without_rejected(seen, candidates, linking, result, families)
             if not set(again.chains) <= set(result.candidates):
-                other = self._fit(x, seen, proposed, again, families)
+                other = self._fit(x, seen, candidates, again, families)
                 result = other if len(other.chains) > len(result.chains) else result
         return result
 
-    def _link(
-        self, seen: ImageEvidence, proposed: Proposals, families: tuple[CatheterFamily, ...], halves: int
-    ) -> _Linking:
-        """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
-        shaft_image = self._shafts(seen)
+    def _link(self, seen: ImageEvidence, candidates: Candidates, families: tuple[CatheterFamily, ...]) -> _Linking:
+        """Link the candidates, and complete chains where not every catheter has a well-fitting one."""
+        shaft_image, proposed, single = self._shafts(seen), candidates.together, len(candidates.single)
         points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
-        possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
-        possible = _with_enough_places(possible, len(points) - halves, len(points))
+        possible = possible_chains(
+            points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK, single=single
+        )
+        possible = candidates.possible(possible, points, families)
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
             return _Linking(points, len(points), possible, linked)
@@ -216,7 +259,7 @@ class ChainDetector:
             return np.where(allowed, self._evidence(probability), -np.inf)
 
         completed = complete_chains(
-            points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm
+            points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm, single
         )
         possible = possible_chains(
             completed.points_uv,
@@ -227,8 +270,9 @@ class ChainDetector:
             len(points),
             _COMPANION_SLACK,
             completed.rows,
+            single,
         )
-        possible = _with_enough_places(possible, len(points) - halves, len(points))
+        possible = candidates.possible(possible, completed.points_uv, families)
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
         return _Linking(completed.points_uv, len(points), possible, linked)
 
@@ -236,7 +280,7 @@ class ChainDetector:
         self,
         x: Image,
         seen: ImageEvidence,
-        proposed: Proposals,
+        candidates: Candidates,
         linking: _Linking,
         families: tuple[CatheterFamily, ...],
     ) -> _FittedSet:
@@ -246,40 +290,45 @@ class ChainDetector:
             seen.tip_logits_at,
         )  # fmt: skip
         clear = [
-            (candidates, one)
-            for candidates, one in zip(linking.chains, fitted, strict=True)
+            (linked, one)
+            for linked, one in zip(linking.chains, fitted, strict=True)
             if one.clearness >= self.acceptance.least_clearness
         ]
         floor = min(family.floor for family in families)
         sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
         found = [one.chain for _, one in clear]
         accepted = []
-        for candidates, chain in zip((candidates for candidates, _ in clear), found, strict=True):
+        for linked, chain in zip((linked for linked, _ in clear), found, strict=True):
             others = [other for other in found if other is not chain]
-            scores = seen.scores_at(chain.pixels_uv)
+            scores = self._of_electrodes(seen.scores_at, chain)
             if self.acceptance.accepts(scores, chain.scores[0]):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
-                accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
+                accepted.append((linked, replace(chain, covariance_px2=covariance, scores=scores)))
         chains = tuple(chain for _, chain in accepted)
         listed = np.ones(len(chains), np.bool_)
         if self.acceptance.strict:
-            listed = self._are_of_catalogue(chains, seen, proposed)
+            listed = self._are_of_catalogue(chains, seen, candidates.single)
         return _FittedSet(
             tuple(chain for chain, kept in zip(chains, listed, strict=True) if kept),
-            tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if kept),
-            tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if not kept),
+            tuple(linked for (linked, _), kept in zip(accepted, listed, strict=True) if kept),
+            tuple(linked for (linked, _), kept in zip(accepted, listed, strict=True) if not kept),
             sure,
         )
 
     def _link_without_rejected(
-        self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
+        self,
+        seen: ImageEvidence,
+        candidates: Candidates,
+        linking: _Linking,
+        result: _FittedSet,
+        families: tuple[CatheterFamily, ...],
     ) -> _Linking:
         """Link again without the chains that would be rejected.
 
         They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
         electrode of an unlisted catheter.
         """
-        scores = seen.scores_at(linking.points_uv)
+        scores = candidates.scores_at(seen, linking.points_uv)
         unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
         allowed = []
         for index, (family, rows, chain_scores) in enumerate(
@@ -310,7 +359,7 @@ class ChainDetector:
             family = self._family(chain)
             if family is None:
                 continue
-            own = log_odds(seen.probability_at(chain.pixels_uv))
+            own = log_odds(self._of_electrodes(seen.probability_at, chain))
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
@@ -377,8 +426,9 @@ class ChainDetector:
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         if not self._in_field(points).all():
             return None
-        scores, variance = seen.scores_at(points), seen.variance_at(points)
-        weights = self._evidence(seen.probability_at(points))
+        there = replace(chain, pixels_uv=points)
+        scores, variance = self._of_electrodes(seen.scores_at, there), seen.variance_at(points)
+        weights = self._evidence(self._of_electrodes(seen.probability_at, there))
         for values in (scores, weights, variance) if hidden.any() else ():
             values[hidden] = np.median(values[~hidden])
         score = chain_score(points, weights, variance, self._shafts(seen), family)
@@ -386,6 +436,24 @@ class ChainDetector:
             return None
         again = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False)
         return replace(again, covariance_px2=widen_covariance(again, taken, self.px_per_mm))
+
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return the chains of means of images that are moved along velocities, most probable first.
+
+        A velocity that is wrong for a catheter blurs it: among chains at one place the most probable has the right velocity.
+        """
+        found: list[tuple[float, Chain]] = []
+        for x in moved_means(images, times_ms, middle, self.px_per_mm):
+            self.forget_image()
+            chains = self.find_chains(x, frame).chains
+            seen = self.image_evidence(x)
+            found += [(float(np.median(log_odds(seen.probability_at(chain.pixels_uv)))), chain) for chain in chains]
+        best: list[Chain] = []
+        for odds, chain in sorted(found, key=lambda one: -one[0]):
+            shared = (_away(chain.pixels_uv, other.pixels_uv) < _HIDING_MM * self.px_per_mm for other in best)
+            if odds >= 0.0 and all(np.count_nonzero(near) < 2 for near in shared):
+                best.append(chain)
+        return tuple(best)
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the image clearly shows a catheter besides these chains."""
@@ -414,6 +482,13 @@ class ChainDetector:
         inside: BoolArray = within & self.field.candidates[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
         return inside
 
+    def _of_electrodes(self, values_at: Callable[[Array], Array], chain: Chain) -> Array:
+        """Return the values of a chain's electrodes, (n,); see :func:`~fluoromap.segmenter.long_tips.with_long_tip`."""
+        family = self._family(chain)
+        return (
+            values_at(chain.pixels_uv) if family is None else with_long_tip(values_at, chain.pixels_uv, family.catheter)
+        )
+
     def _family(self, chain: Chain) -> CatheterFamily | None:
         """Return the most probable family whose catheters have exactly this chain's electrodes."""
         whole = [
@@ -428,16 +503,7 @@ class ChainDetector:
         return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)
 
 
-def _with_enough_places(possible: PossibleChains, first_half: int, last_half: int) -> PossibleChains:
-    """Return the chains that show at least four separate places.
-
-    The candidates from ``first_half`` to before ``last_half`` are electrodes of split pairs: two of them are one place. Three
-    drops of contrast medium may lie like a pair and two rings.
-    """
-    return possible.where(
-        [
-            np.count_nonzero((rows >= first_half) & (rows < last_half), axis=1)
-            <= 2 * max(rows.shape[1] - _LEAST_PLACES, 0)
-            for rows in possible.rows
-        ]
-    )
+def _away(points_uv: Array, from_uv: Array) -> Array:
+    """Return the distance of each point to the nearest of others, (n,)."""
+    nearest: Array = np.linalg.norm(points_uv[:, None] - from_uv[None], axis=2).min(axis=1)
+    return nearest

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,7 +13,9 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
+from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.log_image import Image, LogTransform
+from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
 from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
 
@@ -21,8 +23,7 @@ _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
-_MOVING_MS, _LEAST_MOVING, _MOVING_AT = 70.0, 5, (0.25, 0.625)
-_SAME_ELECTRODE_MM, _SAME_CHAIN_PX = 1.2, 4.0
+_LEAST_MOVED = 5
 
 RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image]], bool]
 """(frame -> chain of one track, frame -> log image) -> whether the run shows a catheter there."""
@@ -67,10 +68,23 @@ class Detector(Protocol):
             None where the image does not show the chain, and from a detector that searches whole frames only.
         """
 
-    def find_moving(
-        self, images: Sequence[Image], times_ms: Array, middle: int, frame: int
-    ) -> tuple[Chain, ...]:
-        """Return chains that only the mean of moved images shows, at their place in the middle one.
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return the chains of means of images that are moved along velocities, most probable first.
+
+        Parameters
+        ----------
+        images : sequence of (rows, columns) float32
+            Log images of successive frames.
+        times_ms : (images,)
+        middle : int
+            Index of the image whose places the chains have.
+        frame : int
+            Its number in the run.
+
+        Returns
+        -------
+        tuple of Chain
+            No two have two electrodes in common. Empty from a detector that searches single frames only.
         """
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
@@ -122,6 +136,8 @@ def segment_run(
         The field mask of the run -> the detector to use.
     search_again : bool
         Whether to search for missing catheters with :meth:`Detector.find_again`.
+    search_moving : bool
+        Whether to search for catheters without a track with :meth:`Detector.find_moving`. Marks take its place.
     shows_catheter : RunJudge, optional
         Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     """
@@ -172,13 +188,12 @@ def segment_run(
     accepts = None if shows_catheter is None else _judge(shows_catheter, log_image)
     entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
     if search_moving and not marks:
+        hidden = _moving_search(detector, log_image, run.frame_times_ms, context)
 
-        def follow(frame: int, chains: tuple[Chain, ...], wrong: Set[int]) -> tuple[FrameChains, ...]:
-            start = FrameChains(frame, chains)
-            left = [_without_tracks(entry, tracked, wrong) for entry, tracked in zip(found, entries, strict=True)]
-            return track_chains(left, run.frame_times_ms, catheters, search, start, accepts)
+        def follow(found: Sequence[FrameChains], start: FrameChains) -> tuple[FrameChains, ...]:
+            return track_chains(found, run.frame_times_ms, catheters, search, start, accepts)
 
-        entries = _add_moving_catheters(run, detector, log_image, entries, catalogue, follow, context)
+        entries = add_hidden_catheters(found, entries, catalogue, run.px_per_mm, hidden, follow)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
@@ -267,6 +282,22 @@ def _chain_search(detector: Detector, log_image: Callable[[int], Image], context
     return search
 
 
+def _moving_search(
+    detector: Detector, log_image: Callable[[int], Image], frame_times_ms: Array, context: Context
+) -> MovingSearch:
+    """Return the search for catheters in the frames near in time; it finds none where these are few."""
+
+    def search(frame: int) -> tuple[Chain, ...]:
+        context.check()
+        near = np.flatnonzero(np.abs(frame_times_ms - frame_times_ms[frame]) <= WINDOW_MS)
+        if len(near) < _LEAST_MOVED:
+            return ()
+        images = [log_image(int(index)) for index in near]
+        return detector.find_moving(images, frame_times_ms[near], frame - int(near[0]), frame)
+
+    return search
+
+
 def _add_missing_catheters(
     x: Image,
     found: tuple[Chain, ...],
@@ -286,66 +317,6 @@ def _add_missing_catheters(
                 carried = detector.find_again(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
                 chains += [] if carried is None else [replace(carried, track=-1)]
     return tuple(chains)
-
-
-def _add_moving_catheters(
-    run: Run,
-    detector: Detector,
-    log_image: Callable[[int], Image],
-    entries: tuple[FrameChains, ...],
-    catalogue: Catalogue,
-    follow: Callable[[int, tuple[Chain, ...], Set[int]], tuple[FrameChains, ...]],
-    context: Context,
-) -> tuple[FrameChains, ...]:
-    """Add tracks of missing catheters that noise hides in single frames."""
-    times_ms, count = run.frame_times_ms, len(run.frames)
-    of_catalogue = Counter(catheter.electrodes for catheter in catalogue.catheters)
-    for part in _MOVING_AT:
-        tracks = {chain.track: len(chain.electrodes) for entry in entries for chain in entry.chains}
-        if not of_catalogue - Counter(tracks.values()):
-            break
-        middle = int(part * count)
-        frames = np.flatnonzero(np.abs(times_ms - times_ms[middle]) <= _MOVING_MS)
-        if len(frames) < _LEAST_MOVING:
-            break
-        context.check()
-        images = [log_image(int(frame)) for frame in frames]
-        guesses = detector.find_moving(images, times_ms[frames], middle - int(frames[0]), middle)
-        chains = list(entries[middle].chains)
-        wrong: set[int] = set()
-        more = 0
-        for chain in sorted(guesses, key=lambda chain: -len(chain.electrodes)):
-            size = len(chain.electrodes)
-            shared = [other for other in chains if _shares_place(chain, other, run.px_per_mm)]
-            left = [number for track, number in tracks.items() if track not in wrong]
-            if any(len(other.electrodes) >= size for other in shared) or left.count(size) >= of_catalogue[size]:
-                continue
-            wrong |= {other.track for other in shared}
-            chains = [other for other in chains if other not in shared] + [chain]
-            more += 1
-            tracks[-more] = size
-        if more:
-            again = follow(middle, tuple(chains), wrong)
-            if _electrodes(again) > _electrodes(entries):
-                entries = again
-    return entries
-
-
-def _without_tracks(entry: FrameChains, tracked: FrameChains, wrong: Set[int]) -> FrameChains:
-    """Return a frame's chains without those of some tracks."""
-    places = [chain for chain in tracked.chains if chain.track in wrong]
-    kept = [chain for chain in entry.chains if all(sum(chain_distance(chain, place)) > _SAME_CHAIN_PX for place in places)]
-    return replace(entry, chains=tuple(kept))
-
-
-def _electrodes(entries: Sequence[FrameChains]) -> int:
-    return sum(len(chain.electrodes) for entry in entries for chain in entry.chains)
-
-
-def _shares_place(one: Chain, other: Chain, px_per_mm: float) -> bool:
-    """Return whether two or more electrodes lie on electrodes of another chain."""
-    away = np.linalg.norm(one.pixels_uv[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
-    return int(np.count_nonzero(away < _SAME_ELECTRODE_MM * px_per_mm)) >= 2
 
 
 def _mark_out_of_field(entries: Sequence[FrameChains], field: FieldMask) -> tuple[FrameChains, ...]:

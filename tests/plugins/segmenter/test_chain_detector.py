@@ -1,5 +1,7 @@
 """Chains of one image: which of them compete, and which are accepted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -92,12 +94,15 @@ def drawn_without_shaft(row):
     return image.astype(np.float32)
 
 
-def chains_found(image, points, probability, scores, **more):
-    everywhere = np.ones(image.shape, np.bool_)
+def detector_of(evidence, catalogue=CATALOGUE):
+    everywhere = np.ones(evidence.smooth.shape, np.bool_)
     field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
-    evidence = Evidence(image, points, probability, scores, **more)
-    detector = ChainDetector(CATALOGUE, field, PX, lambda x: evidence, IN_A_RUN)
-    return detector.find_chains(image, 0).chains
+    return ChainDetector(catalogue, field, PX, lambda x: evidence, IN_A_RUN)
+
+
+def chains_found(image, points, probability, scores, **more):
+    detector = detector_of(Evidence(image, points, probability, scores, **more))
+    return detector.split_pairs(detector.search(image)).entry(0).chains
 
 
 def lies_on(chain, row):
@@ -137,6 +142,22 @@ def test_pairs_that_were_found_as_one_are_split_where_a_catheter_is_missing():
     assert not any(lies_on(chain, catheter) for chain in chains_found(image, points, sure, sure))
     found = chains_found(image, points, sure, sure, halves=catheter[:8])
     assert any(lies_on(chain, catheter) for chain in found)
+
+
+def test_a_split_keeps_the_chains_that_were_found_without_it():
+    catheter, whole = row_of("cs", (60, 60), 0.4, shortened=0.5), row_of("cs", (60, 200), 0.2)
+    merged = 0.5 * (catheter[0::2] + catheter[1::2])[:4]
+    points = np.concatenate([merged, catheter[8:], whole])
+    sure = [0.95] * 16
+    two = Catalogue((catheter_type("decapolar-2-5-2", "cs"), catheter_type("decapolar-2-5-2", "rv")), "cs", "rv")
+    image = drawn([catheter, whole])
+    detector = detector_of(Evidence(image, points, sure, sure, halves=catheter[:8]), two)
+    searched = detector.search(image)
+    (known,) = searched.found.chains
+    moved = replace(known, pixels_uv=known.pixels_uv + 1.0)
+    split = detector.split_pairs(replace(searched, found=replace(searched.found, chains=(moved,))))
+    assert len(split.found.chains) == 2
+    assert moved in split.found.chains
 
 
 def test_three_blobs_are_no_quadripolar_catheter_with_a_split_pair():

@@ -9,8 +9,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_detector import ChainDetector
-from fluoromap.segmenter.learned_chain.moving_search import moving_chains
+from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
 
@@ -49,6 +48,7 @@ class FrameSearch:
 
     - A frame that lacks catheters is searched again in the mean of the frame and its neighbours, which has less noise. Chains of
       the mean are found again in the frame itself. Where this helps once, the following frames are searched so first.
+    - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too. A frame that then shows fewer chains
       than the one before, or none for sure, is searched again with an answer of its own.
     """
@@ -65,49 +65,69 @@ class FrameSearch:
         """Return the chains of one log image; see :class:`~fluoromap.segmenter.run_segmentation.Detector`."""
         first, second = (beside, ()) if self._noisy else ((), beside)
         if self.shares and frame == self._complete + 1:
-            entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
+            _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= self._chains:
                 return entry
-        entry = self._search(x, first, frame, _OWN_CELLS)
-        if beside and (len(entry.chains) < self.catheters or entry.manual_needed is not None):
-            other = self._search(x, second, frame, _OWN_CELLS)
+        searched, entry = self._search(x, first, frame, _OWN_CELLS)
+        if beside and self._lacks_catheters(entry):
+            again, other = self._search(x, second, frame, _OWN_CELLS)
             if len(other.chains) > len(entry.chains):
-                entry, self._noisy = other, True
+                searched, entry, self._noisy = again, other, True
+        if self._lacks_catheters(entry):
+            split = self.detector.split_pairs(searched)
+            if split is not searched:
+                other = self._in_frame(x, split, 1 + len(beside), frame, _OWN_CELLS)
+                entry = other if len(other.chains) > len(entry.chains) else entry
         if entry.manual_needed is None:
             self._complete, self._chains = frame, len(entry.chains)
         return entry
 
-    def _search(self, x: Image, beside: Sequence[Image], frame: int, reach_cells: int) -> FrameChains:
-        """Search an image, or first its mean with the images beside it."""
+    def _lacks_catheters(self, entry: FrameChains) -> bool:
+        return len(entry.chains) < self.catheters or entry.manual_needed is not None
+
+    def _search(
+        self, x: Image, beside: Sequence[Image], frame: int, reach_cells: int
+    ) -> tuple[SearchedImage, FrameChains]:
+        """Search an image, or its mean with the images beside it.
+
+        The chains of the mean are returned at their places in the image.
+        """
         self.detector.forget_image()
         self.network.reach_cells = reach_cells
         mean: Image = np.mean([x, *beside], axis=0, dtype=np.float32) if beside else x
-        entry = self.detector.find_chains(mean, frame)
-        if beside:
-            in_mean = self.detector.image_evidence(mean).likeness
-            self.network.reach_cells = max(reach_cells, _MEAN_CELLS)
-            in_frame = self.detector.image_evidence(x).likeness
-            chains: list[Chain] = []
-            for chain in entry.chains:
-                # The frame is part of the mean: its place there is no independent measurement.
-                loose = replace(chain, covariance_px2=chain.covariance_px2 + _LOOSE_PX**2 * np.eye(2))
-                again = self.detector.find_again(x, loose, np.zeros(2), _REACH_PX, chains)
-                # The mean has less noise, so the same catheter has more contrast over noise there.
-                least = _LEAST_SHARE * np.mean(in_mean.at(chain.pixels_uv)) / np.sqrt(1 + len(beside))
-                if again is not None and np.mean(in_frame.at(again.pixels_uv)) >= least:
-                    chains.append(again)
-            entry = FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
+        searched = self.detector.search(mean)
         self.network.reach_cells = _OWN_CELLS
-        return entry
+        return searched, self._in_frame(x, searched, 1 + len(beside), frame, reach_cells)
+
+    def _in_frame(self, x: Image, searched: SearchedImage, averaged: int, frame: int, reach_cells: int) -> FrameChains:
+        """Return the chains at their places in the image.
+
+        They were searched in the image, or in the mean of ``averaged`` images.
+        """
+        entry = searched.entry(frame)
+        if searched.x is x:
+            return entry
+        self.network.reach_cells = max(reach_cells, _MEAN_CELLS)
+        in_frame = self.detector.image_evidence(x).likeness
+        chains: list[Chain] = []
+        for chain in entry.chains:
+            # The frame is part of the mean: its place there is no independent measurement.
+            loose = replace(chain, covariance_px2=chain.covariance_px2 + _LOOSE_PX**2 * np.eye(2))
+            again = self.detector.find_again(x, loose, np.zeros(2), _REACH_PX, chains)
+            # The mean has less noise, so the same catheter has more contrast over noise there.
+            least = _LEAST_SHARE * np.mean(searched.seen.likeness.at(chain.pixels_uv)) / np.sqrt(averaged)
+            if again is not None and np.mean(in_frame.at(again.pixels_uv)) >= least:
+                chains.append(again)
+        self.network.reach_cells = _OWN_CELLS
+        return FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
 
     def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
         """Return a chain of another frame at its place in this log image."""
         return self.detector.find_again(x, chain, shift, reach_px, taken)
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
-        """Return chains that only the mean of moved images shows."""
-        self.network.reach_cells = _OWN_CELLS
-        return moving_chains(self.detector, images, times_ms, middle, frame)
+        """Return the chains of means of images that are moved along velocities, most probable first."""
+        return self.detector.find_moving(images, times_ms, middle, frame)
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""

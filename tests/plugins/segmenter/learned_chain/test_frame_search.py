@@ -1,5 +1,6 @@
 """Frames searched one after the other: means of neighbours in noise, and shared answers of the network in fast runs."""
 
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,22 +18,36 @@ def chain(shift=0.0):
     return Chain((1, 2, 3, 4), POINTS + shift, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), (("reference", 1.0),))
 
 
+@dataclass(frozen=True)
+class Searched:
+    x: np.ndarray
+    seen: SimpleNamespace
+    chains: tuple
+
+    def entry(self, frame):
+        return FrameChains(frame, self.chains, None if self.chains else Reason.MANUAL_NEEDED)
+
+
 class Detector:
     """Shows a catheter in images of mean ``level`` only; ``likeness`` of an image is the same everywhere."""
 
     def __init__(self, network, level):
         self.network, self.level = network, level
         self.likeness = lambda x: 10.0
-        self.searched, self.found_again = [], []
+        self.searched, self.split, self.found_again = [], [], []
+        self.of_pairs = ()
 
     def forget_image(self):
         pass
 
-    def find_chains(self, x, frame):
+    def search(self, x):
         self.network(x)
         self.searched.append(float(x.mean()))
-        shown = np.isclose(x.mean(), self.level)
-        return FrameChains(frame, (chain(),) if shown else (), None if shown else Reason.MANUAL_NEEDED)
+        return Searched(x, self.image_evidence(x), (chain(),) if np.isclose(x.mean(), self.level) else ())
+
+    def split_pairs(self, searched):
+        self.split.append(float(searched.x.mean()))
+        return replace(searched, chains=self.of_pairs) if self.of_pairs else searched
 
     def image_evidence(self, x):
         return SimpleNamespace(likeness=Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0))
@@ -75,6 +90,15 @@ def test_a_clear_frame_and_one_without_neighbours_are_searched_once():
     assert frames.find_chains(X + 1, 0, [X + 2, X + 3]).manual_needed is None
     assert frames.find_chains(X + 5, 1).manual_needed is Reason.MANUAL_NEEDED
     assert detector.searched == [1.0, 5.0]
+
+
+def test_pairs_are_split_only_where_the_mean_does_not_show_the_catheter_either():
+    frames, detector, _ = search(2.0, shares=False)
+    detector.of_pairs = (chain(30.0),)
+    assert np.allclose(frames.find_chains(X + 1, 0, [X + 2, X + 3]).chains[0].pixels_uv, POINTS + 1)
+    assert detector.split == []
+    assert np.allclose(frames.find_chains(X + 5, 1).chains[0].pixels_uv, POINTS + 30)
+    assert detector.split == [5.0]
 
 
 def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
