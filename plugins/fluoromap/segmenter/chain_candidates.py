@@ -33,14 +33,18 @@ class Candidates:
         """All candidates, in their order."""
         return self.single.with_more(self.middles.proposals)
 
+    @property
+    def tip_middles(self) -> range:
+        """The indices of the middles."""
+        return range(len(self.single), len(self.single) + len(self.middles))
+
     def scores_at(self, seen: ImageEvidence, points_uv: Array) -> Array:
         """Return the scores of points of which the first are these candidates, (n,).
 
         A middle has at least the score of the better end of its tip.
         """
         scores: Array = np.array(seen.scores_at(points_uv))
-        first = len(self.proposals) + len(self.halves)
-        middles = slice(first, first + len(self.middles))
+        middles = list(self.tip_middles)
         scores[middles] = np.maximum(scores[middles], scores[self.middles.ends].max(axis=1))
         return scores
 

@@ -287,7 +287,7 @@ class ChainDetector:
         """Fit linked chains to the image, and drop those that are not accepted."""
         fitted = fit_chains(
             x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed,
-            seen.tip_logits_at,
+            seen.tip_logits_at, candidates.tip_middles,
         )  # fmt: skip
         clear = [
             (linked, one)

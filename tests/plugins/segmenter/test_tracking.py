@@ -152,6 +152,19 @@ def test_misplaced_electrodes_of_a_long_catheter_do_not_interrupt_its_track():
     assert len({one.track for entry in entries for one in entry.chains}) > 1
 
 
+def test_a_chain_a_pair_too_far_along_its_catheter_does_not_keep_it_out():
+    row = np.stack([np.arange(12) * 12.0, np.arange(12) * 3.0], axis=1) + 60
+    found = run([[chain(row[:10] + frame, "cs")] for frame in range(6)])
+    seed = FrameChains(2, (chain(row[2:] + 2, "cs"),))
+
+    def search(frame, known, shift, reach_px, taken):
+        return chain(row[2:] + frame, "cs")
+
+    entries = track_chains(found, times(6), 1, search, seed)
+    for entry in entries:
+        np.testing.assert_allclose(entry.chains[0].pixels_uv, row[:10] + entry.frame)
+
+
 def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():
     long = np.stack([np.arange(6) * 12.0, np.arange(6) * 3.0], axis=1) + 60
     found = run([[chain(long + frame, "cs")] for frame in range(6)])
