@@ -438,7 +438,7 @@ class ChainDetector:
         return replace(again, covariance_px2=widen_covariance(again, taken, self.px_per_mm))
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
-        """Return the chains of means of images that are moved along velocities, most probable first.
+        """Return the chains that moved means show, most probable first.
 
         A velocity that is wrong for a catheter blurs it: among chains at one place the most probable has the right velocity.
         """

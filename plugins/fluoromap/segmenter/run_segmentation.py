@@ -69,7 +69,9 @@ class Detector(Protocol):
         """
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
-        """Return the chains of means of images that are moved along velocities, most probable first.
+        """Return the chains that moved means show, most probable first.
+
+        See :func:`~fluoromap.segmenter.moved_means.moved_means`.
 
         Parameters
         ----------
@@ -285,7 +287,10 @@ def _chain_search(detector: Detector, log_image: Callable[[int], Image], context
 def _moving_search(
     detector: Detector, log_image: Callable[[int], Image], frame_times_ms: Array, context: Context
 ) -> MovingSearch:
-    """Return the search for catheters in the frames near in time; it finds none where these are few."""
+    """Return the search for moving catheters round a frame.
+
+    It finds none where few frames are near in time.
+    """
 
     def search(frame: int) -> tuple[Chain, ...]:
         context.check()

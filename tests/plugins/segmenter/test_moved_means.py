@@ -33,7 +33,10 @@ def test_the_mean_with_the_velocity_of_a_spot_shows_it_whole():
 
 
 def hidden_run(photons=5.0, through_ring=0.7):
-    """Return noisy frames of a decapolar catheter that moves 1.5 px a frame, and its electrodes (frames, 10, 2)."""
+    """Return noisy frames of a moving decapolar catheter.
+
+    Its electrodes (frames, 10, 2) are returned too; they move 1.5 px a frame.
+    """
     random = np.random.default_rng(2)
     cs = CATALOGUE["cs"]
     v, u = np.mgrid[0:256, 0:256].astype(np.float64)

@@ -126,7 +126,7 @@ class FrameSearch:
         return self.detector.find_again(x, chain, shift, reach_px, taken)
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
-        """Return the chains of means of images that are moved along velocities, most probable first."""
+        """Return the chains that moved means show, most probable first."""
         return self.detector.find_moving(images, times_ms, middle, frame)
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
