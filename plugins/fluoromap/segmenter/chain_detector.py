@@ -47,6 +47,7 @@ _WORST_FIT = 2.0
 _BENDING = 0.12
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
+_LEAST_MOVING_ODDS = 0.2
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
 _SAME_PLACE_MM = 1.0
@@ -451,7 +452,7 @@ class ChainDetector:
         best: list[Chain] = []
         for odds, chain in sorted(found, key=lambda one: -one[0]):
             shared = (_away(chain.pixels_uv, other.pixels_uv) < _HIDING_MM * self.px_per_mm for other in best)
-            if odds >= 0.0 and all(np.count_nonzero(near) < 2 for near in shared):
+            if odds >= _LEAST_MOVING_ODDS and all(np.count_nonzero(near) < 2 for near in shared):
                 best.append(chain)
         return tuple(best)
 
