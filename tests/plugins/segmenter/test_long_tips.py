@@ -19,7 +19,10 @@ def proposals(points):
 
 
 def shown(between):
-    """Return an image with two dark spots, and ``between`` of their depth from one to the other."""
+    """Return an image with two dark spots.
+
+    The way between them has ``between`` of their depth.
+    """
     v, u = np.mgrid[:100, :100].astype(np.float64)
     image = np.full((100, 100), 6.0) - between * ((np.abs(v - 50) < 3) & (u > 30) & (u < 50))
     for end in ENDS:
@@ -36,7 +39,7 @@ def test_the_middle_between_the_ends_of_a_long_tip_is_a_candidate():
 
 @pytest.mark.parametrize(
     ("catheters", "points", "between"),
-    [([SHORT], ENDS, 1.0), ([LONG], ENDS, 0.3), ([LONG], ENDS + [[0, 0], [10, 0]], 1.0)],
+    [([SHORT], ENDS, 1.0), ([LONG], ENDS, 0.3), ([LONG], ENDS + np.array([[0.0, 0.0], [10.0, 0.0]]), 1.0)],
 )
 def test_two_rings_on_a_shaft_and_places_too_far_apart_have_no_middle(catheters, points, between):
     assert len(tip_middles(proposals(points), catheters, shown(between))) == 0
