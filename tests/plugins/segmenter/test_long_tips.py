@@ -45,13 +45,13 @@ def test_two_rings_on_a_shaft_and_places_too_far_apart_have_no_middle(catheters,
     assert len(tip_middles(proposals(points), catheters, shown(between))) == 0
 
 
-def test_a_long_tip_has_the_value_of_its_better_end():
+def test_a_long_tip_has_the_value_of_its_weaker_end():
     chain = np.stack([40.0 + PX * LONG.arc_lengths_mm, np.full(4, 50.0)], axis=1)
 
     def values_at(points):
-        return np.where(np.abs(points[:, 0] - 50.0) < 1.0, 0.9, 0.1)
+        return np.where(np.abs(points[:, 0] - 50.0) < 1.0, 0.9, np.where(np.abs(points[:, 0] - 30.0) < 1.0, 0.7, 0.1))
 
-    np.testing.assert_allclose(with_long_tip(values_at, chain, LONG), [0.9, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(with_long_tip(values_at, chain, LONG), [0.7, 0.1, 0.1, 0.1])
     np.testing.assert_allclose(with_long_tip(values_at, chain, SHORT), 0.1)
 
 
