@@ -41,11 +41,11 @@ class Candidates:
     def scores_at(self, seen: ImageEvidence, points_uv: Array) -> Array:
         """Return the scores of points of which the first are these candidates, (n,).
 
-        A middle has at least the score of the better end of its tip.
+        A middle has at least the score of the weaker end of its tip.
         """
         scores: Array = np.array(seen.scores_at(points_uv))
         middles = list(self.tip_middles)
-        scores[middles] = np.maximum(scores[middles], scores[self.middles.ends].max(axis=1))
+        scores[middles] = np.maximum(scores[middles], scores[self.middles.ends].min(axis=1))
         return scores
 
     def possible(self, chains: PossibleChains, points_uv: Array, families: Sequence[CatheterFamily]) -> PossibleChains:

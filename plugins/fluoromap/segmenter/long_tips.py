@@ -90,11 +90,11 @@ def are_ends_of_tip(apart_uv: Array, first_gap_uv: Array, catheter: Catheter) ->
 def with_long_tip(values_at: Callable[[Array], Array], chain_uv: Array, catheter: Catheter) -> Array:
     """Return the values of a chain's electrodes, (electrodes,).
 
-    A long tip has the value of its better end where that is higher.
+    A long tip has the value of its weaker end where that is higher.
     """
     values: Array = np.array(values_at(chain_uv))
     if catheter.has_long_tip:
-        values[0] = max(values[0], values_at(_ends(chain_uv, catheter)).max())
+        values[0] = max(values[0], values_at(_ends(chain_uv, catheter)).min())
     return values
 
 

@@ -19,7 +19,10 @@ def proposals(points):
 
 
 def shown(between):
-    """Return an image with two dark spots, and ``between`` of their depth from one to the other."""
+    """Return an image with two dark spots.
+
+    The way between them has ``between`` of their depth.
+    """
     v, u = np.mgrid[:100, :100].astype(np.float64)
     image = np.full((100, 100), 6.0) - between * ((np.abs(v - 50) < 3) & (u > 30) & (u < 50))
     for end in ENDS:
@@ -36,19 +39,19 @@ def test_the_middle_between_the_ends_of_a_long_tip_is_a_candidate():
 
 @pytest.mark.parametrize(
     ("catheters", "points", "between"),
-    [([SHORT], ENDS, 1.0), ([LONG], ENDS, 0.3), ([LONG], ENDS + [[0, 0], [10, 0]], 1.0)],
+    [([SHORT], ENDS, 1.0), ([LONG], ENDS, 0.3), ([LONG], ENDS + np.array([[0.0, 0.0], [10.0, 0.0]]), 1.0)],
 )
 def test_two_rings_on_a_shaft_and_places_too_far_apart_have_no_middle(catheters, points, between):
     assert len(tip_middles(proposals(points), catheters, shown(between))) == 0
 
 
-def test_a_long_tip_has_the_value_of_its_better_end():
+def test_a_long_tip_has_the_value_of_its_weaker_end():
     chain = np.stack([40.0 + PX * LONG.arc_lengths_mm, np.full(4, 50.0)], axis=1)
 
     def values_at(points):
-        return np.where(np.abs(points[:, 0] - 50.0) < 1.0, 0.9, 0.1)
+        return np.where(np.abs(points[:, 0] - 50.0) < 1.0, 0.9, np.where(np.abs(points[:, 0] - 30.0) < 1.0, 0.7, 0.1))
 
-    np.testing.assert_allclose(with_long_tip(values_at, chain, LONG), [0.9, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(with_long_tip(values_at, chain, LONG), [0.7, 0.1, 0.1, 0.1])
     np.testing.assert_allclose(with_long_tip(values_at, chain, SHORT), 0.1)
 
 
