@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LEAST_ON_LOOP = 8
-_LONG_TIP_MM = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +64,6 @@ class Catheter:
             gap + (tip_mm + ring_mm) / 2 if index == 0 else gap + ring_mm for index, gap in enumerate(edge_spacing_mm)
         )
         return cls(name, electrodes, centres, tip_mm, ring_mm)
-
-    @property
-    def has_long_tip(self) -> bool:
-        """Whether the tip is so long that each of its ends looks like an electrode."""
-        return self.tip_mm >= _LONG_TIP_MM
 
     @property
     def arc_lengths_mm(self) -> NDArray[np.float64]:

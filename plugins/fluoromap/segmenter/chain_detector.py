@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_candidates import Candidates
 from fluoromap.segmenter.chain_fitting import fit_chains, widen_covariance
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import (
@@ -30,10 +29,9 @@ from fluoromap.segmenter.linking import (
 )
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
-from fluoromap.segmenter.long_tips import tip_middles, with_long_tip
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.moved_means import moved_means
-from fluoromap.segmenter.proposals import NO_PROPOSALS, ImageEvidence, Proposals, Proposer, log_odds
+from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
@@ -50,6 +48,7 @@ _WEAKER = 0.25
 _LEAST_MOVING_ODDS = 0.2
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
+_LEAST_PLACES = 4
 _SAME_PLACE_MM = 1.0
 
 
@@ -130,11 +129,14 @@ class _FittedSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchedImage:
-    """A log image, what the proposer says about it, and the chains that were found in it."""
+    """A log image, what the proposer says about it, and the chains that were found in it.
+
+    proposed : the candidates of the search.
+    """
 
     x: Image
     seen: ImageEvidence
-    candidates: Candidates
+    proposed: Proposals
     found: _FittedSet
 
     @property
@@ -187,9 +189,7 @@ class ChainDetector:
         """
         seen = self.image_evidence(x)
         proposed = seen.proposals(self.field.candidates, max(2, self._electrodes // 2))
-        middles = tip_middles(proposed, self.catalogue.catheters, self._shafts(seen))
-        candidates = Candidates(proposed, NO_PROPOSALS, middles)
-        return SearchedImage(x, seen, candidates, self._chains_of(x, seen, candidates))
+        return SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
 
     def split_pairs(self, searched: SearchedImage) -> SearchedImage:
         """Search an image again with pairs split into two electrodes.
@@ -203,8 +203,8 @@ class ChainDetector:
         halves = searched.seen.halves_of_pairs(self.field.candidates)
         if not len(halves):
             return searched
-        candidates = replace(searched.candidates, halves=halves)
-        found = self._chains_of(searched.x, searched.seen, candidates)
+        proposed = searched.proposed.with_more(halves)
+        found = self._chains_of(searched.x, searched.seen, proposed, len(halves))
         split = replace(searched, found=self._with_known_places(found, searched.found.chains))
         return split if split.explained > searched.explained else searched
 
@@ -230,26 +230,29 @@ class ChainDetector:
     def _electrodes(self) -> int:
         return sum(catheter.electrodes for catheter in self.catalogue.catheters)
 
-    def _chains_of(self, x: Image, seen: ImageEvidence, candidates: Candidates) -> _FittedSet:
-        """Return the accepted chains of these candidates."""
+    def _chains_of(self, x: Image, seen: ImageEvidence, proposed: Proposals, halves: int = 0) -> _FittedSet:
+        """Return the accepted chains of these proposals.
+
+        The last ``halves`` of them are electrodes of split pairs.
+        """
         families = catheter_families(self.catalogue)
-        linking = self._link(seen, candidates, families)
-        result = self._fit(x, seen, candidates, linking, families)
+        linking = self._link(seen, proposed, families, halves)
+        result = self._fit(x, seen, proposed, linking, families)
         if self.acceptance.strict and len(result.candidates) < len(linking.chains):
-            again = self._link_without_rejected(seen, candidates, linking, result, families)
+            again = self._link_without_rejected(seen, linking, result, families)
             if not set(again.chains) <= set(result.candidates):
-                other = self._fit(x, seen, candidates, again, families)
+                other = self._fit(x, seen, proposed, again, families)
                 result = other if len(other.chains) > len(result.chains) else result
         return result
 
-    def _link(self, seen: ImageEvidence, candidates: Candidates, families: tuple[CatheterFamily, ...]) -> _Linking:
-        """Link the candidates, and complete chains where not every catheter has a well-fitting one."""
-        shaft_image, proposed, single = self._shafts(seen), candidates.together, len(candidates.single)
+    def _link(
+        self, seen: ImageEvidence, proposed: Proposals, families: tuple[CatheterFamily, ...], halves: int
+    ) -> _Linking:
+        """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
+        shaft_image = self._shafts(seen)
         points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
-        possible = possible_chains(
-            points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK, single=single
-        )
-        possible = candidates.possible(possible, points, families)
+        possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
+        possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
             return _Linking(points, len(points), possible, linked)
@@ -260,7 +263,7 @@ class ChainDetector:
             return np.where(allowed, self._evidence(probability), -np.inf)
 
         completed = complete_chains(
-            points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm, single
+            points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm
         )
         possible = possible_chains(
             completed.points_uv,
@@ -271,9 +274,8 @@ class ChainDetector:
             len(points),
             _COMPANION_SLACK,
             completed.rows,
-            single,
         )
-        possible = candidates.possible(possible, completed.points_uv, families)
+        possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
         return _Linking(completed.points_uv, len(points), possible, linked)
 
@@ -281,55 +283,50 @@ class ChainDetector:
         self,
         x: Image,
         seen: ImageEvidence,
-        candidates: Candidates,
+        proposed: Proposals,
         linking: _Linking,
         families: tuple[CatheterFamily, ...],
     ) -> _FittedSet:
         """Fit linked chains to the image, and drop those that are not accepted."""
         fitted = fit_chains(
             x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed,
-            seen.tip_logits_at, candidates.tip_middles,
+            seen.tip_logits_at,
         )  # fmt: skip
         clear = [
-            (linked, one)
-            for linked, one in zip(linking.chains, fitted, strict=True)
+            (candidates, one)
+            for candidates, one in zip(linking.chains, fitted, strict=True)
             if one.clearness >= self.acceptance.least_clearness
         ]
         floor = min(family.floor for family in families)
         sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
         found = [one.chain for _, one in clear]
         accepted = []
-        for linked, chain in zip((linked for linked, _ in clear), found, strict=True):
+        for candidates, chain in zip((candidates for candidates, _ in clear), found, strict=True):
             others = [other for other in found if other is not chain]
-            scores = self._of_electrodes(seen.scores_at, chain)
+            scores = seen.scores_at(chain.pixels_uv)
             if self.acceptance.accepts(scores, chain.scores[0]):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
-                accepted.append((linked, replace(chain, covariance_px2=covariance, scores=scores)))
+                accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
         chains = tuple(chain for _, chain in accepted)
         listed = np.ones(len(chains), np.bool_)
         if self.acceptance.strict:
-            listed = self._are_of_catalogue(chains, seen, candidates.single)
+            listed = self._are_of_catalogue(chains, seen, proposed)
         return _FittedSet(
             tuple(chain for chain, kept in zip(chains, listed, strict=True) if kept),
-            tuple(linked for (linked, _), kept in zip(accepted, listed, strict=True) if kept),
-            tuple(linked for (linked, _), kept in zip(accepted, listed, strict=True) if not kept),
+            tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if kept),
+            tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if not kept),
             sure,
         )
 
     def _link_without_rejected(
-        self,
-        seen: ImageEvidence,
-        candidates: Candidates,
-        linking: _Linking,
-        result: _FittedSet,
-        families: tuple[CatheterFamily, ...],
+        self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
     ) -> _Linking:
         """Link again without the chains that would be rejected.
 
         They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
         electrode of an unlisted catheter.
         """
-        scores = candidates.scores_at(seen, linking.points_uv)
+        scores = seen.scores_at(linking.points_uv)
         unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
         allowed = []
         for index, (family, rows, chain_scores) in enumerate(
@@ -360,7 +357,7 @@ class ChainDetector:
             family = self._family(chain)
             if family is None:
                 continue
-            own = log_odds(self._of_electrodes(seen.probability_at, chain))
+            own = log_odds(seen.probability_at(chain.pixels_uv))
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
@@ -427,9 +424,8 @@ class ChainDetector:
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         if not self._in_field(points).all():
             return None
-        there = replace(chain, pixels_uv=points)
-        scores, variance = self._of_electrodes(seen.scores_at, there), seen.variance_at(points)
-        weights = self._evidence(self._of_electrodes(seen.probability_at, there))
+        scores, variance = seen.scores_at(points), seen.variance_at(points)
+        weights = self._evidence(seen.probability_at(points))
         for values in (scores, weights, variance) if hidden.any() else ():
             values[hidden] = np.median(values[~hidden])
         score = chain_score(points, weights, variance, self._shafts(seen), family)
@@ -483,13 +479,6 @@ class ChainDetector:
         inside: BoolArray = within & self.field.candidates[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
         return inside
 
-    def _of_electrodes(self, values_at: Callable[[Array], Array], chain: Chain) -> Array:
-        """Return the values of a chain's electrodes, (n,); see :func:`~fluoromap.segmenter.long_tips.with_long_tip`."""
-        family = self._family(chain)
-        return (
-            values_at(chain.pixels_uv) if family is None else with_long_tip(values_at, chain.pixels_uv, family.catheter)
-        )
-
     def _family(self, chain: Chain) -> CatheterFamily | None:
         """Return the most probable family whose catheters have exactly this chain's electrodes."""
         whole = [
@@ -508,3 +497,18 @@ def _away(points_uv: Array, from_uv: Array) -> Array:
     """Return the distance of each point to the nearest of others, (n,)."""
     nearest: Array = np.linalg.norm(points_uv[:, None] - from_uv[None], axis=2).min(axis=1)
     return nearest
+
+
+def _with_enough_places(possible: PossibleChains, first_half: int, last_half: int) -> PossibleChains:
+    """Return the chains that show at least four separate places.
+
+    The candidates from ``first_half`` to before ``last_half`` are electrodes of split pairs: two of them are one place. Three
+    drops of contrast medium may lie like a pair and two rings.
+    """
+    return possible.where(
+        [
+            np.count_nonzero((rows >= first_half) & (rows < last_half), axis=1)
+            <= 2 * max(rows.shape[1] - _LEAST_PLACES, 0)
+            for rows in possible.rows
+        ]
+    )

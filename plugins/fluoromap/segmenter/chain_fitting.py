@@ -50,7 +50,6 @@ def fit_chains(
     noise: float,
     sure: int | None = None,
     tip_logits_at: Callable[[Array], Array] | None = None,
-    tip_middles: range = range(0),
 ) -> tuple[FittedChain, ...]:
     """Fit each chain with every catheter of as many electrodes.
 
@@ -71,8 +70,6 @@ def fit_chains(
         Number of candidates with a blob of their own; they come first. All by default.
     tip_logits_at : callable, optional
         (n, 2) pixels -> (n,) log-odds that electrodes there are tips. No end looks more like a tip by default.
-    tip_middles : range
-        Candidates that are middles of long tips. Chains that begin with one have a long tip there.
 
     Returns
     -------
@@ -83,12 +80,7 @@ def fit_chains(
     foreign = _candidates_of_others(candidates_uv, linked, families)
     electrode_fits: dict[tuple[int, int], tuple[ElectrodeFit, int]] = {}
     for column, family in enumerate(families):
-        rows = [
-            row
-            for row, chain in enumerate(linked)
-            if len(chain.candidates) == family.catheter.electrodes
-            and (family.catheter.has_long_tip or chain.candidates[0] not in tip_middles)
-        ]
+        rows = [row for row, chain in enumerate(linked) if len(chain.candidates) == family.catheter.electrodes]
         if not rows:
             continue
         order = np.array([linked[row].candidates for row in rows])
@@ -109,8 +101,7 @@ def fit_chains(
             first, last = (tip_logits_at(electrode_fit.points_uv[:, end]) for end in (0, -1))
             directed += _TIP_WEIGHT * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
         for index, row in enumerate(rows):
-            is_from_tip = linked[row].candidates[0] in tip_middles or directed[index] >= directed[index + len(rows)]
-            best = index if is_from_tip else index + len(rows)
+            best = index if directed[index] >= directed[index + len(rows)] else index + len(rows)
             likelihood[row, column] = fit[best]
             electrode_fits[row, column] = electrode_fit, best
     probabilities = kind_probabilities(likelihood, families)

@@ -165,7 +165,6 @@ def possible_chains(
     sure: int | None = None,
     slack: float = 0.0,
     completed: Sequence[IntArray] = (),
-    single: int | None = None,
 ) -> PossibleChains:
     """Return all chains that catheters can show.
 
@@ -195,9 +194,6 @@ def possible_chains(
         How far a chain's score may lie below its family's floor.
     completed : sequence of (n, electrodes) int
         More chains of each family, as indices from the tip on. Then the search itself uses only the sure candidates.
-    single : int
-        Number of candidates for electrodes of every kind; they come first. The other sure candidates are middles of long tips. All
-        are of every kind by default.
     """
     sure = len(points_uv) if sure is None else sure
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
@@ -207,7 +203,6 @@ def possible_chains(
         if len(points) >= family.catheter.electrodes:
             spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
             searched = sure if completed else len(points)
-            searched = searched if single is None or family.catheter.has_long_tip else single
             paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px)
             if completed:
                 paths = np.concatenate([paths, completed[index]])

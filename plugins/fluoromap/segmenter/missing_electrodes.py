@@ -47,7 +47,6 @@ def complete_chains(
     least_evidence: float,
     families: Sequence[CatheterFamily],
     px_per_mm: float,
-    single: int,
 ) -> CompletedChains:
     """Complete all chains of candidates that lack electrodes.
 
@@ -65,8 +64,6 @@ def complete_chains(
     families : sequence of CatheterFamily
     px_per_mm : float
         At the isocentre.
-    single : int
-        Number of candidates for electrodes of every kind, as in :func:`~fluoromap.segmenter.linking.possible_chains`.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
     places, gained, spread = [points], [weights], [variance_px2]
@@ -74,11 +71,9 @@ def complete_chains(
     rows: list[IntArray] = []
     for family in families:
         electrodes = family.catheter.electrodes
-        searched = len(points) if family.catheter.has_long_tip else single
         of_family = [np.zeros((0, electrodes), np.int64)]
         if electrodes >= MANY_ELECTRODES:
-            spacing_px = np.asarray(family.catheter.spacing_mm) * px_per_mm
-            traced, positions = trace_rows(points[:searched], weights[:searched], spacing_px, _MOST)
+            traced, positions = trace_rows(points, weights, np.asarray(family.catheter.spacing_mm) * px_per_mm, _MOST)
             for row, position in zip(traced, positions, strict=True):
                 lacking = np.flatnonzero(row < 0)
                 # The electrodes on both sides vouch for the place; what shows there may be another catheter.
@@ -92,9 +87,9 @@ def complete_chains(
                 count += len(lacking)
             rows.append(np.concatenate(of_family))
             continue
-        for missing in range(electrodes) if electrodes > _LEAST_KNOWN and searched >= electrodes - 1 else ():
+        for missing in range(electrodes) if electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1 else ():
             arc_mm = np.delete(family.catheter.arc_lengths_mm, missing)
-            paths = chain_search.find_paths(points[:searched], weights[:searched], np.diff(arc_mm) * px_per_mm)
+            paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm)
             predicted = _curve_weights(family.catheter, missing) @ points[paths]
             dark = evidence_at(predicted)
             kept = np.flatnonzero(dark > least_evidence)

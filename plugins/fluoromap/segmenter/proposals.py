@@ -48,9 +48,6 @@ class Proposals:
         return variance
 
 
-NO_PROPOSALS = Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
     """How much each place of an image looks like an electrode, for the search of a catheter that was seen before.

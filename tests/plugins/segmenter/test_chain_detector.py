@@ -160,21 +160,6 @@ def test_a_split_keeps_the_chains_that_were_found_without_it():
     assert moved in split.found.chains
 
 
-def test_a_long_tip_that_shows_its_ends_only_is_found_by_their_middle():
-    long_tip = catheter_type("ablation-8", "ablation")
-    place = np.array([60.0, 60.0]) + np.outer(long_tip.arc_lengths_mm * PX, [1.0, 0.0])
-    ends = place[0] + np.array([[-2.5 * PX, 0.0], [2.5 * PX, 0.0]])
-    v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
-    image = drawn([place]).astype(np.float64)
-    image -= 0.8 * ((np.abs(v - 60) < 3.0) & (np.abs(u - 60) < 4.0 * PX) & (np.hypot(u - 60, v - 60) >= 3.0))
-    points, sure = np.concatenate([ends, place[1:]]), [0.95] * 5
-    catalogue = Catalogue((long_tip, catheter_type("quadripolar-2-5-2", "rv")), "rv", "ablation")
-    detector = detector_of(Evidence(image.astype(np.float32), points, sure, sure), catalogue)
-    (found,) = detector.search(image.astype(np.float32)).found.chains
-    assert lies_on(found, place)
-    assert found.probability("ablation") == pytest.approx(1.0)
-
-
 def test_three_blobs_are_no_quadripolar_catheter_with_a_split_pair():
     catheter = row_of("ablation", (60, 60), 0.4, shortened=0.5)
     points = np.concatenate([catheter[:2], 0.5 * (catheter[2:3] + catheter[3:])])

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
-from fluoromap.segmenter.proposals import NO_PROPOSALS, Likeness, Proposals, probability_of_contrast
+from fluoromap.segmenter.proposals import Likeness, Proposals, probability_of_contrast
 
 _SCALES_MM = 0.52, 0.73, 1.04
 _LEAST_RING_PX = 5.0
@@ -137,7 +137,7 @@ class BlobResponse:
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
         """Return none: a blob says nothing of a second electrode in it."""
-        return NO_PROPOSALS
+        return Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
 
     def tip_logits_at(self, points_uv: Array) -> Array:
         """Return zeros: a blob does not show which end it is."""

@@ -77,6 +77,6 @@ class LearnedChain:
         def detector_of(field: FieldMask) -> Detector:
             return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
 
-        judge = None if alone else TrackEvidence(trained, catalogue, run.px_per_mm, len(run.frames))
+        judge = None if alone else TrackEvidence(trained, run.px_per_mm, len(run.frames))
         found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)
         return visible_part(found, _DIM_BELOW)

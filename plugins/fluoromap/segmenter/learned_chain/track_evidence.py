@@ -13,14 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import affine_transform
 
-from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
-from fluoromap.segmenter.long_tips import with_long_tip
 from fluoromap.segmenter.proposals import log_odds
 
 _AVERAGED = 8
@@ -46,7 +44,6 @@ class TrackEvidence:
     """
 
     trained: Trained
-    catalogue: Catalogue
     px_per_mm: float
     frames: int
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
@@ -56,14 +53,10 @@ class TrackEvidence:
         usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
         frames = sorted(frame for frame, chain in chains.items() if chain.electrodes == usual)
         paths = np.array([chains[frame].pixels_uv for frame in frames])
-        catheter = self._catheter(chains[frames[len(frames) // 2]])
         odds = np.array(
             [
                 np.concatenate(
-                    [
-                        self.log_odds_along(frames[group], part, log_image, catheter if number == 0 else None)
-                        for number, part in enumerate(_sections(paths[group]))
-                    ]
+                    [self.log_odds_along(frames[group], part, log_image) for part in _sections(paths[group])]
                 )
                 for group in _groups(len(frames))
             ]
@@ -77,21 +70,8 @@ class TrackEvidence:
             shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
         return shown and (is_long or bool(np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower") >= _LEAST_LOW))
 
-    def _catheter(self, chain: Chain) -> Catheter:
-        return max(self.catalogue.catheters, key=lambda catheter: chain.probability(catheter.name))
-
-    def log_odds_along(
-        self,
-        frames: Sequence[int],
-        path_uv: Array,
-        log_image: Callable[[int], Image],
-        from_tip_of: Catheter | None = None,
-    ) -> Array:
-        """Return the log-odds of electrodes in the mean of frames.
-
-        The frames are moved along ``path_uv`` (frames, electrodes, 2). ``from_tip_of`` : the catheter whose tip is the path's first
-        electrode.
-        """
+    def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
+        """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
         scale = network_scale(self.px_per_mm)
         middle = path_uv[len(frames) // 2]
         first = np.floor(middle.min(axis=0) - _MARGIN_PX / scale)
@@ -104,11 +84,7 @@ class TrackEvidence:
             total += affine_transform(small, turn[::-1, ::-1], offset[::-1], total.shape, order=1, mode="nearest")
         total /= len(frames)
         seen = NetworkResponse.of_reduced(total, self.trained, scale)
-
-        def odds_at(points_uv: Array) -> Array:
-            return log_odds(seen.probability_at(points_uv))
-
-        return odds_at(middle - first) if from_tip_of is None else with_long_tip(odds_at, middle - first, from_tip_of)
+        return log_odds(seen.probability_at(middle - first))
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import Chain, PixelFacts
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.field_mask import find_field
@@ -46,7 +45,7 @@ def chains(path_uv):
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
     trained = read_weights(Path(SHIPPED))
-    judge = TrackEvidence(trained, DEFAULT_CATALOGUE, PX_PER_MM, FRAMES)
+    judge = TrackEvidence(trained, PX_PER_MM, FRAMES)
     alone = [NetworkResponse.of_image(image, trained, PX_PER_MM) for image in images]
     for path_uv in noisy.truth.pixels_uv.values():
         assert judge(chains(path_uv), lambda frame: images[frame])
@@ -56,7 +55,7 @@ def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images)
 
 
 def test_a_track_beside_the_catheters_is_rejected(noisy, images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), DEFAULT_CATALOGUE, PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     path_uv = noisy.truth.pixels_uv["reference"]
     for shift in ([0.0, 60.0], [70.0, 0.0], [-55.0, -40.0]):
         beside = path_uv + np.array(shift)
@@ -64,14 +63,14 @@ def test_a_track_beside_the_catheters_is_rejected(noisy, images):
 
 
 def test_a_long_catheter_is_judged_in_sections(images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), DEFAULT_CATALOGUE, PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     row = np.stack([np.linspace(100.0, 400.0, 20), np.full(20, 200.0)], axis=1)
     path_uv = np.repeat(row[None], FRAMES, axis=0)
     assert not judge(chains(path_uv), lambda frame: images[frame])
 
 
 def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), DEFAULT_CATALOGUE, PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     track = chains(noisy.truth.pixels_uv["reference"])
     track[2] = next(iter(chains(noisy.truth.pixels_uv["reference"][2:3, :3]).values()))
     assert judge(track, lambda frame: images[frame])
@@ -82,9 +81,9 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
     [(4, 0.5, 0, True), (4, 0.5, 1, False), (6, 0.5, 1, True), (10, 0.1, 2, True), (10, -0.5, 0, False)],
 )
 def test_clutter_may_hide_some_electrodes_of_a_long_catheter(monkeypatch, electrodes, odds, hidden, accepted):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), DEFAULT_CATALOGUE, PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
 
-    def along(self, frames, path_uv, log_image, from_tip_of):
+    def along(self, frames, path_uv, log_image):
         return np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -4.0)
 
     monkeypatch.setattr(TrackEvidence, "log_odds_along", along)
