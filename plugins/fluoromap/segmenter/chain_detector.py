@@ -30,6 +30,7 @@ from fluoromap.segmenter.linking import (
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
+from fluoromap.segmenter.moved_means import moved_means
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
@@ -44,6 +45,7 @@ _WORST_FIT = 2.0
 _BENDING = 0.12
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
+_LEAST_MOVING_ODDS = 0.2
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
 _LEAST_PLACES = 4
@@ -431,6 +433,24 @@ class ChainDetector:
             return None
         again = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False)
         return replace(again, covariance_px2=widen_covariance(again, taken, self.px_per_mm))
+
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return the chains that moved means show, most probable first.
+
+        A velocity that is wrong for a catheter blurs it: among chains at one place the most probable has the right velocity.
+        """
+        found: list[tuple[float, Chain]] = []
+        for x in moved_means(images, times_ms, middle, self.px_per_mm):
+            self.forget_image()
+            chains = self.find_chains(x, frame).chains
+            seen = self.image_evidence(x)
+            found += [(float(np.median(log_odds(seen.probability_at(chain.pixels_uv)))), chain) for chain in chains]
+        best: list[Chain] = []
+        for odds, chain in sorted(found, key=lambda one: -one[0]):
+            shared = (_away(chain.pixels_uv, other.pixels_uv) < _HIDING_MM * self.px_per_mm for other in best)
+            if odds >= _LEAST_MOVING_ODDS and all(np.count_nonzero(near) < 2 for near in shared):
+                best.append(chain)
+        return tuple(best)
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the image clearly shows a catheter besides these chains."""

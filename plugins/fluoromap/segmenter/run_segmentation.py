@@ -13,7 +13,9 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
+from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.log_image import Image, LogTransform
+from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
 from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
 
@@ -23,6 +25,7 @@ _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
+_LEAST_MOVED = 5
 
 Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
 """(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
@@ -68,6 +71,27 @@ class Detector(Protocol):
         -------
         Chain or None
             None where the image does not show the chain, and from a detector that searches whole frames only.
+        """
+
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return the chains that moved means show, most probable first.
+
+        See :func:`~fluoromap.segmenter.moved_means.moved_means`.
+
+        Parameters
+        ----------
+        images : sequence of (rows, columns) float32
+            Log images of successive frames.
+        times_ms : (images,)
+        middle : int
+            Index of the image whose places the chains have.
+        frame : int
+            Its number in the run.
+
+        Returns
+        -------
+        tuple of Chain
+            No two have two electrodes in common. Empty from a detector that searches single frames only.
         """
 
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
@@ -126,6 +150,7 @@ def segment_run(
     context: Context,
     detector_of: Callable[[FieldMask], Detector],
     search_again: bool = False,
+    search_moving: bool = False,
     shows_catheter: RunJudge | None = None,
 ) -> Segmentation:
     """Segment a run: tracked chains of all frames, and diastolic chains.
@@ -149,6 +174,8 @@ def segment_run(
         The field mask of the run -> the detector to use.
     search_again : bool
         Whether to search for missing catheters with :meth:`Detector.find_again`.
+    search_moving : bool
+        Whether to search for catheters without a track with :meth:`Detector.find_moving`. Marks take its place.
     shows_catheter : RunJudge, optional
         Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     """
@@ -194,6 +221,13 @@ def segment_run(
     seed = mean if len(averaged) > 1 else None
     accepts = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
     entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
+    if search_moving and not marks:
+        hidden = _moving_search(detector, log_image, run.frame_times_ms, context)
+
+        def follow(found: Sequence[FrameChains], start: FrameChains) -> tuple[FrameChains, ...]:
+            return track_chains(found, run.frame_times_ms, catheters, search, start, accepts)
+
+        entries = add_hidden_catheters(found, entries, catalogue, run.px_per_mm, hidden, follow)
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
@@ -289,6 +323,25 @@ def _chain_search(
 
         # A frame may be a number of NumPy, and ``taken`` may grow later.
         return recall(FoundAgain, (int(frame), chain, shift, reach_px, len(taken), *taken), find).chain
+
+    return search
+
+
+def _moving_search(
+    detector: Detector, log_image: Callable[[int], Image], frame_times_ms: Array, context: Context
+) -> MovingSearch:
+    """Return the search for moving catheters round a frame.
+
+    It finds none where few frames are near in time.
+    """
+
+    def search(frame: int) -> tuple[Chain, ...]:
+        context.check()
+        near = np.flatnonzero(np.abs(frame_times_ms - frame_times_ms[frame]) <= WINDOW_MS)
+        if len(near) < _LEAST_MOVED:
+            return ()
+        images = [log_image(int(index)) for index in near]
+        return detector.find_moving(images, frame_times_ms[near], frame - int(near[0]), frame)
 
     return search
 

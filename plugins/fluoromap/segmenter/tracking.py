@@ -163,6 +163,7 @@ def track_chains(
     for track in tracks_kept:
         if 2 * track.reversals > track.detections and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
+        track.chains = _with_kinds_of_track(track)
     usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
@@ -236,16 +237,30 @@ def _accepted(
 
 
 def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
-    """Return whether more frames show a longer catheter there.
+    """Return whether more frames show a longer or displaced chain there.
 
     They are compared with the frames that show the track's own chain. A chain of the seed or of the first frame can be a part of
-    the longer catheter, and would keep it out of every frame.
+    a longer catheter, or lie a pair of electrodes too far along its own, and would keep the catheter out of every frame.
     """
     against = 0
     for frame, chain in track.chains.items():
-        longer = [other for other in found[frame].chains if len(other.electrodes) > len(chain.electrodes)]
-        against += found[frame].manual_needed is None and any(_overlaps(chain, [other]) for other in longer)
+        against += found[frame].manual_needed is None and any(
+            _overlaps(chain, [other]) if len(other.electrodes) > len(chain.electrodes) else _is_displaced(chain, other)
+            for other in found[frame].chains
+        )
     return not track.manual and against > max(track.detections, _LEAST_AGAINST - 1)
+
+
+def _is_displaced(chain: Chain, other: Chain) -> bool:
+    """Return whether a chain of as many electrodes lies farther along.
+
+    It shares at least half of the places, and two or more of its electrodes are elsewhere.
+    """
+    count = len(chain.electrodes)
+    if len(other.electrodes) != count:
+        return False
+    shared = _count_shared(chain, other)
+    return 2 * shared >= count and shared <= count - 2
 
 
 def _starts(chain: Chain, frame: int, tracks: Sequence[_Track]) -> bool:
@@ -268,6 +283,22 @@ def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
             )
         ),
     )
+
+
+def _with_kinds_of_track(track: _Track) -> dict[int, Chain]:
+    """Return a track's chains with the mean of their kinds.
+
+    They are one catheter, and a single frame may be wrong about its name. Chains that were set by hand keep theirs.
+    """
+    names = dict.fromkeys(name for chain in track.chains.values() for name, _ in chain.kinds)
+    kinds = tuple(
+        (name, math.fsum(chain.probability(name) for chain in track.chains.values()) / len(track.chains))
+        for name in names
+    )
+    return {
+        frame: chain if track.manual or chain.manual else replace(chain, kinds=kinds)
+        for frame, chain in track.chains.items()
+    }
 
 
 def _start(found: Sequence[FrameChains], catheters: int) -> int:
@@ -321,11 +352,13 @@ def _mean_shift(one: Chain, other: Chain) -> Array:
 
 def _overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
     """Return whether two or more electrodes lie on electrodes of another chain."""
-    for other in others:
-        apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
-        if np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < _SAME_PLACE_PX**2) >= 2:
-            return True
-    return False
+    return any(_count_shared(chain, other) >= 2 for other in others)
+
+
+def _count_shared(chain: Chain, other: Chain) -> int:
+    """Count the electrodes of a chain that lie on electrodes of another."""
+    apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
+    return int(np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < _SAME_PLACE_PX**2))
 
 
 def _advance(

@@ -1,4 +1,7 @@
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
@@ -126,6 +129,16 @@ def test_a_part_of_a_longer_catheter_does_not_keep_it_out():
     assert [[len(one.electrodes) for one in entry.chains] for entry in entries] == [[10]] * 6
 
 
+def test_the_frames_of_a_track_agree_on_its_name():
+    kinds = [(("cs", 0.9), ("rv", 0.1)), (("cs", 0.3), ("rv", 0.7)), (("cs", 0.9), ("rv", 0.1)), (("cs", 1.0),)]
+    found = run([[replace(chain(POINTS + frame), kinds=said)] for frame, said in enumerate(kinds)])
+    entries = track_chains(found, times(4), 1)
+    assert [one.probability("cs") for entry in entries for one in entry.chains] == pytest.approx([0.775] * 4)
+    by_hand = FrameChains(1, (chain(POINTS + 1, "rv", manual=True),))
+    entries = track_chains([found[0], by_hand, *found[2:]], times(4), 1)
+    assert [one.probability("rv") for one in entries[1].chains] == [1.0]
+
+
 def test_misplaced_electrodes_of_a_long_catheter_do_not_interrupt_its_track():
     row = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
     places = [row + frame for frame in range(6)]
@@ -137,6 +150,19 @@ def test_misplaced_electrodes_of_a_long_catheter_do_not_interrupt_its_track():
         points[:4] += 12.0
     entries = track_chains(run([[chain(points, "cs")] for points in places]), np.arange(6) * 60.0, 1)
     assert len({one.track for entry in entries for one in entry.chains}) > 1
+
+
+def test_a_chain_a_pair_too_far_along_its_catheter_does_not_keep_it_out():
+    row = np.stack([np.arange(12) * 12.0, np.arange(12) * 3.0], axis=1) + 60
+    found = run([[chain(row[:10] + frame, "cs")] for frame in range(6)])
+    seed = FrameChains(2, (chain(row[2:] + 2, "cs"),))
+
+    def search(frame, known, shift, reach_px, taken):
+        return chain(row[2:] + frame, "cs")
+
+    entries = track_chains(found, times(6), 1, search, seed)
+    for entry in entries:
+        np.testing.assert_allclose(entry.chains[0].pixels_uv, row[:10] + entry.frame)
 
 
 def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():

@@ -30,7 +30,7 @@ class CatheterChain:
     """
 
     name: ClassVar[str] = "catheter-chain"
-    version: ClassVar[str] = "7"
+    version: ClassVar[str] = "8"
     Params: ClassVar[type[BaseModel]] = NoParams
 
     def __init__(self, params: BaseModel | None = None) -> None:

@@ -127,6 +127,10 @@ class FourStepDetector:
         """Return None: the paper searches whole frames."""
         return None
 
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return nothing: the paper searches single frames."""
+        return ()
+
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return False: blobs beside the chains may be anything."""
         return False

@@ -125,6 +125,10 @@ class FrameSearch:
         """Return a chain of another frame at its place in this log image."""
         return self.detector.find_again(x, chain, shift, reach_px, taken)
 
+    def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
+        """Return the chains that moved means show, most probable first."""
+        return self.detector.find_moving(images, times_ms, middle, frame)
+
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""
         return self.detector.shows_extra_catheter(x, chains)

@@ -45,7 +45,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "6"
+    version: ClassVar[str] = "8"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -78,5 +78,5 @@ class LearnedChain:
             return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
 
         judge = None if alone else TrackEvidence(trained, run.px_per_mm, len(run.frames))
-        found = segment_run(run, catalogue, marks, context, detector_of, True, judge)
+        found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)
         return visible_part(found, _DIM_BELOW)

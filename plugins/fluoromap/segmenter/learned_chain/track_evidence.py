@@ -27,11 +27,13 @@ _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
-_LEAST_MEDIAN, _LEAST_WHERE_CLEAR, _LEAST_LOW = 0.2, -1.07, -2.0
-"""Log-odds of the middle electrode in each mean; less where half of the single frames show the catheter; of the worst electrode."""
+_LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
+"""Log-odds of the middle electrode, on average over the pictures; of the worst electrode."""
+_LEAST_WHERE_CLEAR, _LEAST_MEAN_WHERE_CLEAR = -1.07, -0.3
+"""Where half of the single frames show the catheter: of the middle electrode in each picture, and on average."""
 _LOW_QUANTILE = 0.1
 _LEAST_LONG = 0.0
-"""Of the middle electrode of six or more. Clutter often hides one or two of them, so the worst electrodes do not count."""
+"""Of the middle electrode of six or more, on average. Clutter often hides some of them: the worst electrodes do not count."""
 _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
@@ -79,10 +81,12 @@ class TrackEvidence:
         )
         clear = sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames
         middle = np.median(odds, axis=1)
-        if len(usual) >= MANY_ELECTRODES:
-            return bool((middle >= (_LEAST_WHERE_CLEAR if clear else _LEAST_LONG)).all())
-        low = np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower")
-        return bool((middle >= (_LEAST_WHERE_CLEAR if clear else _LEAST_MEDIAN)).all() and low >= _LEAST_LOW)
+        is_long = len(usual) >= MANY_ELECTRODES
+        if clear:
+            shown = bool((middle >= _LEAST_WHERE_CLEAR).all() and middle.mean() >= _LEAST_MEAN_WHERE_CLEAR)
+        else:
+            shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
+        return shown and (is_long or bool(np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower") >= _LEAST_LOW))
 
     def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
