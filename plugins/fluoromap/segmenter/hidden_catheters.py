@@ -33,7 +33,7 @@ def add_hidden_catheters(
 ) -> tuple[FrameChains, ...]:
     """Return the tracked chains with those of catheters that lacked a track.
 
-    A longer catheter replaces a track on some of its electrodes. Nothing changes where none of these
+    A longer catheter replaces a track on some of its electrodes, but no track with a mark. Nothing changes where none of these
     catheters, or no more electrodes, are tracked then.
 
     Parameters
@@ -52,6 +52,7 @@ def add_hidden_catheters(
         sizes = {chain.track: len(chain.electrodes) for entry in tracked for chain in entry.chains}
         if not listed - Counter(sizes.values()):
             break
+        marked = {chain.track for entry in tracked for chain in entry.chains if chain.manual}
         frame = int(part * len(tracked))
         chains = list(tracked[frame].chains)
         wrong: set[int] = set()
@@ -61,7 +62,8 @@ def add_hidden_catheters(
             shared = [other for other in (*chains, *added) if _share_electrodes(chain, other, px_per_mm)]
             present = sum(of == size for track, of in sizes.items() if track not in wrong)
             present += sum(len(other.electrodes) == size for other in added)
-            if present < listed[size] and all(len(other.electrodes) < size for other in shared):
+            replaces = all(len(other.electrodes) < size and other.track not in marked for other in shared)
+            if present < listed[size] and replaces:
                 wrong |= {other.track for other in shared}
                 chains = [other for other in chains if other not in shared]
                 added.append(chain)

@@ -119,6 +119,13 @@ class FoundAgain:
     chain: Chain | None
 
 
+@dataclass(frozen=True, eq=False)
+class FoundMoving:
+    """The answer of :meth:`Detector.find_moving`."""
+
+    chains: tuple[Chain, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class ExtraCatheter:
     """The answer of :meth:`Detector.shows_extra_catheter` for the mean image."""
@@ -175,7 +182,7 @@ def segment_run(
     search_again : bool
         Whether to search for missing catheters with :meth:`Detector.find_again`.
     search_moving : bool
-        Whether to search for catheters without a track with :meth:`Detector.find_moving`. Marks take its place.
+        Whether to search for catheters without a track with :meth:`Detector.find_moving`.
     shows_catheter : RunJudge, optional
         Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     """
@@ -221,11 +228,11 @@ def segment_run(
     seed = mean if len(averaged) > 1 else None
     accepts = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
     entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
-    if search_moving and not marks:
-        hidden = _moving_search(detector, log_image, run.frame_times_ms, context)
+    if search_moving:
+        hidden = _moving_search(detector, log_image, run.frame_times_ms, context, recall)
 
         def follow(found: Sequence[FrameChains], start: FrameChains) -> tuple[FrameChains, ...]:
-            return track_chains(found, run.frame_times_ms, catheters, search, start, accepts)
+            return track_chains(found, run.frame_times_ms, catheters, search, start, accepts, marks_first=False)
 
         entries = add_hidden_catheters(found, entries, catalogue, run.px_per_mm, hidden, follow)
     entries = _mark_out_of_field(entries, field)
@@ -328,7 +335,11 @@ def _chain_search(
 
 
 def _moving_search(
-    detector: Detector, log_image: Callable[[int], Image], frame_times_ms: Array, context: Context
+    detector: Detector,
+    log_image: Callable[[int], Image],
+    frame_times_ms: Array,
+    context: Context,
+    recall: Recall[FoundMoving],
 ) -> MovingSearch:
     """Return the search for moving catheters round a frame.
 
@@ -340,8 +351,12 @@ def _moving_search(
         near = np.flatnonzero(np.abs(frame_times_ms - frame_times_ms[frame]) <= WINDOW_MS)
         if len(near) < _LEAST_MOVED:
             return ()
-        images = [log_image(int(index)) for index in near]
-        return detector.find_moving(images, frame_times_ms[near], frame - int(near[0]), frame)
+
+        def find() -> FoundMoving:
+            images = [log_image(int(index)) for index in near]
+            return FoundMoving(detector.find_moving(images, frame_times_ms[near], frame - int(near[0]), frame))
+
+        return recall(FoundMoving, (frame,), find).chains
 
     return search
 

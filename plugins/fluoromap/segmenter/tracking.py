@@ -103,6 +103,7 @@ def track_chains(
     search: ChainSearch | None = None,
     seed: FrameChains | None = None,
     accepts: TrackJudge | None = None,
+    marks_first: bool = True,
 ) -> tuple[FrameChains, ...]:
     """Give the chains of a run track numbers.
 
@@ -131,6 +132,8 @@ def track_chains(
         Decides about each track of four or more frames, and of half of the frames in short runs. Where it rejects one, the run is
         tracked again without the track's chains, twice at most. An accepted track has chains in half of the frames. All tracks are
         accepted by default.
+    marks_first : bool
+        Whether a frame with a mark precedes the seed. Not so where the seed's chains were already followed from the marks.
 
     Returns
     -------
@@ -140,17 +143,17 @@ def track_chains(
     """
     if not found:
         return ()
-    tracks = _follow(found, frame_times_ms, catheters, search, seed)
+    tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     outvoted = [track for track in tracks if _is_outvoted(track, found)]
     if outvoted:
         found = [_without(entry, outvoted) for entry in found]
         kept = () if seed is None else tuple(chain for chain in seed.chains if not _starts(chain, seed.frame, outvoted))
         seed = None if seed is None else replace(seed, chains=kept)
-        tracks = _follow(found, frame_times_ms, catheters, search, seed)
+        tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
     if accepts is not None:
         least = max(least, _ACCEPTED_AT_LEAST * len(found))
-        tracks = _accepted(tracks, found, frame_times_ms, catheters, search, accepts)
+        tracks = _accepted(tracks, found, frame_times_ms, catheters, search, accepts, marks_first)
     tracks_kept = [
         track
         for track in tracks
@@ -185,11 +188,12 @@ def _follow(
     catheters: int,
     search: ChainSearch | None,
     seed: FrameChains | None,
+    marks_first: bool,
 ) -> list[_Track]:
     """Return all tracks, false ones too."""
     marked = [entry.frame for entry in found if any(chain.manual for chain in entry.chains)]
     tracks: list[_Track] = []
-    if seed is not None and seed.chains and not marked:
+    if seed is not None and seed.chains and not (marked and marks_first):
         start = seed.frame
         at = float(frame_times_ms[start])
         tracks = [_Track(chain, at, np.zeros(2), detections=0, from_seed=True) for chain in seed.chains]
@@ -215,6 +219,7 @@ def _accepted(
     catheters: int,
     search: ChainSearch | None,
     accepts: TrackJudge,
+    marks_first: bool,
 ) -> list[_Track]:
     """Return the tracks without wrong ones.
 
@@ -232,7 +237,7 @@ def _accepted(
         sure = [track for track in tracks if len(track.chains) >= judged]
         start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in sure))
         seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
-        tracks = _follow(found, frame_times_ms, catheters, search, seed)
+        tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     return tracks
 
 

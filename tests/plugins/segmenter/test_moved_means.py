@@ -1,6 +1,9 @@
 """Means of frames that are moved along velocities, and catheters that only they show."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from frame_sources import Frames
 
 from fluoromap.catheters import Catalogue, catheter_type
@@ -56,18 +59,27 @@ def hidden_run(photons=5.0, through_ring=0.7):
     return frames, np.array(truth)
 
 
-def test_a_catheter_that_noise_hides_in_every_frame_is_found():
+@pytest.mark.parametrize("marked", [None, 2, 4, 11])
+def test_a_catheter_that_noise_hides_in_every_frame_is_found(marked):
     frames, truth = hidden_run()
     run = Run(Frames(frames), np.arange(FRAMES) * 1000 / 60, PX_PER_MM, PixelFacts(False, 12, False))
-    found = LearnedChain().segment(run, CATALOGUE, {}, Silent())
+    marks = {} if marked is None else {marked: (mark_far_from_all(),)}
+    found = LearnedChain().segment(run, CATALOGUE, marks, Silent())
     right = [
         chain
         for entry in found.frames
         for chain in entry.chains
-        if len(chain.electrodes) == 10
+        if len(chain.electrodes) >= 9
         and np.mean(np.linalg.norm(chain.pixels_uv[:, None] - truth[entry.frame], axis=2).min(axis=0) <= 5.0) > 0.7
     ]
-    assert len(right) >= FRAMES / 2
+    assert len(right) >= FRAMES - 4
+    assert sum(chain.manual for entry in found.frames for chain in entry.chains) == len(marks)
+
+
+def mark_far_from_all():
+    """Return an ablation catheter marked by hand, away from the hidden catheter."""
+    points = np.array([30.0, 230.0]) + np.outer(CATALOGUE["ablation"].arc_lengths_mm * PX_PER_MM, [1.0, 0.0])
+    return Chain((1, 2, 3, 4), points, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), (("ablation", 1.0),), manual=True)
 
 
 def chain(electrodes, at, track=-1):
@@ -103,6 +115,12 @@ def test_a_longer_catheter_replaces_the_track_of_its_part():
     assert start.frame == 2
     assert start.chains == (whole,)
     assert all(entry.chains == () for entry in found)
+
+
+def test_a_track_with_a_mark_is_not_replaced():
+    marked = replace(chain(4, 40.0, 0), manual=True)
+    known = entries(marked)
+    assert add_hidden_catheters(known, known, CATALOGUE, 3.5, lambda frame: [chain(10, 0.0)], None) is known
 
 
 def test_a_search_after_which_fewer_electrodes_are_tracked_changes_nothing():
