@@ -29,8 +29,8 @@ _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
 """Log-odds of the middle electrode, on average over the pictures; of the worst electrode."""
-_LEAST_WHERE_CLEAR, _LEAST_MEAN_WHERE_CLEAR = -1.07, -0.3
-"""Where half of the single frames show the catheter: of the middle electrode in each picture, and on average."""
+_LEAST_WHERE_CLEAR = -1.07
+"""Of the middle electrode in each picture, where half of the single frames show the catheter."""
 _LOW_QUANTILE = 0.1
 _LEAST_LONG = 0.0
 """Of the middle electrode of six or more, on average. Clutter often hides some of them: the worst electrodes do not count."""
@@ -83,7 +83,7 @@ class TrackEvidence:
         middle = np.median(odds, axis=1)
         is_long = len(usual) >= MANY_ELECTRODES
         if clear:
-            shown = bool((middle >= _LEAST_WHERE_CLEAR).all() and middle.mean() >= _LEAST_MEAN_WHERE_CLEAR)
+            shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
         else:
             shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
         return shown and (is_long or bool(np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower") >= _LEAST_LOW))

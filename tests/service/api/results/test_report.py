@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
 from finished_study import FinishedStudy, no_map
+from playwright.sync_api import sync_playwright
 
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import Study
@@ -18,6 +18,8 @@ from fluoromap_service.store.models import Study
 pytestmark = pytest.mark.usefixtures("file_processes")
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+ARGUMENTS = ["--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader"]
+PATIENCE_MS = 240_000
 
 
 class _References(HTMLParser):
@@ -111,11 +113,9 @@ def test_a_browser_draws_the_map(client: TestClient, study: FinishedStudy, tmp_p
     study.finish()
     path = tmp_path / "report.html"
     path.write_text(_page(client, study), encoding="utf-8")
-    command = [
-        browser, "--headless", "--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-sync",
-        "--disable-component-update", "--disable-dev-shm-usage", "--use-gl=angle", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=60000",
-        "--dump-dom", path.as_uri(),
-    ]  # fmt: skip
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=110, check=True).stdout
-    assert re.search(r'<canvas class="wall"[^>]*data-drawn="yes"', shown), shown[-2000:]
+    with sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=browser, args=ARGUMENTS)
+        page = opened.new_page()
+        page.goto(path.as_uri())
+        page.wait_for_selector('canvas.wall[data-drawn="yes"]', state="attached", timeout=PATIENCE_MS)
+        opened.close()
