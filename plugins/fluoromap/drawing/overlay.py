@@ -125,7 +125,7 @@ def draw_overlay(
     canvas = _Canvas(camera.translated(shift_world_mm), look.scale)
     times = look.times or scale_of(chamber, look.step_ms, look.palette)
     size = (camera.columns * look.scale, camera.rows * look.scale)
-    # Enlarging the frame takes a sixth of the time, and another processor may do it meanwhile.
+    # Another processor may enlarge the frame meanwhile.
     with ThreadPoolExecutor(1) as thread:
         enlarged = thread.submit(_enlarged, frame, size)
         facing = canvas.facing(chamber)

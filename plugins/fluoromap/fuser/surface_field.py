@@ -26,7 +26,7 @@ LENGTH_PRIOR = (25.0, 0.6)
 _SHIFT = -1e-4
 _LEAST_WEIGHT = 1e-4
 _TOLERANCE = 1e-6
-"""Relative residual of an eigenvalue. The error of a covariance is a hundredth of it: far below the uncertainty of the times."""
+"""Relative residual of an eigenvalue, far below the uncertainty of the times."""
 _BLOCK = 4
 """Vectors in a block of the Krylov space. A block of one costs more time a vector; large blocks need more vectors."""
 _BASIS = 2.9
@@ -236,7 +236,7 @@ def _largest_eigenpairs(apply: Callable[[Array], Array], start: Array, count: in
         new -= basis[:, old] @ projected[own, old].T
         projected[own, own] = basis[:, own].T @ new
         new -= basis[:, own] @ projected[own, own]
-        # Rounding brings back directions of earlier blocks. A step enlarges them by 1300 at most: the ratio of the largest
+        # Rounding brings back directions of earlier blocks. A step enlarges them by at most the ratio of the largest
         # eigenvalue to the smallest of interest. Every third block keeps them, because they stay far below the tolerance.
         if size // _BLOCK % 3 or size >= enough:
             new -= basis[:, :size] @ (basis[:, :size].T @ new)

@@ -356,7 +356,7 @@ def _lock(session: Session, job_id: str) -> Job:
 
 
 def _add_points(session: Session, result: StoredResult) -> None:
-    # A study has a thousand points: the mapper would take twice as long, and with objects ten times.
+    # A study may have a thousand points, and the mapper takes longer for each row than the table's own statement.
     connection = session.connection()
     # Rejected points have fewer columns. One statement serves successive points with the same columns.
     for _, points in itertools.groupby(result.points, key=dict.keys):

@@ -51,7 +51,7 @@ class SiteTracks:
 
 
 _REMEMBERED_BYTES = 20 << 20
-"""Size limit of the decoded results that a process remembers, counted as stored; in memory they take about twice as much.
+"""Size limit of the decoded results that a process remembers, counted as stored. In memory they take more.
 
 Each stage reads the results of the stages before it, and a correction reads most of them again.
 """

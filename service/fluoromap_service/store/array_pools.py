@@ -30,9 +30,9 @@ _LEAST_PACKED_BYTES = 256
 _LEAST_SHARED_BYTES = 4096
 """In smaller pools a search for arrays of partial results saves nothing."""
 _MOST_BITS = 7.5
-"""Bytes with more information than this are stored uncompressed. A limit of 8 saves 1 % more in twice the time."""
+"""Bytes with more information than this are stored uncompressed: trying them takes time and saves little."""
 _LEVEL = 1
-"""Compression level. Level 6 saves 1 % more in a quarter more time."""
+"""Compression level. Higher ones save little more and take longer."""
 
 PlainPool = tuple[str, tuple[int, ...], list[int]]
 """Type, shape of one array, and the numbers of the arrays."""

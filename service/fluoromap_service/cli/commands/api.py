@@ -54,7 +54,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
             outbox.register(session, read_targets())
     sys.setswitchinterval(SWITCH_SECONDS)
     service = create_app()
-    # The loaded code stays. Else the collector would walk through it, and a request would wait for a tenth of a second.
+    # The loaded code stays. Else the collector would walk through it, and a request would wait for it.
     gc.freeze()
     config = uvicorn.Config(
         service,
