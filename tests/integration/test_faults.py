@@ -168,12 +168,15 @@ def test_a_dead_api_is_started_again(service: Service) -> None:
 def test_event_streams_end_cleanly_when_the_api_ends(service: Service) -> None:
     job = service.start_job("hangs")
     service.until_running(job)
+    api = service.child("api")
     with httpx.stream("GET", f"{service.url}/v1/jobs/{job}/events", timeout=60) as stream:
         lines = stream.iter_lines()
         assert next(lines).startswith("event:")
-        service.child("api").terminate()
+        api.terminate()
         # A stream that is cut raises an error here.
         assert list(lines)
+    # Its streams end before it stops to answer: the next answers could still be its own.
+    until(lambda: gone(api))
     wait_until_ready(service.url, service.data_dir)
     httpx.post(f"{service.url}/v1/jobs/{job}:cancel")
     assert service.ended(job)["state"] == "cancelled"
