@@ -17,7 +17,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ _MOST_BITS = 7.5
 """Bytes with more information than this are stored uncompressed: trying them takes time and saves little."""
 _LEVEL = 1
 """Compression level. Higher ones save little more and take longer."""
+
+Place = TypeVar("Place")
 
 PlainPool = tuple[str, tuple[int, ...], list[int]]
 """Type, shape of one array, and the numbers of the arrays."""
@@ -137,25 +139,26 @@ class Pool:
         described = self.dtype.str, self.shape, steps_between(self.numbers), halved, list(map(len, parts))
         return described, b"".join(parts) if parts else numbers.tobytes()
 
-    def without(self, known: dict[bytes, int]) -> tuple[Pool, list[int], list[int]]:
+    def without(self, known: dict[bytes, Place]) -> tuple[Pool, list[tuple[int, Place]]]:
         """Take out the arrays whose contents are known.
 
         Returns
         -------
-        The other arrays; the numbers of the known arrays; the numbers under which they are known.
+        The other arrays; the numbers of the known arrays with the places where they are known.
         """
+        if not known:
+            return self, []
         size = self.dtype.itemsize * math.prod(self.shape)
-        contents = [self.content[start : start + size] for start in range(0, len(self.content), size)]
-        there = [content in known for content in contents]
-        here = [not is_there for is_there in there]
-        others = Pool(
-            self.dtype,
-            self.shape,
-            list(itertools.compress(self.numbers, here)),
-            b"".join(itertools.compress(contents, here)),
-        )
-        found = list(itertools.compress(contents, there))
-        return others, list(itertools.compress(self.numbers, there)), [known[content] for content in found]
+        numbers, contents, shared = list[int](), list[bytes](), list[tuple[int, Place]]()
+        for index, number in enumerate(self.numbers):
+            content = self.content[index * size : (index + 1) * size]
+            place = known.get(content)
+            if place is None:
+                numbers.append(number)
+                contents.append(content)
+            else:
+                shared.append((number, place))
+        return Pool(self.dtype, self.shape, numbers, b"".join(contents)), shared
 
     def may_share(self) -> bool:
         """Return whether a search for its arrays in partial results may save bytes."""

@@ -27,7 +27,7 @@ import types
 import typing
 import zlib
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from operator import attrgetter
@@ -65,6 +65,8 @@ _PACKED = 1 << 63
 _LEVEL = 1
 """Compression level of the tree."""
 
+_LEAST_SEARCHED_BYTES = 256
+"""Fewest bytes of one type and shape in a partial result that are searched for arrays of the result."""
 _FEW_ARRAYS = 32
 """Most arrays that are looked up one by one. For more of them, all arrays of the content are taken apart at once."""
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
@@ -73,6 +75,8 @@ _pack, _unpack = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder()
 _Blocks = list[tuple[str, int]]  # hash, length
 _Partial = dict[str, int]  # key, number of the block
 _Tree = tuple[int, list[msgspec.Raw]]  # one value with its fields as columns
+_Places = dict[tuple[np.dtype[Any], tuple[int, ...]], dict[bytes, tuple[int, int]]]
+"""For arrays of each type and shape, by their bytes: number of a block, and number of the array in the block."""
 _unpack_plain_head = msgspec.msgpack.Decoder(tuple[str, list[PlainPool], _Blocks, _Partial, _Tree])
 _unpack_packed_head = msgspec.msgpack.Decoder(
     tuple[str, list[PackedPool], list[SharedArrays], _Blocks, _Partial, _Tree]
@@ -142,38 +146,48 @@ class _Encoded:
     def packed(self, partial: Mapping[str, Block]) -> bytes:
         """Return the stored form, with partial results."""
         numbers = {key: self._arrays.add_block(block) for key, block in sorted(partial.items())}
-        pools, shared = self._pools, []
-        for number in dict.fromkeys(numbers.values()):
-            pools, own, known = _take_out(pools, self._arrays.blocks[number])
-            if own:
-                shared.append((number, steps_between(own), steps_between(known)))
+        every = self._arrays.blocks
+        pools, shared = _take_out(self._pools, {number: every[number] for number in numbers.values()})
         described = [pool.packed() for pool in pools]
-        blocks = [(block.sha256, len(block.content)) for block in self._arrays.blocks]
+        blocks = [(block.sha256, len(block.content)) for block in every]
         head = _pack.encode((self._form, [pool for pool, _ in described], shared, blocks, numbers, self._tree))
         head = zlib.compress(head, _LEVEL)
         parts = [(len(head) | _PACKED).to_bytes(ALIGNMENT, "little"), head, *(content for _, content in described)]
-        return b"".join([*parts, *(block.content for block in self._arrays.blocks)])
+        return b"".join([*parts, *(block.content for block in every)])
 
 
-def _take_out(pools: list[Pool], block: Block) -> tuple[list[Pool], list[int], list[int]]:
-    """Take out the arrays that a block holds too.
+def _take_out(pools: list[Pool], blocks: Mapping[int, Block]) -> tuple[list[Pool], list[SharedArrays]]:
+    """Take out the arrays that blocks hold too.
+
+    Parameters
+    ----------
+    blocks : mapping of int to Block
+        Blocks by their numbers. An array of several blocks belongs to the first of them.
 
     Returns
     -------
-    The other arrays; the numbers of the arrays that were taken out, rising; their numbers in the block.
+    The other arrays, and those that were taken out.
     """
     searched = {(pool.dtype, pool.shape) for pool in pools if pool.may_share()}
     if not searched:
-        return pools, [], []
-    known = _Content(None, block.content).arrays_of(searched)
-    others, numbers = list[Pool](), list[tuple[int, int]]()
+        return pools, []
+    # One table for all blocks: a search in each of them would take the square of the number of sites.
+    known: _Places = {kind: {} for kind in searched}
+    for number, block in blocks.items():
+        _Content(None, block.content).add_places(number, known)
+    others, found = list[Pool](), dict[int, list[tuple[int, int]]]()
     for pool in pools:
-        rest, own, found = pool.without(known.get((pool.dtype, pool.shape), {}))
-        numbers += zip(own, found, strict=True)
+        rest, shared = pool.without(known.get((pool.dtype, pool.shape), {}))
+        for own, (number, there) in shared:
+            found.setdefault(number, []).append((own, there))
         if rest.numbers:
             others.append(rest)
-    numbers.sort()
-    return others, [own for own, _ in numbers], [found for _, found in numbers]
+    return others, [_shared_arrays(number, sorted(found[number])) for number in blocks if number in found]
+
+
+def _shared_arrays(block: int, numbers: Sequence[tuple[int, int]]) -> SharedArrays:
+    own, there = zip(*numbers, strict=True)
+    return block, steps_between(own), steps_between(there)
 
 
 def decode(kind: type[T], content: bytes) -> T:
@@ -392,16 +406,18 @@ class _Content:
             by_number.update(zip(pool.numbers, pool.arrays, strict=True))
         return [by_number[number] for number in range(len(by_number))]
 
-    def arrays_of(
-        self, wanted: Set[tuple[np.dtype[Any], tuple[int, ...]]]
-    ) -> dict[tuple[np.dtype[Any], tuple[int, ...]], dict[bytes, int]]:
-        """Return the numbers of the arrays of some types and shapes, by the arrays' bytes."""
-        found: dict[tuple[np.dtype[Any], tuple[int, ...]], dict[bytes, int]] = {}
+    def add_places(self, block: int, known: _Places) -> None:
+        """Add the arrays of this block to the known ones of the same types and shapes.
+
+        A few small arrays are left out: reading them would take longer than storing them again.
+        """
         for pool in self._pools:
-            if isinstance(pool, _StoredPool) and (pool.dtype, pool.shape) in wanted:
-                contents = [array.tobytes() for array in pool.arrays]
-                found[pool.dtype, pool.shape] = dict(zip(contents, pool.numbers, strict=True))
-        return found
+            places = (
+                known.get((pool.dtype, pool.shape)) if isinstance(pool, _StoredPool) and pool.is_searched() else None
+            )
+            if places is not None:
+                for array, number in zip(pool.arrays, pool.numbers, strict=True):
+                    places.setdefault(array.tobytes(), (block, number))
 
     def block(self, number: int) -> Block:
         """Return a block by its number."""
@@ -420,6 +436,10 @@ class _StoredPool:
         self, dtype: np.dtype[Any], shape: tuple[int, ...], numbers: list[int], read: Callable[[], NDArray[Any]]
     ) -> None:
         self.dtype, self.shape, self.numbers, self._read = dtype, shape, numbers, read
+
+    def is_searched(self) -> bool:
+        """Return whether another value may share enough of its arrays."""
+        return self.dtype.itemsize * math.prod(self.shape) * len(self.numbers) >= _LEAST_SEARCHED_BYTES
 
     @functools.cached_property
     def arrays(self) -> list[NDArray[Any]]:
