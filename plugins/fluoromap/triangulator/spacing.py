@@ -80,27 +80,52 @@ class StudyGap:
     chance_mm: float
 
 
-def study_gaps(sites: Sequence[tuple[TwoViewPixels, Array, Array]], catalogue: Catalogue) -> list[StudyGap]:
-    """Return the median of each gap over the sites of a study.
+@dataclass(frozen=True, eq=False)
+class SiteGaps:
+    """The distances between neighbours at one site.
+
+    labels : (catheter, electrode, next electrode) of the g distances. located_mm, catalogue_mm : (g,). variance_mm2 : (g,) of the
+    located distances, from pixel noise.
+    """
+
+    labels: tuple[tuple[str, int, int], ...]
+    located_mm: Array
+    catalogue_mm: Array
+    variance_mm2: Array
+
+
+NO_GAPS = SiteGaps((), np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+def site_gaps(pixels: TwoViewPixels, points_mm: Array, joint_mm2: Array, catalogue: Catalogue) -> SiteGaps:
+    """Return the distances between the neighbours of a site.
 
     Parameters
     ----------
-    sites : sequence of (pixels, points (N, 3) in mm, their covariance (N, 3, N, 3) from pixel noise)
-        All sites of the study. One site's spacing may be wrong by chance; the median over the study is not.
+    points_mm : ndarray, shape (N, 3)
+    joint_mm2 : ndarray, shape (N, 3, N, 3)
+        Covariance of the points from pixel noise.
+    """
+    pairs = neighbours(pixels.labels, catalogue)
+    i, j = np.array([pair[:2] for pair in pairs], dtype=np.intp).reshape(-1, 2).T
+    apart = points_mm[i] - points_mm[j]
+    lengths = np.linalg.norm(apart, axis=1)
+    spread = joint_mm2[i, :, i] + joint_mm2[j, :, j] - joint_mm2[i, :, j] - joint_mm2[j, :, i]
+    variances = np.einsum("ka,kab,kb->k", apart, spread, apart) / np.maximum(lengths, 1e-9) ** 2
+    labels = tuple((*pixels.labels[first], pixels.labels[second][1]) for first, second, _ in pairs)
+    return SiteGaps(labels, lengths, np.array([gap for *_, gap in pairs], dtype=np.float64), variances)
+
+
+def study_gaps(sites: Sequence[SiteGaps]) -> list[StudyGap]:
+    """Return the median of each gap over the sites of a study.
+
+    One site's spacing may be wrong by chance; the median over the study is not.
     """
     found: dict[tuple[str, int, int], list[tuple[float, float, float]]] = {}
-    for pixels, points, joint in sites:
-        pairs = neighbours(pixels.labels, catalogue)
-        if not pairs:
-            continue
-        i, j = np.array([pair[:2] for pair in pairs]).T
-        apart = points[i] - points[j]
-        lengths = np.linalg.norm(apart, axis=1)
-        spread = joint[i, :, i] + joint[j, :, j] - joint[i, :, j] - joint[j, :, i]
-        variances = np.einsum("ka,kab,kb->k", apart, spread, apart) / np.maximum(lengths, 1e-9) ** 2
-        for (first, second, gap), length, variance in zip(pairs, lengths.tolist(), variances.tolist(), strict=True):
-            label = (*pixels.labels[first], pixels.labels[second][1])
-            found.setdefault(label, []).append((length, variance, gap))
+    for site in sites:
+        of_site = zip(site.located_mm.tolist(), site.variance_mm2.tolist(), site.catalogue_mm.tolist(), strict=True)
+        for label, measured in zip(site.labels, of_site, strict=True):
+            found.setdefault(label, []).append(measured)
     gaps = []
     for (name, one, other), of_sites in found.items():
         values = np.array(of_sites)

@@ -99,7 +99,8 @@ class SiteEquations:
     The first ``epipolar`` equations are epipolar distances in px, the others electrode gaps in mm.
 
     residual : (k,). slope : (k, u). fixed : (k, k) covariance of the error from pixels and from the gaps' scatter.
-    breathing, beats : (k, k) covariances from breathing and from beats. breath : (k, 3) effect of breathing, an mm.
+    breathing, beats : (k, p) and (k, q) effects of breathing and of beats, one standard deviation of each of their independent
+    parameters. breath : (k, 3) effect of breathing, an mm.
     pixel_variance : (epipolar,) px^2. same_beat : whether the frames show the same beat if the views were simultaneous.
     """
 
@@ -121,7 +122,8 @@ class SiteEquations:
         """Return the covariance (k, k) of the error in a heart of this scale."""
         if not self.shows_beats(scale):
             return self.fixed
-        total: Array = self.fixed + scale.breathing**2 * self.breathing + scale.beats**2 * self.beats
+        of_breathing, of_beats = scale.breathing * self.breathing, scale.beats * self.beats
+        total: Array = self.fixed + of_breathing @ of_breathing.T + of_beats @ of_beats.T
         return total
 
 
@@ -188,9 +190,9 @@ def site_equations(
     jacobian = jacobians(cameras, points)
 
     def combined(sources: Sequence[ErrorSource]) -> Array:
-        effects = [combine @ source.effect_px for source in sources]
-        each = [effect @ source.covariance @ effect.T for source, effect in zip(sources, effects, strict=True)]
-        return np.asarray(np.sum(each, axis=0), dtype=np.float64)
+        # Breathing and beats have independent parameters.
+        each = [combine @ (source.effect_px * np.sqrt(np.diagonal(source.covariance))) for source in sources]
+        return np.concatenate(each, axis=1)
 
     noise = pixel_noise_px2(pixels.covariances)
     # An electrode's own bend is no beat. Where pixels are known well, it would hide how far whole catheters move.
@@ -223,24 +225,97 @@ def information(rows: Sequence[SiteEquations], linearised_at: Array, log_likelih
     data.
     """
     u = len(linearised_at)
-    matrices, vectors = np.zeros((len(HEART_SCALES), u, u)), np.zeros((len(HEART_SCALES), u))
     constants = np.array(log_likelihoods)
-    breathing, beats = (np.array([getattr(scale, of) ** 2 for scale in HEART_SCALES]) for of in ("breathing", "beats"))
+    products = np.zeros((len(HEART_SCALES), u + 1, u + 1))
+    alike: dict[tuple[bool, tuple[int, ...], tuple[int, ...]], list[SiteEquations]] = {}
     for one in rows:
-        residual = one.residual + one.slope @ linearised_at
-        shown = np.array([one.shows_beats(scale) for scale in HEART_SCALES])
-        of_breathing, of_beats = ((shown * squares)[:, None, None] for squares in (breathing, beats))
-        covariance = one.fixed + of_breathing * one.breathing + of_beats * one.beats
-        factor = np.linalg.cholesky(covariance)
-        both = np.linalg.solve(factor, np.column_stack([one.slope, residual]))
-        products = np.swapaxes(both, -1, -2) @ both
-        matrices += products[:, :-1, :-1]
-        vectors += products[:, :-1, -1]
-        constants -= 0.5 * products[:, -1, -1] + np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
+        alike.setdefault((one.same_beat, one.slope.shape, one.beats.shape), []).append(one)
+    for (same_beat, *_), of_shape in alike.items():
+        in_hearts = _products_of_hearts(_Whitened.of(of_shape, linearised_at))
+        for heart, scale in enumerate(HEART_SCALES):
+            if scale.simultaneous and same_beat:
+                of_heart = in_hearts.still, in_hearts.still_constant
+            else:
+                place = _BREATHING.index(scale.breathing), _BEATS.index(scale.beats)
+                of_heart = in_hearts.moving[place], in_hearts.moving_constants[place]
+            products[heart] += of_heart[0]
+            constants[heart] += of_heart[1] - 0.5 * of_heart[0][-1, -1]
     return [
-        Information(scale, matrix, vector, float(constant))
-        for scale, matrix, vector, constant in zip(HEART_SCALES, matrices, vectors, constants, strict=True)
+        Information(scale, product[:-1, :-1], product[:-1, -1], float(constant))
+        for scale, product, constant in zip(HEART_SCALES, products, constants, strict=True)
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """Products of the equations of s sites whose errors from pixels were made independent, with variance 1.
+
+    products : (s, m, m) of all columns: u of the unknowns, the residual, p of breathing, q of beats. breathing, beats : p and q.
+    constant : log likelihood of all sites without columns.
+    """
+
+    products: Array
+    breathing: int
+    beats: int
+    constant: float
+
+    @classmethod
+    def of(cls, rows: Sequence[SiteEquations], linearised_at: Array) -> _Whitened:
+        """Return the products of sites whose equations have the same shapes."""
+        columns = np.array([
+            np.column_stack([one.slope, one.residual + one.slope @ linearised_at, one.breathing, one.beats])
+            for one in rows
+        ])  # fmt: skip
+        factor = np.linalg.cholesky(np.array([one.fixed for one in rows]))
+        whitened = np.linalg.solve(factor, columns)
+        constant = -np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum()
+        products = np.swapaxes(whitened, -1, -2) @ whitened
+        return cls(products, rows[0].breathing.shape[1], rows[0].beats.shape[1], float(constant))
+
+
+@dataclass(frozen=True, eq=False)
+class _InHearts:
+    """Products (u + 1, u + 1) of unknowns and residual, summed over sites, and log likelihoods without both.
+
+    still, still_constant : where both views show the same moment. moving, moving_constants : (breathing, beats, ...) of every
+    heart's breathing and beats.
+    """
+
+    still: Array
+    still_constant: float
+    moving: Array
+    moving_constants: Array
+
+
+def _products_of_hearts(sites: _Whitened) -> _InHearts:
+    """Return the products for all hearts.
+
+    Breathing and beats have few parameters. The matrix inversion lemma takes them out of the products of all hearts; it inverts
+    small matrices only.
+    """
+    p, q = sites.breathing, sites.beats
+    kept = sites.products.shape[-1] - p - q
+    breathing = np.arange(kept, kept + p)
+    others = np.r_[0:kept, kept + p : kept + p + q]
+    moving = np.empty((len(_BREATHING), len(_BEATS), kept, kept))
+    constants = np.empty((len(_BREATHING), len(_BEATS)))
+    of_breathing = sites.products[:, breathing[:, None], breathing]
+    across, of_others = sites.products[:, breathing[:, None], others], sites.products[:, others[:, None], others]
+    for row, breath in enumerate(_BREATHING):
+        factor = np.linalg.cholesky(np.eye(p) + breath**2 * of_breathing)
+        taken = np.linalg.solve(factor, breath * across)
+        left = of_others - np.swapaxes(taken, -1, -2) @ taken
+        constant = sites.constant - np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum()
+        total = left[:, :kept, :kept].sum(axis=0)
+        # In the axes of the beats' own products, each of their parameters is separate from the others.
+        strengths, axes = np.linalg.eigh(left[:, kept:, kept:])
+        along = (np.swapaxes(axes, -1, -2) @ left[:, kept:, :kept]).reshape(-1, kept)
+        for column, beat in enumerate(_BEATS):
+            growth = 1 + beat**2 * strengths
+            weighted = along * (beat**2 / growth).reshape(-1, 1)
+            moving[row, column] = total - along.T @ weighted
+            constants[row, column] = constant - 0.5 * np.log(growth).sum()
+    return _InHearts(sites.products[:, :kept, :kept].sum(axis=0), sites.constant, moving, constants)
 
 
 def log_evidences(hearts: Sequence[Information], prior: Array) -> Array:

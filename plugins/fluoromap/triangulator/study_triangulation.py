@@ -40,7 +40,16 @@ from fluoromap.triangulator.self_calibration import (
 )
 from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
 from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
-from fluoromap.triangulator.spacing import DOUBT_LIMIT_MM, STUDY_LIMIT_MM, Gap, study_gaps, wrong_spacings
+from fluoromap.triangulator.spacing import (
+    DOUBT_LIMIT_MM,
+    NO_GAPS,
+    STUDY_LIMIT_MM,
+    Gap,
+    SiteGaps,
+    site_gaps,
+    study_gaps,
+    wrong_spacings,
+)
 from fluoromap.triangulator.stray_electrodes import widen_strays
 from fluoromap.triangulator.study_equations import CalibrationSite, SiteEquations, gap_labels, site_equations
 from fluoromap.triangulator.table_motion import Jump, table_jumps, table_notes
@@ -56,8 +65,8 @@ _SAME_BEAT_MS = 200.0
 class SiteLook:
     """The part of a site that the checks of the whole study need.
 
-    points_mm : (N, 3) first points, from nominal cameras. covariance_mm2 : (N, 3, N, 3) from pixel noise. same_beat : whether
-    the two frames show the same beat if the runs began together. scatter : of the beats in its runs. reasons : why the site
+    points_mm : (N, 3) first points, from nominal cameras. gaps : between them. same_beat : whether the two frames show the same
+    beat if the runs began together. scatter : of the beats in its runs. reasons : why the site
     cannot be located; then there are no points. note : a sentence about these reasons, or none. equations : of the site for the
     calibration, with the gantry that the headers state and the gaps of all catheters.
     """
@@ -70,7 +79,7 @@ class SiteLook:
     camera_b: Camera
     pixels: TwoViewPixels
     points_mm: Array
-    covariance_mm2: Array
+    gaps: SiteGaps
     same_beat: bool
     scatter: tuple[BeatScatter, ...] = ()
     reasons: tuple[Reason, ...] = ()
@@ -162,7 +171,7 @@ def _check_study(looks: Sequence[SiteLook], catalogue: Catalogue, params: Uncert
     """Check the study for moved tables and wrong spacings, and calibrate its gantry."""
     resting = frozenset(catalogue.names) - {catalogue.mapping}
     jumps = tuple(table_jumps([(look.cameras, look.pixels, look.points_mm) for look in looks], resting, params))
-    of_study = study_gaps([(look.pixels, look.points_mm, look.covariance_mm2) for look in looks], catalogue)
+    of_study = study_gaps([look.gaps for look in looks])
     wrong = wrong_spacings(of_study, STUDY_LIMIT_MM)
     contradicted = {name: gaps for name, gaps in wrong_spacings(of_study, DOUBT_LIMIT_MM).items() if name not in wrong}
     gaps = [tuple((name, tuple(of)) for name, of in each.items()) for each in (wrong, contradicted)]
@@ -203,7 +212,7 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     The result says why a site cannot be located.
     """
     cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), np.zeros((0, 3, 0, 3)), _same_beat(site))
+    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), NO_GAPS, _same_beat(site))
     angle = ray_angle_deg(*cameras)
     if angle < PARALLEL_BELOW_DEG:
         note = f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed."
@@ -215,8 +224,8 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     sources = error_sources(cameras, points, pixels.labels, catalogue, params, widest, None)
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))
-    covariance = alone.covariance_mm2(pixel_noise_px2(pixels.covariances))
-    look = replace(nothing, pixels=pixels, points_mm=points, covariance_mm2=covariance, scatter=beat_scatter(site))
+    between = site_gaps(pixels, points, alone.covariance_mm2(pixel_noise_px2(pixels.covariances)), catalogue)
+    look = replace(nothing, pixels=pixels, points_mm=points, gaps=between, scatter=beat_scatter(site))
     gaps = gap_labels(catalogue, frozenset(catalogue.names))
     return replace(look, equations=site_equations(look.for_calibration, cameras, catalogue, gaps, params))
 
