@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 ALIGNMENT = 8
 """Bytes of a word: the parts of a plain form begin at a whole number of words."""
 
-_LEAST_PACKED_BYTES = 256
-"""Smaller pools are stored plain: compression saves nothing there."""
+_LEAST_PACKED_BYTES = 2048
+"""Smaller pools are stored plain. A study has thousands of them, and reading a compressed pool takes longer than it saves."""
 _LEAST_SHARED_BYTES = 4096
 """In smaller pools a search for arrays of partial results saves nothing."""
 _MOST_BITS = 7.5

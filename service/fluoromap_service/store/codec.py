@@ -407,9 +407,10 @@ class _Content:
         return [by_number[number] for number in range(len(by_number))]
 
     def add_places(self, block: int, known: _Places) -> None:
-        """Add the arrays of this block to the known ones of the same types and shapes.
+        """Add the arrays of this block to the known ones.
 
-        A few small arrays are left out: reading them would take longer than storing them again.
+        Only the types and shapes of the known arrays are added. A few small arrays are left out: reading them would take longer
+        than storing them again.
         """
         for pool in self._pools:
             places = (
