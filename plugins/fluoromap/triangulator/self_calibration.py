@@ -6,6 +6,7 @@ site. A beat is common to one catheter in one run. The electrodes' epipolar dist
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -68,9 +69,13 @@ class GantryBelief:
     displacements: tuple[Array, Array]
     covariance: Array
 
+    @functools.cached_property
+    def _as_header(self) -> bool:
+        return all((one == np.eye(4)).all() for one in self.displacements)
+
     def cameras(self, nominal: Cameras) -> Cameras:
         """Return the cameras corrected from the header's nominal ones."""
-        if all((one == np.eye(4)).all() for one in self.displacements):
+        if self._as_header:
             return nominal
         in_a, in_b = self.displacements
         return nominal[0].displaced(in_a), nominal[1].displaced(in_b)

@@ -82,24 +82,36 @@ class SiteLocator:
         cameras = self.cameras(site)
         first = self._moment(site.diastole, cameras, moments, jump)
         other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
-        return Diastole(first, other)
+        shown = site.diastole.a, site.diastole.b
+        probability = site.alternative.probability if site.alternative else 0.0
+        phase_known = all(view.phase is not None for view in shown)
+        return Diastole(first, other, probability, shown[0].frame, shown[1].frame, phase_known)
 
     def locate(
-        self, site: MatchedSite, jump: Jump | None, first: Moment, other: Moment | None, cycle: SiteCycle | None
-    ) -> tuple[LocatedSite, SiteErrors]:
+        self, site: MatchedSite, jump: Jump | None, diastole: Diastole, cycle: SiteCycle | None
+    ) -> tuple[LocatedSite, SiteErrors] | None:
         """Return a site in 3D and its share in the study's report.
 
-        The covariances contain the errors that the study shows.
+        The covariances contain the errors that the study shows. Of the site only its name, cameras and notes are read, so that
+        its tracks are not decoded.
 
         Parameters
         ----------
         site : MatchedSite
         jump : Jump or None
-        first, other : Moment
-            The site at diastole, from :meth:`diastole`; ``other`` under the alternative pairing, or None.
+        diastole : Diastole
+            From :meth:`diastole`.
         cycle : SiteCycle or None
             From :meth:`cycle`.
+
+        Returns
+        -------
+        tuple of LocatedSite and SiteErrors, or None
+            None where no plausible position agrees with both views.
         """
+        first, other = diastole.chosen, diastole.alternative
+        if first is None:
+            return None
         cameras = self.cameras(site)
         own = first.errors(self.belief)
         is_certain = jump is not None and jump.is_certain
@@ -111,11 +123,11 @@ class SiteLocator:
         # The study's origin depends on the other sites.
         alone = replace(self, origin=None)
         a_priori, _ = alone._points(site, first, first.errors(self.any_study).joint_mm2, doubts)
-        if site.alternative is not None and other is not None:
+        if other is not None:
             others, other_mm = self._points(site, other, other.errors(self.belief).joint_mm2, doubts)
             any_others, _ = alone._points(site, other, other.errors(self.any_study).joint_mm2, doubts)
             shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
-            p = site.alternative.probability
+            p = diastole.probability
             points, a_priori = (
                 add_alternative(points, others, shift, p),
                 add_alternative(a_priori, any_others, shift, p),
@@ -123,14 +135,14 @@ class SiteLocator:
         reasons = [reason for reason, holds in (
             (Reason.NO_RESTING_CATHETER, self.catalogue.reference is None),
             (Reason.NO_REFERENCE, reference_mm is None),
-            (Reason.PHASE_UNKNOWN, site.diastole.a.phase is None or site.diastole.b.phase is None),
+            (Reason.PHASE_UNKNOWN, not diastole.phase_known),
         ) if holds]  # fmt: skip
         located = LocatedSite(
             site=site.site,
             camera_a=cameras[0],
             camera_b=cameras[1],
-            frame_a=site.diastole.a.frame,
-            frame_b=site.diastole.b.frame,
+            frame_a=diastole.frame_a,
+            frame_b=diastole.frame_b,
             points=points,
             reference_mm=reference_mm,
             cycle=cycle,
@@ -319,11 +331,16 @@ class Moment:
 class Diastole:
     """A site at diastole under the chosen pairing of its catheters, and under the alternative one.
 
-    Each is None where no plausible position agrees with both views, or where there is no such pairing.
+    chosen, alternative : None where no plausible position agrees with both views, or where there is no such pairing. probability :
+    of the alternative pairing. frame_a, frame_b : the diastolic frames, from 0. phase_known : whether both have a phase.
     """
 
     chosen: Moment | None
     alternative: Moment | None
+    probability: float
+    frame_a: int
+    frame_b: int
+    phase_known: bool
 
 
 BUDGET = get_args(Share)

@@ -289,11 +289,8 @@ class _Location:
 
         None where no plausible position agrees with both views.
         """
-        first, other = self._diastole.chosen, self._diastole.alternative
-        if first is None:
-            return None
         locator = self._locator if origin is None else replace(self._locator, origin=origin)
-        return locator.locate(self._site, self._jump, first, other, self._cycle if self._cycle.labels else None)
+        return locator.locate(self._site, self._jump, self._diastole, self._cycle if self._cycle.labels else None)
 
     @functools.cached_property
     def _moments(self) -> CycleMoments | None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 ALIGNMENT = 8
 """Bytes of a word: the parts of a plain form begin at a whole number of words."""
 
-_LEAST_PACKED_BYTES = 2048
+_LEAST_PACKED_BYTES = 4096
 """Smaller pools are stored plain. A study has thousands of them, and reading a compressed pool takes longer than it saves."""
 _LEAST_SHARED_BYTES = 4096
 """In smaller pools a search for arrays of partial results saves nothing."""

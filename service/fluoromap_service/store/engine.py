@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -32,18 +34,41 @@ POSTGRESQL = {
 """Limits that free the locks of a host that vanished in the middle of a transaction."""
 
 
+def _to_json(value: Any) -> str:
+    """Return a value as JSON, quickly where it holds plain values only."""
+    try:
+        return _encode_json(value).decode()
+    except (TypeError, UnicodeEncodeError):
+        # The standard library takes subclasses of the plain types too, and text with halves of a surrogate pair.
+        return json.dumps(value)
+
+
+def _from_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text."""
+    try:
+        return _decode_json(text)
+    except msgspec.DecodeError:
+        # The standard library takes NaN, and halves of a surrogate pair.
+        return json.loads(text)
+
+
+_encode_json, _decode_json = msgspec.json.Encoder().encode, msgspec.json.Decoder().decode
+# A correction in a study of 80 sites writes a thousand rows with JSON.
+_OPTIONS: dict[str, Any] = {"hide_parameters": True, "json_serializer": _to_json, "json_deserializer": _from_json}
+
+
 @functools.cache
 def _engine(url: str) -> Engine:
     if not url.startswith("sqlite"):
         return create_engine(
-            url, pool_pre_ping=True, pool_size=10, max_overflow=20, hide_parameters=True, connect_args=POSTGRESQL
+            url, pool_pre_ping=True, pool_size=10, max_overflow=20, connect_args=POSTGRESQL, **_OPTIONS
         )
     make_private_folder(settings().data_dir)
     path = make_url(url).database
     if path and path != ":memory:":
         make_private_file(Path(path))
     engine = create_engine(
-        url, hide_parameters=True, connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000}
+        url, connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000}, **_OPTIONS
     )
     event.listen(engine, "connect", _on_sqlite_connect)
     event.listen(engine, "begin", _on_sqlite_begin)
