@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fluoromap.contracts import Array, IntArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.matching.pairs import GANTRY_SD_RAD, PairTable, student_cost
 
 SHIFT_SD_MM = 6.0
@@ -53,13 +54,15 @@ class Hypotheses:
         A displacement common to all catheters is subtracted: the heart breathed between the runs. It counts with its prior.
         """
         filled = self.pairs[:, :, 0] >= 0
-        distance = np.where(filled, self.distance_px - self.turn_px @ turn_rad, 0.0)
-        spread = self.variance_px2 + np.einsum("hsi,ij,hsj->hs", self.turn_px, turn_covariance, self.turn_px)
-        weight = np.where(filled, 1.0 / np.where(filled, spread, 1.0), 0.0)
-        pull = (weight * distance).sum(axis=1)
-        stiffness = 1.0 / self.shift_variance_px2 + weight.sum(axis=1)
-        chi2: Array = (weight * distance**2).sum(axis=1) - pull**2 / stiffness
-        return np.maximum(chi2, 0.0), filled.sum(axis=1)
+        return offset_chi2(
+            filled,
+            self.distance_px,
+            self.variance_px2,
+            self.turn_px,
+            self.shift_variance_px2,
+            turn_rad,
+            turn_covariance,
+        )
 
     def subset(self, rows: IntArray) -> Hypotheses:
         """Return some of the hypotheses."""
@@ -67,6 +70,35 @@ class Hypotheses:
             self.pairs[rows], self.fixed_cost[rows], self.distance_px[rows], self.variance_px2[rows],
             self.turn_px[rows], self.position_mm[rows], self.shift_variance_px2,
         )  # fmt: skip
+
+
+def offset_chi2(
+    filled: BoolArray,
+    distance_px: Array,
+    variance_px2: Array,
+    turn_px: Array,
+    shift_variance_px2: ArrayLike,
+    turn_rad: Array,
+    turn_covariance: Array,
+) -> tuple[Array, Array]:
+    """Return chi-squared and number of the epipolar distances of h hypotheses.
+
+    See :meth:`Hypotheses.offset_chi2`. ``shift_variance_px2`` is one number, or one for each hypothesis.
+
+    Parameters
+    ----------
+    filled : ndarray, shape (h, s)
+    distance_px, variance_px2, turn_px, shift_variance_px2
+        As in :class:`Hypotheses`.
+    turn_rad, turn_covariance : ndarray, shape (3,), (3, 3)
+    """
+    distance = np.where(filled, distance_px - turn_px @ turn_rad, 0.0)
+    spread = variance_px2 + np.einsum("hsi,ij,hsj->hs", turn_px, turn_covariance, turn_px)
+    weight = np.where(filled, 1.0 / np.where(filled, spread, 1.0), 0.0)
+    pull = (weight * distance).sum(axis=1)
+    stiffness = 1.0 / np.asarray(shift_variance_px2) + weight.sum(axis=1)
+    chi2: Array = (weight * distance**2).sum(axis=1) - pull**2 / stiffness
+    return np.maximum(chi2, 0.0), filled.sum(axis=1)
 
 
 PRIOR_TURN = (np.zeros(3), GANTRY_SD_RAD**2 * np.eye(3))
