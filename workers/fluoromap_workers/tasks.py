@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import queue as waiting_line
 import socket
+import threading
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,6 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from fluoromap_service.jobs import living_workers, queue, turns
 from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.jobs.stall import StallWatch
+from fluoromap_service.jobs.turns import ReadyStage
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_workers.drain import Drain
@@ -69,20 +72,49 @@ def _place() -> Iterator[Place]:
 
 def _run_stages(place: Place) -> None:
     worker = f"{socket.gethostname()}:{os.getpid()}"
-    compared: set[tuple[str, str]] = set()
     while place.is_ready():
         with reading() as session:
             urgent = turns.most_urgent(session)
         if urgent is None:
             return
-        kind = urgent.job_id, urgent.name
-        if STAGES[urgent.name].subject != "study" and kind not in compared:
-            # After a correction nearly all results of this kind are known.
-            compared.add(kind)
-            place.finish_known(urgent.job_id)
-        else:
+        if STAGES[urgent.name].subject == "study" or not _comparisons.compare(urgent, place):
             run(urgent.stage_id, worker, place, _announce)
     _announce()
+
+
+class _Comparisons:
+    """The kinds of stages, each of one job, whose stored results this worker has looked for.
+
+    After a correction nearly all results of a kind are known. One thread ends their stages; the others wait for it, else they
+    would read and compare the same again.
+    """
+
+    _REMEMBERED = 64
+
+    def __init__(self) -> None:
+        self._locks: OrderedDict[tuple[str, str], threading.Lock] = OrderedDict()
+        self._compared: set[tuple[str, str]] = set()
+        self._own = threading.Lock()
+
+    def compare(self, urgent: ReadyStage, place: Place) -> bool:
+        """End the stages of this kind whose results are stored.
+
+        Return False when a thread has done so before.
+        """
+        kind = urgent.job_id, urgent.name
+        with self._own:
+            lock = self._locks.setdefault(kind, threading.Lock())
+            while len(self._locks) > self._REMEMBERED:
+                self._compared.discard(self._locks.popitem(last=False)[0])
+        with lock:
+            if kind in self._compared:
+                return False
+            place.finish_known(urgent.job_id)
+            self._compared.add(kind)
+            return True
+
+
+_comparisons = _Comparisons()
 
 
 def _announce() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import case, func, or_, select, update
+from sqlalchemy import Select, case, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from fluoromap_service.jobs.pipeline import PIPELINE
@@ -65,6 +67,13 @@ def most_urgent(session: Session) -> ReadyStage | None:
        ``AGE_OF_A_STAGE_SECONDS`` of age count as one stage less, so that no job waits for ever.
     4. The stages of one job come in the order of the pipeline.
     """
+    found = session.execute(_most_urgent()).first()
+    return None if found is None else ReadyStage(*found)
+
+
+@functools.cache
+def _most_urgent() -> Select[*tuple[Any, ...]]:
+    """Return the query, built once: workers ask it between any two stages."""
     whole_study = [stage.name for stage in PIPELINE if stage.subject == "study"]
     open_states = [state for state in StageState if state not in ENDED_STAGE]
     left = (
@@ -74,7 +83,7 @@ def most_urgent(session: Session) -> ReadyStage | None:
         .subquery()
     )
     is_new = Job.state == JobState.QUEUED
-    query = (
+    return (
         select(StageRow.id, StageRow.job_id, StageRow.name)
         .join(Job, Job.id == StageRow.job_id)
         .join(left, left.c.job_id == StageRow.job_id)
@@ -87,5 +96,3 @@ def most_urgent(session: Session) -> ReadyStage | None:
         )
         .limit(1)
     )
-    found = session.execute(query).first()
-    return None if found is None else ReadyStage(*found)
