@@ -10,6 +10,9 @@ from fluoromap.contracts import Array
 LEAST_PROBABILITY = 0.01
 """Sites less probable than this are left out; the others share their probability."""
 
+_SURELY_LATER_SD = 9.0
+"""Standard deviations beyond which a site is later than the earliest one: the probability of chance is 1e-19."""
+
 
 def earliest_sites(names: tuple[str, ...], lat_ms: Array, lat_sd_ms: Array) -> tuple[tuple[str, float], ...]:
     """Return the sites that may be the earliest, most probable first, down to 1 %.
@@ -26,13 +29,14 @@ def earliest_sites(names: tuple[str, ...], lat_ms: Array, lat_sd_ms: Array) -> t
     -------
     tuple of (name, probability)
     """
-    sd = lat_sd_ms[:, None]
-    times = np.linspace((lat_ms - 6 * sd[:, 0]).min(), (lat_ms + 6 * sd[:, 0]).min(), 4001)
-    z = (times - lat_ms[:, None]) / sd
+    times = np.linspace((lat_ms - 6 * lat_sd_ms).min(), (lat_ms + 6 * lat_sd_ms).min(), 4001)
+    possible = np.flatnonzero(lat_ms - _SURELY_LATER_SD * lat_sd_ms <= times[-1])
+    sd = lat_sd_ms[possible, None]
+    z = (times - lat_ms[possible, None]) / sd
     log_later = log_ndtr(-z)
     others = log_later.sum(axis=0) - log_later
     share = np.exp(-0.5 * z**2 - np.log(sd) + others).sum(axis=1)
     share = np.where(share >= LEAST_PROBABILITY * share.sum(), share, 0.0)
     share /= share.sum()
     order = np.argsort(-share, kind="stable")
-    return tuple((str(names[index]), float(share[index])) for index in order if share[index] > 0)
+    return tuple((str(names[possible[index]]), float(share[index])) for index in order if share[index] > 0)

@@ -11,11 +11,14 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import ConvexHull
+from scipy.spatial.distance import cdist
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 
 MOST_FACES = 40_000
 """Limit of a surface's faces, above the need of any chamber at 1 mm: wrong coordinates must not exhaust the memory."""
+_POINTS_AT_ONCE = 64
+"""Points whose nearest faces are searched together, so that a thousand points need little memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,35 +152,47 @@ def nearest_on_surface(vertices_mm: Array, faces: IntArray, points_mm: Array) ->
     corners = vertices_mm[faces]
     middles = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-    nearest_faces, weights = [], []
-    for point in points_mm:
-        away = np.linalg.norm(middles - point, axis=1)
+    index, weight = np.empty(len(points_mm), dtype=np.int64), np.empty((len(points_mm), 3))
+    for first in range(0, len(points_mm), _POINTS_AT_ONCE):
+        some = slice(first, first + _POINTS_AT_ONCE)
+        away = cdist(points_mm[some], middles)
         # Only a face whose circle is nearer than the nearest face middle can contain the nearest point.
-        candidates = np.flatnonzero(away - reach <= away.min())
-        face, weight = _nearest_in_faces(corners[candidates], point)
-        nearest_faces.append(int(candidates[face]))
-        weights.append(weight)
-    index, weight = np.array(nearest_faces, dtype=np.int64), np.array(weights).reshape(-1, 3)
+        of_point, candidates = np.nonzero(away - reach <= away.min(axis=1, keepdims=True))
+        starts = np.searchsorted(of_point, np.arange(len(away)))
+        found, weight[some] = _nearest_in_faces(corners[candidates], points_mm[some][of_point], starts)
+        index[some] = candidates[found]
     positions = np.einsum("kc,kcx->kx", weight, vertices_mm[faces[index]])
     return SurfacePoints(positions, index, weight, np.linalg.norm(positions - points_mm, axis=1))
 
 
-def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
-    """Return the face nearest to a point.
+def _nearest_in_faces(corners_mm: Array, points_mm: Array, starts: IntArray) -> tuple[IntArray, Array]:
+    """Return the nearest of its faces for each of k points.
 
-    The faces have corners (f, 3, 3). The second value is the barycentric weights (3,) there.
+    Parameters
+    ----------
+    corners_mm : ndarray, shape (f, 3, 3)
+        Corners of the faces, those of the first point first.
+    points_mm : ndarray, shape (f, 3)
+        The point of each face.
+    starts : ndarray, shape (k,)
+        First face of each point.
+
+    Returns
+    -------
+    ndarray, shape (k,), and ndarray, shape (k, 3)
+        Indices of the faces, and the barycentric weights of the nearest points in them.
     """
     a, ab, ac = corners_mm[:, 0], corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     bc = corners_mm[:, 2] - corners_mm[:, 1]
     aa, bb, cc = (np.maximum((edge**2).sum(axis=1), 1e-12) for edge in (ab, ac, bc))
     cross = (ab * ac).sum(axis=1)
     determinant = np.maximum(aa * bb - cross**2, 1e-12 * aa * bb)
-    offset = point_mm - a
+    offset = points_mm - a
     along_ab, along_ac = (offset * ab).sum(axis=1), (offset * ac).sum(axis=1)
     v = (bb * along_ab - cross * along_ac) / determinant
     w = (aa * along_ac - cross * along_ab) / determinant
     t_ab, t_ac = np.clip(along_ab / aa, 0, 1), np.clip(along_ac / bb, 0, 1)
-    t_bc = np.clip(((point_mm - corners_mm[:, 1]) * bc).sum(axis=1) / cc, 0, 1)
+    t_bc = np.clip(((points_mm - corners_mm[:, 1]) * bc).sum(axis=1) / cc, 0, 1)
     zero = np.zeros_like(v)
     # The foot of the perpendicular counts where it lies inside the face, else the nearest point of the three edges.
     outside = (v < 0) | (w < 0) | (v + w > 1)
@@ -186,9 +201,13 @@ def _nearest_in_faces(corners_mm: Array, point_mm: Array) -> tuple[int, Array]:
         np.stack([1 - t_ab, t_ab, zero], 1), np.stack([1 - t_ac, zero, t_ac], 1),
         np.stack([zero, 1 - t_bc, t_bc], 1), inner,
     ])  # fmt: skip
-    distances = np.linalg.norm(np.einsum("cfk,fkx->cfx", candidates, corners_mm) - point_mm, axis=2)
-    which, face = np.unravel_index(int(np.argmin(distances)), distances.shape)
-    return int(face), candidates[which, face]
+    distances = np.linalg.norm(np.einsum("cfk,fkx->cfx", candidates, corners_mm) - points_mm, axis=2)
+    least = np.minimum.reduceat(distances, starts, axis=1)
+    which = np.argmin(least, axis=0)
+    of_face = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(corners_mm)))
+    is_least = distances[which[of_face], np.arange(len(of_face))] == least[which, np.arange(len(starts))][of_face]
+    faces = np.minimum.reduceat(np.where(is_least, np.arange(len(of_face)), len(of_face)), starts)
+    return faces, candidates[which, faces]
 
 
 def distance_along_surface(vertices_mm: Array, faces: IntArray, points: SurfacePoints, limit_mm: float) -> Array:
