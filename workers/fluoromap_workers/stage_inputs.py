@@ -343,10 +343,13 @@ _PREPARE: Mapping[StageName, Callable[[StoredJob, str], Work]] = {
 }
 
 
+_sorted_json = json.JSONEncoder(sort_keys=True, allow_nan=False).encode
+
+
 @functools.lru_cache(maxsize=8)
 def _as_json(catalogue: Catalogue) -> bytes:
     """Return a catalogue as JSON; the keys of hundreds of runs contain the same one."""
-    return json.dumps(asdict(catalogue), sort_keys=True, allow_nan=False).encode()
+    return _sorted_json(asdict(catalogue)).encode()
 
 
 def _key(snapshot: Snapshot, name: StageName, *inputs: Any) -> str:
@@ -355,7 +358,7 @@ def _key(snapshot: Snapshot, name: StageName, *inputs: Any) -> str:
     plugin = plugin_of(stage, snapshot)
     digest = hashlib.sha256()
     for item in (name, plugin.name, plugin.version, plugin.params, form_of(stage.result), *inputs):
-        content = item if isinstance(item, bytes) else json.dumps(item, sort_keys=True, allow_nan=False).encode()
+        content = item if isinstance(item, bytes) else _sorted_json(item).encode()
         digest.update(len(content).to_bytes(8, "big"))
         digest.update(content)
     return digest.hexdigest()

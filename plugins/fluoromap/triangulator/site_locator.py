@@ -320,9 +320,10 @@ class Moment:
         squares = dict(zip(BUDGET, self.squares_mm2, strict=True))
         # The electrodes' variances from each pair of study errors.
         of_pairs = errors * (self.study_mm.T @ self.study_mm)
-        for share in dict.fromkeys(self.shares):
-            of = np.array([own == share for own in self.shares])
-            squares[share] += float(of @ of_pairs @ of)
+        names = tuple(dict.fromkeys(self.shares))
+        of = np.array([[own == share for own in self.shares] for share in names], dtype=np.float64)
+        for share, square in zip(names, ((of @ of_pairs) * of).sum(axis=1).tolist(), strict=True):
+            squares[share] += square
         n = len(self.labels)
         return MomentErrors(inflation, (inflation * (joint + joint.T) / 2).reshape(n, 3, n, 3), tuple(squares.values()))
 

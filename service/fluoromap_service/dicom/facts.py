@@ -187,14 +187,15 @@ class InstanceFacts:
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields as JSON types, for :meth:`from_json`."""
-        # Not by asdict, which copies the time of each frame: a job of many runs would wait for it.
         value = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        value["frame_times_ms"] = list(self.frame_times_ms)
+        # Not by asdict or _lists, which visit the time of each frame: a job of many runs would wait for it.
+        value["frame_times_ms"] = None
         value["pixels"] = dataclasses.asdict(self.pixels)
         value["acquired"] = self.acquired.isoformat() if self.acquired else None
         value["warnings"] = [str(warning) for warning in self.warnings]
         value["table_origin"] = str(self.table_origin) if self.table_origin else None
         listed: dict[str, Any] = _lists(value)
+        listed["frame_times_ms"] = list(self.frame_times_ms)
         return listed
 
     @classmethod

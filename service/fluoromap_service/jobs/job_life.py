@@ -44,6 +44,7 @@ SECONDS_BUCKETS = (0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 1800.0)
 """Upper limits of the histogram of stage durations, in seconds."""
 
 _INSERT_POINTS = Point.__table__.insert()  # type: ignore[attr-defined]
+_INSERT_STAGES = StageRow.__table__.insert()  # type: ignore[attr-defined]
 
 _INPUT_BROKEN = {
     "code": "input_broken",
@@ -87,16 +88,16 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
         depends_on = [number for name in stage.depends_on for number in ids[name]]
         plugin = plugin_of(stage, snapshot)
         rows = [
-            StageRow(
-                job_id=job.id, name=stage.name, subject=subject, plugin=plugin.name, plugin_version=plugin.version,
-                depends_on=depends_on, state=StageState.PENDING if depends_on else StageState.READY,
-                ready_since=None if depends_on else now,
-            )
+            {
+                "job_id": job.id, "name": stage.name, "subject": subject, "plugin": plugin.name, "plugin_version": plugin.version,
+                "depends_on": depends_on, "state": StageState.PENDING if depends_on else StageState.READY,
+                "ready_since": None if depends_on else now,
+            }
             for subject in subjects_of(stage, snapshot)
         ]  # fmt: skip
-        session.add_all(rows)
-        session.flush()
-        ids[stage.name] = [row.id for row in rows]
+        # A study may have hundreds of runs, and the mapper takes longer for each object than the table's own statement.
+        added = _INSERT_STAGES.returning(StageRow.__table__.c.id, sort_by_parameter_order=True)
+        ids[stage.name] = list(session.connection().execute(added, rows).scalars()) if rows else []
     _report_job(session, job)
     return job
 

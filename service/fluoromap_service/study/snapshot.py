@@ -52,13 +52,24 @@ class GantrySnapshot(_Frozen):
 
         The origin is the place in the patient where the isocentre was during the first run.
         """
-        camera = camera_from_gantry(self.position())
-        return camera.translated(self.table_offset_mm) if any(self.table_offset_mm) else camera
+        return _camera(self)
 
     @property
     def px_per_mm(self) -> float:
         """Pixels per millimetre at the isocentre, wherever the table is."""
-        return camera_from_gantry(self.position()).px_per_mm
+        return _px_per_mm(self)
+
+
+# The keys of all stages of a job contain these, and after a correction hardly any gantry is new.
+@functools.lru_cache(maxsize=1024)
+def _camera(gantry: GantrySnapshot) -> Camera:
+    camera = camera_from_gantry(gantry.position())
+    return camera.translated(gantry.table_offset_mm) if any(gantry.table_offset_mm) else camera
+
+
+@functools.lru_cache(maxsize=1024)
+def _px_per_mm(gantry: GantrySnapshot) -> float:
+    return camera_from_gantry(gantry.position()).px_per_mm
 
 
 class CorrectedElectrode(_Frozen):
