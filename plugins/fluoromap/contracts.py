@@ -8,7 +8,7 @@ of the top-left pixel. World points are millimetres along DICOM patient axes (LP
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
@@ -467,6 +467,45 @@ class ElectrodePoint:
             object.__setattr__(self, "relative_mm", frozen(self.relative_mm, (3,), "relative_mm"))
             covariance = frozen(self.relative_covariance_mm2, (3, 3), "relative_covariance_mm2")  # type: ignore[arg-type]
             object.__setattr__(self, "relative_covariance_mm2", covariance)
+
+    @classmethod
+    def of_moment(
+        cls,
+        labels: Sequence[tuple[str, int]],
+        positions_mm: Array,
+        covariances_mm2: Array,
+        relative_mm: Array | None,
+        relative_covariances_mm2: Array | None,
+        residuals_px: Sequence[tuple[float, float]],
+        ray_angles_deg: Sequence[float],
+        reasons: Sequence[tuple[Reason, ...]],
+    ) -> tuple[ElectrodePoint, ...]:
+        """Return the points of n electrodes from arrays (n, ...), each checked once.
+
+        A study has thousands of points, and the checks of single ones take longer than their location.
+        """
+        n = len(labels)
+        if (relative_mm is None) != (relative_covariances_mm2 is None):
+            raise ValueError("a relative position needs its covariance")
+        checked = {
+            "position_mm": frozen(positions_mm, (n, 3), "positions_mm"),
+            "covariance_mm2": frozen(covariances_mm2, (n, 3, 3), "covariances_mm2"),
+        }
+        if relative_mm is not None and relative_covariances_mm2 is not None:
+            checked["relative_mm"] = frozen(relative_mm, (n, 3), "relative_mm")
+            checked["relative_covariance_mm2"] = frozen(relative_covariances_mm2, (n, 3, 3), "relative_covariances_mm2")
+        points = []
+        for i, ((catheter, electrode), residual, angle, own) in enumerate(
+            zip(labels, residuals_px, ray_angles_deg, reasons, strict=True)
+        ):
+            point = object.__new__(cls)
+            point.__dict__.update(
+                catheter=catheter, electrode=electrode, relative_mm=None, relative_covariance_mm2=None, residual_px=residual,
+                ray_angle_deg=angle, reasons=own, alternative_mm=None, alternative_probability=0.0,
+            )  # fmt: skip
+            point.__dict__.update((name, array[i]) for name, array in checked.items())
+            points.append(point)
+        return tuple(points)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import get_args
@@ -222,31 +223,20 @@ class SiteLocator:
         doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
             doubts.setdefault(catheter, []).append(reason)
-        # Rows of read-only arrays need no copy for each electrode.
-        positions, covariances = _read_only(points), _read_only(np.einsum("iaib->iab", joint))
         relative = relative_mm2 = None
         if reference_mm is not None:
-            relative = _read_only(points - reference_mm)
-            relative_mm2 = _read_only(relative_covariances_mm2(joint, reference) + added_mm2)
+            relative = points - reference_mm
+            relative_mm2 = relative_covariances_mm2(joint, reference) + added_mm2
         residuals = np.linalg.norm(moment.residuals_px, axis=2).tolist()
-        angles = moment.ray_angles_deg.tolist()
-        found = tuple(
-            ElectrodePoint(
-                catheter=catheter,
-                electrode=electrode,
-                position_mm=positions[i],
-                covariance_mm2=covariances[i],
-                relative_mm=None if relative is None else relative[i],
-                relative_covariance_mm2=None if relative_mm2 is None else relative_mm2[i],
-                residual_px=(residuals[i][0], residuals[i][1]),
-                ray_angle_deg=angles[i],
-                reasons=tuple(
-                    dict.fromkeys((
-                        *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
-                    ))
-                ),
-            )
-            for i, (catheter, electrode) in enumerate(labels)
+        reasons = [
+            tuple(dict.fromkeys((
+                *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
+            )))
+            for i, (catheter, _) in enumerate(labels)
+        ]  # fmt: skip
+        found = ElectrodePoint.of_moment(
+            labels, points, np.einsum("iaib->iab", joint), relative, relative_mm2, [(a, b) for a, b in residuals],
+            moment.ray_angles_deg.tolist(), reasons,
         )  # fmt: skip
         return found, reference_mm
 
@@ -308,8 +298,7 @@ class Moment:
 
     def errors(self, belief: StudyBelief) -> MomentErrors:
         """Return the errors in a study of this belief."""
-        catheters = len({catheter for catheter, _ in self.labels})
-        errors = study_covariance(belief.params, belief.gantry.covariance, catheters)
+        errors = _study_errors(belief, len({catheter for catheter, _ in self.labels}))
         inflation = 1.0
         if len(self.apart_px):
             expected = self.own_px2 + self.study_px @ errors @ self.study_px.T
@@ -348,11 +337,10 @@ BUDGET = get_args(Share)
 """Entries of the :class:`~fluoromap.contracts.ErrorBudget`, in its order."""
 
 
-def _read_only(values: Array) -> Array:
-    """Return a copy that nobody can write to."""
-    copy = np.array(values, order="C")
-    copy.setflags(write=False)
-    return copy
+@functools.lru_cache(maxsize=16)
+def _study_errors(belief: StudyBelief, catheters: int) -> Array:
+    """Return the covariance of the study errors, the same for all sites with as many catheters."""
+    return study_covariance(belief.params, belief.gantry.covariance, catheters)
 
 
 def _squares_mm2(gain: Array, noise_px2: Array, sources: Sequence[ErrorSource]) -> tuple[float, ...]:
