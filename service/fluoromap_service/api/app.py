@@ -55,9 +55,11 @@ from fluoromap_service.api.study import (
     studies,
 )
 from fluoromap_service.jobs import queue
+from fluoromap_service.jobs.pipeline import PIPELINE
 from fluoromap_service.jobs.rule_watch import RuleWatch
 from fluoromap_service.jobs.start_rules import read_rules
 from fluoromap_service.settings import settings
+from fluoromap_service.store.codec import prepare
 from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
@@ -194,6 +196,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 async def _warm_up() -> None:
     await run_in_threadpool(file_pool.start)
+    for stage in PIPELINE:
+        await run_in_threadpool(prepare, stage.result)
     await run_in_threadpool(report_page.prepare)
 
 

@@ -265,19 +265,37 @@ def form_of(kind: type[Any]) -> str:
 @functools.cache
 def _form_of(kind: Any) -> str:
     found: dict[str, list[tuple[str, str]]] = {}
+    for name, one in _dataclasses_in(kind).items():
+        hints = typing.get_type_hints(one)
+        fields = [(field.name, str(hints[field.name])) for field in dataclasses.fields(one)]
+        found[name] = [*fields, ("stored apart", "")] if _is_apart(one) else fields
+    return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
+
+
+def _dataclasses_in(kind: Any) -> dict[str, Any]:
+    """Return the dataclasses of a type's form by their names."""
+    found: dict[str, Any] = {}
 
     def visit(hint: Any) -> None:
         for argument in typing.get_args(hint):
             visit(argument)
         if dataclasses.is_dataclass(hint) and isinstance(hint, type) and hint.__qualname__ not in found:
+            found[hint.__qualname__] = hint
             hints = typing.get_type_hints(hint)
-            fields = [(field.name, str(hints[field.name])) for field in dataclasses.fields(hint)]
-            found[hint.__qualname__] = [*fields, ("stored apart", "")] if _is_apart(hint) else fields
             for field in dataclasses.fields(hint):
                 visit(hints[field.name])
 
     visit(kind)
-    return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
+    return found
+
+
+def prepare(kind: type[Any]) -> None:
+    """Look up the types of a kind ahead of its first reading, which else waits for that."""
+    form_of(kind)
+    for one in _dataclasses_in(kind).values():
+        _ = _fields_column(one).fields
+        if _is_apart(one):
+            _deferred_kind(one)
 
 
 def block_hash(value: Any) -> str | None:
