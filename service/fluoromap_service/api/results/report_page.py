@@ -5,8 +5,11 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
+import io
+import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -76,10 +79,10 @@ def report_of(job_id: str) -> KeptFile:
         guessed = sites_by_row_order(session, job)
         label = study.label if study else None
         depends_on = report_dependencies(template_sha256(), job_id, job.version, label, guessed)
-    return kept_rendering(job_id, depends_on, lambda: report_page(job_id).encode())
+    return kept_rendering(job_id, depends_on, lambda: report_page(job_id))
 
 
-def report_page(job_id: str) -> str:
+def report_page(job_id: str) -> bytes:
     """Return the page of an ended job, with all results that the job has."""
     with ThreadPoolExecutor(PROCESSES) as threads:
         # The pool draws while this thread makes the tables.
@@ -91,12 +94,16 @@ def report_page(job_id: str) -> str:
             values |= {
                 "chamber": _figures(chamber),
                 "map_png": _inline(pictures.map.result().path.read_bytes(), "image/png"),
-                "overlays": list(pictures.shown()),
-                "scene": _json(scene),
+                "overlays": pictures.shown(),
+                "scene": scene,
                 "scripts": _json(packed_modules()),
                 "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
             }
-    return _environment().get_template(TEMPLATE).render(values)
+        # Piece by piece: the pictures of a large study are in memory once, not as text, as page and as bytes.
+        page = io.BytesIO()
+        for piece in _environment().get_template(TEMPLATE).generate(values):
+            page.write(piece.encode())
+        return page.getvalue()
 
 
 def prepare() -> None:
@@ -131,7 +138,7 @@ def _values(job_id: str) -> dict[str, Any]:
             "version": version("fluoromap"),
             "reference": snapshot.reference,
             "map": chamber,
-            "scene": _scene(finished, points, catheters) if finished else None,
+            "scene": _json(_scene(finished, points, catheters)) if finished else None,
             "no_map": no_map,
             "simulated": finished is not None and finished.simulated,
             "tips": rows,
@@ -178,10 +185,17 @@ class _Pictures:
     """The pictures of a report while the pool draws them."""
 
     map: Future[KeptFile]
-    overlays: list[tuple[LocatedView, Future[bytes]]]
+    overlays: deque[tuple[LocatedView, Future[bytes]]]
 
-    def shown(self) -> Iterator[dict[str, Any]]:
-        for view, drawn in self.overlays:
+    def shown(self) -> Iterable[dict[str, Any]]:
+        """Return the pictures one after the other, each forgotten after the page has it; an empty list without any."""
+        pictures = self._drawn()
+        first = next(pictures, None)
+        return [] if first is None else itertools.chain([first], pictures)
+
+    def _drawn(self) -> Iterator[dict[str, Any]]:
+        while self.overlays:
+            view, drawn = self.overlays.popleft()
             try:
                 source = _inline(drawn.result(), "image/jpeg")
             except Problem:
@@ -200,10 +214,10 @@ def _start_pictures(job_id: str, threads: ThreadPoolExecutor) -> _Pictures | Non
     except Problem:
         return None
     map_picture = threads.submit(map_picture_of, job_id, finished)
-    overlays = [
+    overlays = deque(
         (view, threads.submit(jpeg_of, fusion, Look(covariances_mm2=fusion.covariances_mm2)))
         for view, fusion in fusions
-    ]
+    )
     return _Pictures(map_picture, overlays)
 
 
@@ -229,8 +243,9 @@ def _rounded(value: Any) -> Any:
     return None if value is None else round(value, 2)
 
 
-def _inline(content: bytes, media_type: str) -> str:
-    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
+def _inline(content: bytes, media_type: str) -> Markup:
+    """Return a picture as the address of an image; nothing in it needs escaping."""
+    return Markup(f"data:{media_type};base64,{base64.b64encode(content).decode()}")
 
 
 def _json(value: Any) -> Markup:
