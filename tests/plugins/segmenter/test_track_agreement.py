@@ -18,7 +18,7 @@ def chain(points, electrodes=None, **more):
 
 
 def beating(frame):
-    """Return the points of a catheter that moves and bends by up to 5 px."""
+    """Return the points of a moving catheter that bends by up to 5 px."""
     phase = np.sin(frame / 2)
     return ROW + [12 * phase, 8 * phase] + np.linspace(0, 5 * phase, 10)[:, None] * [-0.3, 0.95]
 
