@@ -38,17 +38,37 @@ def shaft_beyond_ends(chains_uv: Array, tip_mm: float, shaft_image: ShaftImage) 
 
 
 def _darkest_ray(ends_uv: Array, ways: Array, later_mm: float, shaft_image: ShaftImage) -> Array:
-    """Return the depth of the darkest ray from each end.
+    """Return the depth of the darkest ray from each end, (n,).
 
-    A ray's depth is the mean of the darker side less the middle, in depths of a clear shaft: (n,) from -1 to 1, and 0 outside
-    the image.
+    It lies between -1 and 1, and is 0 outside the image.
+    """
+    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
+    first, last = _REACH_MM
+    darkest = ray_depths(ends_uv, angles, (later_mm + first, later_mm + last), shaft_image).max(axis=-1)
+    return np.where(np.isfinite(darkest), darkest, 0.0)
+
+
+def ray_depths(starts_uv: Array, angles_rad: Array, reach_mm: tuple[float, float], shaft_image: ShaftImage) -> Array:
+    """Return the depth of rays from points, (n, rays).
+
+    A ray's depth is the mean of the darker side less the middle, in depths of a clear shaft: from -1 to 1, and -inf outside the
+    image.
+
+    Parameters
+    ----------
+    starts_uv : (n, 2)
+        Pixels.
+    angles_rad : (n, rays)
+        Directions, from the column axis to the row axis.
+    reach_mm : tuple of float
+        Where the rays begin and end, from their points.
+    shaft_image : ShaftImage
     """
     smooth, scale = shaft_image.smooth, 1.0 / shaft_image.reduction
-    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
-    along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[:, :, None]
+    along = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)[:, :, None]
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1) * (shaft_image.side_px * scale)
-    steps = (later_mm + np.linspace(*_REACH_MM, _SAMPLES))[:, None] * shaft_image.px_per_mm
-    middle = (ends_uv[:, None, None] + steps * along + 0.5) * scale - 0.5
+    steps = np.linspace(*reach_mm, _SAMPLES)[:, None] * shaft_image.px_per_mm
+    middle = (starts_uv[:, None, None] + steps * along + 0.5) * scale - 0.5
     last = np.array(smooth.shape[::-1]) - 1
     inside = ((middle - np.abs(across) >= 0) & (middle + np.abs(across) <= last)).all(axis=-1)
     values = [smooth[cell[..., 1], cell[..., 0]] for cell in (
@@ -57,5 +77,5 @@ def _darkest_ray(ends_uv: Array, ways: Array, later_mm: float, shaft_image: Shaf
     depth = np.clip((np.minimum(values[0], values[2]) - values[1]) / shaft_image.clear, -1.0, _DARKEST)
     count = inside.sum(axis=-1)
     mean = np.where(inside, depth, 0.0).sum(axis=-1) / np.maximum(count, 1)
-    darkest = np.where(count >= _LEAST_SAMPLES, np.clip(mean, -1.0, 1.0), -np.inf).max(axis=-1)
-    return np.where(np.isfinite(darkest), darkest, 0.0)
+    depths: Array = np.where(count >= _LEAST_SAMPLES, np.clip(mean, -1.0, 1.0), -np.inf)
+    return depths
