@@ -339,7 +339,10 @@ BUDGET = get_args(Share)
 
 @functools.lru_cache(maxsize=16)
 def _study_errors(belief: StudyBelief, catheters: int) -> Array:
-    """Return the covariance of the study errors, the same for all sites with as many catheters."""
+    """Return the covariance of the study errors.
+
+    It is the same for all sites with as many catheters.
+    """
     return study_covariance(belief.params, belief.gantry.covariance, catheters)
 
 

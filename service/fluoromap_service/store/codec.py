@@ -290,7 +290,7 @@ def _dataclasses_in(kind: Any) -> dict[str, Any]:
 
 
 def prepare(kind: type[Any]) -> None:
-    """Look up the types of a kind ahead of its first reading, which else waits for that."""
+    """Look up the types of a kind, for which its first reading would wait."""
     form_of(kind)
     for one in _dataclasses_in(kind).values():
         _ = _fields_column(one).fields

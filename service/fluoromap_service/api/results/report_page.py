@@ -188,7 +188,10 @@ class _Pictures:
     overlays: deque[tuple[LocatedView, Future[bytes]]]
 
     def shown(self) -> Iterable[dict[str, Any]]:
-        """Return the pictures one after the other, each forgotten after the page has it; an empty list without any."""
+        """Return the pictures one after the other.
+
+        Each is forgotten when the page has it. Without pictures the list is empty.
+        """
         pictures = self._drawn()
         first = next(pictures, None)
         return [] if first is None else itertools.chain([first], pictures)
