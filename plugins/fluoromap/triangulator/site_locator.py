@@ -60,27 +60,28 @@ class SiteLocator:
     gap_doubts: Mapping[str, Reason] = field(default_factory=dict)
     origin: ReferenceOrigin | None = None
 
-    def cameras(self, site: MatchedSite) -> Cameras:
-        """Return the cameras of a site as the study shows them."""
-        return self.belief.gantry.cameras((site.camera_a, site.camera_b))
+    def cameras(self, nominal: Cameras) -> Cameras:
+        """Return the cameras of a site as the study shows them, from those of the headers."""
+        return self.belief.gantry.cameras(nominal)
 
-    def moments(self, site: MatchedSite) -> CycleMoments | None:
+    def moments(self, site: MatchedSite, cameras: Cameras) -> CycleMoments | None:
         """Return the moments of a site's cycle; None where the views show too few."""
         known = _phase(site.diastole) is not None
-        return cycle_moments(site.cycle, self.cameras(site), self.method) if known else None
+        return cycle_moments(site.cycle, cameras, self.method) if known else None
 
-    def cycle(self, site: MatchedSite, jump: Jump | None, moments: CycleMoments) -> SiteCycle:
+    def cycle(self, site: MatchedSite, cameras: Cameras, jump: Jump | None, moments: CycleMoments) -> SiteCycle:
         """Locate a site at the moments of its cycle."""
         rest = _phase(site.diastole)
         assert rest is not None, "the site has moments"
         return locate_cycle(
-            moments, rest, self.cameras(site), self.catalogue, self.any_study.params, self.method,
+            moments, rest, cameras, self.catalogue, self.any_study.params, self.method,
             self.any_study.gantry.covariance, jump,
         )  # fmt: skip
 
-    def diastole(self, site: MatchedSite, jump: Jump | None, moments: CycleMoments | None) -> Diastole:
+    def diastole(
+        self, site: MatchedSite, cameras: Cameras, jump: Jump | None, moments: CycleMoments | None
+    ) -> Diastole:
         """Locate a site at diastole, under both pairings of its catheters."""
-        cameras = self.cameras(site)
         first = self._moment(site.diastole, cameras, moments, jump)
         other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
         shown = site.diastole.a, site.diastole.b
@@ -89,16 +90,18 @@ class SiteLocator:
         return Diastole(first, other, probability, shown[0].frame, shown[1].frame, phase_known)
 
     def locate(
-        self, site: MatchedSite, jump: Jump | None, diastole: Diastole, cycle: SiteCycle | None
+        self, site: MatchedSite, cameras: Cameras, jump: Jump | None, diastole: Diastole, cycle: SiteCycle | None
     ) -> tuple[LocatedSite, SiteErrors] | None:
         """Return a site in 3D and its share in the study's report.
 
-        The covariances contain the errors that the study shows. Of the site only its name, cameras and notes are read, so that
-        its tracks are not decoded.
+        The covariances contain the errors that the study shows. Of the site only its name and notes are read, so that its tracks
+        are not decoded.
 
         Parameters
         ----------
         site : MatchedSite
+        cameras : tuple of Camera
+            From :meth:`cameras`.
         jump : Jump or None
         diastole : Diastole
             From :meth:`diastole`.
@@ -113,20 +116,15 @@ class SiteLocator:
         first, other = diastole.chosen, diastole.alternative
         if first is None:
             return None
-        cameras = self.cameras(site)
         own = first.errors(self.belief)
         is_certain = jump is not None and jump.is_certain
         doubts = tuple(dict.fromkeys(reason for reason, holds in (
             (Reason.TABLE_MOVED, is_certain or self.belief.doubt is Reason.TABLE_MOVED),
             (Reason.GEOMETRY_DOUBTFUL, own.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
         ) if holds))  # fmt: skip
-        points, reference_mm = self._points(site, first, own.joint_mm2, doubts)
-        # The study's origin depends on the other sites.
-        alone = replace(self, origin=None)
-        a_priori, _ = alone._points(site, first, first.errors(self.any_study).joint_mm2, doubts)
+        points, a_priori, reference_mm = self._points(site, first, own.joint_mm2, doubts)
         if other is not None:
-            others, other_mm = self._points(site, other, other.errors(self.belief).joint_mm2, doubts)
-            any_others, _ = alone._points(site, other, other.errors(self.any_study).joint_mm2, doubts)
+            others, any_others, other_mm = self._points(site, other, other.errors(self.belief).joint_mm2, doubts)
             shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
             p = diastole.probability
             points, a_priori = (
@@ -202,11 +200,27 @@ class SiteLocator:
         )  # fmt: skip
 
     def _points(
-        self, site: MatchedSite, moment: Moment, joint: Array, site_doubts: tuple[Reason, ...]
-    ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
+        self, site: MatchedSite, moment: Moment, joint: Array, doubts: tuple[Reason, ...]
+    ) -> tuple[tuple[ElectrodePoint, ...], tuple[ElectrodePoint, ...], Array | None]:
+        """Return the electrodes at diastole, the same a priori, and the reference catheter's mean (3,).
+
+        ``joint`` (N, 3, N, 3) is the covariance of all electrodes in this study.
+        """
+        in_any_study = moment.errors(self.any_study).joint_mm2
+        if self.origin is None:
+            (points, a_priori), reference_mm = self._points_of(site, moment, (joint, in_any_study), doubts)
+        else:
+            (points,), reference_mm = self._points_of(site, moment, (joint,), doubts)
+            # The study's origin depends on the other sites.
+            (a_priori,), _ = replace(self, origin=None)._points_of(site, moment, (in_any_study,), doubts)
+        return points, a_priori, reference_mm
+
+    def _points_of(
+        self, site: MatchedSite, moment: Moment, joints: Sequence[Array], site_doubts: tuple[Reason, ...]
+    ) -> tuple[list[tuple[ElectrodePoint, ...]], Array | None]:
         """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located.
 
-        ``joint`` (N, 3, N, 3) is the covariance of all electrodes.
+        ``joints`` (N, 3, N, 3) are covariances of all electrodes; there is one tuple of points for each.
         """
         labels, points = moment.labels, moment.points_mm
         reference = [
@@ -223,10 +237,7 @@ class SiteLocator:
         doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
         for catheter, reason in site.notes:
             doubts.setdefault(catheter, []).append(reason)
-        relative = relative_mm2 = None
-        if reference_mm is not None:
-            relative = points - reference_mm
-            relative_mm2 = relative_covariances_mm2(joint, reference) + added_mm2
+        relative = None if reference_mm is None else points - reference_mm
         residuals = np.linalg.norm(moment.residuals_px, axis=2).tolist()
         reasons = [
             tuple(dict.fromkeys((
@@ -234,10 +245,14 @@ class SiteLocator:
             )))
             for i, (catheter, _) in enumerate(labels)
         ]  # fmt: skip
-        found = ElectrodePoint.of_moment(
-            labels, points, np.einsum("iaib->iab", joint), relative, relative_mm2, [(a, b) for a, b in residuals],
-            moment.ray_angles_deg.tolist(), reasons,
-        )  # fmt: skip
+        shown, angles = [(a, b) for a, b in residuals], moment.ray_angles_deg.tolist()
+        found = []
+        for joint in joints:
+            relative_mm2 = None if relative is None else relative_covariances_mm2(joint, reference) + added_mm2
+            covariances = np.einsum("iaib->iab", joint)
+            found.append(
+                ElectrodePoint.of_moment(labels, points, covariances, relative, relative_mm2, shown, angles, reasons)
+            )
         return found, reference_mm
 
 

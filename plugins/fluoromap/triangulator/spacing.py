@@ -62,8 +62,9 @@ def spacing_mismatches(
     Neighbours are successive located electrodes of one catheter.
     """
     found: set[int] = set()
+    points = points_mm.tolist()
     for i, j, gap in neighbours(labels, catalogue):
-        if abs(math.dist(points_mm[i], points_mm[j]) - gap) > limit_mm:
+        if abs(math.dist(points[i], points[j]) - gap) > limit_mm:
             found |= {i, j}
     return found
 

@@ -124,7 +124,9 @@ def locate_study(
     usable, rejected, notes = _usable_sites(sites, looks)
     header = header_belief(params)
     locator = SiteLocator(method, catalogue, header, any_study_belief(params), params.spacing_limit_mm)
-    return _locate_sites([(site, None, locator) for site, _ in usable], catalogue, context, rejected, notes, None)
+    return _locate_sites(
+        [(site, look.cameras, None, locator) for site, look in usable], catalogue, context, rejected, notes, None
+    )
 
 
 def calibrate_and_locate(
@@ -161,8 +163,8 @@ def calibrate_and_locate(
         SiteLocator(method, catalogue, own, any_study, params.spacing_limit_mm, gap_doubts) for own in (belief, header)
     )
     work = [
-        (site, jump, as_calibrated if i in found.same_gantry else as_header)
-        for i, ((site, _), jump) in enumerate(zip(usable, found.jumps, strict=True))
+        (site, look.cameras, jump, as_calibrated if i in found.same_gantry else as_header)
+        for i, ((site, look), jump) in enumerate(zip(usable, found.jumps, strict=True))
     ]
     return _locate_sites(work, catalogue, context, rejected, notes, found.calibration)
 
@@ -241,7 +243,7 @@ def _same_beat(site: MatchedSite) -> bool:
     return bool(abs(site.frame_times_a_ms[frame_a] - site.frame_times_b_ms[frame_b]) < _SAME_BEAT_MS)
 
 
-_Work = tuple[MatchedSite, Jump | None, SiteLocator]
+_Work = tuple[MatchedSite, Cameras, Jump | None, SiteLocator]
 
 
 def _locate_sites(
@@ -278,9 +280,12 @@ class _Location:
     change only the size of the errors, from which the covariances follow quickly.
     """
 
-    def __init__(self, site: MatchedSite, jump: Jump | None, locator: SiteLocator, context: Context) -> None:
+    def __init__(
+        self, site: MatchedSite, nominal: Cameras, jump: Jump | None, locator: SiteLocator, context: Context
+    ) -> None:
         self._site, self._jump, self._locator = site, jump, locator
-        inputs = (site, jump, locator.catalogue, *locator.cameras(site))
+        self._cameras = locator.cameras(nominal)
+        inputs = (site, jump, locator.catalogue, *self._cameras)
         self._diastole = context.recall(Diastole, inputs, self._locate_diastole)
         self._cycle = context.recall(SiteCycle, inputs, self._locate_cycle)
 
@@ -290,19 +295,21 @@ class _Location:
         None where no plausible position agrees with both views.
         """
         locator = self._locator if origin is None else replace(self._locator, origin=origin)
-        return locator.locate(self._site, self._jump, self._diastole, self._cycle if self._cycle.labels else None)
+        return locator.locate(
+            self._site, self._cameras, self._jump, self._diastole, self._cycle if self._cycle.labels else None
+        )
 
     @functools.cached_property
     def _moments(self) -> CycleMoments | None:
-        return self._locator.moments(self._site)
+        return self._locator.moments(self._site, self._cameras)
 
     def _locate_diastole(self) -> Diastole:
-        return self._locator.diastole(self._site, self._jump, self._moments)
+        return self._locator.diastole(self._site, self._cameras, self._jump, self._moments)
 
     def _locate_cycle(self) -> SiteCycle:
         if self._moments is None or self._diastole.chosen is None:
             return NO_CYCLE
-        return self._locator.cycle(self._site, self._jump, self._moments)
+        return self._locator.cycle(self._site, self._cameras, self._jump, self._moments)
 
 
 def _from_one_origin(
