@@ -383,7 +383,9 @@ class ChainDetector:
             return False
         return all(chain.score >= weights[list(chain.candidates)].sum() - _WORST_FIT for chain in linked)
 
-    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def find_again(
+        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+    ) -> Chain | None:
         """Return another frame's chain at its place in this image.
 
         None when the image does not show it. A rigid search gives a first guess, which is refined. The refined
