@@ -5,7 +5,10 @@ A shaft bends, so a fan of rays is looked at beyond each end, and the darkest ra
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 from fluoromap.contracts import Array
 from fluoromap.segmenter.linking import ShaftImage
@@ -43,19 +46,43 @@ def _darkest_ray(ends_uv: Array, ways: Array, later_mm: float, shaft_image: Shaf
     A ray's depth is the mean of the darker side less the middle, in depths of a clear shaft: (n,) from -1 to 1, and 0 outside
     the image.
     """
-    smooth, scale = shaft_image.smooth, 1.0 / shaft_image.reduction
-    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
-    along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[:, :, None]
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) * (shaft_image.side_px * scale)
-    steps = (later_mm + np.linspace(*_REACH_MM, _SAMPLES))[:, None] * shaft_image.px_per_mm
-    middle = (ends_uv[:, None, None] + steps * along + 0.5) * scale - 0.5
-    last = np.array(smooth.shape[::-1]) - 1
-    inside = ((middle - np.abs(across) >= 0) & (middle + np.abs(across) <= last)).all(axis=-1)
-    values = [smooth[cell[..., 1], cell[..., 0]] for cell in (
-        np.clip(np.rint(middle + side * across), 0, last).astype(np.int64) for side in (-1.0, 0.0, 1.0)
-    )]  # fmt: skip
-    depth = np.clip((np.minimum(values[0], values[2]) - values[1]) / shaft_image.clear, -1.0, _DARKEST)
-    count = inside.sum(axis=-1)
-    mean = np.where(inside, depth, 0.0).sum(axis=-1) / np.maximum(count, 1)
-    darkest = np.where(count >= _LEAST_SAMPLES, np.clip(mean, -1.0, 1.0), -np.inf).max(axis=-1)
-    return np.where(np.isfinite(darkest), darkest, 0.0)
+    scale = 1.0 / shaft_image.reduction
+    steps = (later_mm + np.linspace(*_REACH_MM, _SAMPLES)) * shaft_image.px_per_mm
+    darkest = np.zeros(len(ends_uv))
+    _measure_rays(
+        shaft_image.smooth, np.ascontiguousarray(ends_uv), np.ascontiguousarray(ways), _FAN_RAD, steps, scale,
+        shaft_image.side_px * scale, shaft_image.clear, darkest,
+    )  # fmt: skip
+    return darkest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure_rays(smooth, ends_uv, ways, fan, steps, scale, side, clear, darkest):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the depth of the darkest ray from each end.
+
+    An end without enough samples keeps its value.
+    """
+    last_u, last_v = smooth.shape[1] - 1, smooth.shape[0] - 1
+    for end in range(ends_uv.shape[0]):
+        way = math.atan2(ways[end, 1], ways[end, 0])
+        best = -np.inf
+        for ray in range(fan.size):
+            along_u, along_v = math.cos(way + fan[ray]), math.sin(way + fan[ray])
+            across_u, across_v = -along_v * side, along_u * side
+            count, total = 0, 0.0
+            for sample in range(steps.size):
+                u = (ends_uv[end, 0] + steps[sample] * along_u + 0.5) * scale - 0.5
+                v = (ends_uv[end, 1] + steps[sample] * along_v + 0.5) * scale - 0.5
+                wide_u, wide_v = abs(across_u), abs(across_v)
+                if not (u - wide_u >= 0 and v - wide_v >= 0 and u + wide_u <= last_u and v + wide_v <= last_v):
+                    continue
+                left = smooth[round(v - across_v), round(u - across_u)]
+                middle = smooth[round(v), round(u)]
+                right = smooth[round(v + across_v), round(u + across_u)]
+                depth = (min(left, right) - middle) / clear
+                total += min(max(depth, -1.0), _DARKEST)
+                count += 1
+            if count >= _LEAST_SAMPLES:
+                best = max(best, min(max(total / count, -1.0), 1.0))
+        if best > -np.inf:
+            darkest[end] = best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 
 from fluoromap.catheters import Catalogue
@@ -65,11 +66,22 @@ def electrode_chains(
 
     network = LatestNetwork(lambda x: NetworkResponse.of_image(x, trained, px_per_mm))
 
+    latest: deque[tuple[Image, BlobResponse]] = deque(maxlen=2)
+
+    def blobs_of(x: Image) -> BlobResponse:
+        """Return the blobs of an image.
+
+        A frame and its mean with its neighbours are asked about in turn.
+        """
+        for image, blobs in latest:
+            if image is x:
+                return blobs
+        latest.append((x, BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)))
+        return latest[-1][1]
+
     def ask(x: Image) -> JointEvidence:
-        blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
-        return JointEvidence(
-            network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, network.reach_cells
-        )
+        faint = 0.0 if alone else FAINT_LOG_ODDS
+        return JointEvidence(network(x), blobs_of(x), px_per_mm, least_noise, faint, network.reach_cells)
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else IN_A_RUN)
     rest_px = AT_REST_MM * px_per_mm if frame_ms <= AT_REST_MS else 0.0

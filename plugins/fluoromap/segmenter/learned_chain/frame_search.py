@@ -16,12 +16,12 @@ from fluoromap.segmenter.log_image import Image
 SHARED_MS = 21.0
 """Time between frames up to which the network's answer for one frame says where electrodes are in the next."""
 
-AT_REST_MS, AT_REST_MM = 40.0, 0.8
+AT_REST_MS, AT_REST_MM = 40.0, 1.0
 """Time between frames, and motion since the network's answer, up to which the answer serves frames of a catheter at rest."""
 
 _OWN_CELLS, _MEAN_CELLS, _NEXT_FRAME_CELLS = 1, 2, 3
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
-_AT_REST_CELLS, _MOST_AT_REST = 2, 2
+_AT_REST_CELLS, _MOST_AT_REST = 2, 3
 """How far the answer may lie from a catheter at rest, and how many frames may share it."""
 _REACH_PX = 6.0
 _LOOSE_PX = 3.0
@@ -34,7 +34,10 @@ _NO_FRAME = FrameChains(-2, (), Reason.MANUAL_NEEDED)
 
 @dataclass(slots=True, eq=False)
 class StoredAnswers:
-    """The network's answers for single frames of one run, up to ``most_bytes``."""
+    """The network's answers for single frames of one run, up to ``most_bytes``.
+
+    Tracking searches some of these frames again.
+    """
 
     most_bytes: int = 64 << 20
     _of_frame: dict[int, NetworkResponse] = field(default_factory=dict, init=False)
@@ -46,9 +49,12 @@ class StoredAnswers:
 
     def store(self, frame: int, response: NetworkResponse | None) -> None:
         """Store the answer for a frame, if there is one and room for it."""
-        size = 0 if response is None else response.answers.nbytes + response.probability.nbytes
-        if response is not None and frame not in self._of_frame and self._bytes + size <= self.most_bytes:
-            self._of_frame[frame] = response
+        if response is None or frame in self._of_frame:
+            return
+        small = replace(response, answers=response.answers.astype(np.float16))
+        size = small.answers.nbytes + small.probability.nbytes
+        if self._bytes + size <= self.most_bytes:
+            self._of_frame[frame] = small
             self._bytes += size
 
 
@@ -89,10 +95,9 @@ class FrameSearch:
       the mean are found again in the frame itself. Where this helps once, the following frames are searched so first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
-    - While all catheters move less than ``rest_px``, two more frames use the answer.
+    - While all catheters move less than ``rest_px``, three more frames use the answer.
     - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or catheters that moved, is
       searched again with an answer of its own.
-    - The answers of frames that lack catheters are stored in ``answers``: tracking searches these frames again.
     """
 
     detector: ChainDetector
@@ -113,7 +118,7 @@ class FrameSearch:
         # The mean of a run's frames follows its last frame, with the number of another one.
         is_next = frame == self._next
         entry = self._find_chains(x, frame, beside)
-        if is_next and self._lacks_catheters(entry):
+        if is_next:
             self.answers.store(frame, self._own)
         self._next, self._own = frame + 1, None
         self._step_px = _motion_px(self._latest, entry) if self._latest.frame == frame - 1 else np.inf
@@ -145,7 +150,7 @@ class FrameSearch:
         return entry
 
     def _is_at_rest(self, frame: int) -> bool:
-        """Return whether a frame may use the latest answer, as all catheters hardly moved since."""
+        """Return whether the catheters hardly moved since the latest answer."""
         return (
             frame - self._answered.frame <= _MOST_AT_REST
             and self._latest.frame == frame - 1

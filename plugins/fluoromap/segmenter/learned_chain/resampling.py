@@ -21,10 +21,11 @@ def resampled(x: Image, scale: float) -> Image:
     if scale == 1.0:
         return x
     rows, columns = (max(8, math.ceil(size * scale)) for size in x.shape)
-    half = np.empty((x.shape[0], columns), np.float32)
-    _along_rows(np.ascontiguousarray(x, dtype=np.float32), *_shares(x.shape[1], columns, scale), half)
+    # Across the rows first: that loop is the fast one, and a reduction leaves fewer rows for the other.
+    half = np.empty((rows, x.shape[1]), np.float32)
+    _across_rows(np.ascontiguousarray(x, dtype=np.float32), *_shares(x.shape[0], rows, scale), half)
     out = np.empty((rows, columns), np.float32)
-    _across_rows(half, *_shares(x.shape[0], rows, scale), out)
+    _along_rows(half, *_shares(x.shape[1], columns, scale), out)
     return out
 
 
@@ -64,6 +65,19 @@ def _shares(size: int, count: int, scale: float) -> tuple[IntArray, Image]:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _along_rows(x, first, weights, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    if weights.shape[1] == 4:
+        # A reduction by less than 2, as of most runs: without the inner loop it takes a third of the time.
+        for v in range(out.shape[0]):
+            line = x[v]
+            for u in range(out.shape[1]):
+                at = first[u]
+                out[v, u] = (
+                    weights[u, 0] * line[at]
+                    + weights[u, 1] * line[at + 1]
+                    + weights[u, 2] * line[at + 2]
+                    + weights[u, 3] * line[at + 3]
+                )
+        return
     for v in range(out.shape[0]):
         line = x[v]
         for u in range(out.shape[1]):

@@ -9,11 +9,13 @@ import numpy as np
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.frame_search import FrameSearch, LatestNetwork, StoredAnswers
-from fluoromap.segmenter.proposals import Likeness
+from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.proposals import Likeness, Proposals
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 X = np.zeros((32, 32), np.float32)
-ANSWER = SimpleNamespace(answers=X, probability=X)
+NONE_FOUND = Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
+ANSWER = NetworkResponse(X, np.zeros((32, 32, 5), np.float32), NONE_FOUND, 2.0, 0.0, 1.0)
 
 
 def chain(shift=0.0):
@@ -115,15 +117,15 @@ def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
 
 def test_catheters_at_rest_share_an_answer_until_they_move():
     frames, detector, asked = search(1.0, shares=False, rest_px=4.0)
-    places = [0.0, 0.5, 0.5, 0.7, 0.7, 9.0, 9.0, 18.0, 18.0, 18.0]
+    places = [0.0, 0.5, 0.5, 0.7, 0.7, 0.7, 9.0, 9.0, 18.0, 18.0, 18.0]
     detector.chain_at = lambda frame: places[frame]
     for frame in range(len(places)):
         detector.frame = frame
         assert frames.find_chains(X + 1, frame).chains
         asked.append(frame)
     own = [frame for before, frame in itertools.pairwise(asked) if isinstance(before, float)]
-    # Own answers: until the speed is known, after two more frames, while they move.
-    assert own == [0, 1, 4, 5, 6, 7, 8]
+    # Own answers: until the speed is known, after three more frames, while they move.
+    assert own == [0, 1, 5, 6, 7, 8, 9]
 
 
 def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
@@ -133,25 +135,27 @@ def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
     assert asked == [1.0, 1.0, 5.0, 1.0]
 
 
-def test_tracking_uses_the_answers_of_frames_that_lacked_catheters():
+def test_tracking_uses_the_answers_for_frames_that_were_searched_with_their_own():
     frames, _, asked = search(2.0, shares=False)
     frames.find_chains(X + 1, 0, [X + 2, X + 3])
     frames.find_chains(X + 5, 1)
     assert asked == [1.0, 2.0, 5.0]
     again = X + 5
     frames.find_again(again, chain(), np.zeros(2), 5.0, (), 1)
-    assert frames.network(again) is ANSWER
+    assert frames.network(again).found is NONE_FOUND
     assert asked == [1.0, 2.0, 5.0]
-    # The mean of a run has the number of one of its frames, but is another image.
-    frames.find_chains(X + 9, 0)
-    assert frames.answers.of_frame(0) is None
+
+
+def test_the_mean_of_a_run_is_not_taken_for_the_frame_whose_number_it_has():
+    frames, _, _ = search(1.0, shares=False)
+    frames.find_chains(X + 1, 0)
+    frames.find_chains(X + 9, 5)
+    assert frames.answers.of_frame(0) is not None
+    assert frames.answers.of_frame(5) is None
 
 
 def test_stored_answers_have_a_limit():
-    answers = StoredAnswers(most_bytes=3 * ANSWER.answers.nbytes)
-    answers.store(0, ANSWER)
-    answers.store(1, ANSWER)
-    answers.store(2, None)
-    assert answers.of_frame(0) is ANSWER
-    assert answers.of_frame(1) is None
-    assert answers.of_frame(2) is None
+    answers = StoredAnswers(most_bytes=ANSWER.answers.nbytes + ANSWER.probability.nbytes)
+    for frame, response in enumerate((ANSWER, None, ANSWER)):
+        answers.store(frame, response)
+    assert [answers.of_frame(frame) is not None for frame in range(3)] == [True, False, False]
