@@ -95,7 +95,7 @@ class FrameSearch:
       the mean are found again in the frame itself. Where this helps once, the following frames are searched so first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
-    - While all catheters move less than ``rest_px``, three more frames use the answer.
+    - While all catheters move less than ``rest_px``, three more frames use the answer. Not so in runs whose noise hides catheters.
     - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or catheters that moved, is
       searched again with an answer of its own.
     """
@@ -150,9 +150,10 @@ class FrameSearch:
         return entry
 
     def _is_at_rest(self, frame: int) -> bool:
-        """Return whether the catheters hardly moved since the latest answer."""
+        """Return whether all catheters were clear, and hardly moved since the latest answer."""
         return (
-            frame - self._answered.frame <= _MOST_AT_REST
+            not self._noisy
+            and frame - self._answered.frame <= _MOST_AT_REST
             and self._latest.frame == frame - 1
             and not self._lacks_catheters(self._answered)
             and _motion_px(self._answered, self._latest) + self._step_px < self.rest_px

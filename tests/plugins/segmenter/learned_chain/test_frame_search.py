@@ -135,6 +135,15 @@ def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
     assert asked == [1.0, 1.0, 5.0, 1.0]
 
 
+def test_in_runs_whose_noise_hides_catheters_each_frame_has_an_answer_of_its_own():
+    frames, detector, asked = search(2.0, shares=False, rest_px=4.0)
+    frames.find_chains(X + 1, 0, [X + 2, X + 3])
+    detector.level = 1.0
+    for frame in range(1, 5):
+        assert frames.find_chains(X + 1, frame).chains
+    assert asked[2:] == [1.0] * 4
+
+
 def test_tracking_uses_the_answers_for_frames_that_were_searched_with_their_own():
     frames, _, asked = search(2.0, shares=False)
     frames.find_chains(X + 1, 0, [X + 2, X + 3])
