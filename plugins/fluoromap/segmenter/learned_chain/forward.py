@@ -101,8 +101,7 @@ def _padded_parts(x: Image, border: int, rows: int, wide: int) -> Image:
     the last row read into it.
     """
     channels = x.shape[2]
-    parts = _scratch.array("parts", 4, rows + border + 1, wide, channels)
-    parts.fill(0.0)
+    parts = _scratch.around(f"parts {channels}", x.shape, 4, rows + border + 1, wide, channels)
     for down in range(2):
         for right in range(2):
             part = parts[2 * ((down + border) % 2) + (right + border) % 2]

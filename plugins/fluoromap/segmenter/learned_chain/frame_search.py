@@ -49,12 +49,9 @@ class StoredAnswers:
 
     def store(self, frame: int, response: NetworkResponse | None) -> None:
         """Store the answer for a frame, if there is one and room for it."""
-        if response is None or frame in self._of_frame:
-            return
-        small = replace(response, answers=response.answers.astype(np.float16))
-        size = small.answers.nbytes + small.probability.nbytes
-        if self._bytes + size <= self.most_bytes:
-            self._of_frame[frame] = small
+        size = 0 if response is None else response.answers.nbytes + response.probability.nbytes
+        if response is not None and frame not in self._of_frame and self._bytes + size <= self.most_bytes:
+            self._of_frame[frame] = response
             self._bytes += size
 
 

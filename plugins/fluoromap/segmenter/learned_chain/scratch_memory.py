@@ -20,6 +20,7 @@ class ScratchMemory(threading.local):
 
     def __init__(self) -> None:
         self._stored: dict[str, Image] = {}
+        self._inside: dict[str, tuple[tuple[int, ...], object]] = {}
 
     def array(self, name: str, *shape: int) -> Image:
         """Return an array with undefined content."""
@@ -30,3 +31,15 @@ class ScratchMemory(threading.local):
             if size <= self._MOST:
                 self._stored[name] = flat
         return flat[:size].reshape(shape)
+
+    def around(self, name: str, inside: tuple[int, ...], *shape: int) -> Image:
+        """Return an array with zeros around a picture of the shape ``inside``.
+
+        The caller writes all pixels of the picture each time, and only these: the zeros stay for the next picture of this shape.
+        """
+        array = self.array(name, *shape)
+        before = self._inside.get(name)
+        if before is None or before[0] != inside or before[1] is not array.base:
+            array.fill(0.0)
+            self._inside[name] = inside, array.base
+        return array

@@ -59,9 +59,8 @@ def convolve(x: Image, places: Image, bias: Image, dilation: int, out: Image) ->
     strip = max(1, _STRIP_TILES // across)
     tile_rows = dilation**2 * down
     wide = (across + 1) * inputs
-    padded = _scratch.array("padded", dilation**2, _TILE * down + 2, _TILE, wide)
+    padded = _scratch.around(f"padded {dilation} {inputs}", x.shape, dilation**2, _TILE * down + 2, _TILE, wide)
     lines = _scratch.array("lines", 6 * _TILE * (across + 1) * max(inputs, bias.size))
-    padded.fill(0.0)
     _split(x, dilation, padded)
     for first in range(0, tile_rows, strip):
         count = min(strip, tile_rows - first) * across

@@ -23,3 +23,16 @@ def test_each_thread_has_memory_of_its_own():
     with ThreadPoolExecutor(1) as pool:
         theirs = pool.submit(scratch.array, "tiles", 8).result()
     assert not np.shares_memory(mine, theirs)
+
+
+def test_zeros_stay_around_a_picture_of_the_same_shape_only():
+    scratch = ScratchMemory()
+    for value in (1.0, 2.0):
+        padded = scratch.around("padded", (2, 2), 4, 4)
+        assert not padded[0].any()
+        assert not padded[:, 0].any()
+        padded[1:3, 1:3] = value
+    assert not scratch.around("padded", (1, 3), 4, 4).any()
+    large = scratch.around("padded", (1, 3), 8, 8)
+    assert large.shape == (8, 8)
+    assert not large.any()
