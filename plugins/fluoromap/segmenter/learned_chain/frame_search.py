@@ -168,7 +168,7 @@ class FrameSearch:
         """
         self.detector.forget_image()
         self.network.reach_cells = reach_cells
-        mean: Image = np.mean([x, *beside], axis=0, dtype=np.float32) if beside else x
+        mean = _mean(x, beside) if beside else x
         searched = self.detector.search(mean)
         self.network.reach_cells = _OWN_CELLS
         self._own = self.network.latest_for(x) or self._own
@@ -215,6 +215,14 @@ class FrameSearch:
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""
         return self.detector.shows_extra_catheter(x, chains)
+
+
+def _mean(x: Image, beside: Sequence[Image]) -> Image:
+    total = x + beside[0]
+    for other in beside[1:]:
+        total += other
+    total /= np.float32(1 + len(beside))
+    return total
 
 
 def _motion_px(before: FrameChains, after: FrameChains) -> float:
