@@ -250,7 +250,9 @@ class ChainDetector:
     ) -> _Linking:
         """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
         shaft_image = self._shafts(seen)
-        points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
+        # A copy that may be written to, as the completed points: kernels are compiled for one kind of array only.
+        points = proposed.points_uv.copy()
+        weights, variance = self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
         possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, points, families, self.px_per_mm)

@@ -76,9 +76,9 @@ def _measure_rays(smooth, ends_uv, ways, fan, steps, scale, side, clear, darkest
                 wide_u, wide_v = abs(across_u), abs(across_v)
                 if not (u - wide_u >= 0 and v - wide_v >= 0 and u + wide_u <= last_u and v + wide_v <= last_v):
                     continue
-                left = smooth[round(v - across_v), round(u - across_u)]
-                middle = smooth[round(v), round(u)]
-                right = smooth[round(v + across_v), round(u + across_u)]
+                left = smooth[int(v - across_v + 0.5), int(u - across_u + 0.5)]
+                middle = smooth[int(v + 0.5), int(u + 0.5)]
+                right = smooth[int(v + across_v + 0.5), int(u + across_u + 0.5)]
                 depth = (min(left, right) - middle) / clear
                 total += min(max(depth, -1.0), _DARKEST)
                 count += 1

@@ -158,11 +158,12 @@ class ElectrodeNetwork:
         eighth = self._answer("at_eighth", quarter)
         for name in ("around_1", "around_2", "around_3"):
             eighth += self._answer(name, eighth)
-        _add_doubled(self._answer("back", eighth), quarter)
+        wide = self._answer("back", eighth)
+        rows, columns, channels = quarter.shape
+        quarter.reshape(rows // 2, 2, columns // 2, 2, channels)[:] += wide[:, None, :, None]
         heads = self._answer("heads", self._answer("merged", quarter))
-        cells = np.empty((CELL_PX * heads.shape[0], CELL_PX * heads.shape[1], len(HEADS)), np.float32)
-        _spread_over_cells(heads, cells)
-        return cells
+        cells = heads.reshape(rows, columns, len(HEADS), CELL_PX, CELL_PX).transpose(0, 3, 1, 4, 2)
+        return np.ascontiguousarray(cells).reshape(2 * rows, 2 * columns, len(HEADS))
 
     def _answer(self, name: str, x: Image) -> Image:
         """Return a layer's answer; the next picture's answer replaces it."""
@@ -198,26 +199,3 @@ def _add_bias(flat, bias, wide, rectified, out):  # type: ignore[no-untyped-def]
             source, target = flat[v * wide + u], out[v, u]
             for k in range(bias.size):
                 target[k] = max(source[k] + bias[k], least)
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _add_doubled(small, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add each pixel of ``small`` to the four that it covers."""
-    for v in range(out.shape[0]):
-        for u in range(out.shape[1]):
-            source, target = small[v // 2, u // 2], out[v, u]
-            for k in range(target.size):
-                target[k] += source[k]
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _spread_over_cells(heads, cells):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the four values of each head to its 2 x 2 cells."""
-    for v in range(heads.shape[0]):
-        for u in range(heads.shape[1]):
-            said = heads[v, u]
-            for down in range(2):
-                for right in range(2):
-                    cell = cells[2 * v + down, 2 * u + right]
-                    for head in range(cell.size):
-                        cell[head] = said[4 * head + 2 * down + right]

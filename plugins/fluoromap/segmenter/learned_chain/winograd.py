@@ -36,6 +36,7 @@ _TAPS = np.array(
 )
 _A1, _A2, _A3 = (np.float32(_A**power) for power in (1, 2, 3))
 _B1, _B2, _B3 = (np.float32(_B**power) for power in (1, 2, 3))
+_ONE = np.float32(1)
 _SUM, _PRODUCT = np.float32(_A**2 + _B**2), np.float32((_A * _B) ** 2)
 
 _scratch = ScratchMemory()
@@ -90,60 +91,46 @@ def _split(x, dilation, padded):  # type: ignore[no-untyped-def]  # pragma: no c
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _transform(a, b, c, d, e, f, first, second, third, fourth, fifth, sixth):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Transform six inputs to the six places."""
-    for j in range(first.size):
-        first[j] = _PRODUCT * a[j] - _SUM * c[j] + e[j]
-    for j in range(first.size):
-        second[j] = e[j] - _B2 * c[j] + _A1 * (d[j] - _B2 * b[j])
-    for j in range(first.size):
-        third[j] = e[j] - _B2 * c[j] - _A1 * (d[j] - _B2 * b[j])
-    for j in range(first.size):
-        fourth[j] = e[j] - _A2 * c[j] + _B1 * (d[j] - _A2 * b[j])
-    for j in range(first.size):
-        fifth[j] = e[j] - _A2 * c[j] - _B1 * (d[j] - _A2 * b[j])
-    for j in range(first.size):
-        sixth[j] = _PRODUCT * b[j] - _SUM * d[j] + f[j]
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _transform_tiles(padded, channels, first_row, lines, tiles):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Transform rows of tiles along columns, then along rows."""
+    """Transform rows of tiles along columns, then along rows.
+
+    ``lines`` : memory for what is transformed along columns only.
+    """
     row = padded.shape[2]
     wide = row // 4
     size = wide - channels
     down = padded.shape[1] // 4
+    pictures, places = padded.reshape(-1), tiles.reshape(-1)
     for i in range(tiles.shape[1] // size):
-        part, v = padded[(first_row + i) // down], 4 * ((first_row + i) % down)
-        _transform(
-            part[v], part[v + 1], part[v + 2], part[v + 3], part[v + 4], part[v + 5],
-            lines[:row], lines[row : 2 * row], lines[2 * row : 3 * row], lines[3 * row : 4 * row],
-            lines[4 * row : 5 * row], lines[5 * row : 6 * row],
-        )  # fmt: skip
-        at, to = i * size, (i + 1) * size
+        picture, tile = (first_row + i) // down, (first_row + i) % down
+        above = (picture * padded.shape[1] + 4 * tile) * row
+        _transform(pictures, above, row, above + 4 * row, lines, row, row)
         for k in range(6):
-            line = lines[k * row : (k + 1) * row]
-            p = 6 * k
-            _transform(
-                line[:size], line[wide : wide + size], line[2 * wide : 2 * wide + size],
-                line[3 * wide : 3 * wide + size], line[channels : channels + size],
-                line[wide + channels : wide + channels + size],
-                tiles[p][at:to], tiles[p + 1][at:to], tiles[p + 2][at:to], tiles[p + 3][at:to], tiles[p + 4][at:to],
-                tiles[p + 5][at:to],
-            )  # fmt: skip
+            goal = places[6 * k * tiles.shape[1] + i * size :]
+            _transform(lines, k * row, wide, k * row + channels, goal, tiles.shape[1], size)
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _transform_back(a, b, c, d, e, f, first, second, third, fourth):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Transform the six places to the four outputs."""
-    for j in range(first.size):
-        first[j] = a[j] + (b[j] + c[j]) + (d[j] + e[j])
-    for j in range(first.size):
-        second[j] = _A1 * (b[j] - c[j]) + _B1 * (d[j] - e[j])
-    for j in range(first.size):
-        third[j] = _A2 * (b[j] + c[j]) + _B2 * (d[j] + e[j])
-    for j in range(first.size):
-        fourth[j] = _A3 * (b[j] - c[j]) + _B3 * (d[j] - e[j]) + f[j]
+def _transform(source, start, apart, after, goal, further, count):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Transform six stretches of ``source`` to the six places.
+
+    The first four stretches begin at ``start`` and are ``apart``, the others at ``after``. The places lie ``further`` from each
+    other. Indices are unsigned: checks for negative ones would keep the loops from running on several values at once.
+    """
+    size = np.uintp(count)
+    for end in range(2):
+        place, a = np.uintp(5 * end * further), np.uintp(start + end * apart)
+        c, e = np.uintp(start + (2 + end) * apart), np.uintp(after + end * apart)
+        for j in range(size):
+            goal[place + j] = _PRODUCT * source[a + j] - _SUM * source[c + j] + source[e + j]
+    b, c = np.uintp(start + apart), np.uintp(start + 2 * apart)
+    d, e = np.uintp(start + 3 * apart), np.uintp(after)
+    for middle in range(4):
+        place = np.uintp((1 + middle) * further)
+        other = _B2 if middle < 2 else _A2
+        point = (_A1 if middle < 2 else _B1) * np.float32(1 - 2 * (middle % 2))
+        for j in range(size):
+            goal[place + j] = source[e + j] - other * source[c + j] + point * (source[d + j] - other * source[b + j])
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -155,33 +142,46 @@ def _join_tiles(answers, bias, dilation, across, first_row, lines, out):  # type
     channels = bias.size
     size = across * channels
     down = (out.shape[0] + 4 * dilation - 1) // (4 * dilation)
-    pixels = np.empty((4, size), np.float32)
+    places, pixels = answers.reshape(-1), np.empty(4 * size, np.float32)
     zero = np.float32(0)
     for i in range(answers.shape[1] // size):
-        at, to = i * size, (i + 1) * size
+        part, tile = (first_row + i) // down, (first_row + i) % down
         for k in range(6):
-            p = 4 * k * size
-            _transform_back(
-                answers[k][at:to], answers[k + 6][at:to], answers[k + 12][at:to], answers[k + 18][at:to],
-                answers[k + 24][at:to], answers[k + 30][at:to],
-                lines[p : p + size], lines[p + size : p + 2 * size], lines[p + 2 * size : p + 3 * size],
-                lines[p + 3 * size : p + 4 * size],
-            )  # fmt: skip
-        part = (first_row + i) // down
+            _transform_back(places, k * answers.shape[1] + i * size, 6 * answers.shape[1], lines[4 * k * size :], size)
         for s in range(4):
-            v = (4 * ((first_row + i) % down) + s) * dilation + part // dilation
+            v = (4 * tile + s) * dilation + part // dilation
             if v >= out.shape[0]:
                 break
-            p = s * size
-            _transform_back(
-                lines[p : p + size], lines[p + 4 * size : p + 5 * size], lines[p + 8 * size : p + 9 * size],
-                lines[p + 12 * size : p + 13 * size], lines[p + 16 * size : p + 17 * size],
-                lines[p + 20 * size : p + 21 * size],
-                pixels[0], pixels[1], pixels[2], pixels[3],
-            )  # fmt: skip
-            row = out[v]
+            _transform_back(lines, s * size, 4 * size, pixels, size)
             for column, u in enumerate(range(part % dilation, out.shape[1], dilation)):
-                first = column // 4 * channels
-                source, target = pixels[column % 4][first : first + channels], row[u]
+                begin = column % 4 * size + column // 4 * channels
+                pixel, target = pixels[begin : begin + channels], out[v, u]
                 for k in range(channels):
-                    target[k] = max(source[k] + bias[k], zero)
+                    target[k] = max(pixel[k] + bias[k], zero)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _transform_back(source, start, apart, goal, count):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Transform six stretches of ``source`` to four pixels.
+
+    The stretches are ``apart``. The pixels follow each other in ``goal``.
+    """
+    size = np.uintp(count)
+    b, c = np.uintp(start + apart), np.uintp(start + 2 * apart)
+    d, e = np.uintp(start + 3 * apart), np.uintp(start + 4 * apart)
+    for end in range(2):
+        pixel, alone = np.uintp(3 * end * count), np.uintp(start + 5 * end * apart)
+        near, far, sign = (_A3, _B3, -_ONE) if end else (_ONE, _ONE, _ONE)
+        for j in range(size):
+            goal[pixel + j] = (
+                near * (source[b + j] + sign * source[c + j])
+                + far * (source[d + j] + sign * source[e + j])
+                + source[alone + j]
+            )
+    for middle in range(2):
+        pixel = np.uintp((1 + middle) * count)
+        near, far, sign = (_A2, _B2, _ONE) if middle else (_A1, _B1, -_ONE)
+        for j in range(size):
+            goal[pixel + j] = near * (source[b + j] + sign * source[c + j]) + far * (
+                source[d + j] + sign * source[e + j]
+            )
