@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fluoromap.catheters import Catalogue
+from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_fitting import fit_chains, widen_covariance
+from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import (
     ONE_BY_ONE,
@@ -365,16 +366,30 @@ class ChainDetector:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:
                 like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
-            sure, alike = (
-                unexplained_between(chain, free[odds_of_free >= limit], family.catheter, self.px_per_mm)
-                for limit in (EVEN_ODDS, like)
-            )
             long_ones = [other for other in chains if other is not chain and len(other.electrodes) >= MANY_ELECTRODES]
             row = not_on(proposed.points_uv[odds >= onwards], long_ones, self.px_per_mm)
-            listed[index] = (
-                2 * sure < len(own) and not alike and not continues(chain, row, family.catheter, self.px_per_mm)
-            )
+            sure, alike = free[odds_of_free >= EVEN_ODDS], free[odds_of_free >= like]
+            unexplained = sure, alike, row
+            listed[index] = self._explains(chain, family.catheter, *unexplained)
+            if not listed[index]:
+                uncrossed = (self._not_crossed(points, chain, seen) for points in unexplained)
+                listed[index] = self._explains(chain, family.catheter, *uncrossed)
         return listed
+
+    def _explains(self, chain: Chain, catheter: Catheter, sure: Array, alike: Array, row: Array) -> bool:
+        """Return whether a chain leaves no electrodes of its catheter unexplained.
+
+        sure, alike : proposals that no chain explains, (n, 2). row : proposals in whose line the chain may be.
+        """
+        return (
+            2 * unexplained_between(chain, sure, catheter, self.px_per_mm) < len(chain.electrodes)
+            and not unexplained_between(chain, alike, catheter, self.px_per_mm)
+            and not continues(chain, row, catheter, self.px_per_mm)
+        )
+
+    def _not_crossed(self, points_uv: Array, chain: Chain, seen: ImageEvidence) -> Array:
+        """Return the points at which nothing crosses the chain."""
+        return points_uv[~are_crossings(points_uv, chain.pixels_uv, self._shafts(seen))]
 
     def _is_complete(self, linked: Sequence[CandidateChain], weights: Array) -> bool:
         """Return whether each catheter has a well-fitting chain.

@@ -41,39 +41,56 @@ def shaft_beyond_ends(chains_uv: Array, tip_mm: float, shaft_image: ShaftImage) 
 
 
 def _darkest_ray(ends_uv: Array, ways: Array, later_mm: float, shaft_image: ShaftImage) -> Array:
-    """Return the depth of the darkest ray from each end.
+    """Return the depth of the darkest ray from each end, (n,).
 
-    A ray's depth is the mean of the darker side less the middle, in depths of a clear shaft: (n,) from -1 to 1, and 0 outside
-    the image.
+    It lies between -1 and 1, and is 0 outside the image.
+    """
+    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
+    first, last = _REACH_MM
+    darkest = ray_depths(ends_uv, angles, (later_mm + first, later_mm + last), shaft_image).max(axis=-1)
+    return np.where(np.isfinite(darkest), darkest, 0.0)
+
+
+def ray_depths(starts_uv: Array, angles_rad: Array, reach_mm: tuple[float, float], shaft_image: ShaftImage) -> Array:
+    """Return the depth of rays from points, (n, rays).
+
+    A ray's depth is the mean of the darker side less the middle, in depths of a clear shaft: from -1 to 1, and -inf outside the
+    image.
+
+    Parameters
+    ----------
+    starts_uv : (n, 2)
+        Pixels.
+    angles_rad : (n, rays)
+        Directions, from the column axis to the row axis.
+    reach_mm : tuple of float
+        Where the rays begin and end, from their points.
+    shaft_image : ShaftImage
     """
     scale = 1.0 / shaft_image.reduction
-    steps = (later_mm + np.linspace(*_REACH_MM, _SAMPLES)) * shaft_image.px_per_mm
-    darkest = np.zeros(len(ends_uv))
+    steps = np.linspace(*reach_mm, _SAMPLES) * shaft_image.px_per_mm
+    depths: Array = np.full(angles_rad.shape, -np.inf)
+    # Copies: kernels are compiled for one kind of array only.
     _measure_rays(
-        shaft_image.smooth, np.ascontiguousarray(ends_uv), np.ascontiguousarray(ways), _FAN_RAD, steps, scale,
-        shaft_image.side_px * scale, shaft_image.clear, darkest,
+        shaft_image.smooth, np.array(starts_uv, order="C"), np.array(angles_rad, order="C"), steps, scale,
+        shaft_image.side_px * scale, shaft_image.clear, depths,
     )  # fmt: skip
-    return darkest
+    return depths
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _measure_rays(smooth, ends_uv, ways, fan, steps, scale, side, clear, darkest):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the depth of the darkest ray from each end.
-
-    An end without enough samples keeps its value.
-    """
+def _measure_rays(smooth, starts_uv, angles_rad, steps, scale, side, clear, depths):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the depths of the rays that have enough samples in the image."""
     last_u, last_v = smooth.shape[1] - 1, smooth.shape[0] - 1
-    for end in range(ends_uv.shape[0]):
-        way = math.atan2(ways[end, 1], ways[end, 0])
-        best = -np.inf
-        for ray in range(fan.size):
-            along_u, along_v = math.cos(way + fan[ray]), math.sin(way + fan[ray])
+    for start in range(depths.shape[0]):
+        for ray in range(depths.shape[1]):
+            along_u, along_v = math.cos(angles_rad[start, ray]), math.sin(angles_rad[start, ray])
             across_u, across_v = -along_v * side, along_u * side
+            wide_u, wide_v = abs(across_u), abs(across_v)
             count, total = 0, 0.0
             for sample in range(steps.size):
-                u = (ends_uv[end, 0] + steps[sample] * along_u + 0.5) * scale - 0.5
-                v = (ends_uv[end, 1] + steps[sample] * along_v + 0.5) * scale - 0.5
-                wide_u, wide_v = abs(across_u), abs(across_v)
+                u = (starts_uv[start, 0] + steps[sample] * along_u + 0.5) * scale - 0.5
+                v = (starts_uv[start, 1] + steps[sample] * along_v + 0.5) * scale - 0.5
                 if not (u - wide_u >= 0 and v - wide_v >= 0 and u + wide_u <= last_u and v + wide_v <= last_v):
                     continue
                 left = smooth[int(v - across_v + 0.5), int(u - across_u + 0.5)]
@@ -83,6 +100,4 @@ def _measure_rays(smooth, ends_uv, ways, fan, steps, scale, side, clear, darkest
                 total += min(max(depth, -1.0), _DARKEST)
                 count += 1
             if count >= _LEAST_SAMPLES:
-                best = max(best, min(max(total / count, -1.0), 1.0))
-        if best > -np.inf:
-            darkest[end] = best
+                depths[start, ray] = min(max(total / count, -1.0), 1.0)

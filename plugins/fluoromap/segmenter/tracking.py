@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.track_agreement import ShapeSearch, with_common_kinds, with_common_shape
 
 _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
@@ -166,7 +167,10 @@ def track_chains(
     for track in tracks_kept:
         if 2 * track.reversals > track.detections and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
-        track.chains = _with_kinds_of_track(track)
+        if not track.manual:
+            if search is not None:
+                track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
+            track.chains = with_common_kinds(track.chains)
     usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
@@ -290,20 +294,14 @@ def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
     )
 
 
-def _with_kinds_of_track(track: _Track) -> dict[int, Chain]:
-    """Return a track's chains with the mean of their kinds.
+def _search_beside(track: _Track, tracks: Sequence[_Track], search: ChainSearch) -> ShapeSearch:
+    """Return the search for a track's chain among the chains of the other tracks."""
 
-    They are one catheter, and a single frame may be wrong about its name. Chains that were set by hand keep theirs.
-    """
-    names = dict.fromkeys(name for chain in track.chains.values() for name, _ in chain.kinds)
-    kinds = tuple(
-        (name, math.fsum(chain.probability(name) for chain in track.chains.values()) / len(track.chains))
-        for name in names
-    )
-    return {
-        frame: chain if track.manual or chain.manual else replace(chain, kinds=kinds)
-        for frame, chain in track.chains.items()
-    }
+    def beside(frame: int, chain: Chain, shift: Array, reach_px: float) -> Chain | None:
+        taken = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
+        return search(frame, chain, shift, reach_px, taken)
+
+    return beside
 
 
 def _start(found: Sequence[FrameChains], catheters: int) -> int:

@@ -189,6 +189,25 @@ def test_a_short_chain_with_a_sure_point_between_its_electrodes_is_unlisted():
     assert chains_found(drawn([catheter]), points, [0.99] * 4 + [0.8], [0.9] * 5) == ()
 
 
+def test_a_cable_that_crosses_between_electrodes_does_not_make_a_chain_unlisted():
+    for name in ("ablation", "cs"):
+        catheter = row_of(name, (60, 60), 0.3)
+        crossing = 0.5 * (catheter[1] + catheter[2])
+        cable = np.array([crossing - 40 * np.array([0.2, 1.0]), crossing + 40 * np.array([0.2, 1.0])])
+        image = drawn([catheter])
+        v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+        way = cable[1] - cable[0]
+        image -= 0.3 * (np.abs((u - cable[0, 0]) * way[1] - (v - cable[0, 1]) * way[0]) < 3.0 * np.linalg.norm(way))
+        count = len(catheter)
+        found = chains_found(
+            image.astype(np.float32),
+            np.concatenate([catheter, crossing[None]]),
+            [0.99] * (count + 1),
+            [0.9] * (count + 1),
+        )
+        assert any(lies_on(chain, catheter) for chain in found)
+
+
 def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
     catheter = row_of("ablation", (60, 60), 0.3)
     shaft = 0.5 * (catheter[1:2] + catheter[2:3])

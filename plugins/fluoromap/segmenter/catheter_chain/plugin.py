@@ -30,7 +30,7 @@ class CatheterChain:
     """
 
     name: ClassVar[str] = "catheter-chain"
-    version: ClassVar[str] = "8"
+    version: ClassVar[str] = "9"
     Params: ClassVar[type[BaseModel]] = NoParams
 
     def __init__(self, params: BaseModel | None = None) -> None:

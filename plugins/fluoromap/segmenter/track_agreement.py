@@ -1,0 +1,97 @@
+"""Agreement of a track's frames: they show one catheter, which has one name and bends slowly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.contracts import Array, Chain
+
+_LONG_TRACK, _COMPARED = 5, 60
+_SAME_PX, _DISPLACED_PX = 1.5, 4.0
+_SHARED_AT_LEAST = 0.5
+_SUPPORTED_AT_LEAST = 0.8
+_REACH_PX = 3.0
+
+ShapeSearch = Callable[[int, Chain, Array, float], Chain | None]
+"""(frame, chain in another frame, expected shift, reach in pixels) -> the chain in that frame."""
+
+
+def with_common_kinds(chains: Mapping[int, Chain]) -> dict[int, Chain]:
+    """Return a track's chains with the mean of their kinds.
+
+    They are one catheter, and a single frame may be wrong about its name. Chains that were set by hand keep theirs.
+    """
+    names = dict.fromkeys(name for chain in chains.values() for name, _ in chain.kinds)
+    kinds = tuple(
+        (name, math.fsum(chain.probability(name) for chain in chains.values()) / len(chains)) for name in names
+    )
+    return {frame: chain if chain.manual else replace(chain, kinds=kinds) for frame, chain in chains.items()}
+
+
+def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[int, Chain]:
+    """Return a track's chains after a second search for displaced electrodes.
+
+    Clutter or two electrodes in one blob displace some electrodes of a frame, while the others are where the rest of the run
+    shows them. Where more frames agree on other places of those electrodes, the frame is searched again with the shape of
+    the nearest such frame. The chain remains where that search does not find the shape.
+
+    Parameters
+    ----------
+    chains : Mapping of int to Chain
+        Frame to chain.
+    search : ShapeSearch
+        Called for those frames.
+    """
+    if len(chains) < _LONG_TRACK:
+        return dict(chains)
+    frames = np.array(list(chains))
+    places = _places(list(chains.values()))
+    others = np.arange(len(frames))[:: max(1, len(frames) // _COMPARED)]
+    same, displaced = _compare(places, places[others])
+    support = same.sum(axis=1)
+    agreed = dict(chains)
+    for row in np.flatnonzero((displaced & (support[others] > support[:, None])).any(axis=1)):
+        frame = int(frames[row])
+        if chains[frame].manual:
+            continue
+        better = others[displaced[row] & (support[others] > support[row])]
+        better = better[support[better] >= _SUPPORTED_AT_LEAST * support[better].max()]
+        usual = int(better[np.argmin(np.abs(frames[better] - frame))])
+        shape = chains[int(frames[usual])]
+        found = search(frame, shape, np.nanmedian(places[row] - places[usual], axis=0), _REACH_PX)
+        if found is not None and found.electrodes == shape.electrodes:
+            agrees, _ = _compare(found.pixels_uv[None], shape.pixels_uv[None])
+            if agrees[0, 0]:
+                agreed[frame] = replace(found, kinds=chains[frame].kinds)
+    return agreed
+
+
+def _places(chains: Sequence[Chain]) -> Array:
+    """Return the places of all electrodes, (chains, electrodes, 2), NaN where a chain lacks one."""
+    numbers = sorted({number for chain in chains for number in chain.electrodes})
+    places = np.full((len(chains), len(numbers), 2), np.nan)
+    for row, chain in enumerate(chains):
+        places[row, [numbers.index(number) for number in chain.electrodes]] = chain.pixels_uv
+    return places
+
+
+def _compare(places: Array, others: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which pairs have one shape, and which differ in some electrodes.
+
+    Both are (chains, others). Two chains differ in some electrodes where half of them agree after the median shift.
+    """
+    difference = places[:, None] - others[None]
+    shared = np.isfinite(difference[..., 0])
+    count = shared.sum(axis=2)
+    # A sort puts NaN last.
+    middle = (np.maximum(count - 1, 0) // 2)[..., None, None]
+    away = np.linalg.norm(difference - np.take_along_axis(np.sort(difference, axis=2), middle, axis=2), axis=3)
+    farthest = np.where(shared, away, 0.0).max(axis=2)
+    agreeing = (away <= _SAME_PX).sum(axis=2)
+    enough = count >= _SHARED_AT_LEAST * places.shape[1]
+    return enough & (farthest < _DISPLACED_PX), enough & (farthest >= _DISPLACED_PX) & (2 * agreeing >= count)
