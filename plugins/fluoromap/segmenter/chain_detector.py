@@ -202,7 +202,9 @@ class ChainDetector:
     ) -> _Linking:
         """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
         shaft_image = self._shafts(seen)
-        points, weights, variance = proposed.points_uv, self._evidence(proposed.probability), proposed.variance_px2
+        # A copy that may be written to, as the completed points: kernels are compiled for one kind of array only.
+        points = proposed.points_uv.copy()
+        weights, variance = self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
         possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, points, families, self.px_per_mm)
@@ -367,7 +369,9 @@ class ChainDetector:
             return False
         return all(chain.score >= weights[list(chain.candidates)].sum() - _WORST_FIT for chain in linked)
 
-    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def find_again(
+        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+    ) -> Chain | None:
         """Return another frame's chain at its place in this image.
 
         None when the image does not show it. A rigid search gives a first guess, which is refined. The refined

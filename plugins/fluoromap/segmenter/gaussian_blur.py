@@ -111,6 +111,13 @@ def _blur_rows(x, taps, rows, columns, out):  # type: ignore[no-untyped-def]  # 
 def _area_means(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     rows, columns = out.shape
     scale = np.float32(1.0 / (factor * factor))
+    if factor == 2:
+        # The most frequent reduction: without the inner loops it takes a third of the time.
+        for v in range(rows):
+            upper, lower, row = x[2 * v], x[2 * v + 1], out[v]
+            for u in range(columns):
+                row[u] = scale * ((upper[2 * u] + lower[2 * u]) + (upper[2 * u + 1] + lower[2 * u + 1]))
+        return
     sums = np.empty(x.shape[1], np.float32)
     for v in range(rows):
         # Array expressions in a kernel would take two seconds longer to compile.

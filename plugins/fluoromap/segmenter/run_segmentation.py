@@ -51,7 +51,9 @@ class Detector(Protocol):
             The frames before and after, where they show nearly the same moment.
         """
 
-    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def find_again(
+        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+    ) -> Chain | None:
         """Return a chain of another frame at its place in this log image.
 
         Parameters
@@ -66,6 +68,8 @@ class Detector(Protocol):
             Largest distance from the expected place.
         taken : sequence of Chain
             Other catheters that were already found in this image.
+        frame : int, optional
+            Number of the frame; None for a mean of frames.
 
         Returns
         -------
@@ -326,7 +330,7 @@ def _chain_search(
             if kept is None or kept[0] != frame:
                 context.check()
                 kept = frame, log_image(frame)
-            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken))
+            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken, frame))
 
         # A frame may be a number of NumPy, and ``taken`` may grow later.
         return recall(FoundAgain, (int(frame), chain, shift, reach_px, len(taken), *taken), find).chain

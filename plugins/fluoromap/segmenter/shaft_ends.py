@@ -5,7 +5,10 @@ A shaft bends, so a fan of rays is looked at beyond each end, and the darkest ra
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 from fluoromap.contracts import Array
 from fluoromap.segmenter.linking import ShaftImage
@@ -64,18 +67,37 @@ def ray_depths(starts_uv: Array, angles_rad: Array, reach_mm: tuple[float, float
         Where the rays begin and end, from their points.
     shaft_image : ShaftImage
     """
-    smooth, scale = shaft_image.smooth, 1.0 / shaft_image.reduction
-    along = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)[:, :, None]
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) * (shaft_image.side_px * scale)
-    steps = np.linspace(*reach_mm, _SAMPLES)[:, None] * shaft_image.px_per_mm
-    middle = (starts_uv[:, None, None] + steps * along + 0.5) * scale - 0.5
-    last = np.array(smooth.shape[::-1]) - 1
-    inside = ((middle - np.abs(across) >= 0) & (middle + np.abs(across) <= last)).all(axis=-1)
-    values = [smooth[cell[..., 1], cell[..., 0]] for cell in (
-        np.clip(np.rint(middle + side * across), 0, last).astype(np.int64) for side in (-1.0, 0.0, 1.0)
-    )]  # fmt: skip
-    depth = np.clip((np.minimum(values[0], values[2]) - values[1]) / shaft_image.clear, -1.0, _DARKEST)
-    count = inside.sum(axis=-1)
-    mean = np.where(inside, depth, 0.0).sum(axis=-1) / np.maximum(count, 1)
-    depths: Array = np.where(count >= _LEAST_SAMPLES, np.clip(mean, -1.0, 1.0), -np.inf)
+    scale = 1.0 / shaft_image.reduction
+    steps = np.linspace(*reach_mm, _SAMPLES) * shaft_image.px_per_mm
+    depths: Array = np.full(angles_rad.shape, -np.inf)
+    # Copies: kernels are compiled for one kind of array only.
+    _measure_rays(
+        shaft_image.smooth, np.array(starts_uv, order="C"), np.array(angles_rad, order="C"), steps, scale,
+        shaft_image.side_px * scale, shaft_image.clear, depths,
+    )  # fmt: skip
     return depths
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure_rays(smooth, starts_uv, angles_rad, steps, scale, side, clear, depths):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the depths of the rays that have enough samples in the image."""
+    last_u, last_v = smooth.shape[1] - 1, smooth.shape[0] - 1
+    for start in range(depths.shape[0]):
+        for ray in range(depths.shape[1]):
+            along_u, along_v = math.cos(angles_rad[start, ray]), math.sin(angles_rad[start, ray])
+            across_u, across_v = -along_v * side, along_u * side
+            wide_u, wide_v = abs(across_u), abs(across_v)
+            count, total = 0, 0.0
+            for sample in range(steps.size):
+                u = (starts_uv[start, 0] + steps[sample] * along_u + 0.5) * scale - 0.5
+                v = (starts_uv[start, 1] + steps[sample] * along_v + 0.5) * scale - 0.5
+                if not (u - wide_u >= 0 and v - wide_v >= 0 and u + wide_u <= last_u and v + wide_v <= last_v):
+                    continue
+                left = smooth[int(v - across_v + 0.5), int(u - across_u + 0.5)]
+                middle = smooth[int(v + 0.5), int(u + 0.5)]
+                right = smooth[int(v + across_v + 0.5), int(u + across_u + 0.5)]
+                depth = (min(left, right) - middle) / clear
+                total += min(max(depth, -1.0), _DARKEST)
+                count += 1
+            if count >= _LEAST_SAMPLES:
+                depths[start, ray] = min(max(total / count, -1.0), 1.0)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
@@ -36,17 +38,15 @@ def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_p
     """
     free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
     free = free[_apart(free, chain.pixels_uv[:1], (0.5 * catheter.tip_mm + _BESIDE_MM) * px_per_mm)]
-    count = 0
-    for point in free:
-        for start, end in zip(chain.pixels_uv[:-1], chain.pixels_uv[1:], strict=True):
-            way = end - start
-            length = max(float(np.linalg.norm(way)), 1e-9)
-            along = float((point - start) @ way) / length
-            beside = abs(float(way[0] * (point - start)[1] - way[1] * (point - start)[0])) / length
-            if 0.0 < along < length and beside < _BESIDE_MM * px_per_mm:
-                count += 1
-                break
-    return count
+    if not len(free):
+        return 0
+    way = np.diff(chain.pixels_uv, axis=0)
+    length = np.maximum(np.sqrt((way * way).sum(axis=1)), 1e-9)
+    u, v = np.moveaxis(free[:, None] - chain.pixels_uv[:-1], -1, 0)
+    along = (u * way[:, 0] + v * way[:, 1]) / length
+    beside = np.abs(v * way[:, 0] - u * way[:, 1]) / length
+    is_between = (along > 0.0) & (along < length) & (beside < _BESIDE_MM * px_per_mm)
+    return int(np.count_nonzero(is_between.any(axis=1)))
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
@@ -95,19 +95,27 @@ def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
 
     The line comes from ``before``. Each point is at most ``reach`` from the last.
     """
-    count = 0
-    while len(left):
-        way = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)
-        moves = left - at
-        lengths = np.maximum(np.linalg.norm(moves, axis=1), 1e-9)
-        fits = (lengths <= reach) & (moves @ way >= _LEAST_COSINE * lengths)
-        if not fits.any():
-            break
-        nearest = int(np.argmin(np.where(fits, lengths, np.inf)))
-        before, at = at, left[nearest]
-        left = np.delete(left, nearest, axis=0)
-        count += 1
-    return count
+    return int(_count_in_line(at[0], at[1], before[0], before[1], left, reach))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_in_line(at_u, at_v, before_u, before_v, left, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+    is_left = np.ones(left.shape[0], np.bool_)
+    for count in range(left.shape[0]):
+        way_u, way_v = at_u - before_u, at_v - before_v
+        length = max(math.sqrt(way_u * way_u + way_v * way_v), 1e-9)
+        nearest, least = -1, np.inf
+        for point in range(left.shape[0]):
+            du, dv = left[point, 0] - at_u, left[point, 1] - at_v
+            away = max(math.sqrt(du * du + dv * dv), 1e-9)
+            onwards = (du * way_u + dv * way_v) / length
+            if is_left[point] and away <= reach and onwards >= _LEAST_COSINE * away and away < least:
+                nearest, least = point, away
+        if nearest < 0:
+            return count
+        is_left[nearest] = False
+        before_u, before_v, at_u, at_v = at_u, at_v, left[nearest, 0], left[nearest, 1]
+    return left.shape[0]
 
 
 def not_on(points_uv: Array, chains: Sequence[Chain], px_per_mm: float) -> Array:

@@ -123,7 +123,9 @@ class FourStepDetector:
         chains = [fitted.chain for fitted in fit_chains(x, points, linked, shaft_image, families, noise)]
         return FrameChains(frame, tuple(replace(chain, scores=contrast.of(chain.pixels_uv)) for chain in chains))
 
-    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def find_again(
+        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+    ) -> Chain | None:
         """Return None: the paper searches whole frames."""
         return None
 

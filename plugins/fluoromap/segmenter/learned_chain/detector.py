@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 
 from fluoromap.catheters import Catalogue
@@ -11,7 +12,14 @@ from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, LatestNetwork
+from fluoromap.segmenter.learned_chain.frame_search import (
+    AT_REST_MM,
+    AT_REST_MS,
+    SHARED_MS,
+    FrameSearch,
+    LatestNetwork,
+    StoredAnswers,
+)
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import Trained
@@ -47,22 +55,36 @@ def electrode_chains(
     trained: Trained,
     alone: bool,
     frame_ms: float = math.inf,
+    answers: StoredAnswers | None = None,
 ) -> FrameSearch:
     """Return the detector of one run.
 
     It finds electrodes by network and blobs, and the chains of them. ``alone`` : no other frame confirms a chain. ``frame_ms`` :
-    longest time between frames.
+    longest time between frames. ``answers`` : the network's answers for frames of this run that earlier detectors stored.
     """
     ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
     least_noise = _COARSE_NOISE if pixels.bits_stored <= _COARSE_BITS else 0.0
 
     network = LatestNetwork(lambda x: NetworkResponse.of_image(x, trained, px_per_mm))
 
+    latest: deque[tuple[Image, BlobResponse]] = deque(maxlen=2)
+
+    def blobs_of(x: Image) -> BlobResponse:
+        """Return the blobs of an image.
+
+        A frame and its mean with its neighbours are asked about in turn.
+        """
+        for image, blobs in latest:
+            if image is x:
+                return blobs
+        latest.append((x, BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)))
+        return latest[-1][1]
+
     def ask(x: Image) -> JointEvidence:
-        blobs = BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)
-        return JointEvidence(
-            network(x), blobs, px_per_mm, least_noise, 0.0 if alone else FAINT_LOG_ODDS, network.reach_cells
-        )
+        faint = 0.0 if alone else FAINT_LOG_ODDS
+        return JointEvidence(network(x), blobs_of(x), px_per_mm, least_noise, faint, network.reach_cells)
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else IN_A_RUN)
-    return FrameSearch(detector, network, len(catalogue.catheters), frame_ms <= SHARED_MS)
+    rest_px = AT_REST_MM * px_per_mm if frame_ms <= AT_REST_MS else 0.0
+    stored = StoredAnswers() if answers is None else answers
+    return FrameSearch(detector, network, len(catalogue.catheters), frame_ms <= SHARED_MS, rest_px, stored)

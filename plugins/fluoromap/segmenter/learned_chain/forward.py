@@ -1,8 +1,6 @@
-"""The electrode network on NumPy arrays: one product of matrices for each tap of each layer.
+"""The electrode network on NumPy arrays: products of matrices, for each tap of a window or for each place of Winograd's tiles.
 
-Measured on one core for 32 -> 32 channels at 128 x 128: 2.6 ms like this (58 billion products a second); 5.5 ms with the windows
-gathered into one matrix first; 12 ms as a compiled loop over rows. So SciPy's BLAS does the work, and no inference runtime is
-needed.
+BLAS computes the products, so no inference runtime is needed.
 """
 
 from __future__ import annotations
@@ -14,17 +12,22 @@ from numba import njit
 from scipy.linalg.blas import sgemm
 
 from fluoromap.segmenter.learned_chain.layers import CELL_PX, CONVOLUTIONS, HEADS, Convolution
+from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
+from fluoromap.segmenter.learned_chain.winograd import convolve, transformed_taps
 from fluoromap.segmenter.log_image import Image
 
-_STRIP_PIXELS = 1024
-_HEAT, _TIP = HEADS.index("heat"), HEADS.index("tip")
+_STRIP_VALUES = 16384
+"""Values of a part that a strip of answers reads: they stay in a cache of 1 MB with the products."""
+
+_scratch = ScratchMemory()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """One convolution ready to use.
+    """One convolution ready to use: of single pixels, or of a window, with a step of 2 or rectified.
 
-    taps : (width * width, inputs, outputs) float32, row by row of the window. bias : (outputs,) float32. Batch normalisation is
+    taps : (width * width, inputs, outputs) float32, row by row of the window; for a window without steps (36, inputs, outputs),
+    see :func:`~fluoromap.segmenter.learned_chain.winograd.transformed_taps`. bias : (outputs,) float32. Batch normalisation is
     folded into both.
     """
 
@@ -32,84 +35,83 @@ class Layer:
     taps: Image
     bias: Image
 
+    @classmethod
+    def of_weights(cls, shape: Convolution, taps: Image, bias: Image) -> Layer:
+        """Build from taps (width, width, inputs, outputs) and bias (outputs,)."""
+        flat = np.ascontiguousarray(taps, np.float32).reshape(-1, shape.inputs, shape.outputs)
+        if shape.stride == 1 and shape.width > 1:
+            flat = transformed_taps(flat)
+        return cls(shape, flat, np.ascontiguousarray(bias, np.float32))
+
     def __call__(self, x: Image) -> Image:
         """Apply to (rows, columns, inputs); returns (rows / stride, columns / stride, outputs)."""
-        if self.shape.width == 1:
-            flat = sgemm(1.0, self.taps[0].T, x.reshape(-1, self.shape.inputs).T).T
-            return _finished(flat, self.bias, x.shape[0], x.shape[1], x.shape[1], self.shape.rectified)
-        if self.shape.inputs == 1:
-            return self._gathered(x)
-        return self._tap_by_tap(x)
+        out = np.empty(self.answer_shape(x), np.float32)
+        self.write(x, out)
+        return out
 
-    def _tap_by_tap(self, x: Image) -> Image:
+    def answer_shape(self, x: Image) -> tuple[int, int, int]:
+        """Return the shape of the answer to (rows, columns, inputs)."""
+        return x.shape[0] // self.shape.stride, x.shape[1] // self.shape.stride, self.shape.outputs
+
+    def write(self, x: Image, out: Image) -> None:
+        """Write the answer to (rows, columns, inputs) into ``out``."""
+        if self.shape.width == 1:
+            flat = _scratch.array("products", out.shape[0] * out.shape[1], self.shape.outputs)
+            np.matmul(x.reshape(-1, self.shape.inputs), self.taps[0], out=flat)
+            _add_bias(flat, self.bias, out.shape[1], self.shape.rectified, out)
+        elif self.shape.stride == 1:
+            convolve(x, self.taps, self.bias, self.shape.dilation, out)
+        else:
+            self._write_with_steps(x, out)
+
+    def _write_with_steps(self, x: Image, out: Image) -> None:
         """Sum over the taps: pixels shifted by the tap, times (inputs x outputs).
 
-        Rows of the padded picture follow each other in memory: a shifted picture is the same memory from another start on.
+        The padded picture is stored as its four interleaved parts, so that a tap reads successive pixels of one part. Rows of a
+        part follow each other in memory: a shifted part is the same memory from another start on.
         """
-        stride, dilation = self.shape.stride, self.shape.dilation
-        rows, columns = x.shape[0] // stride, x.shape[1] // stride
-        border = 1 if stride == 2 else dilation
-        wide = columns + 2 * border
-        phases = _phases(x, stride, border, wide)
-        out = np.empty((rows * wide, self.shape.outputs), np.float32)
-        strip = max(1, _STRIP_PIXELS // wide) * wide
-        starts = [self._start(tap, wide, border) for tap in range(len(self.taps))]
-        for first in range(0, len(out), strip):
-            last = min(first + strip, len(out))
-            for tap, (phase, start) in enumerate(starts):
-                sgemm(
-                    1.0, self.taps[tap].T, phases[phase][first + start : last + start].T, beta=0.0 if tap == 0 else 1.0,
-                    c=out[first:last].T, overwrite_c=1,
-                )  # fmt: skip
-        return _finished(out, self.bias, rows, columns, wide, self.shape.rectified)
-
-    def _start(self, tap: int, wide: int, border: int) -> tuple[int, int]:
-        """Return the phase of the picture that a tap reads, and an offset.
-
-        The offset is how far into the phase the first output's pixel lies.
-        """
-        down, right = divmod(tap, self.shape.width)
-        if self.shape.stride == 1:
-            return 0, down * self.shape.dilation * wide + right * self.shape.dilation
-        # Input row 2 r + down - 1: of the odd rows, one before (down = 0) or its own (2); of the even rows its own (1).
-        odd_down, odd_right = down % 2 == 0, right % 2 == 0
-        phase = 2 * int(odd_down) + int(odd_right)
-        shift_down = down // 2 if odd_down else 1
-        shift_right = right // 2 if odd_right else 1
-        return phase, shift_down * wide + shift_right
-
-    def _gathered(self, x: Image) -> Image:
-        """Gather one input channel's windows and multiply them with the taps.
-
-        The windows lie side by side, so one product is enough.
-        """
-        width, stride = self.shape.width, self.shape.stride
-        rows, columns = x.shape[0] // stride, x.shape[1] // stride
-        padded = np.pad(x[..., 0], width // 2)
-        taps = self.taps.reshape(-1, self.shape.outputs)
-        out = np.empty((rows * columns, self.shape.outputs), np.float32)
-        windows = np.empty((max(1, _STRIP_PIXELS // columns) * columns, width * width), np.float32)
-        for first in range(0, len(out), len(windows)):
-            count = min(len(windows), len(out) - first)
-            _gather(padded, first // columns, count // columns, columns, stride, width, windows)
-            sgemm(1.0, taps.T, windows[:count].T, c=out[first : first + count].T, overwrite_c=1)
-        return _finished(out, self.bias, rows, columns, columns, self.shape.rectified)
+        width, inputs, border = self.shape.width, self.shape.inputs, self.shape.width // 2
+        rows, columns, outputs = out.shape
+        wide = columns + border
+        parts = _padded_parts(x, border, rows, wide)
+        starts = [
+            (2 * (down % 2) + right % 2, down // 2 * wide + right // 2)
+            for down, right in (divmod(tap, width) for tap in range(width**2))
+        ]
+        strip = max(1, _STRIP_VALUES // (wide * inputs))
+        for row in range(0, rows, strip):
+            first, last = row * wide, min(row + strip, rows) * wide
+            products = _scratch.array("products", last - first, outputs)
+            shifted = [parts[part, first + start : last + start] for part, start in starts]
+            if inputs == 1:
+                windows = _scratch.array("windows", width**2, last - first)
+                np.concatenate([pixels[:, 0] for pixels in shifted], out=windows.reshape(-1))
+                sgemm(1.0, self.taps[:, 0].T, windows.T, trans_b=1, c=products.T, overwrite_c=1)
+            else:
+                for tap, pixels in enumerate(shifted):
+                    added_to = 0.0 if tap == 0 else 1.0
+                    sgemm(1.0, self.taps[tap].T, pixels.T, beta=added_to, c=products.T, overwrite_c=1)
+            _add_bias(products, self.bias, wide, self.shape.rectified, out[row : row + strip])
 
 
-def _phases(x: Image, stride: int, border: int, wide: int) -> list[Image]:
-    """Return the picture with borders of zeros as (pixels, channels).
+def _padded_parts(x: Image, border: int, rows: int, wide: int) -> Image:
+    """Return the four interleaved parts of the padded picture, each (pixels, channels).
 
-    For a stride of 2 these are its four interleaved parts, even rows first.
+    First come its even rows: their even columns, then the odd ones. A part has a row more than needed, because the last taps of
+    the last row read into it.
     """
-    rows, columns = x.shape[0] // stride, x.shape[1] // stride
-    parts = []
-    for down in range(stride):
-        for right in range(stride):
-            # Two rows more than needed: the last taps of the last row read into them.
-            part = np.zeros((rows + 2 * border + 1, wide, x.shape[2]), np.float32)
-            part[border : rows + border, border : columns + border] = x[down::stride, right::stride]
-            parts.append(part.reshape(-1, x.shape[2]))
-    return parts
+    channels = x.shape[2]
+    parts = _scratch.around(f"parts {channels}", x.shape, 4, rows + border + 1, wide, channels)
+    for down in range(2):
+        for right in range(2):
+            part = parts[2 * ((down + border) % 2) + (right + border) % 2]
+            if channels == 1:
+                pixels = x[down::2, right::2]
+                top, left = (down + border) // 2, (right + border) // 2
+                part[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
+            else:
+                _copy_part(x, down, right, border, part)
+    return parts.reshape(4, -1, channels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,8 +137,7 @@ class ElectrodeNetwork:
                 raise ValueError(
                     f"the weights have no layer {name!r} of shape {expected}: train them with this version"
                 )
-            flat = np.ascontiguousarray(taps, np.float32).reshape(-1, shape.inputs, shape.outputs)
-            layers[name] = Layer(shape, flat, np.ascontiguousarray(bias, np.float32))
+            layers[name] = Layer.of_weights(shape, taps, bias)
         return cls(layers)
 
     def __call__(self, picture: Image) -> Image:
@@ -151,23 +152,39 @@ class ElectrodeNetwork:
         -------
         (rows / 2, columns / 2, 5) float32, see :data:`~fluoromap.segmenter.learned_chain.layers.HEADS`.
         """
-        of = self.layers
-        quarter = of["at_quarter_again"](of["at_quarter"](of["at_half"](picture[..., None])))
-        eighth = of["at_eighth"](quarter)
+        quarter = self._answer(
+            "at_quarter_again", self._answer("at_quarter", self._answer("at_half", picture[..., None]))
+        )
+        eighth = self._answer("at_eighth", quarter)
         for name in ("around_1", "around_2", "around_3"):
-            eighth += of[name](eighth)
-        wide = of["back"](eighth)
+            eighth += self._answer(name, eighth)
+        wide = self._answer("back", eighth)
         rows, columns, channels = quarter.shape
         quarter.reshape(rows // 2, 2, columns // 2, 2, channels)[:] += wide[:, None, :, None]
-        answer = of["heads"](of["merged"](quarter))
-        cells = answer.reshape(rows, columns, len(HEADS), CELL_PX, CELL_PX).transpose(0, 3, 1, 4, 2)
+        heads = self._answer("heads", self._answer("merged", quarter))
+        cells = heads.reshape(rows, columns, len(HEADS), CELL_PX, CELL_PX).transpose(0, 3, 1, 4, 2)
         return np.ascontiguousarray(cells).reshape(2 * rows, 2 * columns, len(HEADS))
 
+    def _answer(self, name: str, x: Image) -> Image:
+        """Return a layer's answer; the next picture's answer replaces it."""
+        layer = self.layers[name]
+        out = _scratch.array(name, *layer.answer_shape(x))
+        layer.write(x, out)
+        return out
 
-def _finished(flat: Image, bias: Image, rows: int, columns: int, wide: int, rectified: bool) -> Image:
-    out = np.empty((rows, columns, bias.size), np.float32)
-    _add_bias(np.ascontiguousarray(flat), bias, wide, rectified, out)
-    return out
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _copy_part(x, down, right, border, part):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Copy every other row and column into a part of the padded picture.
+
+    They start at row ``down`` and column ``right``.
+    """
+    for v in range(down, x.shape[0], 2):
+        line, target = x[v], part[(v + border) // 2]
+        for column in range((x.shape[1] - right + 1) // 2):
+            pixel, goal = line[2 * column + right], target[(right + border) // 2 + column]
+            for k in range(pixel.size):
+                goal[k] = pixel[k]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -182,14 +199,3 @@ def _add_bias(flat, bias, wide, rectified, out):  # type: ignore[no-untyped-def]
             source, target = flat[v * wide + u], out[v, u]
             for k in range(bias.size):
                 target[k] = max(source[k] + bias[k], least)
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _gather(padded, first, rows, columns, stride, width, windows):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for v in range(rows):
-        for u in range(columns):
-            window = windows[v * columns + u]
-            for i in range(width):
-                line = padded[(first + v) * stride + i]
-                for j in range(width):
-                    window[i * width + j] = line[u * stride + j]

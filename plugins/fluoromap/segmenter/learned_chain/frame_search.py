@@ -16,12 +16,43 @@ from fluoromap.segmenter.log_image import Image
 SHARED_MS = 21.0
 """Time between frames up to which the network's answer for one frame says where electrodes are in the next."""
 
+AT_REST_MS, AT_REST_MM = 40.0, 1.0
+"""Time between frames, and motion since the network's answer, up to which the answer serves frames of a catheter at rest."""
+
 _OWN_CELLS, _MEAN_CELLS, _NEXT_FRAME_CELLS = 1, 2, 3
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
+_AT_REST_CELLS, _MOST_AT_REST = 2, 3
+"""How far the answer may lie from a catheter at rest, and how many frames may share it."""
 _REACH_PX = 6.0
 _LOOSE_PX = 3.0
 _LEAST_SHARE = 0.5
 """Least likeness of the frame itself, as a share of what it has when all frames of the mean show the catheter alike."""
+
+
+_NO_FRAME = FrameChains(-2, (), Reason.MANUAL_NEEDED)
+
+
+@dataclass(slots=True, eq=False)
+class StoredAnswers:
+    """The network's answers for single frames of one run, up to ``most_bytes``.
+
+    Tracking searches some of these frames again.
+    """
+
+    most_bytes: int = 64 << 20
+    _of_frame: dict[int, NetworkResponse] = field(default_factory=dict, init=False)
+    _bytes: int = field(default=0, init=False)
+
+    def of_frame(self, frame: int) -> NetworkResponse | None:
+        """Return the answer for a frame where it is stored."""
+        return self._of_frame.get(frame)
+
+    def store(self, frame: int, response: NetworkResponse | None) -> None:
+        """Store the answer for a frame, if there is one and room for it."""
+        size = 0 if response is None else response.answers.nbytes + response.probability.nbytes
+        if response is not None and frame not in self._of_frame and self._bytes + size <= self.most_bytes:
+            self._of_frame[frame] = response
+            self._bytes += size
 
 
 @dataclass(slots=True, eq=False)
@@ -33,13 +64,24 @@ class LatestNetwork:
 
     of_image: Callable[[Image], NetworkResponse]
     reach_cells: int = _OWN_CELLS
-    _response: NetworkResponse | None = None
+    _latest: tuple[Image, NetworkResponse] | None = field(default=None, init=False)
 
     def __call__(self, x: Image) -> NetworkResponse:
         """Return the latest answer where it is borrowed, else the one for this image."""
-        if self.reach_cells == _OWN_CELLS or self._response is None:
-            self._response = self.of_image(x)
-        return self._response
+        answer = None if self._latest is None or self.reach_cells == _OWN_CELLS else self._latest[1]
+        answer = self.latest_for(x) if answer is None else answer
+        if answer is None:
+            answer = self.of_image(x)
+            self._latest = x, answer
+        return answer
+
+    def latest_for(self, x: Image) -> NetworkResponse | None:
+        """Return the latest answer where it is the one for this image."""
+        return self._latest[1] if self._latest is not None and self._latest[0] is x else None
+
+    def remember(self, x: Image, answer: NetworkResponse) -> None:
+        """Make a stored answer for this image the latest one."""
+        self._latest = x, answer
 
 
 @dataclass(slots=True, eq=False)
@@ -49,24 +91,46 @@ class FrameSearch:
     - A frame that lacks catheters is searched again in the mean of the frame and its neighbours, which has less noise. Chains of
       the mean are found again in the frame itself. Where this helps once, the following frames are searched so first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
-    - In fast runs (``shares``) the network's answer for a frame is used in the next one too. A frame that then shows fewer chains
-      than the one before, or none for sure, is searched again with an answer of its own.
+    - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
+    - While all catheters move less than ``rest_px``, three more frames use the answer. Not so in runs whose noise hides catheters.
+    - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or catheters that moved, is
+      searched again with an answer of its own.
     """
 
     detector: ChainDetector
     network: LatestNetwork
     catheters: int
     shares: bool
-    _complete: int = field(default=-2, init=False)
-    _chains: int = field(default=0, init=False)
+    rest_px: float = 0.0
+    answers: StoredAnswers = field(default_factory=StoredAnswers)
+    _next: int = field(default=0, init=False)
+    _own: NetworkResponse | None = field(default=None, init=False)
+    _answered: FrameChains = field(default=_NO_FRAME, init=False)
+    _latest: FrameChains = field(default=_NO_FRAME, init=False)
+    _step_px: float = field(default=np.inf, init=False)
     _noisy: bool = field(default=False, init=False)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image; see :class:`~fluoromap.segmenter.run_segmentation.Detector`."""
+        # The mean of a run's frames follows its last frame, with the number of another one.
+        is_next = frame == self._next
+        entry = self._find_chains(x, frame, beside)
+        if is_next:
+            self.answers.store(frame, self._own)
+        self._next, self._own = frame + 1, None
+        self._step_px = _motion_px(self._latest, entry) if self._latest.frame == frame - 1 else np.inf
+        self._latest = entry
+        return entry
+
+    def _find_chains(self, x: Image, frame: int, beside: Sequence[Image]) -> FrameChains:
         first, second = (beside, ()) if self._noisy else ((), beside)
-        if self.shares and frame == self._complete + 1:
+        if self.shares and frame == self._answered.frame + 1:
             _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
-            if entry.manual_needed is None and len(entry.chains) >= self._chains:
+            if entry.manual_needed is None and len(entry.chains) >= len(self._answered.chains):
+                return entry
+        elif self._is_at_rest(frame):
+            _, entry = self._search(x, first, frame, _AT_REST_CELLS)
+            if entry.manual_needed is None and _motion_px(self._answered, entry) <= self.rest_px:
                 return entry
         searched, entry = self._search(x, first, frame, _OWN_CELLS)
         if beside and self._lacks_catheters(entry):
@@ -79,8 +143,18 @@ class FrameSearch:
                 other = self._in_frame(x, split, 1 + len(beside), frame, _OWN_CELLS)
                 entry = other if len(other.chains) > len(entry.chains) else entry
         if entry.manual_needed is None:
-            self._complete, self._chains = frame, len(entry.chains)
+            self._answered = entry
         return entry
+
+    def _is_at_rest(self, frame: int) -> bool:
+        """Return whether all catheters were clear, and hardly moved since the latest answer."""
+        return (
+            not self._noisy
+            and frame - self._answered.frame <= _MOST_AT_REST
+            and self._latest.frame == frame - 1
+            and not self._lacks_catheters(self._answered)
+            and _motion_px(self._answered, self._latest) + self._step_px < self.rest_px
+        )
 
     def _lacks_catheters(self, entry: FrameChains) -> bool:
         return len(entry.chains) < self.catheters or entry.manual_needed is not None
@@ -94,9 +168,10 @@ class FrameSearch:
         """
         self.detector.forget_image()
         self.network.reach_cells = reach_cells
-        mean: Image = np.mean([x, *beside], axis=0, dtype=np.float32) if beside else x
+        mean = _mean(x, beside) if beside else x
         searched = self.detector.search(mean)
         self.network.reach_cells = _OWN_CELLS
+        self._own = self.network.latest_for(x) or self._own
         return searched, self._in_frame(x, searched, 1 + len(beside), frame, reach_cells)
 
     def _in_frame(self, x: Image, searched: SearchedImage, averaged: int, frame: int, reach_cells: int) -> FrameChains:
@@ -121,9 +196,17 @@ class FrameSearch:
         self.network.reach_cells = _OWN_CELLS
         return FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
 
-    def find_again(self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def find_again(
+        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+    ) -> Chain | None:
         """Return a chain of another frame at its place in this log image."""
-        return self.detector.find_again(x, chain, shift, reach_px, taken)
+        answer = None if frame is None else self.answers.of_frame(frame)
+        if answer is not None:
+            self.network.remember(x, answer)
+        again = self.detector.find_again(x, chain, shift, reach_px, taken)
+        if frame is not None:
+            self.answers.store(frame, self.network.latest_for(x))
+        return again
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first."""
@@ -132,3 +215,27 @@ class FrameSearch:
     def shows_extra_catheter(self, x: Image, chains: Sequence[Chain]) -> bool:
         """Return whether the log image clearly shows a catheter besides these chains."""
         return self.detector.shows_extra_catheter(x, chains)
+
+
+def _mean(x: Image, beside: Sequence[Image]) -> Image:
+    total = x + beside[0]
+    for other in beside[1:]:
+        total += other
+    total /= np.float32(1 + len(beside))
+    return total
+
+
+def _motion_px(before: FrameChains, after: FrameChains) -> float:
+    """Return the largest motion of an electrode from one frame to another.
+
+    It is infinite where a catheter has no chain of as many electrodes in the other frame.
+    """
+    farthest = 0.0
+    for chain in before.chains:
+        moved = (
+            np.linalg.norm(other.pixels_uv - chain.pixels_uv, axis=1).max()
+            for other in after.chains
+            if other.electrodes == chain.electrodes
+        )
+        farthest = max(farthest, float(min(moved, default=np.inf)))
+    return farthest if len(after.chains) >= len(before.chains) else np.inf

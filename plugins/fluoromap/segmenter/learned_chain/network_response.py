@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
@@ -131,8 +132,9 @@ class NetworkResponse:
 
     def probability_at(self, points_uv: Array, reach_cells: int = 1) -> Array:
         """Return the highest probability of the cells within reach of each point, (n,)."""
-        v, u = self._cells_near(points_uv, reach_cells)
-        highest: Array = self.probability[v, u].max(axis=(1, 2), initial=0.0).astype(np.float64)
+        highest = np.zeros(len(points_uv))
+        middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
+        _write_highest(self.probability, middle, reach_cells, highest)
         return highest
 
     def _cells_near(self, points_uv: Array, reach_cells: int) -> tuple[IntArray, IntArray]:
@@ -146,6 +148,18 @@ class NetworkResponse:
         v = np.clip(middle[:, 1, None, None] + steps[:, None], 0, rows - 1)
         u = np.clip(middle[:, 0, None, None] + steps, 0, columns - 1)
         return v, u
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _write_highest(probability, middle, reach, highest):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the highest probability of the cells near each of the cells (u, v)."""
+    last_v, last_u = probability.shape[0] - 1, probability.shape[1] - 1
+    for point in range(highest.size):
+        for dv in range(-reach, reach + 1):
+            v = min(max(middle[point, 1] + dv, 0), last_v)
+            for du in range(-reach, reach + 1):
+                u = min(max(middle[point, 0] + du, 0), last_u)
+                highest[point] = max(highest[point], probability[v, u])
 
 
 def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, variance_gain: float) -> Proposals:

@@ -15,6 +15,7 @@ from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
+from fluoromap.segmenter.learned_chain.frame_search import StoredAnswers
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, segment_run
@@ -45,7 +46,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "9"
+    version: ClassVar[str] = "10"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -74,8 +75,10 @@ class LearnedChain:
         alone = len(run.frames) == 1
         frame_ms = float(np.diff(run.frame_times_ms).max(initial=0.0))
 
+        answers = StoredAnswers()
+
         def detector_of(field: FieldMask) -> Detector:
-            return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms)
+            return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms, answers)
 
         judge = None if alone else TrackEvidence(trained, run.px_per_mm, len(run.frames))
         found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)

@@ -1,4 +1,4 @@
-"""A frame reduced to the scale of the network, by area means over any factor."""
+"""A frame reduced to the scale of the network, by area means over any factor, and frames moved onto each other."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fluoromap.contracts import IntArray
+from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.log_image import Image
 
 
@@ -21,10 +21,11 @@ def resampled(x: Image, scale: float) -> Image:
     if scale == 1.0:
         return x
     rows, columns = (max(8, math.ceil(size * scale)) for size in x.shape)
-    half = np.empty((x.shape[0], columns), np.float32)
-    _along_rows(np.ascontiguousarray(x, dtype=np.float32), *_shares(x.shape[1], columns, scale), half)
+    # Across the rows first: that loop is the fast one, and a reduction leaves fewer rows for the other.
+    half = np.empty((rows, x.shape[1]), np.float32)
+    _across_rows(np.ascontiguousarray(x, dtype=np.float32), *_shares(x.shape[0], rows, scale), half)
     out = np.empty((rows, columns), np.float32)
-    _across_rows(half, *_shares(x.shape[0], rows, scale), out)
+    _along_rows(half, *_shares(x.shape[1], columns, scale), out)
     return out
 
 
@@ -64,6 +65,19 @@ def _shares(size: int, count: int, scale: float) -> tuple[IntArray, Image]:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _along_rows(x, first, weights, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    if weights.shape[1] == 4:
+        # A reduction by less than 2, as of most runs: without the inner loop it takes a third of the time.
+        for v in range(out.shape[0]):
+            line = x[v]
+            for u in range(out.shape[1]):
+                at = first[u]
+                out[v, u] = (
+                    weights[u, 0] * line[at]
+                    + weights[u, 1] * line[at + 1]
+                    + weights[u, 2] * line[at + 2]
+                    + weights[u, 3] * line[at + 3]
+                )
+        return
     for v in range(out.shape[0]):
         line = x[v]
         for u in range(out.shape[1]):
@@ -84,3 +98,26 @@ def _across_rows(x, first, weights, out):  # type: ignore[no-untyped-def]  # pra
             line = x[first[v] + k]
             for u in range(target.size):
                 target[u] += weight * line[u]
+
+
+def add_moved(image: Image, turn: Array, shift: Array, total: Image) -> None:
+    """Add to each pixel (u, v) of ``total`` the image at ``turn`` (u, v) + ``shift``.
+
+    The image is linear between its pixels. Places outside get the nearest pixel.
+    """
+    _add_moved(image, turn, shift, total)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_moved(image, turn, shift, total):  # type: ignore[no-untyped-def]  # pragma: no cover
+    last_u, last_v = image.shape[1] - 1.0, image.shape[0] - 1.0
+    for row in range(total.shape[0]):
+        for column in range(total.shape[1]):
+            u = min(max(turn[0, 0] * column + turn[0, 1] * row + shift[0], 0.0), last_u)
+            v = min(max(turn[1, 0] * column + turn[1, 1] * row + shift[1], 0.0), last_v)
+            left, top = int(u), int(v)
+            right, below = min(left + 1, image.shape[1] - 1), min(top + 1, image.shape[0] - 1)
+            across, down = u - left, v - top
+            upper = image[top, left] + across * (image[top, right] - image[top, left])
+            lower = image[below, left] + across * (image[below, right] - image[below, left])
+            total[row, column] += upper + down * (lower - upper)

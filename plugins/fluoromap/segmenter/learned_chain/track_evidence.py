@@ -11,11 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import affine_transform
 
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
-from fluoromap.segmenter.learned_chain.resampling import resampled
+from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
@@ -99,7 +98,7 @@ class TrackEvidence:
             turn, shift = _similarity(middle, points)
             offset = (turn @ first + shift + 0.5) * scale - 0.5
             small = self._small(frame, log_image, scale)
-            total += affine_transform(small, turn[::-1, ::-1], offset[::-1], total.shape, order=1, mode="nearest")
+            add_moved(small, turn, offset, total)
         total /= len(frames)
         seen = NetworkResponse.of_reduced(total, self.trained, scale)
         return log_odds(seen.probability_at(middle - first))

@@ -1,5 +1,6 @@
 """Frames searched one after the other: means of neighbours in noise, and shared answers of the network in fast runs."""
 
+import itertools
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -7,11 +8,14 @@ import numpy as np
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.learned_chain.frame_search import FrameSearch, LatestNetwork
-from fluoromap.segmenter.proposals import Likeness
+from fluoromap.segmenter.learned_chain.frame_search import FrameSearch, LatestNetwork, StoredAnswers
+from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.proposals import Likeness, Proposals
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 X = np.zeros((32, 32), np.float32)
+NONE_FOUND = Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
+ANSWER = NetworkResponse(X, np.zeros((32, 32, 5), np.float32), NONE_FOUND, 2.0, 0.0, 1.0)
 
 
 def chain(shift=0.0):
@@ -36,6 +40,7 @@ class Detector:
         self.likeness = lambda x: 10.0
         self.searched, self.split, self.found_again = [], [], []
         self.of_pairs = ()
+        self.frame, self.chain_at = 0, lambda frame: 0.0
 
     def forget_image(self):
         pass
@@ -43,7 +48,9 @@ class Detector:
     def search(self, x):
         self.network(x)
         self.searched.append(float(x.mean()))
-        return Searched(x, self.image_evidence(x), (chain(),) if np.isclose(x.mean(), self.level) else ())
+        return Searched(
+            x, self.image_evidence(x), (chain(self.chain_at(self.frame)),) if np.isclose(x.mean(), self.level) else ()
+        )
 
     def split_pairs(self, searched):
         self.split.append(float(searched.x.mean()))
@@ -57,11 +64,11 @@ class Detector:
         return chain(1.0)
 
 
-def search(level, shares):
+def search(level, shares, rest_px=0.0):
     asked = []
-    network = LatestNetwork(lambda x: asked.append(float(x.mean())) or len(asked))
+    network = LatestNetwork(lambda x: asked.append(float(x.mean())) or ANSWER)
     detector = Detector(network, level)
-    return FrameSearch(detector, network, 1, shares), detector, asked
+    return FrameSearch(detector, network, 1, shares, rest_px), detector, asked
 
 
 def test_a_frame_without_its_catheter_is_searched_in_the_mean_and_the_chain_found_again_in_the_frame():
@@ -106,3 +113,58 @@ def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
     for frame in range(6):
         assert frames.find_chains(X + 1, frame).chains
     assert len(asked) == 3
+
+
+def test_catheters_at_rest_share_an_answer_until_they_move():
+    frames, detector, asked = search(1.0, shares=False, rest_px=4.0)
+    places = [0.0, 0.5, 0.5, 0.7, 0.7, 0.7, 9.0, 9.0, 18.0, 18.0, 18.0]
+    detector.chain_at = lambda frame: places[frame]
+    for frame in range(len(places)):
+        detector.frame = frame
+        assert frames.find_chains(X + 1, frame).chains
+        asked.append(frame)
+    own = [frame for before, frame in itertools.pairwise(asked) if isinstance(before, float)]
+    # Own answers: until the speed is known, after three more frames, while they move.
+    assert own == [0, 1, 5, 6, 7, 8, 9]
+
+
+def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
+    frames, _, asked = search(1.0, shares=False, rest_px=4.0)
+    for frame in range(4):
+        frames.find_chains(X + (1 if frame != 2 else 5), frame)
+    assert asked == [1.0, 1.0, 5.0, 1.0]
+
+
+def test_in_runs_whose_noise_hides_catheters_each_frame_has_an_answer_of_its_own():
+    frames, detector, asked = search(2.0, shares=False, rest_px=4.0)
+    frames.find_chains(X + 1, 0, [X + 2, X + 3])
+    detector.level = 1.0
+    for frame in range(1, 5):
+        assert frames.find_chains(X + 1, frame).chains
+    assert asked[2:] == [1.0] * 4
+
+
+def test_tracking_uses_the_answers_for_frames_that_were_searched_with_their_own():
+    frames, _, asked = search(2.0, shares=False)
+    frames.find_chains(X + 1, 0, [X + 2, X + 3])
+    frames.find_chains(X + 5, 1)
+    assert asked == [1.0, 2.0, 5.0]
+    again = X + 5
+    frames.find_again(again, chain(), np.zeros(2), 5.0, (), 1)
+    assert frames.network(again).found is NONE_FOUND
+    assert asked == [1.0, 2.0, 5.0]
+
+
+def test_the_mean_of_a_run_is_not_taken_for_the_frame_whose_number_it_has():
+    frames, _, _ = search(1.0, shares=False)
+    frames.find_chains(X + 1, 0)
+    frames.find_chains(X + 9, 5)
+    assert frames.answers.of_frame(0) is not None
+    assert frames.answers.of_frame(5) is None
+
+
+def test_stored_answers_have_a_limit():
+    answers = StoredAnswers(most_bytes=ANSWER.answers.nbytes + ANSWER.probability.nbytes)
+    for frame, response in enumerate((ANSWER, None, ANSWER)):
+        answers.store(frame, response)
+    assert [answers.of_frame(frame) is not None for frame in range(3)] == [True, False, False]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import affine_transform
 
 from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
 from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS, HEADS
@@ -16,7 +17,7 @@ from fluoromap.segmenter.learned_chain.network_response import (
     network_scale,
 )
 from fluoromap.segmenter.learned_chain.normalisation import normalise
-from fluoromap.segmenter.learned_chain.resampling import resampled
+from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.proposals import Proposals
 
@@ -116,6 +117,17 @@ def test_reduced_pictures_keep_places_and_levels(scale):
     inside = (slice(3, -3), slice(3, -3))
     np.testing.assert_allclose(small[inside], expected[inside], atol=0.2)
     np.testing.assert_allclose(resampled(np.ones((50, 61), np.float32), scale), 1.0, atol=1e-5)
+
+
+def test_moved_pictures_are_those_of_scipy():
+    random = np.random.default_rng(3)
+    image = random.normal(size=(60, 80)).astype(np.float32)
+    turn = np.array([[0.9, -0.2], [0.25, 1.1]])
+    for shift in ([-9.0, 3.5], [30.2, 20.7]):
+        total = np.ones((40, 50), np.float32)
+        add_moved(image, turn, np.array(shift), total)
+        moved = affine_transform(image, turn[::-1, ::-1], shift[::-1], total.shape, order=1, mode="nearest")
+        np.testing.assert_allclose(total, 1.0 + moved, atol=1e-5)
 
 
 def test_frames_near_the_network_s_scale_are_taken_as_they_are():
