@@ -11,16 +11,15 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_fitting import fit_chains, widen_covariance
+from fluoromap.segmenter.acceptance import Acceptance
+from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import (
-    ONE_BY_ONE,
     CandidateChain,
     CatheterFamily,
     PossibleChains,
     ShaftImage,
-    Trust,
     best_chains,
     catheter_families,
     chain_score,
@@ -51,54 +50,6 @@ _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.2
 _GOOD_ALONE = 1.5
 _LEAST_PLACES = 4
 _SAME_PLACE_MM = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Acceptance:
-    """How sure chains have to be, in the measures of one proposer.
-
-    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.refinement.Refined.clearness`, of a chain found in its
-    image and of one of another frame. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter
-    beside those of the catalogue is reported from here on. least_score : of the median of a chain's scores. seen_score,
-    least_seen : at least this share of a chain's electrodes has this score. unseen_evidence : an electrode that was not
-    proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
-    not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
-    row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``least_score`` and ``least_seen``
-    where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
-    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
-    trust : see :class:`~fluoromap.segmenter.linking.Trust`.
-    """
-
-    least_clearness: float
-    again_clearness: float
-    sure_clearness: float
-    extra_clearness: float
-    least_score: float
-    seen_score: float = -np.inf
-    least_seen: float = 0.0
-    unseen_evidence: float = 0.0
-    strict: bool = False
-    row_chain_score: float = np.inf
-    row_score: float = np.inf
-    trust: Trust = ONE_BY_ONE
-
-    def accepts(self, scores: Array, chain_scores: Array) -> BoolArray:
-        """Return whether chains are clear enough, (...).
-
-        Parameters
-        ----------
-        scores : (..., electrodes)
-            Of the electrodes, in the proposer's measure.
-        chain_scores : (...)
-            Of the chains, see :func:`~fluoromap.segmenter.linking.possible_chains`.
-        """
-        middle = np.median(scores, axis=-1)
-        share_seen = np.mean(scores >= self.seen_score, axis=-1)
-        accepted: BoolArray = (middle >= self.least_score) & (share_seen >= self.least_seen)
-        if scores.shape[-1] >= MANY_ELECTRODES:
-            ends = np.minimum(scores[..., :2].max(axis=-1), scores[..., -2:].max(axis=-1))
-            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & (ends >= self.seen_score)
-        return accepted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,6 +249,24 @@ class ChainDetector:
             for candidates, one in zip(linking.chains, fitted, strict=True)
             if one.clearness >= self.acceptance.least_clearness
         ]
+        result = self._accepted(clear, seen, proposed, families, beside=False)
+        if result.chains and len(result.chains) < len(clear):
+            more = self._accepted(clear, seen, proposed, families, beside=True)
+            result = more if len(more.chains) > len(result.chains) else result
+        return result
+
+    def _accepted(
+        self,
+        clear: Sequence[tuple[CandidateChain, FittedChain]],
+        seen: ImageEvidence,
+        proposed: Proposals,
+        families: tuple[CatheterFamily, ...],
+        beside: bool,
+    ) -> _FittedSet:
+        """Return the accepted ones of clear chains.
+
+        beside : whether the image shows another catheter.
+        """
         floor = min(family.floor for family in families)
         sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
         found = [one.chain for _, one in clear]
@@ -305,7 +274,7 @@ class ChainDetector:
         for candidates, chain in zip((candidates for candidates, _ in clear), found, strict=True):
             others = [other for other in found if other is not chain]
             scores = seen.scores_at(chain.pixels_uv)
-            if self.acceptance.accepts(scores, chain.scores[0]):
+            if self.acceptance.accepts(scores, chain.scores[0], beside):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
                 accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
         chains = tuple(chain for _, chain in accepted)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.segmenter.acceptance import ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
@@ -97,10 +98,10 @@ def drawn_without_shaft(row):
     return image.astype(np.float32)
 
 
-def detector_of(evidence, catalogue=CATALOGUE):
+def detector_of(evidence, catalogue=CATALOGUE, acceptance=IN_A_RUN):
     everywhere = np.ones(evidence.smooth.shape, np.bool_)
     field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
-    return ChainDetector(catalogue, field, PX, lambda x: evidence, IN_A_RUN)
+    return ChainDetector(catalogue, field, PX, lambda x: evidence, acceptance)
 
 
 def chains_found(image, points, probability, scores, **more):
@@ -119,6 +120,16 @@ def test_a_chain_that_would_be_rejected_does_not_take_a_catheter_s_place():
     found = chains_found(drawn([catheter, vessel]), points, probability, scores)
     assert len(found) == 1
     assert lies_on(found[0], catheter)
+
+
+def test_a_doubted_catheter_is_accepted_beside_a_sure_one_only():
+    ablation, cs = row_of("ablation", (60, 250), -0.2), row_of("cs", (60, 60), 0.3)
+    acceptance = replace(IN_A_RUN, scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7))
+    for scores_of_cs, count in ((0.9, 2), (0.1, 0)):
+        scores = [0.35] * 4 + [scores_of_cs] * 10
+        image, points = drawn([ablation, cs]), np.concatenate([ablation, cs])
+        detector = detector_of(Evidence(image, points, [0.95] * 14, scores), acceptance=acceptance)
+        assert len(detector.search(image).entry(0).chains) == count
 
 
 @pytest.mark.parametrize(("between", "listed"), [(0.8, True), (0.995, False)])
@@ -219,23 +230,3 @@ def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
     # As probable as its weakest electrode, it is an electrode that the catalogue does not list.
     weak = chains_found(drawn([catheter]), np.concatenate([catheter, shaft]), [0.99, 0.7, 0.99, 0.99, 0.7], [0.9] * 5)
     assert not any(lies_on(chain, catheter) for chain in weak)
-
-
-def test_a_long_row_is_accepted_with_less_from_each_electrode():
-    doubted = np.full(10, 0.3)
-    assert IN_A_RUN.accepts(doubted, 2.5)
-    assert not IN_A_RUN.accepts(doubted, 1.5)
-    assert not IN_A_RUN.accepts(doubted[:4], 2.5)
-    assert not IN_A_RUN.accepts(np.full(10, 0.1), 8.0)
-
-
-def test_a_row_displaced_by_a_pair_is_not_accepted():
-    displaced = np.array([0.9] * 8 + [0.01] * 2)
-    assert not IN_A_RUN.accepts(displaced, 5.0)
-    assert not IN_A_RUN.accepts(displaced[::-1], 5.0)
-    assert IN_A_RUN.accepts(np.array([0.9] * 6 + [0.01] * 2 + [0.9] * 2), 5.0)
-
-
-def test_chains_are_accepted_one_by_one():
-    scores = np.stack([np.full(4, 0.9), np.full(4, 0.1)])
-    assert IN_A_RUN.accepts(scores, np.array([5.0, 5.0])).tolist() == [True, False]

@@ -8,8 +8,9 @@ from pydantic import BaseModel
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, NoParams, Run, Segmentation
+from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
-from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
+from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run
@@ -17,7 +18,7 @@ from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import compile_kernels
 
 _ACCEPTANCE = Acceptance(
-    least_clearness=0.75, again_clearness=0.6, sure_clearness=1.1, extra_clearness=1.3, least_score=3.5
+    least_clearness=0.75, again_clearness=0.6, sure_clearness=1.1, extra_clearness=1.3, scores=ScoreLimits(3.5)
 )
 """Scores are contrast over noise."""
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import PixelFacts
+from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
-from fluoromap.segmenter.chain_detector import Acceptance, ChainDetector
+from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, LatestNetwork
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
@@ -22,17 +23,17 @@ IN_A_RUN = Acceptance(
     again_clearness=0.1,
     sure_clearness=0.1,
     extra_clearness=0.3,
-    least_score=0.4,
-    seen_score=0.15,
-    least_seen=0.85,
+    scores=ScoreLimits(0.4, seen=0.15, least_seen=0.85),
     unseen_evidence=-0.9,
     strict=True,
     row_chain_score=2.0,
     row_score=0.2,
     trust=Trust(share=0.25, chain=0.7),
 )
-_ALONE = replace(IN_A_RUN, least_clearness=0.3, sure_clearness=0.5)
-"""Scores are probabilities. In a single frame no other frame confirms a chain."""
+_ALONE = replace(
+    IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7)
+)
+"""Scores are probabilities. In a single frame no other frame confirms a chain, but another catheter does."""
 
 _COARSE_BITS = 8
 _COARSE_NOISE = 0.004

@@ -1,0 +1,78 @@
+"""Limits that a chain has to reach to be accepted as a catheter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.linking import ONE_BY_ONE, Trust
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreLimits:
+    """Limits for the scores of a chain's electrodes, in the proposer's measure.
+
+    middle : of their median. seen, least_seen : at least this share of the electrodes has this score.
+    """
+
+    middle: float
+    seen: float = -np.inf
+    least_seen: float = 0.0
+
+    def allow(self, scores: Array) -> BoolArray:
+        """Return which chains with scores (..., electrodes) reach the limits, (...)."""
+        share_seen = np.mean(scores >= self.seen, axis=-1)
+        allowed: BoolArray = (np.median(scores, axis=-1) >= self.middle) & (share_seen >= self.least_seen)
+        return allowed
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """How sure chains have to be, in the measures of one proposer.
+
+    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.refinement.ElectrodeFit.clearness`, of a chain found in its
+    image and of one of another frame. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter
+    beside those of the catalogue is reported from here on. scores : limits for a chain. scores_beside : limits for a chain in an
+    image that shows another catheter; the same by default. unseen_evidence : an electrode that was not
+    proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
+    not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
+    row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``scores``
+    where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
+    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
+    trust : see :class:`~fluoromap.segmenter.linking.Trust`.
+    """
+
+    least_clearness: float
+    again_clearness: float
+    sure_clearness: float
+    extra_clearness: float
+    scores: ScoreLimits
+    scores_beside: ScoreLimits | None = None
+    unseen_evidence: float = 0.0
+    strict: bool = False
+    row_chain_score: float = np.inf
+    row_score: float = np.inf
+    trust: Trust = ONE_BY_ONE
+
+    def accepts(self, scores: Array, chain_scores: Array, beside: bool = False) -> BoolArray:
+        """Return whether chains are clear enough, (...).
+
+        Parameters
+        ----------
+        scores : (..., electrodes)
+            Of the electrodes, in the proposer's measure.
+        chain_scores : (...)
+            Of the chains, see :func:`~fluoromap.segmenter.linking.possible_chains`.
+        beside : bool
+            Whether the image shows another catheter.
+        """
+        limits = self.scores if self.scores_beside is None or not beside else self.scores_beside
+        accepted = limits.allow(scores)
+        if scores.shape[-1] >= MANY_ELECTRODES:
+            ends = np.minimum(scores[..., :2].max(axis=-1), scores[..., -2:].max(axis=-1))
+            middle = np.median(scores, axis=-1)
+            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & (ends >= self.scores.seen)
+        return accepted
