@@ -323,13 +323,13 @@ class ChainDetector:
         long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
-        odds_of_free, odds = log_odds(seen.probability_at(free)), log_odds(proposed.probability)
+        odds_of_free, odds = seen.kind_odds_at(free), seen.kind_odds_at(proposed.points_uv)
         listed = np.zeros(len(chains), np.bool_)
         for index, chain in enumerate(chains):
             family = self._family(chain)
             if family is None:
                 continue
-            own = log_odds(seen.probability_at(chain.pixels_uv))
+            own = seen.kind_odds_at(chain.pixels_uv)
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))

@@ -110,6 +110,9 @@ class ImageEvidence(Protocol):
     def probability_at(self, points_uv: Array) -> Array:
         """Return the probability that electrodes are at points, (n,)."""
 
+    def kind_odds_at(self, points_uv: Array) -> Array:
+        """Return the log-odds by which electrodes differ from other blobs, (n,)."""
+
     def unseen_probability_at(self, points_uv: Array) -> Array:
         """Return the probability of electrodes that were not proposed, (n,).
 

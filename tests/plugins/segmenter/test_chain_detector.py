@@ -10,7 +10,7 @@ from fluoromap.segmenter.acceptance import ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
-from fluoromap.segmenter.proposals import Likeness, Proposals
+from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds
 
 PX = 4.0
 SIZE = 360
@@ -54,6 +54,9 @@ class Evidence:
 
     def probability_at(self, points_uv):
         return self._nearest(self.probability, points_uv, 0.01)
+
+    def kind_odds_at(self, points_uv):
+        return log_odds(self.probability_at(points_uv))
 
     def unseen_probability_at(self, points_uv):
         return np.zeros(len(points_uv))

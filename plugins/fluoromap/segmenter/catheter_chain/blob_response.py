@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
-from fluoromap.segmenter.proposals import Likeness, Proposals, probability_of_contrast
+from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 
 _SCALES_MM = 0.52, 0.73, 1.04
 _LEAST_RING_PX = 5.0
@@ -146,6 +146,10 @@ class BlobResponse:
     def probability_at(self, points_uv: Array) -> Array:
         """Return the probability of electrodes at points of the frame, (n,)."""
         return probability_of_contrast(self.scores_at(points_uv))
+
+    def kind_odds_at(self, points_uv: Array) -> Array:
+        """Return the log-odds of electrodes at points, (n,): blobs know nothing else of them."""
+        return log_odds(self.probability_at(points_uv))
 
     unseen_probability_at = probability_at
 

@@ -19,6 +19,7 @@ from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probabi
 
 _EVEN_SHARE = 0.5
 _LEAST_PROBABILITY = 0.05
+_ENOUGH_CONTRAST = 8.0
 _APART_MM = 0.6
 _HALF_APART_MM, _HALF_SD_MM = 0.3, 0.25
 _FAINT, _CLEAR = 5.0, 9.5
@@ -119,10 +120,22 @@ class JointEvidence:
 
         Its log-odds are the mean of those of the network and twice those of the contrast.
         """
-        of_network = log_odds(self._network_at(points_uv))
-        of_contrast = 2.0 * log_odds(probability_of_contrast(self.blobs.scores_at(points_uv)))
-        probability: Array = 1.0 / (1.0 + np.exp(-_EVEN_SHARE * (of_network + of_contrast)))
+        probability: Array = 1.0 / (1.0 + np.exp(-self._odds_at(points_uv)))
         return probability
+
+    def kind_odds_at(self, points_uv: Array) -> Array:
+        """Return the log-odds by which electrodes differ from other blobs, (n,).
+
+        They are those of :meth:`probability_at` with limited contrast: in a clear picture shafts and cables have as much contrast
+        over noise as electrodes.
+        """
+        return self._odds_at(points_uv, _ENOUGH_CONTRAST)
+
+    def _odds_at(self, points_uv: Array, most_contrast: float = np.inf) -> Array:
+        of_network = log_odds(self._network_at(points_uv))
+        contrast = np.minimum(self.blobs.scores_at(points_uv), most_contrast)
+        odds: Array = _EVEN_SHARE * (of_network + 2.0 * log_odds(probability_of_contrast(contrast)))
+        return odds
 
     def unseen_probability_at(self, points_uv: Array) -> Array:
         """Return the same, but 0 where a proposed electrode has the place."""

@@ -31,6 +31,8 @@ _LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
 _LEAST_WHERE_CLEAR = -1.07
 """Of the middle electrode in each picture, where half of the single frames show the catheter."""
 _LOW_QUANTILE = 0.1
+_LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
+"""Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
 _LEAST_LONG = 0.0
 """Of the middle electrode of six or more, on average. Clutter often hides some of them: the worst electrodes do not count."""
 _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
@@ -85,7 +87,7 @@ class TrackEvidence:
             shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
         else:
             shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
-        return shown and (is_long or bool(np.quantile(odds.mean(axis=0), _LOW_QUANTILE, method="lower") >= _LEAST_LOW))
+        return shown and (is_long or _are_electrodes(odds.mean(axis=0)))
 
     def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
@@ -111,6 +113,15 @@ class TrackEvidence:
             if len(self._reduced) > _KEPT_FRAMES:
                 self._reduced.popitem(last=False)
         return small
+
+
+def _are_electrodes(odds: Array) -> bool:
+    """Return whether log-odds (n,) are those of electrodes.
+
+    Either all are high enough, or the others are so high that they excuse the worst.
+    """
+    worst = np.quantile(odds, _LOW_QUANTILE, method="lower")
+    return bool(worst >= _LEAST_LOW or np.clip(odds, *_COUNTED).mean() >= _LEAST_MEAN)
 
 
 def _is_clear(chain: Chain) -> bool:

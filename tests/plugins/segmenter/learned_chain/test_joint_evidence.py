@@ -34,3 +34,11 @@ def test_both_count_alike_for_a_place():
     assert joint(0.5, 4.0).probability_at(at) == 0.5
     assert joint(0.5, 8.0).probability_at(at) > 0.6
     assert joint(0.8, 4.0).probability_at(at) > 0.6
+
+
+def test_more_than_enough_contrast_does_not_make_a_blob_an_electrode():
+    at = np.zeros((1, 2))
+    assert joint(0.1, 60.0).probability_at(at) > 0.8
+    assert joint(0.1, 60.0).kind_odds_at(at) < 0.0
+    assert joint(0.1, 60.0).kind_odds_at(at) == joint(0.1, 8.0).kind_odds_at(at)
+    assert joint(0.1, 6.0).kind_odds_at(at) < joint(0.1, 8.0).kind_odds_at(at)

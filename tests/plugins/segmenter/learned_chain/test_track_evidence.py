@@ -78,9 +78,19 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
 
 @pytest.mark.parametrize(
     ("electrodes", "odds", "hidden", "accepted"),
-    [(4, 0.5, 0, True), (4, 0.5, 1, False), (6, 0.5, 1, True), (10, 0.1, 2, True), (10, -0.5, 0, False)],
+    [
+        (4, 0.5, 0, True),
+        (4, 0.5, 1, False),
+        (4, 2.5, 1, True),
+        (4, 2.5, 2, False),
+        (6, 0.5, 1, True),
+        (10, 0.1, 2, True),
+        (10, -0.5, 0, False),
+    ],
 )
-def test_clutter_may_hide_some_electrodes_of_a_long_catheter(monkeypatch, electrodes, odds, hidden, accepted):
+def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_doubted(
+    monkeypatch, electrodes, odds, hidden, accepted
+):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
 
     def along(self, frames, path_uv, log_image):
