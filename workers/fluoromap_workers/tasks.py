@@ -82,7 +82,7 @@ def _run_stages(place: Place) -> None:
     _announce()
 
 
-class _Comparisons:
+class Comparisons:
     """The kinds of stages, each of one job, whose stored results this worker has looked for.
 
     After a correction nearly all results of a kind are known. One thread ends their stages; the others wait for it, else they
@@ -114,7 +114,7 @@ class _Comparisons:
             return True
 
 
-_comparisons = _Comparisons()
+_comparisons = Comparisons()
 
 
 def _announce() -> None:
