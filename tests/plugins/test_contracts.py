@@ -81,6 +81,29 @@ def test_a_relative_position_needs_its_covariance() -> None:
         ElectrodePoint("mapping", 1, np.zeros(3), np.eye(3), np.zeros(3), None, (0.1, 0.1), 90.0)
 
 
+@pytest.mark.parametrize("with_reference", [True, False])
+def test_points_of_a_moment_are_those_that_are_made_one_by_one(with_reference: bool) -> None:
+    random = np.random.default_rng(3)
+    positions, relative = random.normal(size=(2, 3, 3))
+    covariances, relative_mm2 = random.normal(size=(2, 3, 3, 3))
+    own = (relative, relative_mm2) if with_reference else (None, None)
+    labels, angles = [("cs", 1), ("cs", 2), ("map", 1)], [80.0, 81.0, 82.0]
+    residuals, reasons = [(0.1, 0.2), (0.3, 0.4), (0.5, 0.6)], [(), (Reason.SPACING_MISMATCH,), ()]
+    points = ElectrodePoint.of_moment(labels, positions, covariances, *own, residuals, angles, reasons)
+    for i, point in enumerate(points):
+        single = ElectrodePoint(
+            *labels[i], positions[i], covariances[i], *(None if of is None else of[i] for of in own), residuals[i],
+            angles[i], reasons[i],
+        )  # fmt: skip
+        assert vars(point).keys() == vars(single).keys()
+        for name, value in vars(single).items():
+            np.testing.assert_array_equal(getattr(point, name), value)
+            if isinstance(value, np.ndarray):
+                assert not getattr(point, name).flags.writeable
+    with pytest.raises(ValueError, match="needs its covariance"):
+        ElectrodePoint.of_moment(labels, positions, covariances, relative, None, residuals, angles, reasons)
+
+
 def test_cycles_and_tracks_agree_with_their_labels() -> None:
     with pytest.raises(ValueError, match="positions_mm"):
         SiteCycle(np.array([0.1]), (("mapping", 1),), np.zeros((1, 2, 3)), np.zeros((1, 2, 3, 3)))

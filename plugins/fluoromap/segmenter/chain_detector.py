@@ -252,7 +252,7 @@ class ChainDetector:
             if one.clearness >= self.acceptance.least_clearness
         ]
         result = self._accepted(clear, seen, proposed, families, beside=False)
-        if result.chains and len(result.chains) < len(clear):
+        if self.acceptance.scores_beside is not None and result.chains and len(result.chains) < len(clear):
             more = self._accepted(clear, seen, proposed, families, beside=True)
             result = more if len(more.chains) > len(result.chains) else result
         return result
