@@ -14,6 +14,7 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import Acceptance
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.crossings import are_crossings
+from fluoromap.segmenter.faded_ends import count_faded
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import (
     CandidateChain,
@@ -206,6 +207,7 @@ class ChainDetector:
         points = proposed.points_uv.copy()
         weights, variance = self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
+        possible = self._without_shorter_catheters(possible, points, seen, families)
         possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
@@ -229,9 +231,25 @@ class ChainDetector:
             _COMPANION_SLACK,
             completed.rows,
         )
+        possible = self._without_shorter_catheters(possible, completed.points_uv, seen, families)
         possible = _with_enough_places(possible, len(points) - halves, len(points))
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
         return _Linking(completed.points_uv, len(points), possible, linked)
+
+    def _without_shorter_catheters(
+        self, possible: PossibleChains, points_uv: Array, seen: ImageEvidence, families: tuple[CatheterFamily, ...]
+    ) -> PossibleChains:
+        """Return the chains without those that another catheter of the catalogue explains with fewer electrodes."""
+        if not self.acceptance.strict:
+            return possible
+        contrast, odds = seen.likeness.at(points_uv), seen.kind_odds_at(points_uv)
+        lengths = [family.catheter.electrodes for family in families]
+        kept = []
+        for rows, length in zip(possible.rows, lengths, strict=True):
+            shorter = max((other for other in lengths if other < length), default=0)
+            faded = count_faded(contrast[rows], odds[rows])
+            kept.append((faded == 0) | (length - faded > shorter))
+        return possible.where(kept)
 
     def _fit(
         self,
