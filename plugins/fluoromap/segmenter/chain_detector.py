@@ -14,7 +14,7 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import Acceptance
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.crossings import are_crossings
-from fluoromap.segmenter.faded_ends import count_faded
+from fluoromap.segmenter.faded_ends import without_shorter_catheters
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.linking import (
     CandidateChain,
@@ -239,17 +239,10 @@ class ChainDetector:
     def _without_shorter_catheters(
         self, possible: PossibleChains, points_uv: Array, seen: ImageEvidence, families: tuple[CatheterFamily, ...]
     ) -> PossibleChains:
-        """Return the chains without those that another catheter of the catalogue explains with fewer electrodes."""
         if not self.acceptance.strict:
             return possible
         contrast, odds = seen.likeness.at(points_uv), seen.kind_odds_at(points_uv)
-        lengths = [family.catheter.electrodes for family in families]
-        kept = []
-        for rows, length in zip(possible.rows, lengths, strict=True):
-            shorter = max((other for other in lengths if other < length), default=0)
-            faded = count_faded(contrast[rows], odds[rows])
-            kept.append((faded == 0) | (length - faded > shorter))
-        return possible.where(kept)
+        return without_shorter_catheters(possible, families, contrast, odds)
 
     def _fit(
         self,
