@@ -11,6 +11,7 @@ import typer
 import uvicorn
 
 from fluoromap_service import auth, logs
+from fluoromap_service.allocator import return_freed_memory
 from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.connections import TimedConnection
@@ -19,7 +20,6 @@ from fluoromap_service.cli.environment import (
     apply_options,
     end_with_supervisor,
     keep_compiled_kernels,
-    return_freed_memory,
 )
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir, Host, Port
