@@ -27,7 +27,6 @@ from fluoromap.contracts import (
     LocatedSite,
     MatchedSite,
     Matching,
-    MonoplaneView,
     Refusal,
     RejectedSite,
     Run,
@@ -37,6 +36,7 @@ from fluoromap.contracts import (
     View,
 )
 from fluoromap.fuser.mapped_sites import map_origin, mapped_sites
+from fluoromap.geometry import Camera
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
@@ -47,8 +47,9 @@ from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrac
 from fluoromap_service.store.codec import form_of, plain_form
 from fluoromap_service.store.models import Json, StageRow
 from fluoromap_service.study.run_files import checked_run
-from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
+from fluoromap_service.study.snapshot import CorrectedElectrode, GantrySnapshot, Snapshot
 from fluoromap_workers.point_rows import point_rows
+from fluoromap_workers.tracked_views import TrackedView
 
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
@@ -198,7 +199,7 @@ def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
 def _match(job: StoredJob, study: str) -> Work:
     snapshot, catalogue = job.snapshot, job.catalogue
     segments = {row.subject: row for row in stages_of(job.session, job.job_id, "segment")}
-    cameras = {uid: snapshot.runs[uid].gantry.camera() for uid in segments}
+    cameras = {uid: _camera(snapshot.runs[uid].gantry) for uid in segments}
     views = [(site.site, uid) for site in snapshot.sites for uid in (site.view_a, site.view_b)]
 
     def compute(context: Context) -> Matching:
@@ -206,7 +207,7 @@ def _match(job: StoredJob, study: str) -> Work:
         found = {uid: load_later(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
             SiteRuns(
-                site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b],
+                site.site, cameras[site.view_a][0], cameras[site.view_b][0], found[site.view_a], found[site.view_b],
             )
             for site in snapshot.sites
         )  # fmt: skip
@@ -216,9 +217,16 @@ def _match(job: StoredJob, study: str) -> Work:
         return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
 
     # A result's hash says whether it changed: the result itself is not read for the key.
-    results = ((site, plain_form(cameras[uid]), segments[uid].result) for site, uid in views)
+    results = ((site, cameras[uid][1], segments[uid].result) for site, uid in views)
     key = _key(snapshot, "match", _as_json(catalogue), *(part for view in results for part in view))
     return Work(key, Matching, compute, refused)
+
+
+@functools.lru_cache(maxsize=2048)
+def _camera(gantry: GantrySnapshot) -> tuple[Camera, bytes]:
+    """Return the camera of a run, and its part of a key."""
+    camera = gantry.camera()
+    return camera, plain_form(camera)
 
 
 def _triangulate(job: StoredJob, study: str) -> Work:
@@ -275,10 +283,10 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     plugin = job.snapshot.monoplane
     matched = next((site for site in matching.sites if site.site == name), None)
     located = next((site for site in triangulation.sites if site.site == name), None)
-    views: list[MonoplaneView] = []
+    views: list[TrackedView] = []
     if matched is not None and located is not None:
         others = () if located.cycle else tuple(site.cycle for site in triangulation.sites if site.cycle)
-        views = [_monoplane_view(view, matched, located, job.catalogue, others) for view in job.snapshot.views]
+        views = [_tracked_view(view, matched, located, job.catalogue, others) for view in job.snapshot.views]
     rejected = [] if views else [_rejected_view(view, name, triangulation) for view in job.snapshot.views]
 
     def compute(context: Context) -> SiteTracks:
@@ -287,7 +295,7 @@ def _monoplane(job: StoredJob, name: str) -> Work:
             solver = build_monoplane(plugin.name, plugin.params)
             # One view may support a track where the other does not.
             try:
-                track = _returned(solver.track(view, context), Track, plugin.name)
+                track = _returned(solver.track(view.decoded(), context), Track, plugin.name)
                 tracks.append(ViewTrack(view.view, track, None, ""))
             except Refusal as refusal:
                 tracks.append(ViewTrack(view.view, None, refusal.reason, str(refusal)))
@@ -297,24 +305,21 @@ def _monoplane(job: StoredJob, name: str) -> Work:
         return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
 
     key = _key(
-        job.snapshot, "monoplane", name, *(plain_form(view) for view in rejected), *(plain_form(view) for view in views)
+        job.snapshot, "monoplane", name, *(plain_form(view) for view in rejected), *(view.content() for view in views)
     )
     return Work(key, SiteTracks, compute, refused)
 
 
-def _monoplane_view(
+def _tracked_view(
     view: View, matched: MatchedSite, located: LocatedSite, catalogue: Catalogue, others: tuple[Any, ...]
-) -> MonoplaneView:
-    first = view == "a"
-    return MonoplaneView(
-        site=matched.site,
+) -> TrackedView:
+    return TrackedView(
+        matched=matched,
         view=view,
-        camera=located.camera_a if first else located.camera_b,
+        camera=located.camera(view),
         catalogue=catalogue,
-        frame_times_ms=matched.frame_times_a_ms if first else matched.frame_times_b_ms,
-        observations=matched.track_a if first else matched.track_b,
         a_priori=tuple(_without_name_doubts(point) for point in located.a_priori or located.points),
-        a_priori_frame=located.frame_a if first else located.frame_b,
+        a_priori_frame=located.diastolic_frame(view),
         cycle=located.cycle,
         others=others,
     )
@@ -325,6 +330,8 @@ def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
 
     They move no electrode, and naming a catheter at one site must not redo the others.
     """
+    if NAME_DOUBTS.isdisjoint(point.reasons):
+        return point
     return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -25,10 +25,14 @@ from fluoromap_service.jobs.stage_results import SiteTracks, load, load_file, st
 from fluoromap_service.problem import not_found
 from fluoromap_service.results.finished import done_stage, snapshot_of
 from fluoromap_service.results.maps import FinishedMap, map_of
+from fluoromap_service.store.codec import undecoded
 from fluoromap_service.store.models import Job, StageState
 from fluoromap_service.study.snapshot import Snapshot
 
 VIEWS: tuple[View, ...] = ("a", "b")
+
+_REMEMBERED_VIEWS = 8
+"""A person looks at many frames of few runs. The electrodes in all frames of a study take 100 MB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +167,14 @@ def _views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView
     ]
 
 
-def _chains(site: MatchedSite, view: View) -> dict[int, dict[str, NamedChain]]:
+@lru_cache(maxsize=_REMEMBERED_VIEWS)
+def _chains(site: MatchedSite, view: View) -> Mapping[int, Mapping[str, NamedChain]]:
     """Return the catheters that each frame shows, by name.
 
     At diastole those of the pair that located the site count.
     """
+    # The service remembers the site, so it would keep the decoded tracks of all sites.
+    site = undecoded(site)
     diastole, track = (site.diastole.a, site.track_a) if view == "a" else (site.diastole.b, site.track_b)
     chains: dict[int, dict[str, NamedChain]] = {}
     for observation in (diastole, *track):

@@ -226,6 +226,15 @@ def deferred(kind: type[T], sha256: str, read: Callable[[], bytes]) -> T:
     return made
 
 
+def undecoded(value: T) -> T:
+    """Return a value that is stored apart as it was read, without the fields that were decoded since.
+
+    The fields of the copy take memory only as long as the copy. Another value is returned unchanged.
+    """
+    source = _source_of(value)
+    return value if source is None else deferred(_plain_kind(type(value)), source.sha256, lambda: source.content)
+
+
 def block_of(value: Any, *, finite: bool = True) -> Block:
     """Return the stored form of one value.
 

@@ -37,7 +37,7 @@ from fluoromap_service.api.results.report_tables import (
     tips,
     tracks,
 )
-from fluoromap_service.api.results.tracks import read_tracks
+from fluoromap_service.api.results.tracks import read_entries
 from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import report_dependencies
@@ -128,7 +128,8 @@ def _values(job_id: str) -> dict[str, Any]:
         guessed = sites_by_row_order(session, job)
         rows = tips(points, snapshot.mapping, chamber)
         electrode_rows = electrodes(points)
-        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE, snapshot.mapping)) if tracked else []
+        followed = read_entries(session, job, Origin.REFERENCE, tip_of=snapshot.mapping) if tracked else ()
+        track_rows = tracks(followed)
         return {
             "job": read_job(session, job),
             "label": study.label if study else "Mapping study",

@@ -135,11 +135,11 @@ CSV_ENTRY = csv_entry(
 SiteQuery = Annotated[str | None, Query(description="Only this site; without it all sites.", examples=["S03"])]
 ViewQuery = Annotated[Literal["a", "b"] | None, Query(description="Only this view; without it all tracked views.")]
 
-TracksJson = dict[str, Any]
-"""An answer as JSON values: pydantic would take too long for thousands of samples."""
-
 Entry = tuple[Literal["tracks", "rejected"], dict[str, Any]]
-"""One entry of the answer as JSON values, and the list to which it belongs."""
+"""One entry of the answer, and the list to which it belongs.
+
+It is JSON values: pydantic would take too long for thousands of samples.
+"""
 
 
 def read_entries(
@@ -179,17 +179,6 @@ def read_entries(
                     "samples": [_sample(sample) for sample in found.samples],
                 },
             )
-
-
-def read_tracks(session: Session, job: Job, origin: Origin, tip_of: str) -> TracksJson:
-    """Return the tracks of a catheter's tips as :class:`Tracks`.
-
-    The errors are those of :func:`read_entries`.
-    """
-    answer: TracksJson = {"frame": _frame(origin_in(job, origin)), "tracks": [], "rejected": []}
-    for name, entry in read_entries(session, job, origin, tip_of=tip_of):
-        answer[name].append(entry)
-    return answer
 
 
 def _frame(origin: Origin) -> dict[str, str]:
