@@ -9,6 +9,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -47,7 +49,7 @@ from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrac
 from fluoromap_service.store.codec import form_of, plain_form
 from fluoromap_service.store.models import Json, StageRow
 from fluoromap_service.study.run_files import checked_run
-from fluoromap_service.study.snapshot import CorrectedElectrode, GantrySnapshot, Snapshot
+from fluoromap_service.study.snapshot import CorrectedElectrode, GantrySnapshot, PluginSnapshot, RunSnapshot, Snapshot
 from fluoromap_workers.point_rows import point_rows
 from fluoromap_workers.tracked_views import TrackedView
 
@@ -171,11 +173,41 @@ def _segment(job: StoredJob, uid: str) -> Work:
         motion, times_ms = np.zeros(facts.frames), np.array(facts.frame_times_ms)
         return Segmentation(frames, None, (), motion, times_ms, facts.r_wave_frames)
 
-    # After a correction the keys of all runs are compared: the facts count as they are stored, without being decoded.
-    shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
-    marked = run.model_dump(include={"corrections"})
-    key = _key(job.snapshot, "segment", run.sha256, *shown, px_per_mm, _as_json(catalogue), marked)
-    return Work(key, Segmentation, compute, refused)
+    return Work(_segment_keys.of(job.snapshot, run, catalogue), Segmentation, compute, refused)
+
+
+class _SegmentKeys:
+    """The keys of the stage ``segment`` of the runs that this process compared last, by the hashes of their files.
+
+    After a correction the keys of all runs are compared, and hardly any has changed.
+    """
+
+    _REMEMBERED = 1024
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._remembered: OrderedDict[str, tuple[tuple[PluginSnapshot, RunSnapshot, Catalogue], str]] = OrderedDict()
+
+    def of(self, snapshot: Snapshot, run: RunSnapshot, catalogue: Catalogue) -> str:
+        """Return the key of a run."""
+        inputs = snapshot.segmenter, run, catalogue
+        with self._lock:
+            known, key = self._remembered.get(run.sha256, (None, ""))
+        if known != inputs:
+            # The facts count as they are stored, without being decoded.
+            shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
+            marked = run.model_dump(include={"corrections"})
+            scale = run.gantry.px_per_mm
+            key = _key(snapshot, "segment", run.sha256, *shown, scale, _as_json(catalogue), marked)
+        with self._lock:
+            self._remembered[run.sha256] = inputs, key
+            self._remembered.move_to_end(run.sha256)
+            while len(self._remembered) > self._REMEMBERED:
+                self._remembered.popitem(last=False)
+        return key
+
+
+_segment_keys = _SegmentKeys()
 
 
 def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:

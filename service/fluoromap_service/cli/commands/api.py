@@ -35,6 +35,9 @@ STOP_SECONDS = 5
 SWITCH_SECONDS = 0.001
 """Longest time that a thread computes while the event loop waits for the interpreter; Python's own default is 5 ms."""
 
+COLLECTOR_THRESHOLDS = (10_000, 20, 20)
+"""Rarer runs of the garbage collector than Python's own: answers and jobs of a large study make thousands of small objects."""
+
 app = typer.Typer(add_completion=False)
 
 
@@ -56,6 +59,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     service = create_app()
     # The loaded code stays. Else the collector would walk through it, and a request would wait for it.
     gc.freeze()
+    gc.set_threshold(*COLLECTOR_THRESHOLDS)
     config = uvicorn.Config(
         service,
         http=TimedConnection,
