@@ -21,7 +21,7 @@ def return_freed_memory() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let the C library keep the memory of a task for the next one, in one place for all threads.
+    """Let the C library keep freed memory, in one place for all threads.
 
     For a process that repeats similar tasks: the system clears each new page before the process gets it.
     """

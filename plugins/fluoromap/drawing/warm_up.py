@@ -16,7 +16,10 @@ _TIMES_MS = np.arange(-60.0, 181.0)
 
 
 def warm_up() -> None:
-    """Draw an octahedron at both sizes, with a site for each time that a label may show."""
+    """Draw an octahedron with many sites, at both sizes.
+
+    Each site has another of the times that labels show.
+    """
     camera = camera_from_gantry(Gantry(30.0, 10.0, 1000.0, 700.0, (0.3, 0.3), _PIXELS, _PIXELS))
     corners = _RADIUS_MM * np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])

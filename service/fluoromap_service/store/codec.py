@@ -227,9 +227,9 @@ def deferred(kind: type[T], sha256: str, read: Callable[[], bytes]) -> T:
 
 
 def undecoded(value: T) -> T:
-    """Return a value that is stored apart as it was read, without the fields that were decoded since.
+    """Return a copy of a deferred value without decoded fields.
 
-    The fields of the copy take memory only as long as the copy. Another value is returned unchanged.
+    The fields of the copy take memory only as long as the copy. A value that was not read from the store is returned unchanged.
     """
     source = _source_of(value)
     return value if source is None else deferred(_plain_kind(type(value)), source.sha256, lambda: source.content)

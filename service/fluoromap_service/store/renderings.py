@@ -46,7 +46,9 @@ def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], b
 
 
 def kept_file(job_id: str, depends_on: dict[str, Any], write: Callable[[IO[bytes]], object]) -> KeptFile:
-    """Return a kept rendering that may be long; write it when there is none.
+    """Return a kept rendering; write it when there is none.
+
+    For long ones, which are never whole in memory.
 
     Parameters
     ----------

@@ -208,7 +208,10 @@ def _run_snapshot(
 
 @functools.lru_cache(maxsize=2048)
 def _facts_json(facts: InstanceFacts) -> dict[str, Any]:
-    """Return the facts of a run as JSON values; each job of a study holds those of all its runs."""
+    """Return the facts of a run as JSON values.
+
+    Each job of a study holds those of all its runs.
+    """
     return facts.to_json()
 
 

@@ -82,7 +82,10 @@ def report_of(job_id: str) -> KeptFile:
 
 
 def write_report_page(job_id: str, page: IO[bytes]) -> None:
-    """Write the page of an ended job, with all results that the job has, into an open file."""
+    """Write the page of an ended job into an open file.
+
+    It shows all results that the job has.
+    """
     with ThreadPoolExecutor(PROCESSES) as threads:
         # The pool draws while this thread makes the tables.
         pictures = _start_pictures(job_id, threads)
