@@ -7,13 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from finished_study import matching, triangulation
+from finished_study import make_study, matching, triangulation
+from sql_statements import sql_statements
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import MatchedSite, Matching, MonoplaneView, Observation, SiteCycle
 from fluoromap.reasons import Reason
+from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.store.codec import decode, encode, plain_form
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.models import Job
+from fluoromap_service.study.snapshot import Snapshot
 from fluoromap_workers import tracked_views
+from fluoromap_workers.stage_inputs import StoredJob, prepare
 from fluoromap_workers.tracked_views import TrackedView
 
 CATALOGUE = Catalogue(
@@ -84,3 +90,18 @@ def test_a_solver_gets_the_frames_and_the_remembered_site_keeps_none() -> None:
         )
     )  # fmt: skip
     assert "track_a" not in vars(site)
+
+
+def test_the_stages_of_all_sites_read_the_same_rows_once(data_dir: Any) -> None:
+    study = make_study()
+    study.mapped()
+    with reading() as session:
+        snapshot = Snapshot.model_validate(session.get_one(Job, study.job_id).snapshot)
+    counts = []
+    for subjects in (["S01"], ["S01", "S02"]):
+        with reading() as session, sql_statements() as statements:
+            job = StoredJob(session, study.job_id, snapshot)
+            for subject in subjects:
+                prepare(job, Claim(1, study.job_id, 1, "monoplane", subject))
+        counts.append(len(statements))
+    assert counts[0] == counts[1] > 0

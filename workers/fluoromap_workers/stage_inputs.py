@@ -12,7 +12,8 @@ import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from copy import copy
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -27,7 +28,6 @@ from fluoromap.contracts import (
     ElectrodePoint,
     FrameChains,
     LocatedSite,
-    MatchedSite,
     Matching,
     Refusal,
     RejectedSite,
@@ -97,6 +97,8 @@ class StoredJob:
     session: Session
     job_id: str
     snapshot: Snapshot
+    rows: dict[StageName, StageRow] = field(default_factory=dict)
+    """Rows that were read. The stages of all sites need the same ones."""
 
     @property
     def catalogue(self) -> Catalogue:
@@ -104,18 +106,19 @@ class StoredJob:
 
     def stage(self, name: StageName) -> StageRow:
         """Return the job's one stage of that name."""
-        row = stage_of(self.session, self.job_id, name)
-        assert row is not None, "every job has one"
-        return row
+        if name not in self.rows:
+            row = stage_of(self.session, self.job_id, name)
+            assert row is not None, "every job has one"
+            self.rows[name] = row
+        return self.rows[name]
 
 
-def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
+def prepare(job: StoredJob, claim: Claim) -> Work:
     """Gather the inputs of a stage that may begin.
 
     The stage compares the plugin's version before it computes. A stored result needs no plugin.
     """
-    stage = STAGES[claim.name]
-    job = StoredJob(session, claim.job_id, snapshot)
+    stage, snapshot = STAGES[claim.name], job.snapshot
     work = _PREPARE[stage.name](job, claim.subject)
 
     def compute(context: Context) -> Any:
@@ -318,7 +321,14 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     views: list[TrackedView] = []
     if matched is not None and located is not None:
         others = () if located.cycle else tuple(site.cycle for site in triangulation.sites if site.cycle)
-        views = [_tracked_view(view, matched, located, job.catalogue, others) for view in job.snapshot.views]
+        a_priori = tuple(_without_name_doubts(point) for point in located.a_priori or located.points)
+        views = [
+            TrackedView(
+                matched=matched, view=view, camera=located.camera(view), catalogue=job.catalogue, a_priori=a_priori,
+                a_priori_frame=located.diastolic_frame(view), cycle=located.cycle, others=others,
+            )
+            for view in job.snapshot.views
+        ]  # fmt: skip
     rejected = [] if views else [_rejected_view(view, name, triangulation) for view in job.snapshot.views]
 
     def compute(context: Context) -> SiteTracks:
@@ -342,21 +352,6 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     return Work(key, SiteTracks, compute, refused)
 
 
-def _tracked_view(
-    view: View, matched: MatchedSite, located: LocatedSite, catalogue: Catalogue, others: tuple[Any, ...]
-) -> TrackedView:
-    return TrackedView(
-        matched=matched,
-        view=view,
-        camera=located.camera(view),
-        catalogue=catalogue,
-        a_priori=tuple(_without_name_doubts(point) for point in located.a_priori or located.points),
-        a_priori_frame=located.diastolic_frame(view),
-        cycle=located.cycle,
-        others=others,
-    )
-
-
 def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
     """Return the point without doubts about its name.
 
@@ -364,7 +359,10 @@ def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
     """
     if NAME_DOUBTS.isdisjoint(point.reasons):
         return point
-    return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
+    # Not by replace, which checks the arrays again: most points of a study have such doubts.
+    certain = copy(point)
+    object.__setattr__(certain, "reasons", tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
+    return certain
 
 
 def _rejected_view(view: View, name: str, triangulation: Triangulation) -> ViewTrack:
