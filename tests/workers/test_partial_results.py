@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import delete, select
 from sqlalchemy.exc import OperationalError
 
-from fluoromap.contracts import RejectedSite, Silent
+from fluoromap.contracts import Matching, RejectedSite, Silent
 from fluoromap.matching import study_matching
 from fluoromap.reasons import Reason
 from fluoromap.segmenter import run_segmentation
@@ -22,6 +22,7 @@ from fluoromap.triangulator import study_triangulation
 from fluoromap.triangulator.site_locator import SiteLocator
 from fluoromap_service.jobs import job_life
 from fluoromap_service.store import files
+from fluoromap_service.store.codec import StoredOtherwise, block_of, decode
 from fluoromap_service.store.engine import writing
 from fluoromap_service.store.models import StageResult, StageRow
 from fluoromap_workers import partial_results
@@ -163,3 +164,31 @@ def test_a_partial_result_is_used_for_equal_inputs_only(data_dir: Path) -> None:
     recall(context, "S02", np.arange(3.0), None)
     recall(StageContext(Silent(), held, "b"), "S01", np.arange(3.0), None)
     assert len(computed) == 4
+
+
+def test_a_process_decodes_a_partial_result_once(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    values = partial_results._Values()
+    monkeypatch.setattr(partial_results, "_values", values)
+    decoded: list[str] = []
+    monkeypatch.setattr(
+        partial_results, "decode", lambda kind, content: decoded.append(kind.__name__) or decode(kind, content)
+    )
+    blocks = [block_of(RejectedSite(f"S{number:02}", (Reason.NO_ELECTRODES,))) for number in range(4)]
+    first = values.value(RejectedSite, blocks[0])
+    assert first == RejectedSite("S00", (Reason.NO_ELECTRODES,))
+    assert values.value(RejectedSite, blocks[0]) is first
+    assert len(decoded) == 1
+    with pytest.raises(StoredOtherwise):
+        values.value(Matching, blocks[0])
+
+
+def test_a_process_remembers_partial_results_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = [block_of(RejectedSite(f"S{number:02}", (Reason.NO_ELECTRODES,))) for number in range(4)]
+    monkeypatch.setattr(partial_results, "_REMEMBERED_BYTES", sum(len(block.content) for block in blocks[:2]))
+    values = partial_results._Values()
+    first = [values.value(RejectedSite, block) for block in blocks[:2]]
+    # The second was used last, so the first gives way.
+    assert values.value(RejectedSite, blocks[1]) is first[1]
+    values.value(RejectedSite, blocks[2])
+    assert values.value(RejectedSite, blocks[1]) is first[1]
+    assert values.value(RejectedSite, blocks[0]) is not first[0]

@@ -165,7 +165,7 @@ def _statements_to_end(count: int, monkeypatch: pytest.MonkeyPatch) -> tuple[int
         statements.append(arguments[2])
 
     monkeypatch.setattr(runner.Snapshot, "model_validate", parse)
-    monkeypatch.setattr(runner, "prepare", lambda session, claim, snapshot: Work("d" * 64, _Answer, _never, str))
+    monkeypatch.setattr(runner, "prepare", lambda job, claim: Work("d" * 64, _Answer, _never, str))
     runner._snapshot.cache_clear()
     with writing() as session:
         sha256 = files.keep_bytes(session, encode(_Answer()))

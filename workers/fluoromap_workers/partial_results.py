@@ -6,6 +6,8 @@ the file of the stage's result. So every worker process finds it, and it is dele
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, TypeVar
@@ -37,6 +39,9 @@ _EARLIER_JOBS = 8
 _EARLIER_RESULTS = 2
 """Number of their newest results whose partial results are used."""
 
+_REMEMBERED_BYTES = 24 << 20
+"""Size limit of the values that a process remembers, counted as stored. In memory they take more."""
+
 
 class Connection(Protocol):
     """The connection of a stage to its worker."""
@@ -44,6 +49,45 @@ class Connection(Protocol):
     def progress(self, fraction: float) -> None: ...
 
     def check(self) -> None: ...
+
+
+class _Values:
+    """The values of the partial results that this process used last, by the hashes of their stored forms.
+
+    After a correction nearly all partial results are those of the job before, and decoding them takes as long as their work.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._remembered: OrderedDict[tuple[type, str], tuple[Any, int]] = OrderedDict()
+        self._bytes = 0
+
+    def value(self, kind: type[T], block: Block) -> T:
+        """Return the value of a block.
+
+        Raises
+        ------
+        StoredOtherwise
+            When the block is no stored ``kind`` of these contracts.
+        """
+        name = kind, block.sha256
+        with self._lock:
+            if name in self._remembered:
+                self._remembered.move_to_end(name)
+                value: T = self._remembered[name][0]
+                return value
+        apart = getattr(kind, "stored_apart", False)
+        value = deferred(kind, block.sha256, lambda: block.content) if apart else decode(kind, block.content)
+        with self._lock:
+            if name not in self._remembered:
+                self._remembered[name] = value, len(block.content)
+                self._bytes += len(block.content)
+            while self._bytes > _REMEMBERED_BYTES:
+                self._bytes -= self._remembered.popitem(last=False)[1][1]
+        return value
+
+
+_values = _Values()
 
 
 class StageContext:
@@ -80,8 +124,7 @@ class StageContext:
         return value
 
     def _used(self, key: str, kind: type[T], block: Block) -> T:
-        apart = getattr(kind, "stored_apart", False)
-        value = deferred(kind, block.sha256, lambda: block.content) if apart else decode(kind, block.content)
+        value = _values.value(kind, block)
         self.partial[key] = block
         return value
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,7 +31,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
     notes = {site.site: site.notes for site in matching.sites}
     located = {site.site: site for site in triangulation.sites}
     refused = {site.site: site.reasons for site in triangulation.rejected}
-    axes_mm = _semi_axes_mm(triangulation)
+    accuracies = _accuracies(triangulation)
     for planned in snapshot.sites:
         site = located.get(planned.site)
         reference_doubts = site.doubts_about(snapshot.reference) if site else ()
@@ -43,7 +43,7 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
                     reasons = refused.get(planned.site) or doubts or (Reason.CATHETER_NOT_FOUND,)
                     rows.append(_rejected(job_id, planned, catheter.name, electrode, reasons))
                 else:
-                    rows.append(_located(job_id, planned, site, point, doubts, reference_doubts, axes_mm[id(point)]))
+                    rows.append(_located(job_id, planned, site, point, doubts, reference_doubts, accuracies[id(point)]))
     for not_ready in snapshot.rejected:
         for catheter in snapshot.catalogue.catheters:
             for electrode in range(1, catheter.electrodes + 1):
@@ -51,33 +51,40 @@ def point_rows(job_id: str, snapshot: Snapshot, matching: Matching, triangulatio
     return rows
 
 
-def _semi_axes_mm(triangulation: Triangulation) -> dict[int, tuple[float, float | None]]:
-    """Return the largest semi-axes of each point's two ellipsoids.
+@dataclass(frozen=True, slots=True)
+class _Accuracy:
+    """Largest semi-axis of a point's ellipsoid in mm, and its covariance: xx, xy, xz, yy, yz, zz."""
 
-    One decomposition serves all points. The keys are the ids of the points. The second axis, relative to the reference catheter,
-    may be missing.
+    semi_axis_mm: float
+    covariance_mm2: list[float]
+
+
+def _accuracies(triangulation: Triangulation) -> dict[int, tuple[_Accuracy, _Accuracy | None]]:
+    """Return the accuracy of each point from the isocentre and from the reference catheter.
+
+    One decomposition serves all points. The keys are the ids of the points. The second accuracy may be missing.
     """
     points = [point for site in triangulation.sites for point in site.points]
-    relative = [point for point in points if point.relative_covariance_mm2 is not None]
     if not points:
         return {}
-    axes_mm = largest_semi_axes_mm(
-        [point.covariance_mm2 for point in points] + [point.relative_covariance_mm2 for point in relative]
-    )
-    of_relative = dict(zip(map(id, relative), axes_mm[len(points) :], strict=True))
-    return {id(point): (axis, of_relative.get(id(point))) for point, axis in zip(points, axes_mm, strict=False)}
+    relative = {id(point): point.relative_covariance_mm2 for point in points}
+    known = {point: covariance for point, covariance in relative.items() if covariance is not None}
+    covariances = np.array([*(point.covariance_mm2 for point in points), *known.values()])
+    sixes: list[list[float]] = covariances[:, *_UPPER].tolist()
+    found = list(map(_Accuracy, largest_semi_axes_mm(covariances), sixes))
+    of_relative = dict(zip(known, found[len(points) :], strict=True))
+    return {id(point): (own, of_relative.get(id(point))) for point, own in zip(points, found, strict=False)}
 
 
 def _located(
     job_id: str, planned: SiteSnapshot, site: LocatedSite, point: ElectrodePoint, doubts: tuple[Reason, ...],
-    reference_doubts: tuple[Reason, ...], semi_axes_mm: tuple[float, float | None],
+    reference_doubts: tuple[Reason, ...], accuracies: tuple[_Accuracy, _Accuracy | None],
 ) -> Json:  # fmt: skip
-    semi_axis_mm, relative_semi_axis_mm = semi_axes_mm
-    relative = relative_semi_axis_mm is not None
+    accuracy, relative = accuracies
     own = (*point.reasons, *site.reasons, *doubts)
-    relative_own = (*own, *reference_doubts) if relative else own
+    relative_own = own if relative is None else (*own, *reference_doubts)
     reasons = dict.fromkeys(relative_own)
-    if not relative:
+    if relative is None:
         reasons[Reason.NO_REFERENCE] = None
     return {
         "job_id": job_id,
@@ -85,9 +92,9 @@ def _located(
         "catheter": point.catheter,
         "electrode": point.electrode,
         "position_mm": point.position_mm.tolist(),
-        "covariance_mm2": _six(point.covariance_mm2),
+        "covariance_mm2": accuracy.covariance_mm2,
         "relative_mm": point.relative_mm.tolist() if point.relative_mm is not None else None,
-        "relative_covariance_mm2": _six(point.relative_covariance_mm2) if relative else None,
+        "relative_covariance_mm2": None if relative is None else relative.covariance_mm2,
         "view_a": planned.view_a,
         "view_b": planned.view_b,
         "frame_a": site.frame_a + 1,
@@ -96,10 +103,8 @@ def _located(
         "residual_b_px": point.residual_px[1],
         "ray_angle_deg": point.ray_angle_deg,
         "lat_ms": planned.lat_ms,
-        "grade": grade_of_axis(semi_axis_mm, own),
-        "relative_grade": Grade.REJECTED
-        if relative_semi_axis_mm is None
-        else grade_of_axis(relative_semi_axis_mm, relative_own),
+        "grade": grade_of_axis(accuracy.semi_axis_mm, own),
+        "relative_grade": Grade.REJECTED if relative is None else grade_of_axis(relative.semi_axis_mm, relative_own),
         "reasons": [str(reason) for reason in reasons],
     }
 
@@ -123,9 +128,3 @@ def _rejected(
         "relative_grade": Grade.REJECTED,
         "reasons": [str(reason) for reason in reasons],
     }
-
-
-def _six(covariance: Any) -> list[float]:
-    """Return the upper triangle row by row: xx, xy, xz, yy, yz, zz."""
-    values: list[float] = np.asarray(covariance)[_UPPER].tolist()
-    return values

@@ -25,6 +25,9 @@ from fluoromap_workers import runner
 
 PROGRESS_SECONDS = 0.5
 
+COLLECTOR_THRESHOLDS = (20_000, 20, 50)
+"""Rarer runs of the garbage collector than Python's own."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -81,6 +84,8 @@ def serve(connection: Connection) -> None:
     warm_up()
     # The loaded code stays. Else the collector would walk through it again while a stage makes its small objects.
     gc.freeze()
+    # A stage makes thousands of small objects without cycles.
+    gc.set_threshold(*COLLECTOR_THRESHOLDS)
     link = WorkerLink(connection)
     link.send("ready")
     while True:

@@ -25,7 +25,7 @@ from fluoromap_service.store.models import File, Job, StageResult
 from fluoromap_service.study.snapshot import Snapshot
 from fluoromap_workers.heartbeat import Heartbeat
 from fluoromap_workers.partial_results import Connection, StageContext
-from fluoromap_workers.stage_inputs import PluginChanged, Work, prepare
+from fluoromap_workers.stage_inputs import PluginChanged, StoredJob, Work, prepare
 
 LONGEST_MESSAGE = 500
 
@@ -198,7 +198,11 @@ def _computed(held: Claim, work: Work, context: StageContext) -> tuple[Any, byte
 
 
 def _prepare(session: Session, claim: Claim) -> Work:
-    return prepare(session, claim, _snapshot(claim.job_id))
+    # The stages of a job share its rows, as far as one transaction reads them.
+    jobs: dict[str, StoredJob] = session.info.setdefault("jobs", {})
+    if claim.job_id not in jobs:
+        jobs[claim.job_id] = StoredJob(session, claim.job_id, _snapshot(claim.job_id))
+    return prepare(jobs[claim.job_id], claim)
 
 
 @functools.lru_cache(maxsize=8)

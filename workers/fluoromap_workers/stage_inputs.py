@@ -9,8 +9,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from copy import copy
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -25,9 +28,7 @@ from fluoromap.contracts import (
     ElectrodePoint,
     FrameChains,
     LocatedSite,
-    MatchedSite,
     Matching,
-    MonoplaneView,
     Refusal,
     RejectedSite,
     Run,
@@ -37,6 +38,7 @@ from fluoromap.contracts import (
     View,
 )
 from fluoromap.fuser.mapped_sites import map_origin, mapped_sites
+from fluoromap.geometry import Camera
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.reasons import Reason
 from fluoromap.registry import build_fuser, build_monoplane, build_segmenter, build_triangulator
@@ -47,8 +49,9 @@ from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrac
 from fluoromap_service.store.codec import form_of, plain_form
 from fluoromap_service.store.models import Json, StageRow
 from fluoromap_service.study.run_files import checked_run
-from fluoromap_service.study.snapshot import CorrectedElectrode, Snapshot
+from fluoromap_service.study.snapshot import CorrectedElectrode, GantrySnapshot, PluginSnapshot, RunSnapshot, Snapshot
 from fluoromap_workers.point_rows import point_rows
+from fluoromap_workers.tracked_views import TrackedView
 
 NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
@@ -94,6 +97,8 @@ class StoredJob:
     session: Session
     job_id: str
     snapshot: Snapshot
+    rows: dict[StageName, StageRow] = field(default_factory=dict)
+    """Rows that were read. The stages of all sites need the same ones."""
 
     @property
     def catalogue(self) -> Catalogue:
@@ -101,18 +106,19 @@ class StoredJob:
 
     def stage(self, name: StageName) -> StageRow:
         """Return the job's one stage of that name."""
-        row = stage_of(self.session, self.job_id, name)
-        assert row is not None, "every job has one"
-        return row
+        if name not in self.rows:
+            row = stage_of(self.session, self.job_id, name)
+            assert row is not None, "every job has one"
+            self.rows[name] = row
+        return self.rows[name]
 
 
-def prepare(session: Session, claim: Claim, snapshot: Snapshot) -> Work:
+def prepare(job: StoredJob, claim: Claim) -> Work:
     """Gather the inputs of a stage that may begin.
 
     The stage compares the plugin's version before it computes. A stored result needs no plugin.
     """
-    stage = STAGES[claim.name]
-    job = StoredJob(session, claim.job_id, snapshot)
+    stage, snapshot = STAGES[claim.name], job.snapshot
     work = _PREPARE[stage.name](job, claim.subject)
 
     def compute(context: Context) -> Any:
@@ -170,11 +176,41 @@ def _segment(job: StoredJob, uid: str) -> Work:
         motion, times_ms = np.zeros(facts.frames), np.array(facts.frame_times_ms)
         return Segmentation(frames, None, (), motion, times_ms, facts.r_wave_frames)
 
-    # After a correction the keys of all runs are compared: the facts count as they are stored, without being decoded.
-    shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
-    marked = run.model_dump(include={"corrections"})
-    key = _key(job.snapshot, "segment", run.sha256, *shown, px_per_mm, _as_json(catalogue), marked)
-    return Work(key, Segmentation, compute, refused)
+    return Work(_segment_keys.of(job.snapshot, run, catalogue), Segmentation, compute, refused)
+
+
+class _SegmentKeys:
+    """The keys of the stage ``segment`` of the runs that this process compared last, by the hashes of their files.
+
+    After a correction the keys of all runs are compared, and hardly any has changed.
+    """
+
+    _REMEMBERED = 1024
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._remembered: OrderedDict[str, tuple[tuple[PluginSnapshot, RunSnapshot, Catalogue], str]] = OrderedDict()
+
+    def of(self, snapshot: Snapshot, run: RunSnapshot, catalogue: Catalogue) -> str:
+        """Return the key of a run."""
+        inputs = snapshot.segmenter, run, catalogue
+        with self._lock:
+            known, key = self._remembered.get(run.sha256, (None, ""))
+        if known != inputs:
+            # The facts count as they are stored, without being decoded.
+            shown = [run.facts[name] for name in ("frame_times_ms", "pixels", "r_wave_frames")]
+            marked = run.model_dump(include={"corrections"})
+            scale = run.gantry.px_per_mm
+            key = _key(snapshot, "segment", run.sha256, *shown, scale, _as_json(catalogue), marked)
+        with self._lock:
+            self._remembered[run.sha256] = inputs, key
+            self._remembered.move_to_end(run.sha256)
+            while len(self._remembered) > self._REMEMBERED:
+                self._remembered.popitem(last=False)
+        return key
+
+
+_segment_keys = _SegmentKeys()
 
 
 def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
@@ -198,7 +234,7 @@ def _chains(electrodes: tuple[CorrectedElectrode, ...]) -> tuple[Chain, ...]:
 def _match(job: StoredJob, study: str) -> Work:
     snapshot, catalogue = job.snapshot, job.catalogue
     segments = {row.subject: row for row in stages_of(job.session, job.job_id, "segment")}
-    cameras = {uid: snapshot.runs[uid].gantry.camera() for uid in segments}
+    cameras = {uid: _camera(snapshot.runs[uid].gantry) for uid in segments}
     views = [(site.site, uid) for site in snapshot.sites for uid in (site.view_a, site.view_b)]
 
     def compute(context: Context) -> Matching:
@@ -206,7 +242,7 @@ def _match(job: StoredJob, study: str) -> Work:
         found = {uid: load_later(Segmentation, row) if row.result else None for uid, row in segments.items()}
         sites = tuple(
             SiteRuns(
-                site.site, cameras[site.view_a], cameras[site.view_b], found[site.view_a], found[site.view_b],
+                site.site, cameras[site.view_a][0], cameras[site.view_b][0], found[site.view_a], found[site.view_b],
             )
             for site in snapshot.sites
         )  # fmt: skip
@@ -216,9 +252,16 @@ def _match(job: StoredJob, study: str) -> Work:
         return Matching((), tuple(RejectedSite(site.site, (refusal.reason,)) for site in snapshot.sites))
 
     # A result's hash says whether it changed: the result itself is not read for the key.
-    results = ((site, plain_form(cameras[uid]), segments[uid].result) for site, uid in views)
+    results = ((site, cameras[uid][1], segments[uid].result) for site, uid in views)
     key = _key(snapshot, "match", _as_json(catalogue), *(part for view in results for part in view))
     return Work(key, Matching, compute, refused)
+
+
+@functools.lru_cache(maxsize=2048)
+def _camera(gantry: GantrySnapshot) -> tuple[Camera, bytes]:
+    """Return the camera of a run, and its part of a key."""
+    camera = gantry.camera()
+    return camera, plain_form(camera)
 
 
 def _triangulate(job: StoredJob, study: str) -> Work:
@@ -275,10 +318,17 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     plugin = job.snapshot.monoplane
     matched = next((site for site in matching.sites if site.site == name), None)
     located = next((site for site in triangulation.sites if site.site == name), None)
-    views: list[MonoplaneView] = []
+    views: list[TrackedView] = []
     if matched is not None and located is not None:
         others = () if located.cycle else tuple(site.cycle for site in triangulation.sites if site.cycle)
-        views = [_monoplane_view(view, matched, located, job.catalogue, others) for view in job.snapshot.views]
+        a_priori = tuple(_without_name_doubts(point) for point in located.a_priori or located.points)
+        views = [
+            TrackedView(
+                matched=matched, view=view, camera=located.camera(view), catalogue=job.catalogue, a_priori=a_priori,
+                a_priori_frame=located.diastolic_frame(view), cycle=located.cycle, others=others,
+            )
+            for view in job.snapshot.views
+        ]  # fmt: skip
     rejected = [] if views else [_rejected_view(view, name, triangulation) for view in job.snapshot.views]
 
     def compute(context: Context) -> SiteTracks:
@@ -287,7 +337,7 @@ def _monoplane(job: StoredJob, name: str) -> Work:
             solver = build_monoplane(plugin.name, plugin.params)
             # One view may support a track where the other does not.
             try:
-                track = _returned(solver.track(view, context), Track, plugin.name)
+                track = _returned(solver.track(view.decoded(), context), Track, plugin.name)
                 tracks.append(ViewTrack(view.view, track, None, ""))
             except Refusal as refusal:
                 tracks.append(ViewTrack(view.view, None, refusal.reason, str(refusal)))
@@ -297,27 +347,9 @@ def _monoplane(job: StoredJob, name: str) -> Work:
         return SiteTracks(name, tuple(ViewTrack(view.view, None, refusal.reason, str(refusal)) for view in views))
 
     key = _key(
-        job.snapshot, "monoplane", name, *(plain_form(view) for view in rejected), *(plain_form(view) for view in views)
+        job.snapshot, "monoplane", name, *(plain_form(view) for view in rejected), *(view.content() for view in views)
     )
     return Work(key, SiteTracks, compute, refused)
-
-
-def _monoplane_view(
-    view: View, matched: MatchedSite, located: LocatedSite, catalogue: Catalogue, others: tuple[Any, ...]
-) -> MonoplaneView:
-    first = view == "a"
-    return MonoplaneView(
-        site=matched.site,
-        view=view,
-        camera=located.camera_a if first else located.camera_b,
-        catalogue=catalogue,
-        frame_times_ms=matched.frame_times_a_ms if first else matched.frame_times_b_ms,
-        observations=matched.track_a if first else matched.track_b,
-        a_priori=tuple(_without_name_doubts(point) for point in located.a_priori or located.points),
-        a_priori_frame=located.frame_a if first else located.frame_b,
-        cycle=located.cycle,
-        others=others,
-    )
 
 
 def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
@@ -325,7 +357,12 @@ def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
 
     They move no electrode, and naming a catheter at one site must not redo the others.
     """
-    return replace(point, reasons=tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
+    if NAME_DOUBTS.isdisjoint(point.reasons):
+        return point
+    # Not by replace, which checks the arrays again: most points of a study have such doubts.
+    certain = copy(point)
+    object.__setattr__(certain, "reasons", tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
+    return certain
 
 
 def _rejected_view(view: View, name: str, triangulation: Triangulation) -> ViewTrack:

@@ -11,21 +11,24 @@ from fluoromap.geometry import Gantry, camera_from_gantry
 
 _RADIUS_MM = 30.0
 _PIXELS = 512
+_TIMES_MS = np.arange(-60.0, 181.0)
+"""The times of most maps, in whole ms as the labels show them: the letters of a label are drawn once in a process."""
 
 
 def warm_up() -> None:
-    """Draw an octahedron with six sites, at both sizes."""
+    """Draw an octahedron with many sites, at both sizes.
+
+    Each site has another of the times that labels show.
+    """
     camera = camera_from_gantry(Gantry(30.0, 10.0, 1000.0, 700.0, (0.3, 0.3), _PIXELS, _PIXELS))
     corners = _RADIUS_MM * np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
     sites = tuple(
-        SurfaceSite(f"S{number:02}", corner, corner, 0.0, lat_ms, None)
-        for number, (corner, lat_ms) in enumerate(
-            zip(corners, np.linspace(4.0, 97.0, len(corners)).tolist(), strict=True)
-        )
+        SurfaceSite(f"S{number:03}", corners[number % 6], corners[number % 6], 0.0, lat_ms, None)
+        for number, lat_ms in enumerate(_TIMES_MS.tolist())
     )
     chamber = ChamberMap(
-        vertices_mm=corners, faces=faces, lat_ms=np.array([site.lat_ms for site in sites]), lat_sd_ms=np.ones(6),
+        vertices_mm=corners, faces=faces, lat_ms=np.linspace(4.0, 97.0, 6), lat_sd_ms=np.ones(6),
         covered=np.ones(6, dtype=np.bool_), sites=sites, earliest=((sites[0].site, 1.0),), total_activation_time_ms=93.0,
         leave_one_out_rms_ms=None, volume_ml=0.0, area_cm2=0.0, coverage=1.0,
     )  # fmt: skip

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from fluoromap.contracts import IntArray
 from fluoromap.geometry import Camera
@@ -89,7 +89,7 @@ def geometry_is_doubtful(table: PairTable, pairs: IntArray, px_per_mm: float) ->
     turn = table.turn_px[i, j]
     spread = np.diag(table.variance_px2[i, j]) + (SHIFT_SD_MM * px_per_mm) ** 2 + turn @ PRIOR_TURN[1] @ turn.T
     distance = table.distance_px[i, j]
-    return bool(chi2.sf(distance @ np.linalg.solve(spread, distance), len(i)) < DOUBTFUL_BELOW)
+    return bool(chdtrc(len(i), distance @ np.linalg.solve(spread, distance)) < DOUBTFUL_BELOW)
 
 
 def groups_with_extra(

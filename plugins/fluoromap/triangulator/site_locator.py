@@ -206,7 +206,7 @@ class SiteLocator:
 
         ``joint`` (N, 3, N, 3) is the covariance of all electrodes in this study.
         """
-        in_any_study = moment.errors(self.any_study).joint_mm2
+        in_any_study, _ = moment.joint(self.any_study)
         if self.origin is None:
             (points, a_priori), reference_mm = self._points_of(site, moment, (joint, in_any_study), doubts)
         else:
@@ -313,7 +313,21 @@ class Moment:
 
     def errors(self, belief: StudyBelief) -> MomentErrors:
         """Return the errors in a study of this belief."""
-        errors = _study_errors(belief, len({catheter for catheter, _ in self.labels}))
+        joint, inflation = self.joint(belief)
+        squares = dict(zip(BUDGET, self.squares_mm2, strict=True))
+        # The electrodes' variances from each pair of study errors.
+        of_pairs = self._study_errors(belief) * (self.study_mm.T @ self.study_mm)
+        names, of = _members(self.shares)
+        for share, square in zip(names, ((of @ of_pairs) * of).sum(axis=1).tolist(), strict=True):
+            squares[share] += square
+        return MomentErrors(inflation, joint, tuple(squares.values()))
+
+    def joint(self, belief: StudyBelief) -> tuple[Array, float]:
+        """Return the covariance (N, 3, N, 3) of all electrodes in a study of this belief.
+
+        The second value is the inflation that it contains.
+        """
+        errors = self._study_errors(belief)
         inflation = 1.0
         if len(self.apart_px):
             expected = self.own_px2 + self.study_px @ errors @ self.study_px.T
@@ -321,15 +335,11 @@ class Moment:
             inflation = misfit / len(expected) if chdtrc(len(expected), misfit) < DOUBTFUL_BELOW else 1.0
         displaced = self.study_mm @ errors
         joint = self.own_mm2 + displaced @ self.study_mm.T
-        squares = dict(zip(BUDGET, self.squares_mm2, strict=True))
-        # The electrodes' variances from each pair of study errors.
-        of_pairs = errors * (self.study_mm.T @ self.study_mm)
-        names = tuple(dict.fromkeys(self.shares))
-        of = np.array([[own == share for own in self.shares] for share in names], dtype=np.float64)
-        for share, square in zip(names, ((of @ of_pairs) * of).sum(axis=1).tolist(), strict=True):
-            squares[share] += square
         n = len(self.labels)
-        return MomentErrors(inflation, (inflation * (joint + joint.T) / 2).reshape(n, 3, n, 3), tuple(squares.values()))
+        return (inflation * (joint + joint.T) / 2).reshape(n, 3, n, 3), inflation
+
+    def _study_errors(self, belief: StudyBelief) -> Array:
+        return _study_errors(belief, len({catheter for catheter, _ in self.labels}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,6 +369,13 @@ def _study_errors(belief: StudyBelief, catheters: int) -> Array:
     It is the same for all sites with as many catheters.
     """
     return study_covariance(belief.params, belief.gantry.covariance, catheters)
+
+
+@functools.lru_cache(maxsize=16)
+def _members(shares: tuple[str, ...]) -> tuple[tuple[str, ...], Array]:
+    """Return the different shares (m,), and which errors belong to each, (m, k), 0 or 1."""
+    names = tuple(dict.fromkeys(shares))
+    return names, np.array([[own == share for own in shares] for share in names], dtype=np.float64)
 
 
 def _squares_mm2(gain: Array, noise_px2: Array, sources: Sequence[ErrorSource]) -> tuple[float, ...]:

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-from contextlib import suppress
 from pathlib import Path
 
 from fluoromap_service.parent_process import end_with_parent
 from fluoromap_service.settings import settings
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-
-
-_ALLOCATOR_LIMITS = ((-8, 2), (-3, 1 << 20), (-1, 4 << 20))
-"""M_ARENA_MAX, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of <malloc.h>, with their values."""
 
 SUPERVISOR = "FLUOROMAP_SUPERVISOR"
 """Variable with the process id of the supervisor that started this program."""
@@ -38,17 +32,6 @@ def limit_threads() -> None:
     # A worker already runs one process for each processor. More threads would only compete.
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
-
-
-def return_freed_memory() -> None:
-    """Let the C library give freed memory back to the system.
-
-    Call it before the first thread starts: by default each thread keeps the memory of its largest answer. C libraries without these
-    options decide by themselves.
-    """
-    with suppress(AttributeError, OSError):
-        for option, value in _ALLOCATOR_LIMITS:
-            ctypes.CDLL(None).mallopt(option, value)
 
 
 def apply_options(host: str | None = None, port: int | None = None, data_dir: Path | None = None) -> None:

@@ -96,8 +96,11 @@ def create(session: Session, study_id: str, snapshot: Snapshot) -> Job:
             for subject in subjects_of(stage, snapshot)
         ]  # fmt: skip
         # A study may have hundreds of runs, and the mapper takes longer for each object than the table's own statement.
-        added = _INSERT_STAGES.returning(StageRow.__table__.c.id, sort_by_parameter_order=True)
-        ids[stage.name] = list(session.connection().execute(added, rows).scalars()) if rows else []
+        # Not with RETURNING: SQLite would run one statement for each row.
+        if rows:
+            session.connection().execute(_INSERT_STAGES, rows)
+        added = select(StageRow.id).where(StageRow.job_id == job.id, StageRow.name == stage.name).order_by(StageRow.id)
+        ids[stage.name] = list(session.scalars(added))
     _report_job(session, job)
     return job
 

@@ -88,6 +88,19 @@ def load(kind: type[T], stage: StageRow) -> T:
     return load_file(kind, stage.result)
 
 
+def load_once(kind: type[T], stage: StageRow) -> T:
+    """Return the decoded result of a stage as :func:`load`, without remembering it.
+
+    For a caller that reads the results of many stages one after the other: their arrays take more memory than the service may use.
+    """
+    sha256 = stage.result
+    if sha256 is None:
+        raise ValueError(f"stage {stage.id} has no result")
+    with _lock:
+        known, _ = _remembered.get(sha256, (None, 0))
+    return known if isinstance(known, kind) else _decoded(kind, files.read(sha256))
+
+
 def load_later(kind: type[T], stage: StageRow) -> T:
     """Return the result of a stage that is done, without reading it.
 
@@ -106,13 +119,17 @@ def load_file(kind: type[T], sha256: str) -> T:
     # Two kinds of results may have the same bytes.
     if not isinstance(known, kind):
         content = files.read(sha256)
-        try:
-            known, size = decode(kind, content), len(content)
-        except StoredOtherwise:
-            sentence = "Another version of fluoromap stored this result. Start a new job to get it."
-            raise Problem(409, "result_outdated", sentence) from None
+        known, size = _decoded(kind, content), len(content)
     remember(sha256, known, size)
     return known
+
+
+def _decoded(kind: type[T], content: bytes) -> T:
+    try:
+        return decode(kind, content)
+    except StoredOtherwise:
+        sentence = "Another version of fluoromap stored this result. Start a new job to get it."
+        raise Problem(409, "result_outdated", sentence) from None
 
 
 def remember(sha256: str, result: Any, size: int) -> None:

@@ -11,8 +11,9 @@ from sqlalchemy.orm import Session
 from fluoromap.contracts import Chain, Matching, NamedChain, Segmentation
 from fluoromap.matching.likely_names import likely_names
 from fluoromap_service.jobs.stage_results import load, stage_of
+from fluoromap_service.results.finished import job_of, snapshot_of
+from fluoromap_service.store.codec import undecoded
 from fluoromap_service.store.models import Job, StageRow, StageState
-from fluoromap_service.study.snapshot import Snapshot
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +82,14 @@ def _named_chains(session: Session, job_id: str, uid: str) -> dict[int, tuple[Na
     stage = stage_of(session, job_id, "match")
     if stage is None or stage.state != StageState.DONE:
         return {}
-    snapshot = Snapshot.model_validate(session.get_one(Job, job_id).snapshot)
+    snapshot = snapshot_of(job_of(session, job_id))
     views = {
         site.site: "a" if site.view_a == uid else "b" for site in snapshot.sites if uid in (site.view_a, site.view_b)
     }
     for site in load(Matching, stage).sites:
         if site.site in views:
-            track = site.track_a if views[site.site] == "a" else site.track_b
+            # The service remembers the site, so it would keep the decoded tracks.
+            shown = undecoded(site)
+            track = shown.track_a if views[site.site] == "a" else shown.track_b
             return {frame: observation.chains for frame, observation in enumerate(track)}
     return {}

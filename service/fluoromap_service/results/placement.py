@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -20,14 +21,18 @@ from fluoromap.contracts import (
 from fluoromap.drawing.map_placement import map_shift_mm, tip_pixel
 from fluoromap.geometry import Camera
 from fluoromap.monoplane.track_samples import FrameOrigins, reference_origins
-from fluoromap_service.jobs.stage_results import SiteTracks, load, stage_of
+from fluoromap_service.jobs.stage_results import SiteTracks, load, load_file, stage_of
 from fluoromap_service.problem import not_found
 from fluoromap_service.results.finished import done_stage, snapshot_of
 from fluoromap_service.results.maps import FinishedMap, map_of
+from fluoromap_service.store.codec import undecoded
 from fluoromap_service.store.models import Job, StageState
 from fluoromap_service.study.snapshot import Snapshot
 
 VIEWS: tuple[View, ...] = ("a", "b")
+
+_REMEMBERED_VIEWS = 8
+"""A person looks at many frames of few runs. The electrodes in all frames of a study take 100 MB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +49,8 @@ class LocatedView:
 class MapPlacement:
     """The map in one view of a located site.
 
-    site : of the view, in 3D. chains : frame, counted from 0 -> catheter -> the electrodes that the frame shows. origins : of
-    the reference catheter in each frame by the track of this view; None where the view has no track.
+    site : of the view, in 3D. chains : frame, counted from 0 -> catheter -> the electrodes that the frame shows. tracks_sha256 :
+    hash of the stored tracks of the site; None where it has none.
     """
 
     view: LocatedView
@@ -54,7 +59,7 @@ class MapPlacement:
     snapshot: Snapshot
     site: LocatedSite
     chains: Mapping[int, Mapping[str, NamedChain]]
-    origins: FrameOrigins | None
+    tracks_sha256: str | None
 
     @property
     def camera(self) -> Camera:
@@ -95,13 +100,23 @@ class MapPlacement:
 
         None at diastole, which located the site, and in frames that do not show the catheter.
         """
-        origins = self.origins
-        if frame == self.view.frame or origins is None or frame >= len(origins.same_frame):
+        # The tracks of a site are long, and most overlays show diastole.
+        if frame == self.view.frame:
             return None
-        if not origins.same_frame[frame]:
+        origins = self._origins
+        if origins is None or frame >= len(origins.same_frame) or not origins.same_frame[frame]:
             return None
         position: Array = origins.positions_mm[frame]
         return position
+
+    @cached_property
+    def _origins(self) -> FrameOrigins | None:
+        """Origins by the reference catheter in each frame of this view's track; None without a track."""
+        if self.tracks_sha256 is None:
+            return None
+        views = load_file(SiteTracks, self.tracks_sha256).views
+        track = next((each.track for each in views if each.view == self.view.view), None)
+        return None if track is None else reference_origins(track, self.site, self.snapshot.reference, None)
 
 
 def located_views(session: Session, job: Job) -> list[LocatedView]:
@@ -140,7 +155,7 @@ def placement_of(session: Session, job: Job, uid: str) -> MapPlacement:
         snapshot=snapshot,
         site=site,
         chains={} if matched is None else _chains(matched, view.view),
-        origins=_origins(session, job, site, view.view, snapshot.reference),
+        tracks_sha256=_tracks_sha256(session, job, site.site),
     )
 
 
@@ -152,11 +167,14 @@ def _views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView
     ]
 
 
-def _chains(site: MatchedSite, view: View) -> dict[int, dict[str, NamedChain]]:
+@lru_cache(maxsize=_REMEMBERED_VIEWS)
+def _chains(site: MatchedSite, view: View) -> Mapping[int, Mapping[str, NamedChain]]:
     """Return the catheters that each frame shows, by name.
 
     At diastole those of the pair that located the site count.
     """
+    # The service remembers the site, so it would keep the decoded tracks of all sites.
+    site = undecoded(site)
     diastole, track = (site.diastole.a, site.track_a) if view == "a" else (site.diastole.b, site.track_b)
     chains: dict[int, dict[str, NamedChain]] = {}
     for observation in (diastole, *track):
@@ -165,9 +183,6 @@ def _chains(site: MatchedSite, view: View) -> dict[int, dict[str, NamedChain]]:
     return chains
 
 
-def _origins(session: Session, job: Job, site: LocatedSite, view: View, reference: str | None) -> FrameOrigins | None:
-    stage = stage_of(session, job.id, "monoplane", site.site)
-    if stage is None or stage.state != StageState.DONE:
-        return None
-    track = next((each.track for each in load(SiteTracks, stage).views if each.view == view), None)
-    return None if track is None else reference_origins(track, site, reference, None)
+def _tracks_sha256(session: Session, job: Job, site: str) -> str | None:
+    stage = stage_of(session, job.id, "monoplane", site)
+    return stage.result if stage is not None and stage.state == StageState.DONE else None

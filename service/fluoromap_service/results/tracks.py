@@ -19,7 +19,7 @@ from fluoromap.monoplane.track_samples import (
     track_samples,
 )
 from fluoromap.reasons import Reason
-from fluoromap_service.jobs.stage_results import SiteTracks, load, stages_of
+from fluoromap_service.jobs.stage_results import SiteTracks, load, load_once, stages_of
 from fluoromap_service.problem import not_found
 from fluoromap_service.results.finished import done_stage, snapshot_of, stage_not_ready
 from fluoromap_service.results.origins import Origin, origin_in
@@ -112,7 +112,7 @@ def _site(
         raise stage_not_ready(job, "monoplane", stage)
     site = next((entry for entry in triangulation.sites if entry.site == stage.subject), None)
     site_reasons = next((entry.reasons for entry in triangulation.rejected if entry.site == stage.subject), ())
-    for result in load(SiteTracks, stage).views:
+    for result in load_once(SiteTracks, stage).views:
         if result.view not in views:
             continue
         if result.track is None or site is None:

@@ -226,6 +226,15 @@ def deferred(kind: type[T], sha256: str, read: Callable[[], bytes]) -> T:
     return made
 
 
+def undecoded(value: T) -> T:
+    """Return a copy of a deferred value without decoded fields.
+
+    The fields of the copy take memory only as long as the copy. A value that was not read from the store is returned unchanged.
+    """
+    source = _source_of(value)
+    return value if source is None else deferred(_plain_kind(type(value)), source.sha256, lambda: source.content)
+
+
 def block_of(value: Any, *, finite: bool = True) -> Block:
     """Return the stored form of one value.
 

@@ -49,7 +49,7 @@ class BrokenFile(Exception):
 
 def path_of(sha256: str) -> Path:
     """Return the path for the content with this hash; the file need not exist."""
-    return settings().files_dir / sha256[:2] / sha256
+    return settings().files_dir.joinpath(sha256[:2], sha256)
 
 
 @contextmanager

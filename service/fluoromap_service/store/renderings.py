@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
@@ -42,25 +42,45 @@ def kept_rendering(job_id: str, depends_on: dict[str, Any], make: Callable[[], b
     make : callable
         Makes the content. It is called outside any transaction.
     """
+    return kept_file(job_id, depends_on, lambda file: file.write(make()))
+
+
+def kept_file(job_id: str, depends_on: dict[str, Any], write: Callable[[IO[bytes]], object]) -> KeptFile:
+    """Return a kept rendering; write it when there is none.
+
+    For long ones, which are never whole in memory.
+
+    Parameters
+    ----------
+    job_id : str
+    depends_on : dict
+        As :func:`kept_rendering`.
+    write : callable
+        Writes the content into an open file, piece by piece. It is called outside any transaction.
+    """
     key = _key(job_id, depends_on)
     kept = _find(key)
     if kept is not None:
         return kept
-    content = make()
-    try:
-        with writing() as session:
-            sha256 = files.keep_bytes(session, content)
-            row = session.scalar(select(Rendering).where(Rendering.key == key))
-            if row is None:
-                session.add(Rendering(job_id=job_id, key=key, sha256=sha256))
-            else:
-                row.sha256 = sha256
-    except IntegrityError:
-        # Another request made the same rendering meanwhile: take that one.
-        kept = _find(key)
-        if kept is None:
-            raise
-        return kept
+    with files.incoming() as path:
+        with path.open("wb") as file:
+            write(file)
+        # Other writers wait for the transaction, so the hash of a long file is made before it.
+        sha256 = files.sha256_of(path)
+        try:
+            with writing() as session:
+                files.keep(session, path, sha256=sha256)
+                row = session.scalar(select(Rendering).where(Rendering.key == key))
+                if row is None:
+                    session.add(Rendering(job_id=job_id, key=key, sha256=sha256))
+                else:
+                    row.sha256 = sha256
+        except IntegrityError:
+            # Another request made the same rendering meanwhile: take that one.
+            kept = _find(key)
+            if kept is None:
+                raise
+            return kept
     return KeptFile(sha256, files.path_of(sha256))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from fluoromap.registry import DEFAULTS, Kind, UnknownPlugin, plugin
-from fluoromap_service.dicom.facts import Point
+from fluoromap_service.dicom.facts import InstanceFacts, Point
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import Study
 from fluoromap_service.study import corrections
@@ -202,7 +203,16 @@ def _run_snapshot(
     assert gantry is not None, "a ready site's runs have their geometry"
     if table_offset_mm is not None:
         gantry = gantry.model_copy(update={"table_offset_mm": table_offset_mm})
-    return RunSnapshot(sha256=run.sha256, facts=run.facts.to_json(), gantry=gantry, corrections=by_hand)
+    return RunSnapshot(sha256=run.sha256, facts=_facts_json(run.facts), gantry=gantry, corrections=by_hand)
+
+
+@functools.lru_cache(maxsize=2048)
+def _facts_json(facts: InstanceFacts) -> dict[str, Any]:
+    """Return the facts of a run as JSON values.
+
+    Each job of a study holds those of all its runs.
+    """
+    return facts.to_json()
 
 
 def _site_snapshot(site: BoundSite) -> SiteSnapshot:

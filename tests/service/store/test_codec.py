@@ -18,6 +18,7 @@ from fluoromap.reasons import Reason
 from fluoromap_service.store import array_pools, codec
 from fluoromap_service.store.codec import (
     StoredOtherwise,
+    block_hash,
     block_of,
     decode,
     deferred,
@@ -25,6 +26,7 @@ from fluoromap_service.store.codec import (
     form_of,
     partial_results,
     plain_form,
+    undecoded,
 )
 from fluoromap_service.store.value_hash import digest
 
@@ -219,6 +221,18 @@ def test_a_deferred_value_of_another_form_says_so() -> None:
     value = deferred(Segmentation, "hash", lambda: encode(_whole()))
     with pytest.raises(StoredOtherwise):
         _ = value.frames
+
+
+def test_an_undecoded_copy_has_the_fields_and_the_hash_of_its_value() -> None:
+    content = encode(_segmentation())
+    value = deferred(Segmentation, "hash", lambda: content)
+    times = value.frame_times_ms
+    copy = undecoded(value)
+    assert "frame_times_ms" not in vars(copy)
+    np.testing.assert_array_equal(copy.frame_times_ms, times)
+    assert block_hash(copy) == block_hash(value) == "hash"
+    whole = _segmentation()
+    assert undecoded(whole) is whole
 
 
 def test_a_digest_distinguishes_types_and_places() -> None:

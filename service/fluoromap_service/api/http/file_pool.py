@@ -16,6 +16,7 @@ from enum import StrEnum
 from typing import ParamSpec, TypeVar
 
 from fluoromap.drawing.warm_up import warm_up as draw_first_picture
+from fluoromap_service.allocator import keep_freed_memory
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 
@@ -139,6 +140,7 @@ def _kill(pool: ProcessPoolExecutor) -> None:
 
 def _prepare_process(mib: int) -> None:
     _limit_memory(mib)
+    keep_freed_memory()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Beside the first task, which may be the upload of a run.
     threading.Thread(target=draw_first_picture, daemon=True).start()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import zipfile
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import IO, cast
 
 from fastapi.responses import StreamingResponse
@@ -22,6 +24,9 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 _LEVEL = 1
 """Compression of the tables: a higher level takes several times as long and saves a fifth."""
+
+_PIECE_BYTES = 1 << 18
+"""A table of a study has 70 MB, so it is read and sent in pieces."""
 
 
 @router.get(
@@ -64,6 +69,11 @@ class _Outflow:
     def flush(self) -> None:
         """Do nothing: the reader takes the bytes when it is ready."""
 
+    @property
+    def waiting(self) -> int:
+        """Number of bytes that nobody has taken."""
+        return len(self._waiting)
+
     def take(self) -> bytes:
         """Return the bytes that were written since the last call."""
         content = bytes(self._waiting)
@@ -82,8 +92,19 @@ def _zipped(files: Iterable[ArchiveFile]) -> Iterator[bytes]:
             entry = zipfile.ZipInfo(file.name, _DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED if file.compress else zipfile.ZIP_STORED
             entry.external_attr = 0o644 << 16
-            archive.writestr(entry, file.content, compresslevel=_LEVEL)
-            # A table of a study has 20 MB, and the next file may need as much while it is made.
-            del file
+            # Only writestr has an argument for it, and that takes the whole content.
+            entry._compresslevel = _LEVEL  # type: ignore[attr-defined]
+            with _opened(file.content) as content:
+                entry.file_size = content.seek(0, io.SEEK_END)
+                content.seek(0)
+                with archive.open(entry, "w") as member:
+                    while piece := content.read(_PIECE_BYTES):
+                        member.write(piece)
+                        if outflow.waiting >= _PIECE_BYTES:
+                            yield outflow.take()
             yield outflow.take()
     yield outflow.take()
+
+
+def _opened(content: bytes | Path) -> IO[bytes]:
+    return content.open("rb") if isinstance(content, Path) else io.BytesIO(content)

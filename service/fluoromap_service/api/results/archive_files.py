@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from fluoromap.drawing.overlay import Look
@@ -31,10 +32,13 @@ from fluoromap_service.store.renderings import KeptFile
 
 @dataclass(frozen=True, slots=True)
 class ArchiveFile:
-    """One file of the archive; ``compress`` is False for content that does not become smaller."""
+    """One file of the archive: its content, or the path of a kept file.
+
+    ``compress`` is False for content that does not become smaller.
+    """
 
     name: str
-    content: bytes
+    content: bytes | Path
     compress: bool = True
 
 
@@ -58,7 +62,7 @@ def archive_files(job_id: str) -> Iterator[ArchiveFile]:
         found = _map_and_fusions(job_id)
         overlays = [] if found is None else _start_overlays(job_id, found[1], threads)
         yield from _tables(job_id, job_version)
-        yield ArchiveFile("report.html", report_of(job_id).path.read_bytes())
+        yield ArchiveFile("report.html", report_of(job_id).path)
         if found is not None:
             yield from _map(job_id, found[0])
         yield from _overlays(overlays)
@@ -76,7 +80,7 @@ def _tables(job_id: str, job_version: int) -> Iterator[ArchiveFile]:
         with reading() as session:
             points = points_csv(points_of(session, job_of(session, job_id), Origin.REFERENCE)).encode()
         yield ArchiveFile("points.csv", points)
-        yield ArchiveFile("tracks.csv", tracks_table_of(job_id, job_version).path.read_bytes())
+        yield ArchiveFile("tracks.csv", tracks_table_of(job_id, job_version).path)
     except Problem as problem:
         if problem.code != "not_ready":
             raise
@@ -96,11 +100,11 @@ def _map_and_fusions(job_id: str) -> tuple[FinishedMap, list[tuple[LocatedView, 
 
 
 def _map(job_id: str, finished: FinishedMap) -> Iterator[ArchiveFile]:
-    yield ArchiveFile("map.png", map_picture_of(job_id, finished).path.read_bytes(), compress=False)
+    yield ArchiveFile("map.png", map_picture_of(job_id, finished).path, compress=False)
     yield ArchiveFile("map.json", activation_map(finished, Origin.REFERENCE).model_dump_json().encode())
     for mesh_format in MeshFormat:
         mesh = mesh_of(job_id, finished, mesh_format, Origin.REFERENCE)
-        yield ArchiveFile(f"mesh/chamber.{mesh_format}", mesh.path.read_bytes())
+        yield ArchiveFile(f"mesh/chamber.{mesh_format}", mesh.path)
 
 
 def _start_overlays(
@@ -119,7 +123,7 @@ def _start_overlays(
 def _overlays(overlays: Sequence[tuple[str, Future[KeptFile]]]) -> Iterator[ArchiveFile]:
     for name, picture in overlays:
         try:
-            yield ArchiveFile(f"{name}.png", picture.result().path.read_bytes(), compress=False)
+            yield ArchiveFile(f"{name}.png", picture.result().path, compress=False)
         except Problem as problem:
             yield ArchiveFile(f"{name}.txt", f"{problem.detail}\n".encode())
 

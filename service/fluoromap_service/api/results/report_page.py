@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
-import io
 import itertools
 import json
 from collections import deque
@@ -14,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, get_args
+from typing import IO, Any, get_args
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -38,7 +37,7 @@ from fluoromap_service.api.results.report_tables import (
     tips,
     tracks,
 )
-from fluoromap_service.api.results.tracks import read_tracks
+from fluoromap_service.api.results.tracks import read_entries
 from fluoromap_service.jobs.stage_results import load, stage_of, stages_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.dependencies import report_dependencies
@@ -50,7 +49,7 @@ from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.results.row_order import sites_by_row_order
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Study
-from fluoromap_service.store.renderings import KeptFile, kept_rendering
+from fluoromap_service.store.renderings import KeptFile, kept_file
 from fluoromap_service.study.snapshot import SiteSnapshot
 
 WEB = Path(__file__).parents[2] / "web"
@@ -79,11 +78,14 @@ def report_of(job_id: str) -> KeptFile:
         guessed = sites_by_row_order(session, job)
         label = study.label if study else None
         depends_on = report_dependencies(template_sha256(), job_id, job.version, label, guessed)
-    return kept_rendering(job_id, depends_on, lambda: report_page(job_id))
+    return kept_file(job_id, depends_on, lambda file: write_report_page(job_id, file))
 
 
-def report_page(job_id: str) -> bytes:
-    """Return the page of an ended job, with all results that the job has."""
+def write_report_page(job_id: str, page: IO[bytes]) -> None:
+    """Write the page of an ended job into an open file.
+
+    It shows all results that the job has.
+    """
     with ThreadPoolExecutor(PROCESSES) as threads:
         # The pool draws while this thread makes the tables.
         pictures = _start_pictures(job_id, threads)
@@ -99,11 +101,9 @@ def report_page(job_id: str) -> bytes:
                 "scripts": _json(packed_modules()),
                 "title": _json(f"{values['label']}: {purpose_text(simulated=values['simulated'])}"),
             }
-        # Piece by piece: the pictures of a large study are in memory once, not as text, as page and as bytes.
-        page = io.BytesIO()
+        # Piece by piece: the page of a large study has tens of MB.
         for piece in _environment().get_template(TEMPLATE).generate(values):
             page.write(piece.encode())
-        return page.getvalue()
 
 
 def prepare() -> None:
@@ -131,7 +131,8 @@ def _values(job_id: str) -> dict[str, Any]:
         guessed = sites_by_row_order(session, job)
         rows = tips(points, snapshot.mapping, chamber)
         electrode_rows = electrodes(points)
-        track_rows = tracks(read_tracks(session, job, Origin.REFERENCE, snapshot.mapping)) if tracked else []
+        followed = read_entries(session, job, Origin.REFERENCE, tip_of=snapshot.mapping) if tracked else ()
+        track_rows = tracks(followed)
         return {
             "job": read_job(session, job),
             "label": study.label if study else "Mapping study",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from fluoromap.contracts import CHI2_95_3D, Calibration, ChamberMap, ErrorBudget
 from fluoromap.reasons import Reason
 from fluoromap_service.api.results.points import Point
+from fluoromap_service.api.results.tracks import Entry
 
 Row = dict[str, Any]
 
@@ -54,36 +55,37 @@ def electrodes(points: Sequence[Point]) -> list[Row]:
     ]  # fmt: skip
 
 
-def tracks(answer: Row) -> list[Row]:
+def tracks(entries: Iterable[Entry]) -> list[Row]:
     """Return a row for every view.
 
     It is the track of its mapping tip, or the reasons why it has none.
 
     Parameters
     ----------
-    answer : dict
-        The answer of ``read_tracks`` for the tip of the mapping catheter.
+    entries : iterable of Entry
+        From ``read_entries`` for the tip of the mapping catheter.
     """
-    rows = []
-    for track in answer["tracks"]:
-        located = [sample for sample in track["samples"] if sample["x_mm"] is not None]
-        reasons = dict.fromkeys(Reason(reason) for sample in track["samples"] for reason in sample["reasons"])
+    rows, rejected = [], []
+    for name, entry in entries:
+        if name == "rejected":
+            rejected.append(
+                {
+                    "site": entry["site"], "view": entry["view"], "solver": "no track", "located": 0, "frames": 0,
+                    "reasons": [Reason(reason) for reason in entry["reasons"]], "along_mm": None, "lateral_mm": None,
+                }
+            )  # fmt: skip
+            continue
+        located = [sample for sample in entry["samples"] if sample["x_mm"] is not None]
+        reasons = dict.fromkeys(Reason(reason) for sample in entry["samples"] for reason in sample["reasons"])
         rows.append(
             {
-                "site": track["site"], "view": track["view"], "solver": track["solver"], "located": len(located),
-                "frames": len(track["samples"]), "reasons": list(reasons),
+                "site": entry["site"], "view": entry["view"], "solver": entry["solver"], "located": len(located),
+                "frames": len(entry["samples"]), "reasons": list(reasons),
                 "along_mm": median(sample["along_ray_sd_mm"] for sample in located) if located else None,
                 "lateral_mm": median(sample["lateral_sd_mm"] for sample in located) if located else None,
             }
         )  # fmt: skip
-    for rejected in answer["rejected"]:
-        rows.append(
-            {
-                "site": rejected["site"], "view": rejected["view"], "solver": "no track", "located": 0, "frames": 0,
-                "reasons": [Reason(reason) for reason in rejected["reasons"]], "along_mm": None, "lateral_mm": None,
-            }
-        )  # fmt: skip
-    return rows
+    return rows + rejected
 
 
 def glossary(rows: Sequence[Row]) -> list[Reason]:

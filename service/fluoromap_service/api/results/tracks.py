@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import itertools
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Iterator
+from typing import IO, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 from fastapi import Query, Request, Response
-from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
@@ -19,7 +16,6 @@ from fluoromap.monoplane.track_samples import Sample
 from fluoromap.reasons import Reason
 from fluoromap_service.api.http.csv_answers import (
     MEDIA_TYPE_UTF8,
-    PIECE_CHARACTERS,
     csv_entry,
     csv_headers,
     csv_pieces,
@@ -29,6 +25,7 @@ from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
+from fluoromap_service.api.http.spooled_answers import spooled_answer
 from fluoromap_service.api.results.origins import FrameOfReference, OriginQuery, Position, Six
 from fluoromap_service.results.dependencies import tracks_table_dependencies
 from fluoromap_service.results.finished import job_of
@@ -36,7 +33,7 @@ from fluoromap_service.results.origins import Origin, origin_in
 from fluoromap_service.results.tracks import RejectedView, tracks_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
-from fluoromap_service.store.renderings import KeptFile, kept_rendering
+from fluoromap_service.store.renderings import KeptFile, kept_file
 
 router = new_router(tags=["results"])
 
@@ -138,11 +135,11 @@ CSV_ENTRY = csv_entry(
 SiteQuery = Annotated[str | None, Query(description="Only this site; without it all sites.", examples=["S03"])]
 ViewQuery = Annotated[Literal["a", "b"] | None, Query(description="Only this view; without it all tracked views.")]
 
-TracksJson = dict[str, Any]
-"""An answer as JSON values: pydantic would take too long for thousands of samples."""
-
 Entry = tuple[Literal["tracks", "rejected"], dict[str, Any]]
-"""One entry of the answer as JSON values, and the list to which it belongs."""
+"""One entry of the answer, and the list to which it belongs.
+
+It is JSON values: pydantic would take too long for thousands of samples.
+"""
 
 
 def read_entries(
@@ -184,33 +181,21 @@ def read_entries(
             )
 
 
-def read_tracks(session: Session, job: Job, origin: Origin, tip_of: str) -> TracksJson:
-    """Return the tracks of a catheter's tips as :class:`Tracks`.
-
-    The errors are those of :func:`read_entries`.
-    """
-    answer: TracksJson = {"frame": _frame(origin_in(job, origin)), "tracks": [], "rejected": []}
-    for name, entry in read_entries(session, job, origin, tip_of=tip_of):
-        answer[name].append(entry)
-    return answer
-
-
 def _frame(origin: Origin) -> dict[str, str]:
     return {"axes": "LPS", "origin": str(origin), "unit": "mm"}
 
 
-def _json_pieces(entries: Iterable[Entry], origin: Origin) -> list[bytes]:
+def _json_pieces(entries: Iterable[Entry], origin: Origin) -> Iterator[bytes]:
     """Return the text of :class:`Tracks`, in pieces."""
-    texts: dict[str, list[bytes]] = {"tracks": [], "rejected": []}
+    yield b'{"frame":' + msgspec.json.encode(_frame(origin)) + b',"tracks":['
+    comma, rejected = b"", []
     for name, entry in entries:
-        texts[name].append(msgspec.json.encode(entry))
-    start = b'{"frame":' + msgspec.json.encode(_frame(origin))
-    lists = [[b',"' + name.encode() + b'":[', *_with_commas(of), b"]"] for name, of in texts.items()]
-    return [start, *itertools.chain.from_iterable(lists), b"}"]
-
-
-def _with_commas(texts: Sequence[bytes]) -> list[bytes]:
-    return [piece for text in texts for piece in (b",", text)][1:]
+        if name == "rejected":
+            rejected.append(msgspec.json.encode(entry))
+            continue
+        yield comma + msgspec.json.encode(entry)
+        comma = b","
+    yield b'],"rejected":[' + b",".join(rejected) + b"]}"
 
 
 def _sample(sample: Sample) -> dict[str, Any]:
@@ -257,42 +242,17 @@ def _lines(entries: Iterable[Entry]) -> Iterator[list[Any]]:
         yield [view["site"], view["view"], *[None] * 20, str(Grade.REJECTED), ";".join(view["reasons"])]
 
 
-def _csv_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
+def _csv_answer(job_id: str, origin: Origin, site: str | None, view: View | None) -> Response:
     with reading() as session:
-        return list(tracks_csv(read_entries(session, job_of(session, job_id), origin, site, view)))
+        pieces = tracks_csv(read_entries(session, job_of(session, job_id), origin, site, view))
+        return spooled_answer(pieces, MEDIA_TYPE_UTF8, csv_headers("tracks.csv"))
 
 
-def _json_of(job_id: str, origin: Origin, site: str | None, view: View | None) -> list[bytes]:
+def _json_answer(job_id: str, origin: Origin, site: str | None, view: View | None) -> Response:
     with reading() as session:
         job = job_of(session, job_id)
-        return _json_pieces(read_entries(session, job, origin, site, view), origin_in(job, origin))
-
-
-def _whole_answer(pieces: Sequence[bytes], media_type: str, headers: dict[str, str]) -> Response:
-    """Return an answer of pieces that are all made.
-
-    They are never joined in memory.
-    """
-    headers = {**headers, "Content-Length": str(sum(map(len, pieces)))}
-    return StreamingResponse(_large_pieces(pieces), 200, headers, media_type)
-
-
-def _large_pieces(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """Return the same bytes in pieces of about 256 KB.
-
-    The server sends each piece from another thread, so small pieces take longer.
-    """
-    waiting = bytearray()
-    for piece in pieces:
-        waiting += piece
-        if len(waiting) >= PIECE_CHARACTERS:
-            yield bytes(waiting)
-            waiting.clear()
-    yield bytes(waiting)
-
-
-def _csv_answer(pieces: Sequence[bytes]) -> Response:
-    return _whole_answer(pieces, MEDIA_TYPE_UTF8, csv_headers("tracks.csv"))
+        pieces = _json_pieces(read_entries(session, job, origin, site, view), origin_in(job, origin))
+        return spooled_answer(pieces, "application/json", {"Vary": "Accept"})
 
 
 def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
@@ -301,13 +261,11 @@ def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
     It is made when there is none. Its coordinates count from the reference catheter.
     """
 
-    def make() -> bytes:
-        content = io.BytesIO()
+    def write(file: IO[bytes]) -> None:
         with reading() as session:
-            content.writelines(tracks_csv(read_entries(session, job_of(session, job_id), Origin.REFERENCE)))
-        return content.getvalue()
+            file.writelines(tracks_csv(read_entries(session, job_of(session, job_id), Origin.REFERENCE)))
 
-    return kept_rendering(job_id, tracks_table_dependencies(job_id, job_version), make)
+    return kept_file(job_id, tracks_table_dependencies(job_id, job_version), write)
 
 
 @router.get(
@@ -332,8 +290,8 @@ def get_tracks(
     is done.
     """
     if wants_csv(request):
-        return _csv_answer(_csv_of(job_id, origin, site, view))
-    return _whole_answer(_json_of(job_id, origin, site, view), "application/json", {"Vary": "Accept"})
+        return _csv_answer(job_id, origin, site, view)
+    return _json_answer(job_id, origin, site, view)
 
 
 @router.get(
@@ -350,4 +308,4 @@ def get_tracks_csv(
     origin: OriginQuery = Origin.REFERENCE,
 ) -> Response:
     """Return the same tracks as `tracks`, always as CSV."""
-    return _csv_answer(_csv_of(job_id, origin, site, view))
+    return _csv_answer(job_id, origin, site, view)

@@ -11,6 +11,7 @@ import typer
 import uvicorn
 
 from fluoromap_service import auth, logs
+from fluoromap_service.allocator import return_freed_memory
 from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.connections import TimedConnection
@@ -19,7 +20,6 @@ from fluoromap_service.cli.environment import (
     apply_options,
     end_with_supervisor,
     keep_compiled_kernels,
-    return_freed_memory,
 )
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir, Host, Port
@@ -34,6 +34,9 @@ STOP_SECONDS = 5
 
 SWITCH_SECONDS = 0.001
 """Longest time that a thread computes while the event loop waits for the interpreter; Python's own default is 5 ms."""
+
+COLLECTOR_THRESHOLDS = (10_000, 20, 20)
+"""Rarer runs of the garbage collector than Python's own: answers and jobs of a large study make thousands of small objects."""
 
 app = typer.Typer(add_completion=False)
 
@@ -56,6 +59,7 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     service = create_app()
     # The loaded code stays. Else the collector would walk through it, and a request would wait for it.
     gc.freeze()
+    gc.set_threshold(*COLLECTOR_THRESHOLDS)
     config = uvicorn.Config(
         service,
         http=TimedConnection,

@@ -276,7 +276,7 @@ def test_a_second_archive_takes_the_files_of_the_first(
     for module, name in (
         (overlay_routes, "run_in_pool"),
         (maps, "run_in_pool"),
-        (report_page, "report_page"),
+        (report_page, "write_report_page"),
         (tracks, "tracks_csv"),
     ):
         monkeypatch.setattr(module, name, never)
