@@ -31,7 +31,7 @@ from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.moved_means import moved_means
-from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, log_odds
+from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
@@ -272,10 +272,10 @@ class ChainDetector:
         floor = min(family.floor for family in families)
         sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
         found = [one.chain for _, one in clear]
+        all_scores = answers_for_each(seen.scores_at, [chain.pixels_uv for chain in found])
         accepted = []
-        for candidates, chain in zip((candidates for candidates, _ in clear), found, strict=True):
+        for (candidates, _), chain, scores in zip(clear, found, all_scores, strict=True):
             others = [other for other in found if other is not chain]
-            scores = seen.scores_at(chain.pixels_uv)
             if self.acceptance.accepts(scores, chain.scores[0], beside):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
                 accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
@@ -323,13 +323,13 @@ class ChainDetector:
         long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
-        odds_of_free, odds = seen.kind_odds_at(free), seen.kind_odds_at(proposed.points_uv)
+        places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
+        odds_of_free, odds, *odds_of_chains = answers_for_each(seen.kind_odds_at, places)
         listed = np.zeros(len(chains), np.bool_)
-        for index, chain in enumerate(chains):
+        for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
             family = self._family(chain)
             if family is None:
                 continue
-            own = seen.kind_odds_at(chain.pixels_uv)
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))

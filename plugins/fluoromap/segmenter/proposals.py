@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -134,6 +134,15 @@ class ImageEvidence(Protocol):
 
 Proposer = Callable[[Image], ImageEvidence]
 """Looks at one log image, (rows, columns) float32."""
+
+
+def answers_for_each(ask: Callable[[Array], Array], places: Sequence[Array]) -> list[Array]:
+    """Return the answers (n,) for each of several sets of places (n, 2), which are asked about at once."""
+    if not places:
+        return []
+    answers = ask(np.concatenate(places))
+    ends = np.cumsum([len(points) for points in places]).tolist()
+    return [answers[end - len(points) : end] for points, end in zip(places, ends, strict=True)]
 
 
 _EVEN_CONTRAST = 4.0

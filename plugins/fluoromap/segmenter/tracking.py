@@ -458,7 +458,8 @@ def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -
             away, bent = chain_distance(track.chain, chain, shift)
             if away <= gate and bent <= _BEND_PX:
                 cost[row, column] = away + 2.0 * bent + unlike
-            elif not chain.manual:
+            elif not chain.manual and (away <= gate or chain.electrodes != track.chain.electrodes):
+                # Turned, the same electrodes have the same mean shift.
                 if row not in others:
                     others[row] = _reverse(chain)
                 away, bent = chain_distance(track.chain, others[row], shift)
