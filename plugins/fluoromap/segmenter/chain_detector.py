@@ -34,6 +34,7 @@ from fluoromap.segmenter.moved_means import moved_means
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.track_agreement import is_same_shape
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
@@ -370,7 +371,14 @@ class ChainDetector:
         return all(chain.score >= weights[list(chain.candidates)].sum() - _WORST_FIT for chain in linked)
 
     def find_again(
-        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+        self,
+        x: Image,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        frame: int | None = None,
+        same_shape: bool = False,
     ) -> Chain | None:
         """Return another frame's chain at its place in this image.
 
@@ -410,7 +418,8 @@ class ChainDetector:
         points = guess + np.einsum("nij,nj->ni", gain, found - guess)
         covariance = gain @ covariance
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-        if not self._in_field(points).all():
+        # The shape comes before the scores: it needs no pass of a network.
+        if not self._in_field(points).all() or (same_shape and not is_same_shape(points, chain.pixels_uv)):
             return None
         scores, variance = seen.scores_at(points), seen.variance_at(points)
         weights = self._evidence(seen.probability_at(points))

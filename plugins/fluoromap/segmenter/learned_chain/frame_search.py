@@ -148,14 +148,21 @@ class FrameSearch:
         return FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
 
     def find_again(
-        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+        self,
+        x: Image,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        frame: int | None = None,
+        same_shape: bool = False,
     ) -> Chain | None:
         """Return a chain of another frame at its place in this log image."""
         if frame is None:
-            return self.detector.find_again(x, chain, shift, reach_px, taken)
+            return self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape)
         self.network.remember(x, self.answers.network.of_frame(frame))
         self.blobs.remember(x, self.answers.blobs.of_frame(frame))
-        again = self.detector.find_again(x, chain, shift, reach_px, taken)
+        again = self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape)
         self._store_blobs(x, frame)
         return again
 

@@ -65,7 +65,7 @@ class Detector:
     def image_evidence(self, x):
         return SimpleNamespace(likeness=Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0))
 
-    def find_again(self, x, known, shift, reach_px, taken):
+    def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False):
         self.found_again.append((float(x.mean()), known))
         return chain(1.0)
 
