@@ -58,11 +58,22 @@ class Layer:
         if self.shape.width == 1:
             flat = _scratch.array("products", out.shape[0] * out.shape[1], self.shape.outputs)
             np.matmul(x.reshape(-1, self.shape.inputs), self.taps[0], out=flat)
-            _write_with_bias(flat, self.bias, self.shape.rectified, out)
+            _add_bias(
+                flat.reshape(out.shape[0], -1), self._bias_of_row(out), self._least, out.reshape(out.shape[0], -1)
+            )
         elif self.shape.stride == 1:
             convolve(x, self.taps, self.bias, self.shape.dilation, out)
         else:
             self._write_with_steps(x, out)
+
+    @property
+    def _least(self) -> np.float32:
+        """Smallest value that the layer answers."""
+        return np.float32(0.0 if self.shape.rectified else -1e30)
+
+    def _bias_of_row(self, out: Image) -> Image:
+        """Return the bias of all pixels of a row of ``out``, one after the other."""
+        return np.tile(self.bias, out.shape[1])
 
     def _write_with_steps(self, x: Image, out: Image) -> None:
         """Sum over the taps: pixels shifted by the tap, times (inputs x outputs).
@@ -78,6 +89,7 @@ class Layer:
             (2 * (down % 2) + right % 2, down // 2 * wide + right // 2)
             for down, right in (divmod(tap, width) for tap in range(width**2))
         ]
+        bias = self._bias_of_row(out)
         strip = max(1, _STRIP_VALUES // (wide * inputs))
         for row in range(0, rows, strip):
             first, last = row * wide, min(row + strip, rows) * wide
@@ -91,7 +103,8 @@ class Layer:
                 for tap, pixels in enumerate(shifted):
                     added_to = 0.0 if tap == 0 else 1.0
                     sgemm(1.0, self.taps[tap].T, pixels.T, beta=added_to, c=products.T, overwrite_c=1)
-            _write_with_bias(products, self.bias, self.shape.rectified, out[row : row + strip])
+            answers = out[row : row + strip]
+            _add_bias(products.reshape(len(answers), -1), bias, self._least, answers.reshape(len(answers), -1))
 
 
 def _padded_parts(x: Image, border: int, rows: int, wide: int) -> Image:
@@ -170,19 +183,9 @@ class ElectrodeNetwork:
         return out
 
 
-def _write_with_bias(flat: Image, bias: Image, rectified: bool, out: Image) -> None:
-    """Write the first columns of each row with the bias added.
-
-    Rows of ``flat`` (pixels, channels) are as long as those of ``out`` or longer. Negative values become 0 where ``rectified``.
-    """
-    rows, columns = out.shape[:2]
-    least = np.float32(0.0 if rectified else -1e30)
-    _add_bias(flat.reshape(rows, -1), np.tile(bias, columns), least, out.reshape(rows, -1))
-
-
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _add_bias(flat, bias, least, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the first columns of each row with the bias (columns,) added, and at least ``least``."""
+    """Write the first values of each row with the bias (values,) added, and at least ``least``. Rows of ``flat`` may be longer."""
     for v in range(out.shape[0]):
         source, target = flat[v], out[v]
         for u in range(bias.size):
