@@ -160,6 +160,6 @@ def probability_of_contrast(contrast_over_noise: Array) -> Array:
 
 def log_odds(probability: Array) -> Array:
     """Return ln(p / (1 - p)) of probabilities, finite for 0 and 1."""
-    inside = np.clip(probability, 1e-9, 1.0 - 1e-9)
+    inside = np.minimum(np.maximum(probability, 1e-9), 1.0 - 1e-9)
     odds: Array = np.log(inside / (1.0 - inside))
     return odds

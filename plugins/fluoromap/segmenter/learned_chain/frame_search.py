@@ -194,10 +194,9 @@ def _motion_px(before: FrameChains, after: FrameChains) -> float:
     """
     farthest = 0.0
     for chain in before.chains:
-        moved = (
-            np.linalg.norm(other.pixels_uv - chain.pixels_uv, axis=1).max()
-            for other in after.chains
-            if other.electrodes == chain.electrodes
-        )
-        farthest = max(farthest, float(min(moved, default=np.inf)))
+        alike = [other.pixels_uv for other in after.chains if other.electrodes == chain.electrodes]
+        if not alike:
+            return np.inf
+        moved = np.linalg.norm(np.array(alike) - chain.pixels_uv, axis=2).max(axis=1)
+        farthest = max(farthest, float(moved.min()))
     return farthest if len(after.chains) >= len(before.chains) else np.inf
