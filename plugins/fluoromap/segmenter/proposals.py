@@ -137,7 +137,10 @@ Proposer = Callable[[Image], ImageEvidence]
 
 
 def answers_for_each(ask: Callable[[Array], Array], places: Sequence[Array]) -> list[Array]:
-    """Return the answers (n,) for each of several sets of places (n, 2), which are asked about at once."""
+    """Ask about several sets of places at once.
+
+    Each set is (n, 2). Returns the answers of each set, (n,).
+    """
     if not places:
         return []
     answers = ask(np.concatenate(places))

@@ -72,7 +72,10 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
 
 
 def is_same_shape(points_uv: Array, others_uv: Array) -> bool:
-    """Return whether the electrodes of a chain lie like those of another, whatever their shift; both (n, 2)."""
+    """Return whether two chains have the same shape.
+
+    Both are (n, 2), of the same electrodes. A common shift does not count.
+    """
     same, _ = _compare(points_uv[None], others_uv[None])
     return bool(same[0, 0])
 

@@ -185,7 +185,10 @@ class ElectrodeNetwork:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _add_bias(flat, bias, least, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the first values of each row with the bias (values,) added, and at least ``least``. Rows of ``flat`` may be longer."""
+    """Write the first values of each row with the bias added.
+
+    Rows of ``flat`` may be longer than ``bias`` and the rows of ``out``. ``least`` : smaller values become this.
+    """
     for v in range(out.shape[0]):
         source, target = flat[v], out[v]
         for u in range(bias.size):

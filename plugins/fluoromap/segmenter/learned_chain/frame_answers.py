@@ -76,7 +76,10 @@ class LatestNetwork:
         return self._latest[1]
 
     def remember(self, x: Image, answer: NetworkEvidence | None) -> None:
-        """Make a stored answer for this image the latest one; without one, ask about few places only."""
+        """Make a stored answer for this image the latest one.
+
+        Without one, the network is asked about few places only.
+        """
         if answer is not None:
             self._latest = x, answer
         elif self._latest is None or self._latest[0] is not x:

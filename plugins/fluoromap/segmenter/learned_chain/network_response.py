@@ -166,7 +166,10 @@ class NetworkResponse:
 
 
 def cell_grid(scale: float) -> tuple[float, float]:
-    """Return frame pixels from cell to cell, and where the first lies; ``scale`` as in :func:`network_scale`."""
+    """Return the distance of cells and the first cell's place.
+
+    Both are in pixels of the frame. ``scale`` : see :func:`network_scale`.
+    """
     return CELL_PX / scale, 0.5 / scale - 0.5
 
 

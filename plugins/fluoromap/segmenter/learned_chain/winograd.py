@@ -130,10 +130,10 @@ def _transform_tiles(padded, wide, down, first_row, lines, tiles, apart_tiles, s
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _join_tiles(answers, apart_answers, bias, dilation, down, first_row, lines, pixels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Transform the answers of rows of tiles back to pixels, along columns, then along rows.
+    """Transform the answers of rows of tiles back to pixels.
 
-    Each step transforms six stretches of memory, ``apart`` from each other, to four that follow each other. The bias is added and
-    negative values become 0. apart_answers : length of one place of all tiles. lines, pixels : memory for steps between.
+    First along columns, then along rows. Each step transforms six stretches of memory, ``apart`` from each other, to four that
+    follow each other. The bias is added and negative values become 0. apart_answers : length of one place of all tiles. lines, pixels : memory for steps between.
     """
     channels, size = bias.size, pixels.size // 4
     zero = np.float32(0)
