@@ -133,7 +133,9 @@ def _join_tiles(answers, apart_answers, bias, dilation, down, first_row, lines, 
     """Transform the answers of rows of tiles back to pixels.
 
     First along columns, then along rows. Each step transforms six stretches of memory, ``apart`` from each other, to four that
-    follow each other. The bias is added and negative values become 0. apart_answers : length of one place of all tiles. lines, pixels : memory for steps between.
+    follow each other. The bias is added and negative values become 0.
+
+    apart_answers : length of one place of all tiles. lines, pixels : memory for steps between.
     """
     channels, size = bias.size, pixels.size // 4
     zero = np.float32(0)
