@@ -32,9 +32,10 @@ from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.moved_means import moved_means
-from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, log_odds
+from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.track_agreement import is_same_shape
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
@@ -283,10 +284,10 @@ class ChainDetector:
         floor = min(family.floor for family in families)
         sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
         found = [one.chain for _, one in clear]
+        all_scores = answers_for_each(seen.scores_at, [chain.pixels_uv for chain in found])
         accepted = []
-        for candidates, chain in zip((candidates for candidates, _ in clear), found, strict=True):
+        for (candidates, _), chain, scores in zip(clear, found, all_scores, strict=True):
             others = [other for other in found if other is not chain]
-            scores = seen.scores_at(chain.pixels_uv)
             if self.acceptance.accepts(scores, chain.scores[0], beside):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
                 accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
@@ -334,13 +335,13 @@ class ChainDetector:
         long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
-        odds_of_free, odds = seen.kind_odds_at(free), seen.kind_odds_at(proposed.points_uv)
+        places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
+        odds_of_free, odds, *odds_of_chains = answers_for_each(seen.kind_odds_at, places)
         listed = np.zeros(len(chains), np.bool_)
-        for index, chain in enumerate(chains):
+        for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
             family = self._family(chain)
             if family is None:
                 continue
-            own = seen.kind_odds_at(chain.pixels_uv)
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
@@ -381,7 +382,14 @@ class ChainDetector:
         return all(chain.score >= weights[list(chain.candidates)].sum() - _WORST_FIT for chain in linked)
 
     def find_again(
-        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+        self,
+        x: Image,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        frame: int | None = None,
+        same_shape: bool = False,
     ) -> Chain | None:
         """Return another frame's chain at its place in this image.
 
@@ -421,7 +429,8 @@ class ChainDetector:
         points = guess + np.einsum("nij,nj->ni", gain, found - guess)
         covariance = gain @ covariance
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-        if not self._in_field(points).all():
+        # The shape comes before the scores: it needs no pass of a network.
+        if not self._in_field(points).all() or (same_shape and not is_same_shape(points, chain.pixels_uv)):
             return None
         scores, variance = seen.scores_at(points), seen.variance_at(points)
         weights = self._evidence(seen.probability_at(points))

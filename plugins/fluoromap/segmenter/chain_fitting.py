@@ -19,6 +19,7 @@ from fluoromap.segmenter.linking import (
 )
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.proposals import answers_for_each
 from fluoromap.segmenter.refinement import ElectrodeFit, predict_on_curve, refine
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 
@@ -98,7 +99,7 @@ def fit_chains(
         ends = _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter.tip_mm, shaft_image)
         directed = fit + ends
         if tip_logits_at is not None and _tip_shows(family.catheter):
-            first, last = (tip_logits_at(electrode_fit.points_uv[:, end]) for end in (0, -1))
+            first, last = answers_for_each(tip_logits_at, [electrode_fit.points_uv[:, end] for end in (0, -1)])
             directed += _TIP_WEIGHT * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
         for index, row in enumerate(rows):
             best = index if directed[index] >= directed[index + len(rows)] else index + len(rows)

@@ -31,9 +31,7 @@ def gaussian(x: Image, sigma: float) -> Image:
         return _blur(x, _taps(sigma))
     small = reduce_by(x, factor)
     added = (factor**2 - 1) / 12.0 + factor**2 / 6.0
-    out = np.empty(x.shape, np.float32)
-    _enlarge(_blur(small, _taps(math.sqrt(sigma**2 - added) / factor)), factor, out)
-    return out
+    return _enlarge(_blur(small, _taps(math.sqrt(sigma**2 - added) / factor)), factor, x.shape)
 
 
 def reduce_by(x: Image, factor: int) -> Image:
@@ -44,9 +42,19 @@ def reduce_by(x: Image, factor: int) -> Image:
     rows, columns = -(-x.shape[0] // factor), -(-x.shape[1] // factor)
     if (rows * factor, columns * factor) != x.shape:
         x = np.pad(x, ((0, rows * factor - x.shape[0]), (0, columns * factor - x.shape[1])), mode="edge")
-    out = np.empty((rows, columns), np.float32)
-    _area_means(np.ascontiguousarray(x, dtype=np.float32), factor, out)
-    return out
+    if factor == 2:
+        # The most frequent reduction: compiled, it takes a quarter of the time.
+        out = np.empty((rows, columns), np.float32)
+        _halve(np.ascontiguousarray(x, dtype=np.float32), out)
+        return out
+    total: Image = x[::factor].astype(np.float32)
+    for part in range(1, factor):
+        total += x[part::factor]
+    sums = [total[:, part::factor] for part in range(factor)]
+    while len(sums) > 1:
+        half = -(-len(sums) // 2)
+        sums = [one + other for one, other in zip(sums, sums[half:], strict=False)] + sums[len(sums) - half : half]
+    return sums[0] * np.float32(1.0 / (factor * factor))
 
 
 @functools.lru_cache(maxsize=64)
@@ -64,7 +72,8 @@ def _taps(sigma: float) -> Image:
 def _blur(x: Image, taps: Image) -> Image:
     out = np.empty(x.shape, np.float32)
     rows, columns = (_reflected(size, taps.size - 1) for size in x.shape)
-    _blur_rows(np.ascontiguousarray(x, dtype=np.float32), taps, rows, columns, out)
+    middle, line = np.empty(x.shape[1], np.float32), np.empty(columns.size, np.float32)
+    _blur_rows(np.ascontiguousarray(x, dtype=np.float32), taps, rows, columns, middle, line, out)
     return out
 
 
@@ -85,14 +94,12 @@ def _add_pair(out, first, second, weight):  # type: ignore[no-untyped-def]  # pr
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blur_rows(x, taps, rows, columns, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _blur_rows(x, taps, rows, columns, middle, line, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Blur across the rows into a line with mirrored ends, then along that line.
 
-    ``rows`` and ``columns`` : see :func:`_reflected`.
+    ``rows`` and ``columns`` : see :func:`_reflected`. ``middle`` and ``line`` : memory for a row without and with mirrored ends.
     """
     reach = taps.size - 1
-    middle = np.empty(out.shape[1], np.float32)
-    line = np.empty(columns.size, np.float32)
     for v in range(out.shape[0]):
         for u in range(middle.size):
             middle[u] = taps[0] * x[v, u]
@@ -108,48 +115,30 @@ def _blur_rows(x, taps, rows, columns, out):  # type: ignore[no-untyped-def]  # 
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _area_means(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    rows, columns = out.shape
-    scale = np.float32(1.0 / (factor * factor))
-    if factor == 2:
-        # The most frequent reduction: without the inner loops it takes a third of the time.
-        for v in range(rows):
-            upper, lower, row = x[2 * v], x[2 * v + 1], out[v]
-            for u in range(columns):
-                row[u] = scale * ((upper[2 * u] + lower[2 * u]) + (upper[2 * u + 1] + lower[2 * u + 1]))
-        return
-    sums = np.empty(x.shape[1], np.float32)
-    for v in range(rows):
-        # Array expressions in a kernel would take two seconds longer to compile.
-        for u in range(sums.size):
-            sums[u] = x[v * factor, u]
-        for k in range(1, factor):
-            row = x[v * factor + k]
-            for u in range(sums.size):
-                sums[u] += row[u]
-        for u in range(columns):
-            total = np.float32(0)
-            for k in range(factor):
-                total += sums[u * factor + k]
-            out[v, u] = total * scale
+def _halve(x, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    quarter = np.float32(0.25)
+    for v in range(out.shape[0]):
+        upper, lower, row = x[2 * v], x[2 * v + 1], out[v]
+        for u in range(row.size):
+            row[u] = quarter * ((upper[2 * u] + lower[2 * u]) + (upper[2 * u + 1] + lower[2 * u + 1]))
+
+
+def _enlarge(small: Image, factor: int, shape: tuple[int, ...]) -> Image:
+    """Interpolate linearly between the centres of the reduced pixels, (rows, columns) of ``shape``."""
+    wide = np.empty((shape[1], small.shape[0]), np.float32)
+    _interpolate_rows(np.ascontiguousarray(small.T), factor, wide)
+    out = np.empty(shape, np.float32)
+    _interpolate_rows(np.ascontiguousarray(wide.T), factor, out)
+    return out
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _enlarge(small, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Interpolate linearly between the centres of the reduced pixels."""
-    rows, columns = small.shape
-    wide = np.empty((rows, out.shape[1]), np.float32)
-    for u in range(out.shape[1]):
-        place = min(max((u + 0.5) / factor - 0.5, 0.0), columns - 1.0)
-        left = int(place)
-        right = min(left + 1, columns - 1)
-        share = np.float32(place - left)
-        for v in range(rows):
-            wide[v, u] = small[v, left] + share * (small[v, right] - small[v, left])
+def _interpolate_rows(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    last = x.shape[0] - 1
     for v in range(out.shape[0]):
-        place = min(max((v + 0.5) / factor - 0.5, 0.0), rows - 1.0)
+        place = min(max((v + 0.5) / factor - 0.5, 0.0), float(last))
         top = int(place)
         share = np.float32(place - top)
-        upper, lower, row = wide[top], wide[min(top + 1, rows - 1)], out[v]
+        upper, lower, row = x[top], x[min(top + 1, last)], out[v]
         for u in range(row.size):
             row[u] = upper[u] + share * (lower[u] - upper[u])

@@ -227,31 +227,36 @@ def best_chains(
     has catheters.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
-    found: list[CandidateChain] = []
     # A long catheter has many chains that differ in one electrode: they must not crowd out the other families.
     most = max(_LEAST_OF_FAMILY, _BEST // len(families))
-    for index, (paths, scores) in enumerate(zip(possible.rows, possible.scores, strict=True)):
-        best = np.argsort(-scores)[:most]
-        found += [
-            CandidateChain(tuple(paths[row].tolist()), index, float(scores[row]))
-            for row in best
-            if np.isfinite(scores[row])
-        ]
-    if not found:
+    best = [np.argsort(-scores)[:most] for scores in possible.scores]
+    best = [rows[np.isfinite(scores[rows])] for rows, scores in zip(best, possible.scores, strict=True)]
+    scores = np.concatenate([of_family[rows] for rows, of_family in zip(best, possible.scores, strict=True)])
+    if not len(scores):
         return ()
-    values = {id(chain): chain.score + families[chain.family].worth for chain in found}
-    found = sorted(found, key=lambda chain: -values[id(chain)])
-    within = np.full((len(found), max(len(chain.candidates) for chain in found)), -1, np.int64)
-    for row, chain in enumerate(found):
-        within[row, : len(chain.candidates)] = chain.candidates
+    family = np.repeat(np.arange(len(families)), [len(rows) for rows in best])
+    longest = max(paths.shape[1] for paths in possible.rows)
+    within = np.full((len(scores), longest), -1, np.int64)
+    for index, (rows, paths) in enumerate(zip(best, possible.rows, strict=True)):
+        within[family == index, : paths.shape[1]] = paths[rows]
+    values = scores + np.array([each.worth for each in families])[family]
+    order = np.argsort(-values, kind="stable")
+    within, family, scores = within[order], family[order], scores[order]
     chosen = chain_search.best_set(
-        np.array([values[id(chain)] for chain in found]),
+        values[order],
         chain_search.count_shared(within, points, _SAME_PLACE_MM * px_per_mm, _SAME_PLACES),
-        np.array([chain.family for chain in found]),
-        np.array([len(family.names) for family in families]),
+        family,
+        np.array([len(each.names) for each in families]),
         _SHARED,
     )
-    return tuple(found[int(index)] for index in chosen)
+    return tuple(
+        CandidateChain(
+            tuple(within[row, : families[family[row]].catheter.electrodes].tolist()),
+            int(family[row]),
+            float(scores[row]),
+        )
+        for row in chosen.tolist()
+    )
 
 
 def chain_score(

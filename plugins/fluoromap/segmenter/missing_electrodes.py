@@ -17,6 +17,7 @@ from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.linking import CatheterFamily
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES, trace_rows
+from fluoromap.segmenter.proposals import answers_for_each
 from fluoromap.segmenter.refinement import predict_on_curve
 
 _LEAST_KNOWN = 3
@@ -37,6 +38,19 @@ class CompletedChains:
     weights: Array
     variance_px2: Array
     rows: tuple[IntArray, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _IncompleteChains:
+    """Chains that lack the same electrodes.
+
+    rows : indices of the candidates from the tip on, (n, electrodes - 1); of a long catheter one row (1, electrodes) with -1 for
+    missing electrodes. missing : indices of the missing electrodes. places_uv : where they are predicted, (n, 2) or (missing, 2).
+    """
+
+    rows: IntArray
+    missing: IntArray
+    places_uv: Array
 
 
 def complete_chains(
@@ -66,43 +80,53 @@ def complete_chains(
         At the isocentre.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
+    incomplete = [_incomplete_chains(points, weights, family.catheter, px_per_mm) for family in families]
+    predicted = [chains.places_uv for of_family in incomplete for chains in of_family]
+    dark_of = iter(answers_for_each(evidence_at, predicted))
     places, gained, spread = [points], [weights], [variance_px2]
     count = len(points)
     rows: list[IntArray] = []
-    for family in families:
+    for family, of_family in zip(families, incomplete, strict=True):
         electrodes = family.catheter.electrodes
-        of_family = [np.zeros((0, electrodes), np.int64)]
-        if electrodes >= MANY_ELECTRODES:
-            traced, positions = trace_rows(points, weights, np.asarray(family.catheter.spacing_mm) * px_per_mm, _MOST)
-            for row, position in zip(traced, positions, strict=True):
-                lacking = np.flatnonzero(row < 0)
+        complete = [np.zeros((0, electrodes), np.int64)]
+        for chains in of_family:
+            dark = next(dark_of)
+            kept = np.arange(len(dark))
+            if electrodes >= MANY_ELECTRODES:
                 # The electrodes on both sides vouch for the place; what shows there may be another catheter.
-                dark = np.clip(evidence_at(position[lacking]), _TRACED_LEAST, 0.0) if len(lacking) else np.zeros(0)
-                numbered = row.copy()
-                numbered[lacking] = count + np.arange(len(lacking))
-                of_family.append(numbered[None])
-                places.append(position[lacking])
-                gained.append(dark)
-                spread.append(np.full(len(lacking), (_TRACED_SD_MM * px_per_mm) ** 2))
-                count += len(lacking)
-            rows.append(np.concatenate(of_family))
-            continue
-        for missing in range(electrodes) if electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1 else ():
-            arc_mm = np.delete(family.catheter.arc_lengths_mm, missing)
-            paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm)
-            predicted = _curve_weights(family.catheter, missing) @ points[paths]
-            dark = evidence_at(predicted)
-            kept = np.flatnonzero(dark > least_evidence)
-            kept = kept[np.argsort(-(dark[kept] + weights[paths[kept]].sum(axis=1)), kind="stable")[:_MOST]]
-            numbers = count + np.arange(len(kept))
-            of_family.append(np.insert(paths[kept], missing, numbers, axis=1))
-            places.append(predicted[kept])
+                dark = np.clip(dark, _TRACED_LEAST, 0.0)
+                sd = _TRACED_SD_MM
+                row = chains.rows.copy()
+                row[0, chains.missing] = count + kept
+                complete.append(row)
+            else:
+                value = dark + weights[chains.rows].sum(axis=1)
+                kept = np.flatnonzero(dark > least_evidence)
+                kept = kept[np.argsort(-value[kept], kind="stable")[:_MOST]]
+                sd = _END_SD_MM if chains.missing[0] in (0, electrodes - 1) else _INNER_SD_MM
+                complete.append(np.insert(chains.rows[kept], chains.missing[0], count + np.arange(len(kept)), axis=1))
+            places.append(chains.places_uv[kept])
             gained.append(dark[kept])
-            sd = _END_SD_MM if missing in (0, electrodes - 1) else _INNER_SD_MM
             spread.append(np.full(len(kept), (sd * px_per_mm) ** 2))
             count += len(kept)
-        rows.append(np.concatenate(of_family))
+        rows.append(np.concatenate(complete))
     return CompletedChains(np.concatenate(places), np.concatenate(gained), np.concatenate(spread), tuple(rows))
+
+
+def _incomplete_chains(points: Array, weights: Array, catheter: Catheter, px_per_mm: float) -> list[_IncompleteChains]:
+    """Return the chains of candidates (n, 2) that lack electrodes of a catheter."""
+    electrodes, spacing_px = catheter.electrodes, np.asarray(catheter.spacing_mm) * px_per_mm
+    found = []
+    if electrodes >= MANY_ELECTRODES:
+        for row, position in zip(*trace_rows(points, weights, spacing_px, _MOST), strict=True):
+            missing = np.flatnonzero(row < 0)
+            found.append(_IncompleteChains(row[None], missing, position[missing]))
+    elif electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1:
+        for number in range(electrodes):
+            arc_mm = np.delete(catheter.arc_lengths_mm, number)
+            paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm)
+            found.append(_IncompleteChains(paths, np.array([number]), _curve_weights(catheter, number) @ points[paths]))
+    return found
 
 
 @functools.lru_cache(maxsize=256)

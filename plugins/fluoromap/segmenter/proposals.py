@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -136,6 +136,18 @@ Proposer = Callable[[Image], ImageEvidence]
 """Looks at one log image, (rows, columns) float32."""
 
 
+def answers_for_each(ask: Callable[[Array], Array], places: Sequence[Array]) -> list[Array]:
+    """Ask about several sets of places at once.
+
+    Each set is (n, 2). Returns the answers of each set, (n,).
+    """
+    if not places:
+        return []
+    answers = ask(np.concatenate(places))
+    ends = np.cumsum([len(points) for points in places]).tolist()
+    return [answers[end - len(points) : end] for points, end in zip(places, ends, strict=True)]
+
+
 _EVEN_CONTRAST = 4.0
 
 
@@ -151,6 +163,6 @@ def probability_of_contrast(contrast_over_noise: Array) -> Array:
 
 def log_odds(probability: Array) -> Array:
     """Return ln(p / (1 - p)) of probabilities, finite for 0 and 1."""
-    inside = np.clip(probability, 1e-9, 1.0 - 1e-9)
+    inside = np.minimum(np.maximum(probability, 1e-9), 1.0 - 1e-9)
     odds: Array = np.log(inside / (1.0 - inside))
     return odds

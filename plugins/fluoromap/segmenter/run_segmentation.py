@@ -52,7 +52,14 @@ class Detector(Protocol):
         """
 
     def find_again(
-        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+        self,
+        x: Image,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        frame: int | None = None,
+        same_shape: bool = False,
     ) -> Chain | None:
         """Return a chain of another frame at its place in this log image.
 
@@ -70,6 +77,8 @@ class Detector(Protocol):
             Other catheters that were already found in this image.
         frame : int, optional
             Number of the frame; None for a mean of frames.
+        same_shape : bool
+            Whether the electrodes must lie as in the other frame.
 
         Returns
         -------
@@ -324,16 +333,18 @@ def _chain_search(
 ) -> ChainSearch:
     kept: tuple[int, Image] | None = None
 
-    def search(frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain]) -> Chain | None:
+    def search(
+        frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], same_shape: bool = False
+    ) -> Chain | None:
         def find() -> FoundAgain:
             nonlocal kept
             if kept is None or kept[0] != frame:
                 context.check()
                 kept = frame, log_image(frame)
-            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken, frame))
+            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken, frame, same_shape))
 
         # A frame may be a number of NumPy, and ``taken`` may grow later.
-        return recall(FoundAgain, (int(frame), chain, shift, reach_px, len(taken), *taken), find).chain
+        return recall(FoundAgain, (int(frame), chain, shift, reach_px, same_shape, len(taken), *taken), find).chain
 
     return search
 

@@ -64,11 +64,20 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
         usual = int(better[np.argmin(np.abs(frames[better] - frame))])
         shape = chains[int(frames[usual])]
         found = search(frame, shape, np.nanmedian(places[row] - places[usual], axis=0), _REACH_PX)
-        if found is not None and found.electrodes == shape.electrodes:
-            agrees, _ = _compare(found.pixels_uv[None], shape.pixels_uv[None])
-            if agrees[0, 0]:
-                agreed[frame] = replace(found, kinds=chains[frame].kinds)
+        if found is None or found.electrodes != shape.electrodes:
+            continue
+        if is_same_shape(found.pixels_uv, shape.pixels_uv):
+            agreed[frame] = replace(found, kinds=chains[frame].kinds)
     return agreed
+
+
+def is_same_shape(points_uv: Array, others_uv: Array) -> bool:
+    """Return whether two chains have the same shape.
+
+    Both are (n, 2), of the same electrodes. A common shift does not count.
+    """
+    same, _ = _compare(points_uv[None], others_uv[None])
+    return bool(same[0, 0])
 
 
 def _places(chains: Sequence[Chain]) -> Array:

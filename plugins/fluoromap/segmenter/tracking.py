@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -36,8 +37,14 @@ _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
 _DISPLACED_WEIGHT = 0.5
 
-ChainSearch = Callable[[int, Chain, Array, float, Sequence[Chain]], Chain | None]
-"""(frame, chain in another frame, expected shift, reach in pixels, other chains of the frame) -> the chain in that frame."""
+
+class ChainSearch(Protocol):
+    """Search for a chain of another frame."""
+
+    def __call__(
+        self, frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], same_shape: bool = False
+    ) -> Chain | None:
+        """Return the chain in a frame; see :meth:`~fluoromap.segmenter.run_segmentation.Detector.find_again`."""
 
 
 TrackJudge = Callable[[Mapping[int, Chain]], bool]
@@ -299,7 +306,7 @@ def _search_beside(track: _Track, tracks: Sequence[_Track], search: ChainSearch)
 
     def beside(frame: int, chain: Chain, shift: Array, reach_px: float) -> Chain | None:
         taken = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
-        return search(frame, chain, shift, reach_px, taken)
+        return search(frame, chain, shift, reach_px, taken, same_shape=True)
 
     return beside
 
@@ -458,7 +465,8 @@ def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -
             away, bent = chain_distance(track.chain, chain, shift)
             if away <= gate and bent <= _BEND_PX:
                 cost[row, column] = away + 2.0 * bent + unlike
-            elif not chain.manual:
+            elif not chain.manual and (away <= gate or chain.electrodes != track.chain.electrodes):
+                # Turned, the same electrodes have the same mean shift.
                 if row not in others:
                     others[row] = _reverse(chain)
                 away, bent = chain_distance(track.chain, others[row], shift)

@@ -95,12 +95,11 @@ def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
 
     The line comes from ``before``. Each point is at most ``reach`` from the last.
     """
-    return int(_count_in_line(at[0], at[1], before[0], before[1], left, reach))
+    return int(_count_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_in_line(at_u, at_v, before_u, before_v, left, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
-    is_left = np.ones(left.shape[0], np.bool_)
+def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     for count in range(left.shape[0]):
         way_u, way_v = at_u - before_u, at_v - before_v
         length = max(math.sqrt(way_u * way_u + way_v * way_v), 1e-9)

@@ -188,6 +188,25 @@ def test_an_end_that_looks_like_a_tip_is_the_tip():
         np.testing.assert_allclose(found.pixels_uv[0], end, atol=2.0)
 
 
+def test_a_chain_of_another_shape_is_refused_before_its_electrodes_are_judged(monkeypatch):
+    catheter = row_of("ablation", (60, 60), 0.3)
+    image = drawn([catheter])
+    evidence = Evidence(image, catheter, [0.9] * 4, [0.9] * 4)
+    (known,) = chains_found(image, catheter, [0.9] * 4, [0.9] * 4)
+    bent = known.pixels_uv.copy()
+    bent[2] += 4.6 * np.array([-np.sin(0.3), np.cos(0.3)])
+    other = replace(known, pixels_uv=bent, covariance_px2=np.tile(25.0 * np.eye(2), (4, 1, 1)))
+    detector = detector_of(evidence)
+    same = detector.find_again(image, known, np.zeros(2), 3.0, (), same_shape=True)
+    assert same is not None
+    assert lies_on(same, catheter)
+    found = detector.find_again(image, other, np.zeros(2), 3.0, ())
+    assert found is not None
+    assert np.linalg.norm(found.pixels_uv[2] - bent[2]) > 4.0
+    monkeypatch.setattr(Evidence, "scores_at", None)
+    assert detector.find_again(image, other, np.zeros(2), 3.0, (), same_shape=True) is None
+
+
 def test_less_likely_points_between_half_of_the_electrodes_make_a_long_chain_unlisted():
     catheter = row_of("cs", (60, 60), 0.4)
     gaps = 0.5 * (catheter[:-1] + catheter[1:])[[1, 3, 5, 7]]

@@ -103,7 +103,8 @@ def test_tracking_searches_displaced_electrodes_beside_the_other_chains():
     found = [FrameChains(frame, (chain(points), other), None) for frame, points in enumerate(places)]
     taken_there = []
 
-    def search(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken, same_shape=False):
+        assert same_shape
         taken_there.append((frame, len(taken)))
         return chain(beating(frame))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -65,7 +65,7 @@ class BlobResponse:
             _half_laplacian(blurred, sigma, stack[level])
         valid = inside[::reduction, ::reduction][::3, ::3]
         noise = np.array([robust_sd(level[::3, ::3][valid]) for level in stack])
-        best, other = np.empty((2, *small.shape), np.float32)
+        best, other = np.empty(small.shape, np.float32), np.empty(small.shape, np.float32)
         np.multiply(stack[0], np.float32(1.0 / noise[0]), out=best)
         for level in range(1, len(stack)):
             np.multiply(stack[level], np.float32(1.0 / noise[level]), out=other)
@@ -73,6 +73,15 @@ class BlobResponse:
         of_pixels = pixel_noise(small, inside[::reduction, ::reduction])
         of_positions = of_pixels if reduction == 2 else max(of_pixels, _noise_at_half_size(x, inside))
         return cls(stack, best, noise, smooth, of_pixels, of_positions, reduction, px_per_mm)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the images, bytes."""
+        return self.stack.nbytes + self.best.nbytes + self.smooth.nbytes
+
+    def without_stack(self) -> BlobResponse:
+        """Return what answers about places need; it makes no proposals."""
+        return replace(self, stack=np.empty((0, *self.smooth.shape), np.float32))
 
     @property
     def likeness(self) -> Likeness:

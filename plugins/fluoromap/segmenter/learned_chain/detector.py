@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import replace
 
 from fluoromap.catheters import Catalogue
@@ -12,15 +11,15 @@ from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.frame_search import (
     AT_REST_MM,
     AT_REST_MS,
     SHARED_MS,
     FrameSearch,
-    LatestNetwork,
-    StoredAnswers,
 )
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
+from fluoromap.segmenter.learned_chain.nearby_network import NearbyNetwork
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import Trust
@@ -60,31 +59,21 @@ def electrode_chains(
     """Return the detector of one run.
 
     It finds electrodes by network and blobs, and the chains of them. ``alone`` : no other frame confirms a chain. ``frame_ms`` :
-    longest time between frames. ``answers`` : the network's answers for frames of this run that earlier detectors stored.
+    longest time between frames. ``answers`` : those of network and blobs for frames of this run that earlier detectors stored.
     """
     ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
     least_noise = _COARSE_NOISE if pixels.bits_stored <= _COARSE_BITS else 0.0
 
-    network = LatestNetwork(lambda x: NetworkResponse.of_image(x, trained, px_per_mm))
-
-    latest: deque[tuple[Image, BlobResponse]] = deque(maxlen=2)
-
-    def blobs_of(x: Image) -> BlobResponse:
-        """Return the blobs of an image.
-
-        A frame and its mean with its neighbours are asked about in turn.
-        """
-        for image, blobs in latest:
-            if image is x:
-                return blobs
-        latest.append((x, BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm)))
-        return latest[-1][1]
+    network = LatestNetwork(
+        lambda x: NetworkResponse.of_image(x, trained, px_per_mm), lambda x: NearbyNetwork(x, trained, px_per_mm)
+    )
+    blobs = LatestBlobs(lambda x: BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm))
 
     def ask(x: Image) -> JointEvidence:
         faint = 0.0 if alone else FAINT_LOG_ODDS
-        return JointEvidence(network(x), blobs_of(x), px_per_mm, least_noise, faint, network.reach_cells)
+        return JointEvidence(network(x), blobs(x), px_per_mm, least_noise, faint, network.reach_cells)
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else IN_A_RUN)
     rest_px = AT_REST_MM * px_per_mm if frame_ms <= AT_REST_MS else 0.0
     stored = StoredAnswers() if answers is None else answers
-    return FrameSearch(detector, network, len(catalogue.catheters), frame_ms <= SHARED_MS, rest_px, stored)
+    return FrameSearch(detector, network, blobs, len(catalogue.catheters), frame_ms <= SHARED_MS, rest_px, stored)

@@ -58,11 +58,22 @@ class Layer:
         if self.shape.width == 1:
             flat = _scratch.array("products", out.shape[0] * out.shape[1], self.shape.outputs)
             np.matmul(x.reshape(-1, self.shape.inputs), self.taps[0], out=flat)
-            _add_bias(flat, self.bias, out.shape[1], self.shape.rectified, out)
+            _add_bias(
+                flat.reshape(out.shape[0], -1), self._bias_of_row(out), self._least, out.reshape(out.shape[0], -1)
+            )
         elif self.shape.stride == 1:
             convolve(x, self.taps, self.bias, self.shape.dilation, out)
         else:
             self._write_with_steps(x, out)
+
+    @property
+    def _least(self) -> np.float32:
+        """Smallest value that the layer answers."""
+        return np.float32(0.0 if self.shape.rectified else -1e30)
+
+    def _bias_of_row(self, out: Image) -> Image:
+        """Return the bias of all pixels of a row of ``out``, one after the other."""
+        return np.tile(self.bias, out.shape[1])
 
     def _write_with_steps(self, x: Image, out: Image) -> None:
         """Sum over the taps: pixels shifted by the tap, times (inputs x outputs).
@@ -78,6 +89,7 @@ class Layer:
             (2 * (down % 2) + right % 2, down // 2 * wide + right // 2)
             for down, right in (divmod(tap, width) for tap in range(width**2))
         ]
+        bias = self._bias_of_row(out)
         strip = max(1, _STRIP_VALUES // (wide * inputs))
         for row in range(0, rows, strip):
             first, last = row * wide, min(row + strip, rows) * wide
@@ -86,12 +98,13 @@ class Layer:
             if inputs == 1:
                 windows = _scratch.array("windows", width**2, last - first)
                 np.concatenate([pixels[:, 0] for pixels in shifted], out=windows.reshape(-1))
-                sgemm(1.0, self.taps[:, 0].T, windows.T, trans_b=1, c=products.T, overwrite_c=1)
+                np.matmul(windows.T, self.taps[:, 0], out=products)
             else:
                 for tap, pixels in enumerate(shifted):
                     added_to = 0.0 if tap == 0 else 1.0
                     sgemm(1.0, self.taps[tap].T, pixels.T, beta=added_to, c=products.T, overwrite_c=1)
-            _add_bias(products, self.bias, wide, self.shape.rectified, out[row : row + strip])
+            answers = out[row : row + strip]
+            _add_bias(products.reshape(len(answers), -1), bias, self._least, answers.reshape(len(answers), -1))
 
 
 def _padded_parts(x: Image, border: int, rows: int, wide: int) -> Image:
@@ -105,12 +118,9 @@ def _padded_parts(x: Image, border: int, rows: int, wide: int) -> Image:
     for down in range(2):
         for right in range(2):
             part = parts[2 * ((down + border) % 2) + (right + border) % 2]
-            if channels == 1:
-                pixels = x[down::2, right::2]
-                top, left = (down + border) // 2, (right + border) // 2
-                part[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
-            else:
-                _copy_part(x, down, right, border, part)
+            pixels = x[down::2, right::2]
+            top, left = (down + border) // 2, (right + border) // 2
+            part[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
     return parts.reshape(4, -1, channels)
 
 
@@ -174,28 +184,12 @@ class ElectrodeNetwork:
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _copy_part(x, down, right, border, part):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Copy every other row and column into a part of the padded picture.
+def _add_bias(flat, bias, least, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the first values of each row with the bias added.
 
-    They start at row ``down`` and column ``right``.
+    Rows of ``flat`` may be longer than ``bias`` and the rows of ``out``. ``least`` : smaller values become this.
     """
-    for v in range(down, x.shape[0], 2):
-        line, target = x[v], part[(v + border) // 2]
-        for column in range((x.shape[1] - right + 1) // 2):
-            pixel, goal = line[2 * column + right], target[(right + border) // 2 + column]
-            for k in range(pixel.size):
-                goal[k] = pixel[k]
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _add_bias(flat, bias, wide, rectified, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the first columns of each row with the bias added.
-
-    A row has ``wide`` pixels. Negative values become 0 where ``rectified``.
-    """
-    least = np.float32(0.0) if rectified else np.float32(-1e30)
     for v in range(out.shape[0]):
-        for u in range(out.shape[1]):
-            source, target = flat[v * wide + u], out[v, u]
-            for k in range(bias.size):
-                target[k] = max(source[k] + bias[k], least)
+        source, target = flat[v], out[v]
+        for u in range(bias.size):
+            target[u] = max(source[u] + bias[u], least)

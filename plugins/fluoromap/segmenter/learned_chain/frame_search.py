@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
+from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
 
@@ -19,7 +20,7 @@ SHARED_MS = 21.0
 AT_REST_MS, AT_REST_MM = 40.0, 1.0
 """Time between frames, and motion since the network's answer, up to which the answer serves frames of a catheter at rest."""
 
-_OWN_CELLS, _MEAN_CELLS, _NEXT_FRAME_CELLS = 1, 2, 3
+_MEAN_CELLS, _NEXT_FRAME_CELLS = 2, 3
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
 _AT_REST_CELLS, _MOST_AT_REST = 2, 3
 """How far the answer may lie from a catheter at rest, and how many frames may share it."""
@@ -30,58 +31,6 @@ _LEAST_SHARE = 0.5
 
 
 _NO_FRAME = FrameChains(-2, (), Reason.MANUAL_NEEDED)
-
-
-@dataclass(slots=True, eq=False)
-class StoredAnswers:
-    """The network's answers for single frames of one run, up to ``most_bytes``.
-
-    Tracking searches some of these frames again.
-    """
-
-    most_bytes: int = 64 << 20
-    _of_frame: dict[int, NetworkResponse] = field(default_factory=dict, init=False)
-    _bytes: int = field(default=0, init=False)
-
-    def of_frame(self, frame: int) -> NetworkResponse | None:
-        """Return the answer for a frame where it is stored."""
-        return self._of_frame.get(frame)
-
-    def store(self, frame: int, response: NetworkResponse | None) -> None:
-        """Store the answer for a frame, if there is one and room for it."""
-        size = 0 if response is None else response.answers.nbytes + response.probability.nbytes
-        if response is not None and frame not in self._of_frame and self._bytes + size <= self.most_bytes:
-            self._of_frame[frame] = response
-            self._bytes += size
-
-
-@dataclass(slots=True, eq=False)
-class LatestNetwork:
-    """The network's answer that the next image is judged with.
-
-    of_image : asks the network. reach_cells : how far from a place its answer may lie; above 1 the latest answer is used again.
-    """
-
-    of_image: Callable[[Image], NetworkResponse]
-    reach_cells: int = _OWN_CELLS
-    _latest: tuple[Image, NetworkResponse] | None = field(default=None, init=False)
-
-    def __call__(self, x: Image) -> NetworkResponse:
-        """Return the latest answer where it is borrowed, else the one for this image."""
-        answer = None if self._latest is None or self.reach_cells == _OWN_CELLS else self._latest[1]
-        answer = self.latest_for(x) if answer is None else answer
-        if answer is None:
-            answer = self.of_image(x)
-            self._latest = x, answer
-        return answer
-
-    def latest_for(self, x: Image) -> NetworkResponse | None:
-        """Return the latest answer where it is the one for this image."""
-        return self._latest[1] if self._latest is not None and self._latest[0] is x else None
-
-    def remember(self, x: Image, answer: NetworkResponse) -> None:
-        """Make a stored answer for this image the latest one."""
-        self._latest = x, answer
 
 
 @dataclass(slots=True, eq=False)
@@ -99,6 +48,7 @@ class FrameSearch:
 
     detector: ChainDetector
     network: LatestNetwork
+    blobs: LatestBlobs
     catheters: int
     shares: bool
     rest_px: float = 0.0
@@ -116,7 +66,8 @@ class FrameSearch:
         is_next = frame == self._next
         entry = self._find_chains(x, frame, beside)
         if is_next:
-            self.answers.store(frame, self._own)
+            self.answers.network.store(frame, self._own)
+            self._store_blobs(x, frame)
         self._next, self._own = frame + 1, None
         self._step_px = _motion_px(self._latest, entry) if self._latest.frame == frame - 1 else np.inf
         self._latest = entry
@@ -132,15 +83,15 @@ class FrameSearch:
             _, entry = self._search(x, first, frame, _AT_REST_CELLS)
             if entry.manual_needed is None and _motion_px(self._answered, entry) <= self.rest_px:
                 return entry
-        searched, entry = self._search(x, first, frame, _OWN_CELLS)
+        searched, entry = self._search(x, first, frame, OWN_CELLS)
         if beside and self._lacks_catheters(entry):
-            again, other = self._search(x, second, frame, _OWN_CELLS)
+            again, other = self._search(x, second, frame, OWN_CELLS)
             if len(other.chains) > len(entry.chains):
                 searched, entry, self._noisy = again, other, True
         if self._lacks_catheters(entry):
             split = self.detector.split_pairs(searched)
             if split is not searched:
-                other = self._in_frame(x, split, 1 + len(beside), frame, _OWN_CELLS)
+                other = self._in_frame(x, split, 1 + len(beside), frame, OWN_CELLS)
                 entry = other if len(other.chains) > len(entry.chains) else entry
         if entry.manual_needed is None:
             self._answered = entry
@@ -170,7 +121,7 @@ class FrameSearch:
         self.network.reach_cells = reach_cells
         mean = _mean(x, beside) if beside else x
         searched = self.detector.search(mean)
-        self.network.reach_cells = _OWN_CELLS
+        self.network.reach_cells = OWN_CELLS
         self._own = self.network.latest_for(x) or self._own
         return searched, self._in_frame(x, searched, 1 + len(beside), frame, reach_cells)
 
@@ -193,20 +144,31 @@ class FrameSearch:
             least = _LEAST_SHARE * np.mean(searched.seen.likeness.at(chain.pixels_uv)) / np.sqrt(averaged)
             if again is not None and np.mean(in_frame.at(again.pixels_uv)) >= least:
                 chains.append(again)
-        self.network.reach_cells = _OWN_CELLS
+        self.network.reach_cells = OWN_CELLS
         return FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
 
     def find_again(
-        self, x: Image, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], frame: int | None = None
+        self,
+        x: Image,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        frame: int | None = None,
+        same_shape: bool = False,
     ) -> Chain | None:
         """Return a chain of another frame at its place in this log image."""
-        answer = None if frame is None else self.answers.of_frame(frame)
-        if answer is not None:
-            self.network.remember(x, answer)
-        again = self.detector.find_again(x, chain, shift, reach_px, taken)
-        if frame is not None:
-            self.answers.store(frame, self.network.latest_for(x))
+        if frame is None:
+            return self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape)
+        self.network.remember(x, self.answers.network.of_frame(frame))
+        self.blobs.remember(x, self.answers.blobs.of_frame(frame))
+        again = self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape)
+        self._store_blobs(x, frame)
         return again
+
+    def _store_blobs(self, x: Image, frame: int) -> None:
+        blobs = self.blobs.latest_for(x)
+        self.answers.blobs.store(frame, None if blobs is None else blobs.without_stack())
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first."""
@@ -232,10 +194,9 @@ def _motion_px(before: FrameChains, after: FrameChains) -> float:
     """
     farthest = 0.0
     for chain in before.chains:
-        moved = (
-            np.linalg.norm(other.pixels_uv - chain.pixels_uv, axis=1).max()
-            for other in after.chains
-            if other.electrodes == chain.electrodes
-        )
-        farthest = max(farthest, float(min(moved, default=np.inf)))
+        alike = [other.pixels_uv for other in after.chains if other.electrodes == chain.electrodes]
+        if not alike:
+            return np.inf
+        moved = np.linalg.norm(np.array(alike) - chain.pixels_uv, axis=2).max(axis=1)
+        farthest = max(farthest, float(moved.min()))
     return farthest if len(after.chains) >= len(before.chains) else np.inf

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 
@@ -36,7 +36,7 @@ class JointEvidence:
     place the network's answer for it may lie.
     """
 
-    network: NetworkResponse
+    network: NetworkEvidence
     blobs: BlobResponse
     px_per_mm: float
     least_noise: float

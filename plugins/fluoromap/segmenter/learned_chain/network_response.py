@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -38,6 +39,18 @@ _HEAT, _OFFSET_U, _OFFSET_V, _LOG_VARIANCE, _TIP = (
 )
 
 
+class NetworkEvidence(Protocol):
+    """What the network says about one log image; see :class:`NetworkResponse`."""
+
+    def proposals(self, allowed: BoolArray, expected: int) -> Proposals: ...
+
+    def halves_of_pairs(self) -> Array: ...
+
+    def tip_logits_at(self, points_uv: Array, reach_cells: int = 1) -> Array: ...
+
+    def probability_at(self, points_uv: Array, reach_cells: int = 1) -> Array: ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NetworkResponse:
     """Answers of the network to one log image.
@@ -54,6 +67,11 @@ class NetworkResponse:
     first_px: float
     variance_gain: float
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the answers, bytes."""
+        return self.answers.nbytes + self.probability.nbytes
+
     @classmethod
     def of_image(cls, x: Image, trained: Trained, px_per_mm: float) -> NetworkResponse:
         """Ask the network about a log image, reduced to the network's scale."""
@@ -67,9 +85,8 @@ class NetworkResponse:
         It has ``scale`` times the size of the frame.
         """
         answers = answer(trained, normalise(small))
-        odds = trained.odds_gain * answers[..., _HEAT] + trained.odds_offset
-        probability = 1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))
-        cell_px, first_px = CELL_PX / scale, 0.5 / scale - 0.5
+        probability = electrode_probability(trained, answers)
+        cell_px, first_px = cell_grid(scale)
         found = _peaks(probability, answers, cell_px, first_px, trained.variance_gain)
         return cls(probability, answers, found, cell_px, first_px, trained.variance_gain)
 
@@ -132,10 +149,8 @@ class NetworkResponse:
 
     def probability_at(self, points_uv: Array, reach_cells: int = 1) -> Array:
         """Return the highest probability of the cells within reach of each point, (n,)."""
-        highest = np.zeros(len(points_uv))
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
-        _write_highest(self.probability, middle, reach_cells, highest)
-        return highest
+        return highest_near(self.probability, middle, reach_cells)
 
     def _cells_near(self, points_uv: Array, reach_cells: int) -> tuple[IntArray, IntArray]:
         """Return rows and columns of the cells near points.
@@ -148,6 +163,28 @@ class NetworkResponse:
         v = np.clip(middle[:, 1, None, None] + steps[:, None], 0, rows - 1)
         u = np.clip(middle[:, 0, None, None] + steps, 0, columns - 1)
         return v, u
+
+
+def cell_grid(scale: float) -> tuple[float, float]:
+    """Return the distance of cells and the first cell's place.
+
+    Both are in pixels of the frame. ``scale`` : see :func:`network_scale`.
+    """
+    return CELL_PX / scale, 0.5 / scale - 0.5
+
+
+def electrode_probability(trained: Trained, answers: Image) -> Image:
+    """Return the probability of an electrode's centre in each cell by the answers (rows, columns, heads)."""
+    odds = trained.odds_gain * answers[..., _HEAT] + trained.odds_offset
+    probability: Image = 1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0)))
+    return probability
+
+
+def highest_near(probability: Image, cells: IntArray, reach: int) -> Array:
+    """Return the highest probability of the cells within reach of each of the cells (n, 2), (n,)."""
+    highest = np.zeros(len(cells))
+    _write_highest(probability, cells, reach, highest)
+    return highest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -15,7 +15,7 @@ from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
-from fluoromap.segmenter.learned_chain.frame_search import StoredAnswers
+from fluoromap.segmenter.learned_chain.frame_answers import StoredAnswers
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, segment_run

@@ -62,126 +62,117 @@ def convolve(x: Image, places: Image, bias: Image, dilation: int, out: Image) ->
     wide = (across + 1) * inputs
     padded = _scratch.around(f"padded {dilation} {inputs}", x.shape, dilation**2, _TILE * down + 2, _TILE, wide)
     lines = _scratch.array("lines", 6 * _TILE * (across + 1) * max(inputs, bias.size))
+    pixels = _scratch.array("pixels", _TILE * across * bias.size)
     _split(x, dilation, padded)
     for first in range(0, tile_rows, strip):
         count = min(strip, tile_rows - first) * across
         tiles = _scratch.array("tiles", _PLACES, count, inputs)
         answers = _scratch.array("answers", _PLACES, count, bias.size)
         _transform_tiles(
-            padded.reshape(dilation**2, -1, _TILE * wide), inputs, first, lines, tiles.reshape(_PLACES, -1)
+            padded.reshape(-1), wide, down, first, lines, tiles.reshape(-1), count * inputs, across * inputs
         )
         np.matmul(tiles, places, out=answers)
-        _join_tiles(answers.reshape(_PLACES, -1), bias, dilation, across, first, lines, out)
+        _join_tiles(answers.reshape(-1), count * bias.size, bias, dilation, down, first, lines, pixels, out)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _split(x, dilation, padded):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _split(x: Image, dilation: int, padded: Image) -> None:
     """Write all pixels to their places in the padded pictures (picture, row, column modulo 4, column / 4 x channels)."""
-    channels = x.shape[2]
-    for v in range(x.shape[0]):
-        line = x[v]
-        for part in range(dilation):
-            target = padded[v % dilation * dilation + part, v // dilation + 1]
-            for column, u in enumerate(range(part, x.shape[1], dilation)):
-                first = (column + 1) // 4 * channels
-                goal = target[(column + 1) % 4][first : first + channels]
-                pixel = line[u]
-                for k in range(channels):
-                    goal[k] = pixel[k]
+    whole_pixels = np.dtype((np.void, 4 * x.shape[2]))
+    pixels, pictures = x.view(whole_pixels)[..., 0], padded.view(whole_pixels)
+    for down in range(dilation):
+        for right in range(dilation):
+            picture = pictures[down * dilation + right, 1:]
+            for column in range(_TILE):
+                part = pixels[down::dilation, right + column * dilation :: _TILE * dilation]
+                first = (column + 1) // _TILE
+                picture[: part.shape[0], (column + 1) % _TILE, first : first + part.shape[1]] = part
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _transform_tiles(padded, channels, first_row, lines, tiles):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _transform_tiles(padded, wide, down, first_row, lines, tiles, apart_tiles, size):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Transform rows of tiles along columns, then along rows.
 
-    ``lines`` : memory for what is transformed along columns only.
+    Each step transforms six stretches of memory to the six places. The first four stretches begin at ``start`` and are ``apart``,
+    the others at ``after``. The places lie ``further`` from each other. All steps share their loops, because each loop costs a
+    tenth of a second to compile. Indices are unsigned: checks for negative ones would keep the loops from running on several
+    values at once.
+
+    padded : all padded pictures, each with ``down`` rows of tiles. wide : length of a quarter of a row. lines : memory for what is
+    transformed along columns only. apart_tiles : length of one place of all tiles. size : length of one place of a row of tiles.
     """
-    row = padded.shape[2]
-    wide = row // 4
-    size = wide - channels
-    down = padded.shape[1] // 4
-    pictures, places = padded.reshape(-1), tiles.reshape(-1)
-    for i in range(tiles.shape[1] // size):
+    row = 4 * wide
+    for i in range(apart_tiles // size):
         picture, tile = (first_row + i) // down, (first_row + i) % down
-        above = (picture * padded.shape[1] + 4 * tile) * row
-        _transform(pictures, above, row, above + 4 * row, lines, row, row)
-        for k in range(6):
-            goal = places[6 * k * tiles.shape[1] + i * size :]
-            _transform(lines, k * row, wide, k * row + channels, goal, tiles.shape[1], size)
+        for step in range(7):
+            if step == 0:
+                source, start, apart = padded, (picture * (4 * down + 2) + 4 * tile) * row, row
+                after, goal, place, further, count = start + 4 * row, lines, 0, row, row
+            else:
+                source, start, apart = lines, (step - 1) * row, wide
+                after, goal, place = start + wide - size, tiles, 6 * (step - 1) * apart_tiles + i * size
+                further, count = apart_tiles, size
+            for end in range(2):
+                p, a = np.uintp(place + 5 * end * further), np.uintp(start + end * apart)
+                c, e = np.uintp(start + (2 + end) * apart), np.uintp(after + end * apart)
+                for j in range(np.uintp(count)):
+                    goal[p + j] = _PRODUCT * source[a + j] - _SUM * source[c + j] + source[e + j]
+            b, c = np.uintp(start + apart), np.uintp(start + 2 * apart)
+            d, e = np.uintp(start + 3 * apart), np.uintp(after)
+            for middle in range(4):
+                p = np.uintp(place + (1 + middle) * further)
+                other = _B2 if middle < 2 else _A2
+                point = (_A1 if middle < 2 else _B1) * np.float32(1 - 2 * (middle % 2))
+                for j in range(np.uintp(count)):
+                    goal[p + j] = (
+                        source[e + j] - other * source[c + j] + point * (source[d + j] - other * source[b + j])
+                    )
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _transform(source, start, apart, after, goal, further, count):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Transform six stretches of ``source`` to the six places.
-
-    The first four stretches begin at ``start`` and are ``apart``, the others at ``after``. The places lie ``further`` from each
-    other. Indices are unsigned: checks for negative ones would keep the loops from running on several values at once.
-    """
-    size = np.uintp(count)
-    for end in range(2):
-        place, a = np.uintp(5 * end * further), np.uintp(start + end * apart)
-        c, e = np.uintp(start + (2 + end) * apart), np.uintp(after + end * apart)
-        for j in range(size):
-            goal[place + j] = _PRODUCT * source[a + j] - _SUM * source[c + j] + source[e + j]
-    b, c = np.uintp(start + apart), np.uintp(start + 2 * apart)
-    d, e = np.uintp(start + 3 * apart), np.uintp(after)
-    for middle in range(4):
-        place = np.uintp((1 + middle) * further)
-        other = _B2 if middle < 2 else _A2
-        point = (_A1 if middle < 2 else _B1) * np.float32(1 - 2 * (middle % 2))
-        for j in range(size):
-            goal[place + j] = source[e + j] - other * source[c + j] + point * (source[d + j] - other * source[b + j])
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _join_tiles(answers, bias, dilation, across, first_row, lines, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _join_tiles(answers, apart_answers, bias, dilation, down, first_row, lines, pixels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Transform the answers of rows of tiles back to pixels.
 
-    The bias is added and negative values become 0.
+    First along columns, then along rows. Each step transforms six stretches of memory, ``apart`` from each other, to four that
+    follow each other. The bias is added and negative values become 0.
+
+    apart_answers : length of one place of all tiles. lines, pixels : memory for steps between.
     """
-    channels = bias.size
-    size = across * channels
-    down = (out.shape[0] + 4 * dilation - 1) // (4 * dilation)
-    places, pixels = answers.reshape(-1), np.empty(4 * size, np.float32)
+    channels, size = bias.size, pixels.size // 4
     zero = np.float32(0)
-    for i in range(answers.shape[1] // size):
+    for i in range(apart_answers // size):
         part, tile = (first_row + i) // down, (first_row + i) % down
-        for k in range(6):
-            _transform_back(places, k * answers.shape[1] + i * size, 6 * answers.shape[1], lines[4 * k * size :], size)
-        for s in range(4):
-            v = (4 * tile + s) * dilation + part // dilation
-            if v >= out.shape[0]:
+        for step in range(10):
+            v = (4 * tile + step - 6) * dilation + part // dilation
+            if step < 6:
+                source, start, apart = answers, step * apart_answers + i * size, 6 * apart_answers
+                goal, place = lines, 4 * step * size
+            elif v < out.shape[0]:
+                source, start, apart = lines, (step - 6) * size, 4 * size
+                goal, place = pixels, 0
+            else:
                 break
-            _transform_back(lines, s * size, 4 * size, pixels, size)
+            b, c = np.uintp(start + apart), np.uintp(start + 2 * apart)
+            d, e = np.uintp(start + 3 * apart), np.uintp(start + 4 * apart)
+            for end in range(2):
+                p, alone = np.uintp(place + 3 * end * size), np.uintp(start + 5 * end * apart)
+                near, far, sign = (_A3, _B3, -_ONE) if end else (_ONE, _ONE, _ONE)
+                for j in range(np.uintp(size)):
+                    goal[p + j] = (
+                        near * (source[b + j] + sign * source[c + j])
+                        + far * (source[d + j] + sign * source[e + j])
+                        + source[alone + j]
+                    )
+            for middle in range(2):
+                p = np.uintp(place + (1 + middle) * size)
+                near, far, sign = (_A2, _B2, _ONE) if middle else (_A1, _B1, -_ONE)
+                for j in range(np.uintp(size)):
+                    goal[p + j] = near * (source[b + j] + sign * source[c + j]) + far * (
+                        source[d + j] + sign * source[e + j]
+                    )
+            if step < 6:
+                continue
             for column, u in enumerate(range(part % dilation, out.shape[1], dilation)):
                 begin = column % 4 * size + column // 4 * channels
                 pixel, target = pixels[begin : begin + channels], out[v, u]
                 for k in range(channels):
                     target[k] = max(pixel[k] + bias[k], zero)
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _transform_back(source, start, apart, goal, count):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Transform six stretches of ``source`` to four pixels.
-
-    The stretches are ``apart``. The pixels follow each other in ``goal``.
-    """
-    size = np.uintp(count)
-    b, c = np.uintp(start + apart), np.uintp(start + 2 * apart)
-    d, e = np.uintp(start + 3 * apart), np.uintp(start + 4 * apart)
-    for end in range(2):
-        pixel, alone = np.uintp(3 * end * count), np.uintp(start + 5 * end * apart)
-        near, far, sign = (_A3, _B3, -_ONE) if end else (_ONE, _ONE, _ONE)
-        for j in range(size):
-            goal[pixel + j] = (
-                near * (source[b + j] + sign * source[c + j])
-                + far * (source[d + j] + sign * source[e + j])
-                + source[alone + j]
-            )
-    for middle in range(2):
-        pixel = np.uintp((1 + middle) * count)
-        near, far, sign = (_A2, _B2, _ONE) if middle else (_A1, _B1, -_ONE)
-        for j in range(size):
-            goal[pixel + j] = near * (source[b + j] + sign * source[c + j]) + far * (
-                source[d + j] + sign * source[e + j]
-            )

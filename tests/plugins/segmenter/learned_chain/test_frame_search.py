@@ -8,7 +8,9 @@ import numpy as np
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.learned_chain.frame_search import FrameSearch, LatestNetwork, StoredAnswers
+from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredByFrame
+from fluoromap.segmenter.learned_chain.frame_search import FrameSearch
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.proposals import Likeness, Proposals
 
@@ -16,6 +18,10 @@ POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 X = np.zeros((32, 32), np.float32)
 NONE_FOUND = Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
 ANSWER = NetworkResponse(X, np.zeros((32, 32, 5), np.float32), NONE_FOUND, 2.0, 0.0, 1.0)
+
+
+def blobs_of(x):
+    return BlobResponse(np.zeros((3, *x.shape), np.float32), x, np.ones(3), x, 0.01, 0.01, 1, 3.0)
 
 
 def chain(shift=0.0):
@@ -59,16 +65,16 @@ class Detector:
     def image_evidence(self, x):
         return SimpleNamespace(likeness=Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0))
 
-    def find_again(self, x, known, shift, reach_px, taken):
+    def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False):
         self.found_again.append((float(x.mean()), known))
         return chain(1.0)
 
 
 def search(level, shares, rest_px=0.0):
     asked = []
-    network = LatestNetwork(lambda x: asked.append(float(x.mean())) or ANSWER)
+    network = LatestNetwork(lambda x: asked.append(float(x.mean())) or ANSWER, lambda x: SimpleNamespace(of=x))
     detector = Detector(network, level)
-    return FrameSearch(detector, network, 1, shares, rest_px), detector, asked
+    return FrameSearch(detector, network, LatestBlobs(blobs_of), 1, shares, rest_px), detector, asked
 
 
 def test_a_frame_without_its_catheter_is_searched_in_the_mean_and_the_chain_found_again_in_the_frame():
@@ -155,16 +161,41 @@ def test_tracking_uses_the_answers_for_frames_that_were_searched_with_their_own(
     assert asked == [1.0, 2.0, 5.0]
 
 
+def test_tracking_asks_the_network_about_places_of_frames_that_have_no_answer_of_their_own():
+    frames, _, asked = search(2.0, shares=False)
+    x = X + 5
+    frames.find_again(x, chain(), np.zeros(2), 5.0, (), 1)
+    assert frames.network(x).of is x
+    assert asked == []
+
+
+def test_tracking_uses_the_blobs_of_frames_that_were_searched():
+    frames, _, _ = search(1.0, shares=False)
+    x = X + 1
+    frames.blobs(x)
+    frames.find_chains(x, 0)
+    again = X + 1
+    frames.find_again(again, chain(), np.zeros(2), 5.0, (), 0)
+    assert frames.blobs(again).best is x
+
+
 def test_the_mean_of_a_run_is_not_taken_for_the_frame_whose_number_it_has():
     frames, _, _ = search(1.0, shares=False)
     frames.find_chains(X + 1, 0)
     frames.find_chains(X + 9, 5)
-    assert frames.answers.of_frame(0) is not None
-    assert frames.answers.of_frame(5) is None
+    assert frames.answers.network.of_frame(0) is not None
+    assert frames.answers.network.of_frame(5) is None
 
 
 def test_stored_answers_have_a_limit():
-    answers = StoredAnswers(most_bytes=ANSWER.answers.nbytes + ANSWER.probability.nbytes)
+    answers = StoredByFrame(most_bytes=ANSWER.answers.nbytes + ANSWER.probability.nbytes)
     for frame, response in enumerate((ANSWER, None, ANSWER)):
         answers.store(frame, response)
     assert [answers.of_frame(frame) is not None for frame in range(3)] == [True, False, False]
+
+
+def test_stored_blobs_answer_about_places_without_the_memory_of_their_scales():
+    blobs = blobs_of(X)
+    stored = blobs.without_stack()
+    assert stored.nbytes == blobs.best.nbytes + blobs.smooth.nbytes
+    assert np.array_equal(stored.scores_at(POINTS), blobs.scores_at(POINTS))
