@@ -9,6 +9,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.linking import CatheterFamily, PossibleChains
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 
 _FADED, _LEAST_CONTRAST = 0.5, 8.0
 _LEAST_AT_END = 2
@@ -22,8 +23,8 @@ def without_shorter_catheters(
 ) -> PossibleChains:
     """Return the likely chains that no catheter with fewer electrodes explains.
 
-    A chain loses 0.75 of its score for each place at its ends that shows no electrode. It is left out where a shorter catheter of
-    the catalogue has as many electrodes as the rest of the chain.
+    A chain of six or more electrodes loses 0.75 of its score for each place at its ends that shows no electrode. It is left out
+    where a shorter catheter of the catalogue has as many electrodes as the rest of the chain.
 
     Parameters
     ----------
@@ -39,7 +40,8 @@ def without_shorter_catheters(
     allowed, all_scores = [], []
     likely = possible.where([np.isfinite(scores) for scores in possible.scores])
     for rows, scores, length in zip(likely.rows, likely.scores, lengths, strict=True):
-        faded = count_faded(contrast[rows], odds[rows])
+        is_long = length >= MANY_ELECTRODES
+        faded = count_faded(contrast[rows], odds[rows]) if is_long else np.zeros(len(rows), np.int64)
         shorter = max((other for other in lengths if other < length), default=0)
         allowed.append((faded == 0) | (length - faded > shorter))
         all_scores.append(scores - _PRICE * faded)

@@ -25,7 +25,8 @@ class Evidence:
     reduction = 1
     pixel_noise = position_noise = 0.02
 
-    def __init__(self, image, points, probability, scores, halves=None, tips=()):
+    def __init__(self, image, points, probability, scores, halves=None, tips=(), contrast=0.0):
+        self.contrast = contrast
         self.smooth, self.points = image, points
         self.probability, self.scores = np.asarray(probability), np.asarray(scores)
         self.halves = np.zeros((0, 2)) if halves is None else halves
@@ -33,7 +34,11 @@ class Evidence:
 
     @property
     def likeness(self):
-        return Likeness(np.zeros_like(self.smooth), 1.0, 0.0)
+        """As much for the points as ``contrast``, and nothing elsewhere."""
+        values = np.zeros_like(self.smooth)
+        u, v = np.rint(self.points).astype(np.int64).T
+        values[v, u] = self.contrast
+        return Likeness(values, 1.0, 0.0)
 
     def proposals(self, allowed, expected):
         order = np.argsort(-self.probability, kind="stable")
@@ -249,3 +254,17 @@ def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
     # As probable as its weakest electrode, it is an electrode that the catalogue does not list.
     weak = chains_found(drawn([catheter]), np.concatenate([catheter, shaft]), [0.99, 0.7, 0.99, 0.99, 0.7], [0.9] * 5)
     assert not any(lies_on(chain, catheter) for chain in weak)
+
+
+@pytest.mark.parametrize(("contrast", "long"), [(20.0, False), (4.0, True)])
+def test_a_short_catheter_with_its_shaft_is_no_long_one_where_noise_would_not_hide_the_rest(contrast, long):
+    catalogue = Catalogue(
+        (catheter_type("decapolar-2-5-2", "cs"), catheter_type("hexapolar-2-5-2", "his")), "cs", "his"
+    )
+    row = row_of("cs", (60, 60), 0.4)
+    probability = np.array([0.99] * 6 + [0.3] * 4)
+    evidence = Evidence(
+        drawn([row[:6]]), row, probability, [0.9] * 6 + [0.6] * 4, contrast=np.where(probability > 0.5, contrast, 1.0)
+    )
+    (chain,) = detector_of(evidence, catalogue).search(evidence.smooth).entry(0).chains
+    assert lies_on(chain, row if long else row[:6])
