@@ -42,7 +42,8 @@ class Acceptance:
     row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``scores``
     where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
     so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
-    trust : see :class:`~fluoromap.segmenter.linking.Trust`.
+    trust : see :class:`~fluoromap.segmenter.linking.Trust`. faded_price : if ``strict``, what the score of a chain of six or more
+    loses for each place at its ends that shows no electrode.
     """
 
     least_clearness: float
@@ -56,6 +57,7 @@ class Acceptance:
     row_chain_score: float = np.inf
     row_score: float = np.inf
     trust: Trust = ONE_BY_ONE
+    faded_price: float = 0.0
 
     def accepts(self, scores: Array, chain_scores: Array, beside: bool = False) -> BoolArray:
         """Return whether chains are clear enough, (...).

@@ -243,7 +243,7 @@ class ChainDetector:
         if not self.acceptance.strict:
             return possible
         contrast, odds = seen.likeness.at(points_uv), seen.kind_odds_at(points_uv)
-        return without_shorter_catheters(possible, families, contrast, odds)
+        return without_shorter_catheters(possible, families, contrast, odds, self.acceptance.faded_price)
 
     def _fit(
         self,

@@ -14,17 +14,15 @@ from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 _FADED, _LEAST_CONTRAST = 0.5, 8.0
 _LEAST_AT_END = 2
 _EVEN_ODDS = 0.0
-_PRICE = 0.75
-"""Half of the least that an electrode adds to the value of a set of chains: it may be there and hidden."""
 
 
 def without_shorter_catheters(
-    possible: PossibleChains, families: Sequence[CatheterFamily], contrast: Array, odds: Array
+    possible: PossibleChains, families: Sequence[CatheterFamily], contrast: Array, odds: Array, price: float
 ) -> PossibleChains:
     """Return the likely chains that no catheter with fewer electrodes explains.
 
-    A chain of six or more electrodes loses 0.75 of its score for each place at its ends that shows no electrode. It is left out
-    where a shorter catheter of the catalogue has as many electrodes as the rest of the chain.
+    A chain of six or more electrodes loses ``price`` of its score for each place at its ends that shows no electrode. It is left
+    out where a shorter catheter of the catalogue has as many electrodes as the rest of the chain.
 
     Parameters
     ----------
@@ -35,6 +33,8 @@ def without_shorter_catheters(
         How much the candidates look like electrodes, in standard deviations of the noise.
     odds : (n,)
         Log-odds by which they differ from other blobs.
+    price : float
+        Infinite: chains with such places are left out.
     """
     lengths = [family.catheter.electrodes for family in families]
     allowed, all_scores = [], []
@@ -44,7 +44,7 @@ def without_shorter_catheters(
         faded = count_faded(contrast[rows], odds[rows]) if is_long else np.zeros(len(rows), np.int64)
         shorter = max((other for other in lengths if other < length), default=0)
         allowed.append((faded == 0) | (length - faded > shorter))
-        all_scores.append(scores - _PRICE * faded)
+        all_scores.append(scores - np.where(faded > 0, price * np.maximum(faded, 1), 0.0))
     return replace(likely, scores=tuple(all_scores)).where(allowed)
 
 

@@ -44,16 +44,25 @@ def test_a_chain_is_left_out_where_a_shorter_catheter_has_its_electrodes(shown, 
     )
     contrast, odds = np.array([CLEAR] * shown + [NOTHING] * (10 - shown)).T
     possible = PossibleChains((np.arange(10)[None], np.arange(6)[None]), (np.array([5.0]), np.array([4.0])))
-    long, short = without_shorter_catheters(possible, catheter_families(catalogue), contrast, odds).scores
+    long, short = without_shorter_catheters(possible, catheter_families(catalogue), contrast, odds, 0.75).scores
     assert short == [4.0]
     assert len(long) == kept
-    assert (long < 5.0).all()
+    assert (long == 5.0 - 0.75 * (10 - shown)).all()
+
+
+def test_no_place_may_be_empty_at_an_infinite_price():
+    families = catheter_families(Catalogue((catheter_type("decapolar-2-5-2", "cs"),), None, "cs"))
+    possible = PossibleChains((np.array([np.arange(10), np.arange(9, -1, -1)]),), (np.array([5.0, 4.0]),))
+    for shown, scores in ((10, [5.0, 4.0]), (8, [-np.inf, -np.inf])):
+        contrast, odds = np.array([CLEAR] * shown + [NOTHING] * (10 - shown)).T
+        found = without_shorter_catheters(possible, families, contrast, odds, np.inf)
+        np.testing.assert_array_equal(found.scores[0], scores)
 
 
 def test_unlikely_chains_are_left_out():
     families = catheter_families(Catalogue((catheter_type("quadripolar-2-5-2", "cs"),), None, "cs"))
     possible = PossibleChains((np.arange(4)[None],), (np.array([-np.inf]),))
-    (scores,) = without_shorter_catheters(possible, families, np.ones(4), np.ones(4)).scores
+    (scores,) = without_shorter_catheters(possible, families, np.ones(4), np.ones(4), 0.75).scores
     assert not len(scores)
 
 
@@ -61,4 +70,4 @@ def test_a_short_catheter_may_have_hidden_electrodes():
     families = catheter_families(Catalogue((catheter_type("quadripolar-2-5-2", "cs"),), None, "cs"))
     possible = PossibleChains((np.arange(4)[None],), (np.array([3.0]),))
     contrast, odds = np.array([CLEAR, CLEAR, NOTHING, NOTHING]).T
-    assert without_shorter_catheters(possible, families, contrast, odds).scores[0] == [3.0]
+    assert without_shorter_catheters(possible, families, contrast, odds, 0.75).scores[0] == [3.0]

@@ -36,9 +36,15 @@ IN_A_RUN = Acceptance(
     row_chain_score=2.0,
     row_score=0.2,
     trust=Trust(share=0.25, chain=0.7),
+    # Half of the least that an electrode adds to the value of a set of chains: it may be there and hidden.
+    faded_price=0.75,
 )
 _ALONE = replace(
-    IN_A_RUN, least_clearness=0.3, sure_clearness=0.5, scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7)
+    IN_A_RUN,
+    least_clearness=0.3,
+    sure_clearness=0.5,
+    scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7),
+    faded_price=math.inf,
 )
 """Scores are probabilities. In a single frame no other frame confirms a chain, but another catheter does."""
 
