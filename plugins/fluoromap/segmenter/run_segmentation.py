@@ -17,6 +17,7 @@ from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_cathet
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
+from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
 
 T = TypeVar("T")
@@ -255,6 +256,8 @@ def segment_run(
         chains = _add_missing_catheters(mean_x, chains, detector, averaged, entries, catheters)
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
+    if search_again:
+        chains = _with_shapes_of_tracks(mean_x, chains, detector, averaged, entries)
     if shows_catheter is not None and count > 1:
         tracks = {chain.track for entry in entries for chain in entry.chains}
         chains = tuple(chain for chain in chains if chain.manual or chain.track in tracks)
@@ -395,6 +398,27 @@ def _add_missing_catheters(
                 carried = detector.find_again(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
                 chains += [] if carried is None else [replace(carried, track=-1)]
     return tuple(chains)
+
+
+def _with_shapes_of_tracks(
+    x: Image,
+    chains: tuple[Chain, ...],
+    detector: Detector,
+    averaged: tuple[int, ...],
+    entries: Sequence[FrameChains],
+) -> tuple[Chain, ...]:
+    """Return the mean image's chains in the shape of their tracks."""
+    middle = averaged[len(averaged) // 2]
+    agreed = []
+    for chain in chains:
+        track = {entry.frame: other for entry in entries for other in entry.chains if other.track == chain.track}
+        beside = [other for other in chains if other is not chain]
+
+        def search(shape: Chain, shift: Array, reach_px: float, beside: list[Chain] = beside) -> Chain | None:
+            return detector.find_again(x, shape, shift, reach_px, beside, same_shape=True)
+
+        agreed.append(with_shape_of_track(chain, middle, track, search))
+    return tuple(agreed)
 
 
 def _mark_out_of_field(entries: Sequence[FrameChains], field: FieldMask) -> tuple[FrameChains, ...]:

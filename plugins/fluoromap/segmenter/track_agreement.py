@@ -80,6 +80,30 @@ def is_same_shape(points_uv: Array, others_uv: Array) -> bool:
     return bool(same[0, 0])
 
 
+def with_shape_of_track(
+    chain: Chain, frame: int, track: Mapping[int, Chain], search: Callable[[Chain, Array, float], Chain | None]
+) -> Chain:
+    """Return the chain of a mean in the shape of its track.
+
+    It is searched again as in :func:`with_common_shape`.
+
+    Parameters
+    ----------
+    chain : Chain
+        In the mean of frames round ``frame``.
+    frame : int
+    track : Mapping of int to Chain
+        Frame to chain of the same catheter.
+    search : callable
+        (chain in another frame, expected shift, reach in pixels) -> the chain in the mean.
+    """
+
+    def search_mean(searched: int, shape: Chain, shift: Array, reach_px: float) -> Chain | None:
+        return search(shape, shift, reach_px) if searched == frame else None
+
+    return with_common_shape({**track, frame: chain}, search_mean)[frame]
+
+
 def _places(chains: Sequence[Chain]) -> Array:
     """Return the places of all electrodes, (chains, electrodes, 2), NaN where a chain lacks one."""
     numbers = sorted({number for chain in chains for number in chain.electrodes})

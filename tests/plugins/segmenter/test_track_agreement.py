@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.contracts import Chain, FrameChains
-from fluoromap.segmenter.track_agreement import with_common_kinds, with_common_shape
+from fluoromap.segmenter.track_agreement import with_common_kinds, with_common_shape, with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
 
 ROW = np.stack([np.arange(10) * 9.0, np.arange(10) * 3.0], axis=1) + 60
@@ -113,3 +113,28 @@ def test_tracking_searches_displaced_electrodes_beside_the_other_chains():
     for entry in entries:
         (followed,) = (one for one in entry.chains if one.pixels_uv[0, 0] < 130)
         np.testing.assert_allclose(followed.pixels_uv, beating(entry.frame))
+
+
+def test_a_mean_is_searched_again_where_its_track_shows_another_shape():
+    track = {frame: chain(beating(frame)) for frame in range(FRAMES)}
+    search, asked = search_of(beating)
+    wrong = chain(displaced(beating(4)))
+    found = with_shape_of_track(wrong, 4, track, lambda *known: search(4, *known))
+    np.testing.assert_allclose(found.pixels_uv, beating(4))
+    assert asked == [4]
+    right = chain(beating(4) + 0.2)
+    assert with_shape_of_track(right, 4, track, lambda *known: search(4, *known)) is right
+    assert asked == [4]
+
+
+def test_displaced_frames_of_a_track_do_not_change_its_mean():
+    track = {frame: chain(displaced(beating(frame)) if frame == 7 else beating(frame)) for frame in range(FRAMES)}
+    search, asked = search_of(beating)
+    right = chain(beating(4))
+    assert with_shape_of_track(right, 4, track, lambda *known: search(4, *known)) is right
+    assert not asked
+
+
+def test_a_mean_without_a_track_remains():
+    wrong = chain(displaced(beating(4)))
+    assert with_shape_of_track(wrong, 4, {}, lambda *_: None) is wrong
