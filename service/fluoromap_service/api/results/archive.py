@@ -15,6 +15,7 @@ from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
+from fluoromap_service.api.http.spooled_answers import PIECE_BYTES
 from fluoromap_service.api.results.archive_files import ArchiveFile, archive_files
 
 router = new_router(tags=["results"])
@@ -24,9 +25,6 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 _LEVEL = 1
 """Compression of the tables: a higher level takes several times as long and saves a fifth."""
-
-_PIECE_BYTES = 1 << 18
-"""A table of a study has 70 MB, so it is read and sent in pieces."""
 
 
 @router.get(
@@ -94,13 +92,14 @@ def _zipped(files: Iterable[ArchiveFile]) -> Iterator[bytes]:
             entry.external_attr = 0o644 << 16
             # Only writestr has an argument for it, and that takes the whole content.
             entry._compresslevel = _LEVEL  # type: ignore[attr-defined]
+            # A table of a study has 70 MB, so it is read and sent in pieces.
             with _opened(file.content) as content:
                 entry.file_size = content.seek(0, io.SEEK_END)
                 content.seek(0)
                 with archive.open(entry, "w") as member:
-                    while piece := content.read(_PIECE_BYTES):
+                    while piece := content.read(PIECE_BYTES):
                         member.write(piece)
-                        if outflow.waiting >= _PIECE_BYTES:
+                        if outflow.waiting >= PIECE_BYTES:
                             yield outflow.take()
             yield outflow.take()
     yield outflow.take()

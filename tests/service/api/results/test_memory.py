@@ -123,7 +123,7 @@ def test_the_archive_reads_and_sends_its_files_in_pieces(tmp_path: Path) -> None
         ArchiveFile("noise", tmp_path / "noise"),
     ]
     pieces = list(archive._zipped(entries))
-    assert max(map(len, pieces)) < 4 * archive._PIECE_BYTES
+    assert max(map(len, pieces)) < 4 * archive.PIECE_BYTES
     whole = [
         ("job.json", b"{}", True), ("tracks.csv", table, True), ("overlays/S01-a.png", noise, False), ("noise", noise, True),
     ]  # fmt: skip
