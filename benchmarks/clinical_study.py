@@ -168,7 +168,7 @@ def _pure(folder: Path, spec: StudySpec, segmenter: str) -> dict[str, float]:
                     site=matched.site, view=view, camera=at_site.camera(view), catalogue=DEFAULT_CATALOGUE,
                     frame_times_ms=getattr(matched, f"frame_times_{view}_ms"),
                     observations=getattr(matched, f"track_{view}"),
-                    a_priori=at_site.a_priori or at_site.points, a_priori_frame=at_site.diastolic_frame(view),
+                    a_priori=at_site.a_priori_points, a_priori_frame=at_site.diastolic_frame(view),
                     cycle=at_site.cycle, others=others,
                 )  # fmt: skip
                 try:

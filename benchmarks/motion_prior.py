@@ -144,7 +144,7 @@ def monoplane_view(matched: MatchedSite, located: LocatedSite, a: bool, others: 
         catalogue=CATALOGUE,
         frame_times_ms=matched.frame_times_a_ms if a else matched.frame_times_b_ms,
         observations=matched.track_a if a else matched.track_b,
-        a_priori=located.a_priori,
+        a_priori=located.a_priori_points,
         a_priori_frame=located.frame_a if a else located.frame_b,
         cycle=None if others else located.cycle,
         others=tuple(site.cycle for site in others if site.cycle),

@@ -236,7 +236,7 @@ def monoplane_view(
         catalogue=study.catalogue,
         frame_times_ms=matched.frame_times_b_ms if view else matched.frame_times_a_ms,
         observations=matched.track_b if view else matched.track_a,
-        a_priori=site.a_priori,
+        a_priori=site.a_priori_points,
         a_priori_frame=site.frame_b if view else site.frame_a,
         cycle=site.cycle,
         others=() if site.cycle else tuple(one.cycle for one in located.sites if one.cycle),

@@ -79,7 +79,7 @@ def _tracks(matching: Matching, triangulation: Triangulation) -> list[SiteTracks
                 catalogue=DEFAULT_CATALOGUE,
                 frame_times_ms=getattr(matched, f"frame_times_{view}_ms"),
                 observations=getattr(matched, f"track_{view}"),
-                a_priori=site.a_priori,
+                a_priori=site.a_priori_points,
                 a_priori_frame=getattr(site, f"frame_{view}"),
                 cycle=site.cycle,
                 others=(),

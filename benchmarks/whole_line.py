@@ -26,7 +26,7 @@ from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import CHI2_95_3D, LocatedSite, MatchedSite, Run, Segmentation, Segmenter, Silent
 from fluoromap.geometry import Gantry, camera_from_gantry
 from fluoromap.matching import SiteRuns, match_study
-from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy, StudySpec, simulate_study
+from fluoromap.phantom import Contrast, SimulatedRun, SimulatedSite, SimulatedStudy, StudySpec, simulate_study
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
@@ -47,6 +47,7 @@ CASES: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 """Types of the catheters: the first is the reference, the last maps."""
+CONTRASTS: dict[str, tuple[Contrast, Contrast]] = {"LAT": ("LAT", "LAT"), "PA": ("PA", "PA"), "LAT+PA": ("LAT", "PA")}
 SEGMENTERS: dict[str, type[Segmenter]] = {"learned-chain": LearnedChain, "catheter-chain": CatheterChain}
 
 
@@ -83,7 +84,7 @@ def main() -> None:
     parser.add_argument("--segmenter", choices=SEGMENTERS, default="learned-chain")
     parser.add_argument("--sites", type=int, default=5)
     parser.add_argument("--frames", type=int, default=30)
-    parser.add_argument("--contrast", choices=("LAT", "PA"), default="LAT", help="appearance of both views")
+    parser.add_argument("--contrast", choices=CONTRASTS, default="LAT", help="appearance of the views")
     parser.add_argument("--draw", type=Path, metavar="FOLDER", help="draw a frame of each run")
     given = parser.parse_args()
     catalogue = catalogue_of(CASES[given.case])
@@ -94,7 +95,7 @@ def main() -> None:
     tallies = []
     for seed in range(given.seed, given.seed + given.seeds):
         spec = StudySpec(
-            seed, sites=given.sites, frames=given.frames, contrast=(given.contrast, given.contrast), gantries=gantries(),
+            seed, sites=given.sites, frames=given.frames, contrast=CONTRASTS[given.contrast], gantries=gantries(),
             gantry_error_deg=0.3, isocentre_error_mm=0.6, catalogue=catalogue,
         )  # fmt: skip
         tallies.append(measure(spec, SEGMENTERS[given.segmenter](), given.draw))

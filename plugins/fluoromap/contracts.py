@@ -8,9 +8,11 @@ of the top-left pixel. World points are millimetres along DICOM patient axes (LP
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -29,6 +31,9 @@ T = TypeVar("T")
 
 CHI2_95_3D = 7.814727903251179
 """95th percentile of the chi-squared distribution with 3 degrees of freedom: a 95 % ellipsoid's squared radius."""
+
+ADDED_LATER = MappingProxyType({"added later": True})
+"""Metadata of a field that earlier versions lack: the store reads their results with the field's default."""
 
 
 class StageStopped(Exception):
@@ -259,6 +264,7 @@ class Chain:
     kinds : catheter name -> probability (the sum is at most 1); look-alikes share theirs.
     track : chains of one run with the same track number are the same catheter in different frames; -1 without a track.
     manual : set by hand (then ``kinds`` has one name with probability 1).
+    tip_odds : log-odds that the numbers begin at the catheter's tip and not at its other end; None where that is no question.
     """
 
     electrodes: tuple[int, ...]
@@ -268,6 +274,7 @@ class Chain:
     kinds: tuple[tuple[str, float], ...]
     track: int = -1
     manual: bool = False
+    tip_odds: float | None = field(default=None, metadata=ADDED_LATER)
 
     def __post_init__(self) -> None:
         m = len(self.electrodes)
@@ -278,6 +285,19 @@ class Chain:
         object.__setattr__(self, "scores", frozen(self.scores, (m,), "scores"))
         if sum(probability for _, probability in self.kinds) > 1 + 1e-6:
             raise ValueError(f"probabilities of kinds {self.kinds} add up to more than 1")
+        if self.tip_odds is not None and not math.isfinite(self.tip_odds):
+            raise ValueError(f"tip_odds is {self.tip_odds}; it must be finite, or None")
+
+    def from_other_end(self, electrodes: int) -> Chain:
+        """Return the chain of a catheter with so many electrodes, numbered from the other end."""
+        return replace(
+            self,
+            electrodes=tuple(electrodes + 1 - number for number in reversed(self.electrodes)),
+            pixels_uv=self.pixels_uv[::-1],
+            covariance_px2=self.covariance_px2[::-1],
+            scores=self.scores[::-1],
+            tip_odds=None if self.tip_odds is None else -self.tip_odds,
+        )
 
     def probability(self, catheter: str) -> float:
         """Return the probability that this is ``catheter``."""
@@ -494,16 +514,22 @@ class ElectrodePoint:
         if relative_mm is not None and relative_covariances_mm2 is not None:
             checked["relative_mm"] = frozen(relative_mm, (n, 3), "relative_mm")
             checked["relative_covariance_mm2"] = frozen(relative_covariances_mm2, (n, 3, 3), "relative_covariances_mm2")
+        # Lists of rows: indexing an array takes longer than the rest.
+        nothing = [None] * n
+        columns = [
+            list(checked[name]) if name in checked else nothing
+            for name in ("position_mm", "covariance_mm2", "relative_mm", "relative_covariance_mm2")
+        ]
         points = []
-        for i, ((catheter, electrode), residual, angle, own) in enumerate(
-            zip(labels, residuals_px, ray_angles_deg, reasons, strict=True)
+        for (catheter, electrode), residual, angle, own, place, covariance, relative, its_covariance in zip(
+            labels, residuals_px, ray_angles_deg, reasons, *columns, strict=True
         ):
             point = object.__new__(cls)
             point.__dict__.update(
-                catheter=catheter, electrode=electrode, relative_mm=None, relative_covariance_mm2=None, residual_px=residual,
-                ray_angle_deg=angle, reasons=own, alternative_mm=None, alternative_probability=0.0,
+                catheter=catheter, electrode=electrode, position_mm=place, covariance_mm2=covariance, relative_mm=relative,
+                relative_covariance_mm2=its_covariance, residual_px=residual, ray_angle_deg=angle, reasons=own,
+                alternative_mm=None, alternative_probability=0.0,
             )  # fmt: skip
-            point.__dict__.update((name, array[i]) for name, array in checked.items())
             points.append(point)
         return tuple(points)
 
@@ -546,12 +572,23 @@ class StudyVariation:
 
 
 @dataclass(frozen=True, eq=False)
+class APriori:
+    """A site's points at diastole with the covariances of any gantry and any heart."""
+
+    stored_apart: ClassVar[bool] = True
+    """They are stored by themselves: a correction at another site does not change them."""
+
+    points: tuple[ElectrodePoint, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class LocatedSite:
     """A site in 3D: points at diastole, cycle and final cameras (self-calibrated or not).
 
     frame_a, frame_b : the diastolic frames. reference_mm : (3,) the reference catheter's mean, None where not located.
     variation : of the study that contains the site. a_priori : the points with the covariances of any gantry and any heart;
-    cycle has these too. A correction at another site changes neither, so that no track has to be computed again.
+    None where a triangulator does not distinguish them. cycle has such covariances too. A correction at another site changes
+    neither, so that no track has to be computed again.
     """
 
     site: str
@@ -564,11 +601,16 @@ class LocatedSite:
     cycle: SiteCycle | None
     reasons: tuple[Reason, ...] = ()
     variation: StudyVariation = StudyVariation()
-    a_priori: tuple[ElectrodePoint, ...] = ()
+    a_priori: APriori | None = None
 
     def __post_init__(self) -> None:
         if self.reference_mm is not None:
             object.__setattr__(self, "reference_mm", frozen(self.reference_mm, (3,), "reference_mm"))
+
+    @property
+    def a_priori_points(self) -> tuple[ElectrodePoint, ...]:
+        """The points of ``a_priori``, or ``points`` where there is none."""
+        return self.points if self.a_priori is None else self.a_priori.points
 
     def point(self, catheter: str, electrode: int) -> ElectrodePoint | None:
         """Return the point of an electrode, or None where it was not located."""

@@ -58,7 +58,7 @@ _SENTENCES: dict[Reason, str] = {
     Reason.MANUAL_NEEDED: "The electrodes could not be distinguished from the background; mark them by hand on one frame.",
     Reason.CATHETER_NOT_FOUND: "This catheter was not found in one of the views; mark it by hand on one frame.",
     Reason.IDENTITY_BY_MOTION: "The reference catheter was chosen among look-alikes because it moves least between the sites.",
-    Reason.IDENTITY_UNCERTAIN: "Two catheters could be exchanged; name one of them by hand on one frame.",
+    Reason.IDENTITY_UNCERTAIN: "Two catheters, or the two ends of this one, could be exchanged; mark it by hand on one frame.",
     Reason.NO_REFERENCE: "No reference catheter was located here; its mean over the other sites was used, else the isocentre.",
     Reason.NO_RESTING_CATHETER: "No catheter rests in this study; a table that moved between the two views would not be noticed.",
     Reason.NO_ACTIVATION_TIME: "This site has no activation time; send one with the activation-time table.",

@@ -11,7 +11,7 @@ from finished_study import make_study, matching, triangulation
 from sql_statements import sql_statements
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import MatchedSite, Matching, MonoplaneView, Observation, SiteCycle
+from fluoromap.contracts import APriori, MatchedSite, Matching, MonoplaneView, Observation, SiteCycle
 from fluoromap.reasons import Reason
 from fluoromap_service.jobs.job_life import Claim
 from fluoromap_service.store.codec import decode, encode, plain_form
@@ -32,7 +32,7 @@ def _view(matched: MatchedSite | None = None, **changes: Any) -> TrackedView:
     located = triangulation().sites[0]
     view = TrackedView(
         matched=matched or matching().sites[0], view="a", camera=located.camera("a"), catalogue=CATALOGUE,
-        a_priori=located.points, a_priori_frame=located.diastolic_frame("a"), cycle=None, others=(),
+        a_priori=APriori(located.points), a_priori_frame=located.diastolic_frame("a"), cycle=None, others=(),
     )  # fmt: skip
     return replace(view, **changes)
 
@@ -51,7 +51,7 @@ def test_every_field_of_a_view_is_part_of_its_key() -> None:
         "catalogue": _view(catalogue=replace(CATALOGUE, mapping="reference", reference="mapping")),
         "frame_times_ms": _view(replace(site, frame_times_a_ms=site.frame_times_a_ms + 1.0)),
         "observations": _view(without),
-        "a_priori": _view(a_priori=located.points[:-1]),
+        "a_priori": _view(a_priori=APriori(located.points[:-1])),
         "a_priori_frame": _view(a_priori_frame=0),
         "cycle": _view(cycle=CYCLE),
         "others": _view(others=(CYCLE,)),
@@ -69,7 +69,7 @@ def test_other_parts_of_a_matched_site_do_not_change_the_key() -> None:
 
 
 def test_the_frames_of_an_unchanged_site_are_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tracked_views, "_hashes", tracked_views._FrameHashes())
+    monkeypatch.setattr(tracked_views, "_hashes", tracked_views._Hashes())
     content = _view(_stored()).content()
     assert content == _view().content()
 
@@ -86,7 +86,8 @@ def test_a_solver_gets_the_frames_and_the_remembered_site_keeps_none() -> None:
     expected = matching().sites[0]
     assert plain_form(shown) == plain_form(
         MonoplaneView(
-            "S01", "a", _view().camera, CATALOGUE, expected.frame_times_a_ms, expected.track_a, _view().a_priori, 1, None, (),
+            "S01", "a", _view().camera, CATALOGUE, expected.frame_times_a_ms, expected.track_a, _view().a_priori.points, 1,
+            None, (),
         )
     )  # fmt: skip
     assert "track_a" not in vars(site)

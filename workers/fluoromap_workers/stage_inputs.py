@@ -12,7 +12,6 @@ import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -22,12 +21,13 @@ from sqlalchemy.orm import Session
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
+    APriori,
     Chain,
     ChamberMap,
     Context,
-    ElectrodePoint,
     FrameChains,
     LocatedSite,
+    MappedSite,
     Matching,
     Refusal,
     RejectedSite,
@@ -52,8 +52,6 @@ from fluoromap_service.study.run_files import checked_run
 from fluoromap_service.study.snapshot import CorrectedElectrode, GantrySnapshot, PluginSnapshot, RunSnapshot, Snapshot
 from fluoromap_workers.point_rows import point_rows
 from fluoromap_workers.tracked_views import TrackedView
-
-NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 
 Result = TypeVar("Result")
 
@@ -296,6 +294,13 @@ def _with_doubts(site: LocatedSite, doubts: tuple[Reason, ...]) -> LocatedSite:
     return site if reasons == site.reasons else replace(site, reasons=reasons)
 
 
+@dataclass(frozen=True, slots=True)
+class _MappedSites:
+    """The sites of a map; one form of all of them is made faster than a form of each."""
+
+    sites: tuple[MappedSite, ...]
+
+
 def _fuse(job: StoredJob, study: str) -> Work:
     triangulation, plugin = load(Triangulation, job.stage("triangulate")), job.snapshot.fuser
     times = {site.site: (site.lat_ms, site.lat_sd_ms) for site in job.snapshot.sites}
@@ -309,7 +314,7 @@ def _fuse(job: StoredJob, study: str) -> Work:
     def refused(refusal: Refusal) -> MapResult:
         return MapResult(None, refusal.reason, str(refusal), origin)
 
-    key = _key(job.snapshot, "fuse", list(origin or ()), *(plain_form(site) for site in sites))
+    key = _key(job.snapshot, "fuse", list(origin or ()), plain_form(_MappedSites(sites)))
     return Work(key, MapResult, compute, refused)
 
 
@@ -321,7 +326,7 @@ def _monoplane(job: StoredJob, name: str) -> Work:
     views: list[TrackedView] = []
     if matched is not None and located is not None:
         others = () if located.cycle else tuple(site.cycle for site in triangulation.sites if site.cycle)
-        a_priori = tuple(_without_name_doubts(point) for point in located.a_priori or located.points)
+        a_priori = APriori(located.points) if located.a_priori is None else located.a_priori
         views = [
             TrackedView(
                 matched=matched, view=view, camera=located.camera(view), catalogue=job.catalogue, a_priori=a_priori,
@@ -350,19 +355,6 @@ def _monoplane(job: StoredJob, name: str) -> Work:
         job.snapshot, "monoplane", name, *(plain_form(view) for view in rejected), *(view.content() for view in views)
     )
     return Work(key, SiteTracks, compute, refused)
-
-
-def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
-    """Return the point without doubts about its name.
-
-    They move no electrode, and naming a catheter at one site must not redo the others.
-    """
-    if NAME_DOUBTS.isdisjoint(point.reasons):
-        return point
-    # Not by replace, which checks the arrays again: most points of a study have such doubts.
-    certain = copy(point)
-    object.__setattr__(certain, "reasons", tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
-    return certain
 
 
 def _rejected_view(view: View, name: str, triangulation: Triangulation) -> ViewTrack:

@@ -1,6 +1,7 @@
 """The views that the stage ``monoplane`` tracks, and their parts of its key.
 
-After a correction the keys of all sites are compared. The frames of a site are long, so a process computes their hash once.
+After a correction the keys of all sites are compared. The frames of a site are long, and its points are many, so a process
+computes their hashes once.
 """
 
 from __future__ import annotations
@@ -8,28 +9,35 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, ElectrodePoint, MatchedSite, MonoplaneView, Observation, SiteCycle, View
+from fluoromap.contracts import APriori, Array, ElectrodePoint, MatchedSite, MonoplaneView, Observation, SiteCycle, View
 from fluoromap.geometry import Camera
+from fluoromap.reasons import Reason
 from fluoromap_service.store.codec import block_hash, plain_form, undecoded
 
+NAME_DOUBTS = frozenset({Reason.IDENTITY_BY_MOTION, Reason.IDENTITY_UNCERTAIN})
 _REMEMBERED_HASHES = 8192
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedView:
-    """One view of one site, whose frames are decoded only where somebody needs them.
+    """One view of one site, whose frames and points are decoded only where somebody needs them.
 
-    matched : the site with the frames of both views. The other fields are those of :class:`fluoromap.contracts.MonoplaneView`.
+    matched : the site with the frames of both views. a_priori : the site's points; their doubts about names do not count. The
+    other fields are those of :class:`fluoromap.contracts.MonoplaneView`.
     """
 
     matched: MatchedSite
     view: View
     camera: Camera
     catalogue: Catalogue
-    a_priori: tuple[ElectrodePoint, ...]
+    a_priori: APriori
     a_priori_frame: int
     cycle: SiteCycle | None
     others: tuple[SiteCycle, ...]
@@ -44,7 +52,7 @@ class TrackedView:
             catalogue=self.catalogue,
             frame_times_ms=frames.frame_times_ms,
             observations=frames.observations,
-            a_priori=self.a_priori,
+            a_priori=_points(self.a_priori).points,
             a_priori_frame=self.a_priori_frame,
             cycle=self.cycle,
             others=self.others,
@@ -53,24 +61,30 @@ class TrackedView:
     def content(self) -> bytes:
         """Return bytes that are equal for equal decoded views.
 
-        The frames count with their hash.
+        Frames and points count with their hashes.
         """
-        values = {field.name: getattr(self, field.name) for field in fields(_Content) if field.name != "frames_sha256"}
-        return plain_form(_Content(**values, frames_sha256=_hashes.of(self.matched, self.view)))
+        hashes: dict[str, Any] = {
+            "frames_sha256": _hashes.of(
+                (block_hash(self.matched), self.view), partial(_frames, self.matched, self.view)
+            ),
+            "points_sha256": _hashes.of((block_hash(self.a_priori), "a_priori"), partial(_points, self.a_priori)),
+        }
+        values = {field.name: getattr(self, field.name) for field in fields(_Content) if field.name not in hashes}
+        return plain_form(_Content(**values, **hashes))
 
 
 @dataclass(frozen=True, eq=False)
 class _Content:
-    """A tracked view, with the hash of its frames in their place."""
+    """A tracked view, with the hashes of its frames and its points in their places."""
 
     view: View
     camera: Camera
     catalogue: Catalogue
-    a_priori: tuple[ElectrodePoint, ...]
     a_priori_frame: int
     cycle: SiteCycle | None
     others: tuple[SiteCycle, ...]
     frames_sha256: str
+    points_sha256: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,20 +104,37 @@ def _frames(matched: MatchedSite, view: View) -> _Frames:
     return _Frames(site.site, site.frame_times_b_ms, site.track_b)
 
 
-class _FrameHashes:
-    """The hashes of the frames of a matched site's views, by the hash of the site."""
+def _points(a_priori: APriori) -> APriori:
+    """Return the points without doubts about their names.
+
+    They move no electrode, and naming a catheter at one site must not redo the others.
+    """
+    # As with the frames: the worker remembers the site.
+    return APriori(tuple(map(_without_name_doubts, undecoded(a_priori).points)))
+
+
+def _without_name_doubts(point: ElectrodePoint) -> ElectrodePoint:
+    if NAME_DOUBTS.isdisjoint(point.reasons):
+        return point
+    # Not by replace, which checks the arrays again: most points of a study have such doubts.
+    certain = copy(point)
+    object.__setattr__(certain, "reasons", tuple(reason for reason in point.reasons if reason not in NAME_DOUBTS))
+    return certain
+
+
+class _Hashes:
+    """The hashes of frames and points, by the hashes of the stored values that hold them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._remembered: OrderedDict[tuple[str | None, View], str] = OrderedDict()
+        self._remembered: OrderedDict[tuple[str | None, str], str] = OrderedDict()
 
-    def of(self, matched: MatchedSite, view: View) -> str:
-        """Return the hash of the frames of one view."""
-        name = block_hash(matched), view
+    def of(self, name: tuple[str | None, str], read: Callable[[], Any]) -> str:
+        """Return the hash of the value of a name; ``read`` returns the value."""
         with self._lock:
             known = self._remembered.get(name)
         if known is None:
-            known = hashlib.sha256(plain_form(_frames(matched, view))).hexdigest()
+            known = hashlib.sha256(plain_form(read())).hexdigest()
         with self._lock:
             self._remembered[name] = known
             self._remembered.move_to_end(name)
@@ -112,4 +143,4 @@ class _FrameHashes:
         return known
 
 
-_hashes = _FrameHashes()
+_hashes = _Hashes()

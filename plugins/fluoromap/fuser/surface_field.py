@@ -111,11 +111,12 @@ class Regression:
 
     def at_vertices(self) -> tuple[Array, Array]:
         """Return posterior mean (n, c) and variance (n, c) at the vertices."""
-        return self._posterior(self._field.modes, self._trend)
+        mean, square = self._moments(self._field.modes, self._trend)
+        return mean, np.maximum(square - mean**2, 0.0)
 
     def mean_at(self, rows: csr_array) -> Array:
         """Return the posterior mean (m, c) where ``rows`` (m, n) interpolate the vertices."""
-        return self._posterior(rows @ self._field.modes, rows @ self._trend)[0]
+        return self._moments(rows @ self._field.modes, rows @ self._trend, variance=False)[0]
 
     def leave_one_out(self) -> tuple[Array, Array]:
         """Predict each value from all others: mean (k, c) and variance (k, c), the measurement's error included.
@@ -132,7 +133,11 @@ class Regression:
         spread = (weights * (variance + offset**2)).sum(axis=0) - mean**2
         return self._values - mean, spread
 
-    def _posterior(self, modes: Array, trend: Array) -> tuple[Array, Array]:
+    def _moments(self, modes: Array, trend: Array, *, variance: bool = True) -> tuple[Array, Array]:
+        """Return the posterior's mean (n, c), and the mean of its square.
+
+        Without the variance, the second is that of the uncertain lengths and amplitudes alone.
+        """
         evidence = np.array([fit.evidence for fit in self._fits])
         weights = np.exp(evidence - logsumexp(evidence))
         weights[weights < _LEAST_WEIGHT] = 0.0
@@ -156,11 +161,13 @@ class Regression:
                 here = both @ (known @ fit.solved)
                 mean += weight * here
                 square += weight * here**2
-                explained += weight * (known @ fit.inverse @ known.T)
-            left = (shares @ powers) * (modes**2 @ spectrum) + shares.sum() * trend_variance
-            left -= np.einsum("nk,nk->n", both @ explained, both)
-            square += np.maximum(left, 0.0)[:, None]
-        return mean, np.maximum(square - mean**2, 0.0)
+                if variance:
+                    explained += weight * (known @ fit.inverse @ known.T)
+            if variance:
+                left = (shares @ powers) * (modes**2 @ spectrum) + shares.sum() * trend_variance
+                left -= np.einsum("nk,nk->n", both @ explained, both)
+                square += np.maximum(left, 0.0)[:, None]
+        return mean, square
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -110,9 +110,13 @@ def groups_with_extra(
     shift = float(np.median(table.distance_px[filled[:, 0], filled[:, 1]]))
     longest = [max(one.frames for one in view) for view in (catheters_a, catheters_b)]
     found = []
-    for i, first in enumerate(catheters_a):
-        for j, second in enumerate(catheters_b):
-            if i in filled[:, 0] or j in filled[:, 1] or not table.possible[i, j]:
+    left_a, left_b = (
+        [(index, one) for index, one in enumerate(view) if index not in used]
+        for view, used in zip((catheters_a, catheters_b), filled.T.tolist(), strict=True)
+    )
+    for i, first in left_a:
+        for j, second in left_b:
+            if not table.possible[i, j]:
                 continue
             if min(first.frames / max(longest[0], 1), second.frames / max(longest[1], 1)) < _EXTRA_SEEN:
                 continue

@@ -196,10 +196,10 @@ def _stillest(
     sites: Sequence[Sequence[PairedCatheter]], places: list[list[int]], free: list[int]
 ) -> tuple[int, Reason]:
     """Return the place in ``free`` whose catheter moves least, and the certainty."""
-    shown = [set(_positions_at(sites, places, place)) for place in free]
-    together = sorted(set.intersection(*shown))
+    shown = [_positions_at(sites, places, place) for place in free]
+    together = sorted(set.intersection(*map(set, shown)))
     if len(free) > 1 and len(together) >= 3:
-        positions = np.array([[_positions_at(sites, places, place)[s] for s in together] for place in free])
+        positions = np.array([[of_place[s] for s in together] for of_place in shown])
         irregular = any(one.irregular for site in sites for one in site)
         for index, place in enumerate(free):
             others = np.delete(positions, index, axis=0)

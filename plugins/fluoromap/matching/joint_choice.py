@@ -7,6 +7,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit, logit
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.matching.hypotheses import PRIOR_TURN, Hypotheses, offset_chi2
@@ -20,6 +21,8 @@ _ANCHORS_PER_SITE = 6
 _ANCHOR_RANGE = 15.0
 _ANCHORS_AT_ONCE = 16
 """Anchors whose costs are computed at once, so that a study of hundreds of sites needs little memory."""
+_LOG_ODDS_STEP = 0.1
+"""Steps of the alternative's log odds. The odds follow from assumed costs, which are known much less accurately."""
 _REFINED = 6
 _ROUNDS = 3
 
@@ -339,9 +342,17 @@ def _site_choice(study: _Study, site: int, probability: Array, place_cost: Array
     answer = _in_order(study, one, row, int(np.argmin(cost[row])))
     if others[second] <= 0:
         return SiteChoice(answer, None, 0.0)
-    return SiteChoice(
-        answer, _in_order(study, one, second, int(np.argmin(cost[second]))), float(min(others[second], 0.5))
-    )
+    alternative = _in_order(study, one, second, int(np.argmin(cost[second])))
+    return SiteChoice(answer, alternative, _on_grid(float(min(others[second], 0.5))))
+
+
+def _on_grid(probability: float) -> float:
+    """Return the nearest probability whose logarithm of odds is a whole number of steps.
+
+    The places of the other sites determine it a little. So a correction at one site changes no other site, unless it changes the
+    odds there.
+    """
+    return float(expit(_LOG_ODDS_STEP * round(float(logit(probability)) / _LOG_ODDS_STEP)))
 
 
 def _in_order(study: _Study, one: Hypotheses, row: int, order: int) -> IntArray:

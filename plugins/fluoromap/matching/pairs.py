@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array, BoolArray
+from fluoromap.contracts import Array, BoolArray, Chain
 from fluoromap.geometry import Camera
-from fluoromap.matching.run_catheters import RunCatheter, common_electrodes
+from fluoromap.matching.run_catheters import RunCatheter
 from fluoromap.matching.two_view import signed_epipolar_px, triangulate_linear
 
 LEAST_VOTE = 0.15
@@ -39,6 +39,11 @@ class PairTable:
     group_cost : (groups, n, m), spacing and votes; infinite where the name is impossible.
     motion_cost : (n, m, shifts) over the cycle, for each shift of view b's phases.
     position_mm : (n, m, 3), mean of the electrodes in the world.
+    turned : (n, m, 2), whether the chain of view a and that of view b are numbered from the other end. The other fields hold for
+    these numbers.
+    other_end_cost : (n, m), by how much the pair costs more with both chains numbered from the other end; infinite where that is
+    no question. one_end_cost : (n, m), the same with one of the two numbered from its other end.
+    axis_mm : (n, m, 3), from the highest of the common electrodes to the lowest.
     """
 
     possible: BoolArray
@@ -49,6 +54,10 @@ class PairTable:
     group_cost: Array
     motion_cost: Array
     position_mm: Array
+    turned: BoolArray
+    other_end_cost: Array
+    one_end_cost: Array
+    axis_mm: Array
 
 
 def student_cost(chi2: Array, terms: int | Array = 1) -> Array:
@@ -103,52 +112,137 @@ def pair_table(
     ``motion_cost`` compares them over the cycle, see :func:`~fluoromap.matching.phase_matching.motion_misfit`.
     """
     n, m = len(catheters_a), len(catheters_b)
-    shared = {}
-    for i, first in enumerate(catheters_a):
-        for j, second in enumerate(catheters_b):
-            if first.manual_name and second.manual_name and first.manual_name != second.manual_name:
-                continue
-            in_a, in_b = common_electrodes(first.diastole, second.diastole)
-            if in_a:
-                shared[i, j] = (in_a, in_b)
     table = PairTable(
         np.zeros((n, m), dtype=np.bool_), np.zeros((n, m)), np.ones((n, m)), np.zeros((n, m, 3)), np.zeros((n, m)),
-        np.full((len(groups), n, m), np.inf), motion_cost, np.zeros((n, m, 3)),
+        np.full((len(groups), n, m), np.inf), motion_cost, np.zeros((n, m, 3)), np.zeros((n, m, 2), dtype=np.bool_),
+        np.full((n, m), np.inf), np.full((n, m), np.inf), np.zeros((n, m, 3)),
     )  # fmt: skip
-    if not shared:
+    readings = [
+        reading
+        for i, first in enumerate(catheters_a)
+        for j, second in enumerate(catheters_b)
+        if not (first.manual_name and second.manual_name and first.manual_name != second.manual_name)
+        for reading in _readings((i, j), first, second)
+    ]
+    if not readings:
         return table
-    pixels_a = np.concatenate([catheters_a[i].diastole.pixels_uv[rows] for (i, _), (rows, _) in shared.items()])
-    pixels_b = np.concatenate([catheters_b[j].diastole.pixels_uv[rows] for (_, j), (_, rows) in shared.items()])
+    pixels_a = np.concatenate([catheters_a[one.pair[0]].diastole.pixels_uv[one.rows_a] for one in readings])
+    pixels_b = np.concatenate([catheters_b[one.pair[1]].diastole.pixels_uv[one.rows_b] for one in readings])
     distances = signed_epipolar_px(*cameras, pixels_a, pixels_b)
-    turned = np.stack(
+    moved = np.stack(
         [signed_epipolar_px(cameras[0], _turned(cameras[1], axis), pixels_a, pixels_b) for axis in range(3)], axis=1
     )
-    slopes = (turned - distances[:, None]) / _TURN_RAD
+    slopes = (moved - distances[:, None]) / _TURN_RAD
     points = triangulate_linear(*cameras, pixels_a, pixels_b)
-    ends = np.cumsum([len(rows) for rows, _ in shared.values()])
+    ends = np.cumsum([len(one.rows_a) for one in readings])
     catheter_variance = (CATHETER_SD_MM * cameras[1].px_per_mm) ** 2
-    for ((i, j), (in_a, in_b)), end in zip(shared.items(), ends, strict=True):
-        own = slice(end - len(in_a), end)
+    noise_a, noise_b = ([_variances_px2(one.diastole) for one in catheters] for catheters in (catheters_a, catheters_b))
+    votes_a, votes_b = (
+        np.array([[one.vote(group) for group in groups] for one in catheters])
+        for catheters in (catheters_a, catheters_b)
+    )
+    costs: dict[tuple[int, int], dict[tuple[bool, bool], float]] = {}
+    for one, end in zip(readings, ends, strict=True):
+        own = slice(end - len(one.rows_a), end)
+        i, j = one.pair
         first, second = catheters_a[i], catheters_b[j]
-        noise = _PIXEL_FLOOR_PX**2 + sum(
-            np.trace(chain.covariance_px2[rows], axis1=1, axis2=2) / 2
-            for chain, rows in ((first.diastole, in_a), (second.diastole, in_b))
-        )
+        noise = _PIXEL_FLOOR_PX**2 + noise_a[i][one.rows_a] + noise_b[j][one.rows_b]
         mean = common_distance(distances[own], noise)
-        table.distance_px[i, j] = mean
-        table.variance_px2[i, j] = catheter_variance + 1 / (1 / noise).sum()
-        table.turn_px[i, j] = slopes[own].mean(axis=0)
-        table.position_mm[i, j] = points[own].mean(axis=0)
         uneven = float(student_cost((distances[own] - mean) ** 2 / noise).sum())
-        table.shape_cost[i, j] = uneven + bend_cost(points[own])
-        electrodes = [first.diastole.electrodes[row] for row in in_a]
-        for k, group in enumerate(groups):
-            spacing = min(spacing_cost(points[own], electrodes, catalogue[name]) for name in group)
-            votes = np.array([one.vote(group) for one in (first, second)])
-            if votes.mean() >= LEAST_VOTE:
-                table.group_cost[k, i, j] = spacing - np.log(np.maximum(votes, 0.02)).sum()
-        table.possible[i, j] = bool(np.isfinite(table.group_cost[:, i, j]).any())
+        shape = uneven + bend_cost(points[own])
+        for ways in one.ways:
+            at = points[own][::-1] if ways[0] else points[own]
+            electrodes = [first.electrodes + 1 - number for number in reversed(one.numbers)] if ways[0] else one.numbers
+            ends_cost = _ends_cost(first, ways[0]) + _ends_cost(second, ways[1])
+            whole = first.electrodes if ways[0] else None
+            names = _name_costs(at, electrodes, whole, np.stack([votes_a[i], votes_b[j]]), catalogue, groups)
+            by_group = ends_cost + names
+            cost = shape + float(by_group.min(initial=np.inf))
+            known = costs.setdefault((i, j), {})
+            if cost < min(known.values(), default=np.inf) or not known:
+                table.distance_px[i, j] = mean
+                table.variance_px2[i, j] = catheter_variance + 1 / (1 / noise).sum()
+                table.turn_px[i, j] = slopes[own].mean(axis=0)
+                table.position_mm[i, j] = points[own].mean(axis=0)
+                table.shape_cost[i, j] = shape
+                table.group_cost[:, i, j] = by_group
+                table.possible[i, j] = bool(np.isfinite(by_group).any())
+                table.turned[i, j] = ways
+                table.axis_mm[i, j] = at[0] - at[-1]
+            known[ways] = cost
+    for (i, j), known in costs.items():
+        in_a, in_b = (bool(way) for way in table.turned[i, j])
+        if table.possible[i, j] and len(known) > 1:
+            least = known[in_a, in_b]
+            table.other_end_cost[i, j] = known.get((not in_a, not in_b), np.inf) - least
+            one_end = [known.get(ways, np.inf) for ways in ((not in_a, in_b), (in_a, not in_b))]
+            table.one_end_cost[i, j] = min(one_end) - least
     return table
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """Two chains, electrode by electrode.
+
+    numbers : of the common electrodes in view a. rows_a, rows_b : these electrodes in each chain. ways : which of the chains may be
+    numbered from the other end so that these electrodes belong together.
+    """
+
+    pair: tuple[int, int]
+    numbers: list[int]
+    rows_a: list[int]
+    rows_b: list[int]
+    ways: tuple[tuple[bool, bool], ...]
+
+
+def _variances_px2(chain: Chain) -> Array:
+    """Return the variance of a chain's electrodes along any direction, (m,)."""
+    variances: Array = np.trace(chain.covariance_px2, axis1=1, axis2=2) / 2
+    return variances
+
+
+def _readings(pair: tuple[int, int], first: RunCatheter, second: RunCatheter) -> list[_Reading]:
+    """Return the ways in which two chains may show the same electrodes."""
+    alike = first.electrodes == second.electrodes
+    may_turn = [alike and one.tip_odds is not None for one in (first, second)]
+    ways = [(a, b) for a in (False, True) for b in (False, True) if (may_turn[0] or not a) and (may_turn[1] or not b)]
+    found = []
+    for opposite in (False, True):
+        own = tuple(way for way in ways if (way[0] != way[1]) == opposite)
+        in_a, in_b = first.diastole.electrodes, second.diastole.electrodes
+        partners = {number: second.electrodes + 1 - number if opposite else number for number in in_a}
+        numbers = [number for number in in_a if partners[number] in in_b]
+        if own and numbers:
+            rows_a = [in_a.index(number) for number in numbers]
+            rows_b = [in_b.index(partners[number]) for number in numbers]
+            found.append(_Reading(pair, numbers, rows_a, rows_b, own))
+    return found
+
+
+def _ends_cost(catheter: RunCatheter, is_turned: bool) -> float:
+    """Return the cost of numbering a catheter from its other end."""
+    return catheter.tip_odds or 0.0 if is_turned else 0.0
+
+
+def _name_costs(
+    points_world_mm: Array,
+    electrodes: Sequence[int],
+    whole: int | None,
+    votes: Array,
+    catalogue: Catalogue,
+    groups: Sequence[tuple[str, ...]],
+) -> Array:
+    """Return the cost (groups,) of each name's spacings and votes (2, groups).
+
+    Names of catheters that do not have ``whole`` electrodes, where it is given, are impossible.
+    """
+    costs: Array = -np.log(np.maximum(votes, 0.02)).sum(axis=0)
+    for k, group in enumerate(groups):
+        if votes[0, k] + votes[1, k] >= 2 * LEAST_VOTE and whole in (None, catalogue[group[0]].electrodes):
+            costs[k] += min(spacing_cost(points_world_mm, electrodes, catalogue[name]) for name in group)
+        else:
+            costs[k] = np.inf
+    return costs
 
 
 def _turned(camera: Camera, axis: int) -> Camera:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -81,6 +81,28 @@ class RunCatheter:
         """RMS distance of the centroid from its mean place through the run."""
         _, centroids = self.centroids_uv
         return float(np.sqrt(centroids.var(axis=0).sum())) if len(centroids) else np.inf
+
+    @functools.cached_property
+    def electrodes(self) -> int:
+        """The highest electrode number in any frame."""
+        return max(chain.electrodes[-1] for chain in (self.diastole, *self.chains.values()))
+
+    @functools.cached_property
+    def tip_odds(self) -> float | None:
+        """Log-odds that the numbers begin at the tip, the mean over the frames.
+
+        None where the segmenter does not doubt it, and where a person has numbered the electrodes.
+        """
+        chains = (self.diastole, *self.chains.values())
+        if any(chain.manual for chain in chains):
+            return None
+        odds = [chain.tip_odds for chain in self.chains.values() or (self.diastole,) if chain.tip_odds is not None]
+        return sum(odds) / len(odds) if odds else None
+
+    def turned(self) -> RunCatheter:
+        """Return the catheter with its electrodes numbered from the other end."""
+        chains = {frame: chain.from_other_end(self.electrodes) for frame, chain in self.chains.items()}
+        return replace(self, chains=chains, diastole=self.diastole.from_other_end(self.electrodes))
 
     @property
     def facts(self) -> CatheterFacts:

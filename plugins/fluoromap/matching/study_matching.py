@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+
+import numpy as np
+from scipy.special import expit
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
@@ -27,17 +30,20 @@ from fluoromap.matching.doubts import (
     groups_with_extra,
     mirrored_sites,
 )
+from fluoromap.matching.ends import common_ends
 from fluoromap.matching.hypotheses import Hypotheses
 from fluoromap.matching.identity import PairedCatheter, look_alike_groups, name_look_alikes
 from fluoromap.matching.joint_choice import SiteChoice, choose_pairings
 from fluoromap.matching.pairs import PairTable
 from fluoromap.matching.phase_matching import pair_by_phase, phase_shift
 from fluoromap.matching.run_catheters import RunCatheter
-from fluoromap.matching.site_comparison import SiteComparison, SiteRuns, SiteViews, compare_views, views_of
+from fluoromap.matching.site_comparison import RunInView, SiteComparison, SiteRuns, SiteViews, compare_views, views_of
 from fluoromap.reasons import Reason
 
 LEAST_PROBABILITY = 0.02
 """Another pairing with a lower probability counts as ruled out."""
+_UNSURE_END = 0.1
+"""Probability that a catheter is numbered from the wrong end, above which its identity is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +61,13 @@ class _ComparedSite:
 class _NamedSite:
     """A site with named catheters.
 
-    pairs, alternative : name -> chain of view a, of view b. probability : of the alternative. notes : (name, reason of
-    doubt).
+    pairs, alternative : name -> chain of view a, of view b. turned : name -> whether each of the two is numbered from the other
+    end. probability : of the alternative. notes : (name, reason of doubt).
     """
 
     compared: _ComparedSite
     pairs: dict[str, tuple[int, int]]
+    turned: dict[str, tuple[bool, bool]]
     alternative: dict[str, tuple[int, int]] | None
     probability: float
     notes: tuple[tuple[str, Reason], ...]
@@ -71,7 +78,7 @@ class _NamedSite:
         # The order of the names is part of the result.
         pairs = tuple(self.pairs.items())
         alternative = None if self.alternative is None else (tuple(self.alternative.items()), self.probability)
-        return runs.site, *runs.content, catalogue, pairs, alternative, self.notes
+        return runs.site, *runs.content, catalogue, pairs, tuple(self.turned.items()), alternative, self.notes
 
 
 class _Views:
@@ -178,10 +185,36 @@ def _name_all(
                 at_site[slot] = at_site[slot] or left.pop(0)
         if reason is not None:
             doubts.update(dict.fromkeys(group, reason))
-    return [
+    named = [
         _named_site(site, choice, own, doubts, groups, slots)
         for site, choice, own in zip(sites, choices, names, strict=True)
     ]
+    for name in catalogue.names:
+        named = _with_common_ends(name, named, rests=name != catalogue.mapping)
+    return named
+
+
+def _with_common_ends(name: str, sites: Sequence[_NamedSite], rests: bool) -> list[_NamedSite]:
+    """Return the sites with this catheter numbered from one end.
+
+    All sites together say which end. A catheter that does not rest lies differently at each.
+    """
+    shown = [site for site in sites if name in site.pairs]
+    own = [(site.compared.table, site.pairs[name]) for site in shown]
+    costs = np.array([table.other_end_cost[pair] for table, pair in own])
+    if not np.isfinite(costs).any():
+        return list(sites)
+    axes = np.array([table.axis_mm[pair] for table, pair in own])
+    wrong, sure = common_ends(axes, costs) if rests else (np.zeros(len(costs), dtype=np.bool_), costs)
+    answers = {}
+    for site, (table, pair), is_wrong, cost in zip(shown, own, wrong, sure, strict=True):
+        ways, notes = site.turned[name], site.notes
+        if is_wrong:
+            ways = (not ways[0], not ways[1])
+        if expit(-cost) + expit(-table.one_end_cost[pair]) > _UNSURE_END:
+            notes = tuple(dict.fromkeys((*notes, (name, Reason.IDENTITY_UNCERTAIN))))
+        answers[site.compared.runs.site] = replace(site, turned={**site.turned, name: ways}, notes=notes)
+    return [answers.get(site.compared.runs.site, site) for site in sites]
 
 
 def _paired(site: _ComparedSite, pair: IntArray, place: int) -> PairedCatheter:
@@ -227,7 +260,13 @@ def _named_site(
         notes.extend((name, Reason.EXTRA_CATHETER) for name in groups[number] if name in pairs)
     if site.comparison.irregular:
         notes.extend((name, Reason.IRREGULAR_RHYTHM) for name in pairs)
-    return _NamedSite(site, pairs, alternative, choice.probability, tuple(dict.fromkeys(notes)))
+    turned = {name: _ways(site.table, pair) for name, pair in pairs.items()}
+    return _NamedSite(site, pairs, turned, alternative, choice.probability, tuple(dict.fromkeys(notes)))
+
+
+def _ways(table: PairTable, pair: tuple[int, int]) -> tuple[bool, bool]:
+    """Return which chains of a pair are numbered from the other end."""
+    return bool(table.turned[pair][0]), bool(table.turned[pair][1])
 
 
 def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) -> MatchedSite:
@@ -239,13 +278,15 @@ def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) ->
     phases_b = b.phases
     if views.folded is not None and phases_b is not None:
         phases_b = (phases_b + phase_shift(cameras, views.folded, list(named.pairs.values()))) % 1.0
-    in_a = {name: a.catheters[i] for name, (i, _) in named.pairs.items()}
-    in_b = {name: b.catheters[j] for name, (_, j) in named.pairs.items()}
+    in_a, in_b = _in_views((a, b), named.pairs, named.turned)
     track_a, track_b = _track(in_a, a.segmentation, a.phases), _track(in_b, b.segmentation, phases_b)
     alternative = None
     if named.alternative is not None and catalogue.mapping in named.alternative:
-        other_a = {name: a.catheters[i] for name, (i, _) in named.alternative.items()}
-        other_b = {name: b.catheters[j] for name, (_, j) in named.alternative.items()}
+        other_turned = {
+            name: named.turned[name] if named.pairs.get(name) == pair else _ways(named.compared.table, pair)
+            for name, pair in named.alternative.items()
+        }
+        other_a, other_b = _in_views((a, b), named.alternative, other_turned)
         alternative = Alternative(_at_diastole(catalogue, other_a, other_b, a.phases, phases_b), named.probability)
     missing = [(name, Reason.CATHETER_NOT_FOUND) for name in catalogue.names if name not in named.pairs]
     return MatchedSite(
@@ -261,6 +302,20 @@ def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) ->
         notes=(*missing, *named.notes),
         alternative=alternative,
     )
+
+
+def _in_views(
+    views: tuple[RunInView, RunInView], pairs: dict[str, tuple[int, int]], turned: dict[str, tuple[bool, bool]]
+) -> tuple[dict[str, RunCatheter], dict[str, RunCatheter]]:
+    """Return the catheters of each view by their names, numbered from the right end."""
+    a, b = (
+        {
+            name: view.catheters[pair[k]].turned() if turned[name][k] else view.catheters[pair[k]]
+            for name, pair in pairs.items()
+        }
+        for k, view in enumerate(views)
+    )
+    return a, b
 
 
 def _named(name: str, chain: Chain) -> NamedChain:

@@ -9,6 +9,23 @@ import numpy as np
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.linking import ONE_BY_ONE, Trust
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.visible_part import LEAST_VISIBLE
+
+UNSEEN = 0.0
+"""Score of an electrode outside the field: the others say where it is."""
+
+
+def middle_score(scores: Array) -> Array:
+    """Return the medians (...) of the scores (..., electrodes) that are not NaN.
+
+    NumPy's own median takes several times as long for so few values.
+    """
+    if np.isnan(scores).any():
+        return np.asarray(np.nanmedian(scores, axis=-1))
+    ordered = np.sort(scores, axis=-1)
+    count = scores.shape[-1]
+    middle: Array = 0.5 * (ordered[..., (count - 1) // 2] + ordered[..., count // 2])
+    return middle
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,9 +40,12 @@ class ScoreLimits:
     least_seen: float = 0.0
 
     def allow(self, scores: Array) -> BoolArray:
-        """Return which chains with scores (..., electrodes) reach the limits, (...)."""
-        share_seen = np.mean(scores >= self.seen, axis=-1)
-        allowed: BoolArray = (np.median(scores, axis=-1) >= self.middle) & (share_seen >= self.least_seen)
+        """Return which chains with scores (..., electrodes) reach the limits, (...).
+
+        Electrodes outside the field have NaN and do not count.
+        """
+        share_seen = np.mean((scores >= self.seen) | np.isnan(scores), axis=-1)
+        allowed: BoolArray = (middle_score(scores) >= self.middle) & (share_seen >= self.least_seen)
         return allowed
 
 
@@ -65,7 +85,7 @@ class Acceptance:
         Parameters
         ----------
         scores : (..., electrodes)
-            Of the electrodes, in the proposer's measure.
+            Of the electrodes, in the proposer's measure; NaN outside the field.
         chain_scores : (...)
             Of the chains, see :func:`~fluoromap.segmenter.linking.possible_chains`.
         beside : bool
@@ -74,7 +94,20 @@ class Acceptance:
         limits = self.scores if self.scores_beside is None or not beside else self.scores_beside
         accepted = limits.allow(scores)
         if scores.shape[-1] >= MANY_ELECTRODES:
-            ends = np.minimum(scores[..., :2].max(axis=-1), scores[..., -2:].max(axis=-1))
-            middle = np.median(scores, axis=-1)
-            accepted |= (chain_scores >= self.row_chain_score) & (middle >= self.row_score) & (ends >= self.scores.seen)
-        return accepted
+            unseen = np.isnan(scores)
+            ends = np.where(unseen, np.inf, scores)
+            ends = np.minimum(ends[..., :2].max(axis=-1), ends[..., -2:].max(axis=-1))
+            clear = (chain_scores >= self.row_chain_score) & (middle_score(scores) >= self.row_score)
+            accepted |= clear & (ends >= self.scores.seen)
+        seen_enough: BoolArray = accepted & shows_enough(~np.isnan(scores))
+        return seen_enough
+
+
+def shows_enough(is_seen: BoolArray) -> BoolArray:
+    """Return which chains have enough of their electrodes in the field, (...).
+
+    All of a catheter with three electrodes or fewer, else three of them and half. is_seen : (..., electrodes).
+    """
+    electrodes = is_seen.shape[-1]
+    enough: BoolArray = is_seen.sum(axis=-1) >= min(max(LEAST_VISIBLE, 0.5 * electrodes), electrodes)
+    return enough

@@ -11,7 +11,8 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.acceptance import Acceptance
+from fluoromap.segmenter.acceptance import UNSEEN, Acceptance, shows_enough
+from fluoromap.segmenter.bars import follows_bars
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
@@ -41,10 +42,11 @@ from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, sho
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
 _AGAIN_SLACK = 2.5
+_CONFIRMED_CONTRAST = 3.0
 _STRAY_PX = 5.0
 _HIDING_MM, _LEAST_FREE = 1.2, 2
 _WORST_FIT = 2.0
-_BENDING = 0.12
+_BENDING, _LEAST_REACH_PX, _SMOOTH_PX = 0.12, 6.5, 35.0
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
 _LEAST_MOVING_ODDS = 0.2
@@ -139,11 +141,20 @@ class ChainDetector:
         """Search the chains of one log image.
 
         One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
-        accepted too. Weaker chains alone come with ``manual_needed``.
+        accepted too. Weaker chains alone come with ``manual_needed``. Where catheters lack, electrodes near the edge of the field
+        may belong to them.
         """
         seen = self.image_evidence(x)
-        proposed = seen.proposals(self.field.candidates, max(2, self._electrodes // 2))
-        return SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
+        expected = max(2, self._electrodes // 2)
+        proposed = seen.proposals(self.field.candidates, expected)
+        searched = SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
+        if len(searched.found.chains) == len(self.catalogue.catheters):
+            return searched
+        with_edge = seen.proposals(self.field.with_edge, expected)
+        if len(with_edge) == len(proposed):
+            return searched
+        other = SearchedImage(x, seen, with_edge, self._chains_of(x, seen, with_edge))
+        return other if other.explained > searched.explained else searched
 
     def split_pairs(self, searched: SearchedImage) -> SearchedImage:
         """Search an image again with pairs split into two electrodes.
@@ -216,11 +227,19 @@ class ChainDetector:
 
         def dark(places: Array) -> Array:
             probability = seen.unseen_probability_at(places)
-            allowed = self._in_field(places) & (probability > 0)
-            return np.where(allowed, self._evidence(probability), -np.inf)
+            known = np.where(probability > 0, self._evidence(probability), -np.inf)
+            # Outside the field nothing speaks for or against an electrode.
+            return np.where(self._is_seen(places), known, 0.0)
 
         completed = complete_chains(
-            points, weights, variance, dark, self.acceptance.unseen_evidence, families, self.px_per_mm
+            points,
+            weights,
+            variance,
+            dark,
+            self.acceptance.unseen_evidence,
+            families,
+            self.px_per_mm,
+            self.field.inside,
         )
         possible = possible_chains(
             completed.points_uv,
@@ -242,7 +261,8 @@ class ChainDetector:
     ) -> PossibleChains:
         if not self.acceptance.strict:
             return possible
-        contrast, odds = seen.likeness.at(points_uv), seen.kind_odds_at(points_uv)
+        contrast = seen.likeness.at(points_uv)
+        odds = np.where(self._is_seen(points_uv), seen.kind_odds_at(points_uv), EVEN_ODDS)
         return without_shorter_catheters(possible, families, contrast, odds, self.acceptance.faded_price)
 
     def _fit(
@@ -256,7 +276,7 @@ class ChainDetector:
         """Fit linked chains to the image, and drop those that are not accepted."""
         fitted = fit_chains(
             x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed,
-            seen.tip_logits_at,
+            seen.tip_logits_at, self._is_seen(linking.points_uv),
         )  # fmt: skip
         clear = [
             (candidates, one)
@@ -288,9 +308,11 @@ class ChainDetector:
         accepted = []
         for (candidates, _), chain, scores in zip(clear, found, all_scores, strict=True):
             others = [other for other in found if other is not chain]
-            if self.acceptance.accepts(scores, chain.scores[0], beside):
+            is_seen = self._is_seen(chain.pixels_uv)
+            if self.acceptance.accepts(np.where(is_seen, scores, np.nan), chain.scores[0], beside):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
-                accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=scores)))
+                shown = np.where(is_seen, scores, UNSEEN)
+                accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=shown)))
         chains = tuple(chain for _, chain in accepted)
         listed = np.ones(len(chains), np.bool_)
         if self.acceptance.strict:
@@ -310,7 +332,7 @@ class ChainDetector:
         They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
         electrode of an unlisted catheter.
         """
-        scores = seen.scores_at(linking.points_uv)
+        scores = np.where(self._is_seen(linking.points_uv), seen.scores_at(linking.points_uv), np.nan)
         unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
         allowed = []
         for index, (family, rows, chain_scores) in enumerate(
@@ -329,10 +351,10 @@ class ChainDetector:
     def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
         """Return which chains can be catheters of the catalogue, (n,).
 
-        Others are part of a catheter with more electrodes than the catalogue has. The electrodes of one catheter look
-        alike, so proposals in less than half of the gaps may be parts of a dark shaft if they are less probable: less than a
-        long chain's weaker electrodes, or clearly less than all electrodes of a short one and 0.77 at most. Electrodes of a
-        long chain in another chain's line belong to the long one.
+        Others are part of a catheter with more electrodes than the catalogue has, or no catheter: their electrodes are places on
+        parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
+        dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
+        a short one and 0.77 at most. Electrodes of a long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
@@ -340,9 +362,11 @@ class ChainDetector:
         listed = np.zeros(len(chains), np.bool_)
         for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
             family = self._family(chain)
-            if family is None:
+            is_seen = chain.scores > UNSEEN
+            if family is None or follows_bars(chain.pixels_uv[is_seen], self._shafts(seen)):
                 continue
             onwards = EVEN_ODDS
+            own = own[is_seen]
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:
@@ -362,9 +386,11 @@ class ChainDetector:
 
         sure, alike : proposals that no chain explains, (n, 2). row : proposals in whose line the chain may be.
         """
+        # Those alike are among the sure ones.
+        between = unexplained_between(chain, sure, catheter, self.px_per_mm)
         return (
-            2 * unexplained_between(chain, sure, catheter, self.px_per_mm) < len(chain.electrodes)
-            and not unexplained_between(chain, alike, catheter, self.px_per_mm)
+            2 * between < len(chain.electrodes)
+            and not (between and unexplained_between(chain, alike, catheter, self.px_per_mm))
             and not continues(chain, row, catheter, self.px_per_mm)
         )
 
@@ -390,6 +416,7 @@ class ChainDetector:
         taken: Sequence[Chain],
         frame: int | None = None,
         same_shape: bool = False,
+        confirmed: bool = False,
     ) -> Chain | None:
         """Return another frame's chain at its place in this image.
 
@@ -410,6 +437,7 @@ class ChainDetector:
         for other in taken:
             near = np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
             hidden |= near < _HIDING_MM * self.px_per_mm
+        hidden |= ~self._is_seen(guess)
         if np.count_nonzero(~hidden) < _LEAST_FREE:
             return None
         place = refine(
@@ -424,22 +452,31 @@ class ChainDetector:
         found = place.points_uv[0]
         is_stray = np.linalg.norm(found - guess, axis=1) > _STRAY_PX
         covariance = np.where(is_stray[:, None, None], (4 * _STRAY_PX) ** 2 * np.eye(2), place.covariance_px2[0])
-        expected = chain.covariance_px2 + (_BENDING * reach_px) ** 2 * np.eye(2)
+        expected = chain.covariance_px2 + _bending_px(reach_px) ** 2 * np.eye(2)
         gain = expected @ np.linalg.inv(expected + covariance)
         points = guess + np.einsum("nij,nj->ni", gain, found - guess)
         covariance = gain @ covariance
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         # The shape comes before the scores: it needs no pass of a network.
-        if not self._in_field(points).all() or (same_shape and not is_same_shape(points, chain.pixels_uv)):
+        is_seen = self._is_seen(points)
+        if not shows_enough(is_seen) or (same_shape and not is_same_shape(points, chain.pixels_uv)):
             return None
         scores, variance = seen.scores_at(points), seen.variance_at(points)
         weights = self._evidence(seen.probability_at(points))
         for values in (scores, weights, variance) if hidden.any() else ():
             values[hidden] = np.median(values[~hidden])
-        score = chain_score(points, weights, variance, self._shafts(seen), family)
-        if score < family.floor - _AGAIN_SLACK or place.clearness[0] < self.acceptance.again_clearness:
+        if place.clearness[0] < self.acceptance.again_clearness:
             return None
-        again = replace(chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False)
+        score = chain_score(points, weights, variance, self._shafts(seen), family)
+        # Half an electrode at the edge cannot be located.
+        scores[~_are_in(self.field.with_edge, points)] = UNSEEN
+        in_view = confirmed and np.mean(seen.likeness.at(points[is_seen])) >= _CONFIRMED_CONTRAST
+        if score < family.floor - _AGAIN_SLACK and not in_view:
+            return None
+        # The search keeps the order of the electrodes, so that it says nothing about the tip.
+        again = replace(
+            chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False, tip_odds=None
+        )  # fmt: skip
         return replace(again, covariance_px2=widen_covariance(again, taken, self.px_per_mm))
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
@@ -479,13 +516,9 @@ class ChainDetector:
         fitted = fit_chains(x, points, linked, shaft_image, families, seen.position_noise)
         return any(one.clearness >= self.acceptance.extra_clearness for one in fitted)
 
-    def _in_field(self, points_uv: Array) -> BoolArray:
-        """Return which points lie where electrodes may be, (n,)."""
-        rows, columns = self.field.candidates.shape
-        u, v = np.rint(points_uv).astype(np.int64).T
-        within = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
-        inside: BoolArray = within & self.field.candidates[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
-        return inside
+    def _is_seen(self, points_uv: Array) -> BoolArray:
+        """Return which points lie in the field, (n,)."""
+        return _are_in(self.field.inside, points_uv)
 
     def _family(self, chain: Chain) -> CatheterFamily | None:
         """Return the most probable family whose catheters have exactly this chain's electrodes."""
@@ -499,6 +532,23 @@ class ChainDetector:
     def _shafts(self, seen: ImageEvidence) -> ShaftImage:
         clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
         return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)
+
+
+def _are_in(field: BoolArray, points_uv: Array) -> BoolArray:
+    """Return which points lie in a part of the image, (n,)."""
+    rows, columns = field.shape
+    u, v = np.rint(points_uv).astype(np.int64).T
+    within = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    inside: BoolArray = within & field[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
+    return inside
+
+
+def _bending_px(reach_px: float) -> float:
+    """Return the standard deviation of a place from the shape of an earlier frame, pixels.
+
+    Catheters bend smoothly: from one frame of a fast run to the next the shape hardly changes.
+    """
+    return _BENDING * min(reach_px, max(_LEAST_REACH_PX, reach_px * reach_px / _SMOOTH_PX))
 
 
 def _away(points_uv: Array, from_uv: Array) -> Array:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fluoromap.catheters import Catheter
-from fluoromap.contracts import Array, Chain
+from fluoromap.contracts import Array, BoolArray, Chain
 from fluoromap.segmenter.linking import (
     CandidateChain,
     CatheterFamily,
@@ -27,6 +27,8 @@ _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0
 _TIP_WEIGHT, _MOST_TIP = 1.0, 4.0
 _LONG_TIP_MM = 3.0
+_TIP_SHARE = 0.25
+"""Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
 
 
@@ -51,6 +53,7 @@ def fit_chains(
     noise: float,
     sure: int | None = None,
     tip_logits_at: Callable[[Array], Array] | None = None,
+    is_seen: BoolArray | None = None,
 ) -> tuple[FittedChain, ...]:
     """Fit each chain with every catheter of as many electrodes.
 
@@ -71,6 +74,8 @@ def fit_chains(
         Number of candidates with a blob of their own; they come first. All by default.
     tip_logits_at : callable, optional
         (n, 2) pixels -> (n,) log-odds that electrodes there are tips. No end looks more like a tip by default.
+    is_seen : (n,) bool, optional
+        Which candidates lie in the field. The others stay where they are. All by default.
 
     Returns
     -------
@@ -79,7 +84,7 @@ def fit_chains(
     """
     likelihood = np.full((len(linked), len(families)), -np.inf)
     foreign = _candidates_of_others(candidates_uv, linked, families)
-    electrode_fits: dict[tuple[int, int], tuple[ElectrodeFit, int]] = {}
+    electrode_fits: dict[tuple[int, int], tuple[ElectrodeFit, int, float]] = {}
     for column, family in enumerate(families):
         rows = [row for row, chain in enumerate(linked) if len(chain.candidates) == family.catheter.electrodes]
         if not rows:
@@ -87,10 +92,12 @@ def fit_chains(
         order = np.array([linked[row].candidates for row in rows])
         hidden = np.array([[candidate in foreign[row] for candidate in linked[row].candidates] for row in rows])
         order, hidden = (np.concatenate([forth, forth[:, ::-1]]) for forth in (order, hidden))
+        outside = np.zeros_like(hidden) if is_seen is None else ~is_seen[order]
         without_blob = np.zeros_like(hidden) if sure is None else order >= sure
         electrode_fit = refine(
-            x, candidates_uv[order], family.catheter, shaft_image.px_per_mm, noise, hidden, without_blob
+            x, candidates_uv[order], family.catheter, shaft_image.px_per_mm, noise, hidden | outside, without_blob
         )
+        electrode_fit = _with_places(electrode_fit, candidates_uv[order], outside)
         no_variance = np.zeros(order.shape)
         fit = electrode_fit.log_likelihood + spacing_fit(
             electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm
@@ -102,16 +109,19 @@ def fit_chains(
             first, last = answers_for_each(tip_logits_at, [electrode_fit.points_uv[:, end] for end in (0, -1)])
             directed += _TIP_WEIGHT * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
         for index, row in enumerate(rows):
-            best = index if directed[index] >= directed[index + len(rows)] else index + len(rows)
+            forth_over_back = float(directed[index] - directed[index + len(rows)])
+            best = index if forth_over_back >= 0 else index + len(rows)
             likelihood[row, column] = fit[best]
-            electrode_fits[row, column] = electrode_fit, best
+            electrode_fits[row, column] = electrode_fit, best, _TIP_SHARE * abs(forth_over_back)
     probabilities = kind_probabilities(likelihood, families)
     chains = []
     for row, chain in enumerate(linked):
         of_family = [
             sum(probability for name, probability in probabilities[row] if name in family.names) for family in families
         ]
-        electrode_fit, best = electrode_fits.get((row, int(np.argmax(of_family)))) or electrode_fits[row, chain.family]
+        electrode_fit, best, tip_odds = (
+            electrode_fits.get((row, int(np.argmax(of_family)))) or electrode_fits[row, chain.family]
+        )
         chains.append(
             FittedChain(
                 Chain(
@@ -120,11 +130,19 @@ def fit_chains(
                     covariance_px2=electrode_fit.covariance_px2[best],
                     scores=np.full(len(chain.candidates), chain.score),
                     kinds=probabilities[row],
+                    tip_odds=tip_odds,
                 ),
                 float(electrode_fit.clearness[best]),
             )
         )
     return tuple(chains)
+
+
+def _with_places(fit: ElectrodeFit, places_uv: Array, outside: BoolArray) -> ElectrodeFit:
+    """Return the fit with electrodes outside the field at these places (n, electrodes, 2)."""
+    if not outside.any():
+        return fit
+    return replace(fit, points_uv=np.where(outside[..., None], places_uv, fit.points_uv))
 
 
 def _tip_shows(catheter: Catheter) -> bool:

@@ -15,8 +15,8 @@ from fluoromap.segmenter.collimator import within_collimator
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
-MARGIN_PX = 16
-"""Candidates closer than this to the edge of the field are ignored, pixels."""
+MARGIN_PX, EDGE_PX = 16, 8
+"""Candidates closer than this to the edge of the field are ignored, pixels: at first, and where catheters lack."""
 
 _SAMPLES = 15
 _DARK = 0.06
@@ -31,13 +31,15 @@ _Pixel = TypeVar("_Pixel", bound=np.generic)
 class FieldMask:
     """The field of one run.
 
-    inside : the eroded field; candidates : pixels where electrodes may lie; both (rows, columns).
+    inside : the eroded field; candidates : pixels where electrodes may lie; with_edge : the same and those near the edge;
+    all (rows, columns).
     outside, nearest : flat indices of the pixels outside and, for each, of the nearest pixel inside.
     mean_level : mean stored grey level inside, over the sampled frames.
     """
 
     inside: BoolArray
     candidates: BoolArray
+    with_edge: BoolArray
     outside: IntArray
     nearest: IntArray
     mean_level: float
@@ -141,14 +143,16 @@ def _build_mask(half: BoolArray, median: Image, shape: tuple[int, int]) -> Field
         inside = eroded if eroded.any() else half
     # A candidate also needs a margin to the border of the image: half an electrode cannot be located.
     to_edge = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
-    candidates = to_edge > 0.5 * min(MARGIN_PX, min(shape) // 8)
+    candidates, with_edge = (
+        _double_size(to_edge > 0.5 * min(margin, min(shape) // 8), shape) for margin in (MARGIN_PX, EDGE_PX)
+    )
     whole = _double_size(inside, shape)
     outside = np.flatnonzero(~whole)
     nearest = np.zeros(0, dtype=np.int64)
     if outside.size:
         v, u = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
         nearest = _double_size(2 * (v.astype(np.int64) * shape[1] + u), shape).ravel()[outside]
-    return FieldMask(whole, _double_size(candidates, shape), outside, nearest, float(median[inside].mean()))
+    return FieldMask(whole, candidates, with_edge, outside, nearest, float(median[inside].mean()))
 
 
 def _double_size(half: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:

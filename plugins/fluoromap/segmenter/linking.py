@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,6 +103,7 @@ class PossibleChains:
         )
 
 
+@functools.lru_cache(maxsize=32)
 def catheter_families(catalogue: Catalogue) -> tuple[CatheterFamily, ...]:
     """Group the catalogue's catheters by :meth:`~fluoromap.catheters.Catheter.looks_like`."""
     groups: list[list[Catheter]] = []
@@ -229,15 +231,47 @@ def best_chains(
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
     # A long catheter has many chains that differ in one electrode: they must not crowd out the other families.
     most = max(_LEAST_OF_FAMILY, _BEST // len(families))
-    best = [np.argsort(-scores)[:most] for scores in possible.scores]
-    best = [rows[np.isfinite(scores[rows])] for rows, scores in zip(best, possible.scores, strict=True)]
-    scores = np.concatenate([of_family[rows] for rows, of_family in zip(best, possible.scores, strict=True)])
+    likely = possible.where([np.isfinite(scores) for scores in possible.scores])
+    compared = [np.argsort(-scores, kind="stable")[:most] for scores in likely.scores]
+    chosen = _best_set(likely, compared, points, families, px_per_mm)
+    # Nor must parts of a long catheter crowd out another one of their own family, which lies elsewhere.
+    for _ in range(len(families)):
+        if len(chosen) in (0, sum(len(family.names) for family in families)):
+            break
+        taken = [candidate for chain in chosen for candidate in chain.candidates]
+        away = np.linalg.norm(points[:, None] - points[taken], axis=2).min(axis=1)
+        is_taken = away < _SAME_PLACE_MM * px_per_mm
+        compared = []
+        for index, (paths, scores) in enumerate(zip(likely.rows, likely.scores, strict=True)):
+            elsewhere = np.flatnonzero(is_taken[paths].sum(axis=1) < _SAME_PLACES)
+            of_family = [chain.candidates for chain in chosen if chain.family == index]
+            own = [np.flatnonzero((paths == np.array(candidates)).all(axis=1))[:1] for candidates in of_family]
+            compared.append(np.concatenate([*own, elsewhere[np.argsort(-scores[elsewhere], kind="stable")[:most]]]))
+        more = _best_set(likely, compared, points, families, px_per_mm)
+        if len(more) <= len(chosen):
+            break
+        chosen = more
+    return chosen
+
+
+def _best_set(
+    possible: PossibleChains,
+    compared: Sequence[IntArray],
+    points: Array,
+    families: Sequence[CatheterFamily],
+    px_per_mm: float,
+) -> tuple[CandidateChain, ...]:
+    """Return the best set of some chains, best first.
+
+    compared : for each family, the indices of these chains.
+    """
+    scores = np.concatenate([of_family[rows] for rows, of_family in zip(compared, possible.scores, strict=True)])
     if not len(scores):
         return ()
-    family = np.repeat(np.arange(len(families)), [len(rows) for rows in best])
+    family = np.repeat(np.arange(len(families)), [len(rows) for rows in compared])
     longest = max(paths.shape[1] for paths in possible.rows)
     within = np.full((len(scores), longest), -1, np.int64)
-    for index, (rows, paths) in enumerate(zip(best, possible.rows, strict=True)):
+    for index, (rows, paths) in enumerate(zip(compared, possible.rows, strict=True)):
         within[family == index, : paths.shape[1]] = paths[rows]
     values = scores + np.array([each.worth for each in families])[family]
     order = np.argsort(-values, kind="stable")

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fluoromap.contracts import Array, IntArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.chain_search import LONGEST, SHORTEST
 
 MANY_ELECTRODES = 6
@@ -25,7 +25,9 @@ _MISSING_PRICE = 1.5
 _MOST_ROWS = 4000
 
 
-def trace_rows(points_uv: Array, weights: Array, spacing_px: Array, most: int) -> tuple[IntArray, Array]:
+def trace_rows(
+    points_uv: Array, weights: Array, spacing_px: Array, most: int, inside: BoolArray
+) -> tuple[IntArray, Array]:
     """Return the best traces through candidates.
 
     Parameters
@@ -38,6 +40,8 @@ def trace_rows(points_uv: Array, weights: Array, spacing_px: Array, most: int) -
         Spacings from the tip on, at the isocentre, not foreshortened.
     most : int
         At most so many traces are returned.
+    inside : (rows, columns) bool
+        The field. Up to half of the electrodes may lie outside it.
 
     Returns
     -------
@@ -50,7 +54,7 @@ def trace_rows(points_uv: Array, weights: Array, spacing_px: Array, most: int) -
     electrodes = len(spacing_px) + 1
     rows = np.empty((_MOST_ROWS, electrodes), np.int64)
     places, scores = np.empty((_MOST_ROWS, electrodes, 2)), np.empty(_MOST_ROWS)
-    count = _trace(points_uv, weights, spacing_px, best, int(_MOST_MISSING * electrodes), rows, places, scores)
+    count = _trace(points_uv, weights, spacing_px, best, int(_MOST_MISSING * electrodes), inside, rows, places, scores)
     rows, first = np.unique(rows[:count], axis=0, return_index=True)
     order = np.argsort(-scores[first], kind="stable")[:most]
     rows, places = rows[order], places[first[order]]
@@ -59,7 +63,7 @@ def trace_rows(points_uv: Array, weights: Array, spacing_px: Array, most: int) -
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _trace(points, weights, spacing, seeds, most_missing, rows, places, scores):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, scores):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write all traces with few enough missing electrodes; return how many."""
     m = spacing.size + 1
     count = 0
@@ -81,7 +85,7 @@ def _trace(points, weights, spacing, seeds, most_missing, rows, places, scores):
                 place[a, 0], place[a, 1] = points[i, 0], points[i, 1]
                 place[a + 1, 0], place[a + 1, 1] = points[j, 0], points[j, 1]
                 score = weights[i] + weights[j]
-                missing = 0
+                missing = beyond = 0
                 for way in range(2):
                     step = 1 if way == 0 else -1
                     at = a + 1 if way == 0 else a
@@ -111,6 +115,15 @@ def _trace(points, weights, spacing, seeds, most_missing, rows, places, scores):
                         at += step
                         if found < 0:
                             place[at, 0], place[at, 1] = eu, ev
+                            if (
+                                eu < 0
+                                or ev < 0
+                                or eu >= inside.shape[1]
+                                or ev >= inside.shape[0]
+                                or not inside[int(ev), int(eu)]
+                            ):
+                                beyond += 1
+                                continue
                             missing += 1
                             gap += 1
                             if gap > _MISSING_IN_A_ROW:
@@ -124,7 +137,7 @@ def _trace(points, weights, spacing, seeds, most_missing, rows, places, scores):
                         moved = max(math.sqrt(mu * mu + mv * mv), 1e-9)
                         ratio = min(max(0.5 * ratio + 0.5 * moved / space, SHORTEST), LONGEST)
                         direction_u, direction_v = mu / moved, mv / moved
-                if missing > most_missing or count == rows.shape[0]:
+                if missing > most_missing or 2 * (missing + beyond) > m or count == rows.shape[0]:
                     continue
                 for k in range(m):
                     rows[count, k] = row[k]

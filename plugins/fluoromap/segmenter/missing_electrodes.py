@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catheter
-from fluoromap.contracts import Array, IntArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.linking import CatheterFamily
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES, trace_rows
@@ -61,6 +61,7 @@ def complete_chains(
     least_evidence: float,
     families: Sequence[CatheterFamily],
     px_per_mm: float,
+    inside: BoolArray,
 ) -> CompletedChains:
     """Complete all chains of candidates that lack electrodes.
 
@@ -78,9 +79,11 @@ def complete_chains(
     families : sequence of CatheterFamily
     px_per_mm : float
         At the isocentre.
+    inside : (rows, columns) bool
+        The field. A long catheter may have more missing electrodes outside it.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
-    incomplete = [_incomplete_chains(points, weights, family.catheter, px_per_mm) for family in families]
+    incomplete = [_incomplete_chains(points, weights, family.catheter, px_per_mm, inside) for family in families]
     predicted = [chains.places_uv for of_family in incomplete for chains in of_family]
     dark_of = iter(answers_for_each(evidence_at, predicted))
     places, gained, spread = [points], [weights], [variance_px2]
@@ -113,12 +116,14 @@ def complete_chains(
     return CompletedChains(np.concatenate(places), np.concatenate(gained), np.concatenate(spread), tuple(rows))
 
 
-def _incomplete_chains(points: Array, weights: Array, catheter: Catheter, px_per_mm: float) -> list[_IncompleteChains]:
+def _incomplete_chains(
+    points: Array, weights: Array, catheter: Catheter, px_per_mm: float, inside: BoolArray
+) -> list[_IncompleteChains]:
     """Return the chains of candidates (n, 2) that lack electrodes of a catheter."""
     electrodes, spacing_px = catheter.electrodes, np.asarray(catheter.spacing_mm) * px_per_mm
     found = []
     if electrodes >= MANY_ELECTRODES:
-        for row, position in zip(*trace_rows(points, weights, spacing_px, _MOST), strict=True):
+        for row, position in zip(*trace_rows(points, weights, spacing_px, _MOST, inside), strict=True):
             missing = np.flatnonzero(row < 0)
             found.append(_IncompleteChains(row[None], missing, position[missing]))
     elif electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1:

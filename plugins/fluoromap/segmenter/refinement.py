@@ -240,10 +240,13 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
                         u = min(max(points[row, k, 0] + s * du - w * dv, 0.0), highest_u)
                         v = min(max(points[row, k, 1] + s * dv + w * du, 0.0), highest_v)
                         left, top = int(u), int(v)
-                        f = np.float32(u - left)
-                        upper = x[top, left] + f * (x[top, left + 1] - x[top, left])
-                        lower = x[top + 1, left] + f * (x[top + 1, left + 1] - x[top + 1, left])
-                        total += upper + np.float32(v - top) * (lower - upper)
+                        f, g = np.float32(u - left), np.float32(v - top)
+                        # Unsigned: signed indices are checked for negative ones, six times a sample.
+                        a, b = np.uintp(top), np.uintp(left)
+                        c, d = np.uintp(top + 1), np.uintp(left + 1)
+                        upper = x[a, b] + f * (x[a, d] - x[a, b])
+                        lower = x[c, b] + f * (x[c, d] - x[c, b])
+                        total += upper + g * (lower - upper)
                     profile[i] = total / lines
                 chosen = 0
                 for place in range(2 * shift + 1):

@@ -61,6 +61,7 @@ class Detector(Protocol):
         taken: Sequence[Chain],
         frame: int | None = None,
         same_shape: bool = False,
+        confirmed: bool = False,
     ) -> Chain | None:
         """Return a chain of another frame at its place in this log image.
 
@@ -80,6 +81,8 @@ class Detector(Protocol):
             Number of the frame; None for a mean of frames.
         same_shape : bool
             Whether the electrodes must lie as in the other frame.
+        confirmed : bool
+            Whether means of several frames show the catheter. Then contrast alone decides whether this image shows it.
 
         Returns
         -------
@@ -337,17 +340,25 @@ def _chain_search(
     kept: tuple[int, Image] | None = None
 
     def search(
-        frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], same_shape: bool = False
+        frame: int,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        same_shape: bool = False,
+        confirmed: bool = False,
     ) -> Chain | None:
         def find() -> FoundAgain:
             nonlocal kept
             if kept is None or kept[0] != frame:
                 context.check()
                 kept = frame, log_image(frame)
-            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken, frame, same_shape))
+            return FoundAgain(detector.find_again(kept[1], chain, shift, reach_px, taken, frame, same_shape, confirmed))
 
         # A frame may be a number of NumPy, and ``taken`` may grow later.
-        return recall(FoundAgain, (int(frame), chain, shift, reach_px, same_shape, len(taken), *taken), find).chain
+        return recall(
+            FoundAgain, (int(frame), chain, shift, reach_px, same_shape, confirmed, len(taken), *taken), find
+        ).chain
 
     return search
 

@@ -63,11 +63,11 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
         better = better[support[better] >= _SUPPORTED_AT_LEAST * support[better].max()]
         usual = int(better[np.argmin(np.abs(frames[better] - frame))])
         shape = chains[int(frames[usual])]
-        found = search(frame, shape, np.nanmedian(places[row] - places[usual], axis=0), _REACH_PX)
+        found = search(frame, shape, _median_shift(places[row] - places[usual]), _REACH_PX)
         if found is None or found.electrodes != shape.electrodes:
             continue
         if is_same_shape(found.pixels_uv, shape.pixels_uv):
-            agreed[frame] = replace(found, kinds=chains[frame].kinds)
+            agreed[frame] = replace(found, kinds=chains[frame].kinds, tip_odds=chains[frame].tip_odds)
     return agreed
 
 
@@ -102,6 +102,12 @@ def with_shape_of_track(
         return search(shape, shift, reach_px) if searched == frame else None
 
     return with_common_shape({**track, frame: chain}, search_mean)[frame]
+
+
+def _median_shift(difference: Array) -> Array:
+    """Return the median (2,) of the differences (electrodes, 2) that both chains have."""
+    shift: Array = np.median(difference[np.isfinite(difference[:, 0])], axis=0)
+    return shift
 
 
 def _places(chains: Sequence[Chain]) -> Array:

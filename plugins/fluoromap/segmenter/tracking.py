@@ -23,6 +23,8 @@ _STIFF_PX = 3.5
 _BENDING_PX_PER_MS = 0.05
 _KEPT_VELOCITY = 0.6
 _STALE_MS = 50.0
+_FAINT = 0.12
+"""Share of its best score at an older place below which a chain far from there is something else."""
 _OTHER_KIND = 6.0
 _IMPOSSIBLE = 1e6
 _CONFIRMED_PX = 18.0
@@ -42,7 +44,14 @@ class ChainSearch(Protocol):
     """Search for a chain of another frame."""
 
     def __call__(
-        self, frame: int, chain: Chain, shift: Array, reach_px: float, taken: Sequence[Chain], same_shape: bool = False
+        self,
+        frame: int,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        same_shape: bool = False,
+        confirmed: bool = False,
     ) -> Chain | None:
         """Return the chain in a frame; see :meth:`~fluoromap.segmenter.run_segmentation.Detector.find_again`."""
 
@@ -67,6 +76,7 @@ class _Track:
     detections: int = 1
     reversals: int = 0
     from_seed: bool = False
+    confirmed: bool = False
     manual: bool = False
     chains: dict[int, Chain] = field(default_factory=dict)
 
@@ -171,6 +181,10 @@ def track_chains(
         or (accepts is not None and len(track.chains) >= least)
     ]
     tracks_kept.sort(key=lambda track: -track.detections)
+    if accepts is not None and search is not None:
+        for track in tracks_kept:
+            if not track.manual:
+                _complete(track, tracks_kept, frame_times_ms, catheters, search)
     for track in tracks_kept:
         if 2 * track.reversals > track.detections and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
@@ -204,10 +218,15 @@ def _follow(
     """Return all tracks, false ones too."""
     marked = [entry.frame for entry in found if any(chain.manual for chain in entry.chains)]
     tracks: list[_Track] = []
+    begun_with: tuple[Chain, ...] = ()
     if seed is not None and seed.chains and not (marked and marks_first):
         start = seed.frame
         at = float(frame_times_ms[start])
-        tracks = [_Track(chain, at, np.zeros(2), detections=0, from_seed=True) for chain in seed.chains]
+        begun_with = seed.chains
+        tracks = [
+            _Track(chain, at, np.zeros(2), detections=0, from_seed=True, confirmed=not marks_first)
+            for chain in begun_with
+        ]
     else:
         start = marked[0] if marked else _start(found, catheters)
     for frames in (range(start, len(found)), range(start - 1, -1, -1)):
@@ -220,6 +239,11 @@ def _follow(
                 track.velocity = _first_velocity(track.chains, frame_times_ms)
         for frame in frames:
             _advance(tracks, found[frame], float(frame_times_ms[frame]), catheters, search)
+    for track, begun in zip(tracks, begun_with, strict=False):
+        # A frame in which the seed was found again says of the tip what the seed says.
+        again = track.chains.get(start)
+        if again is not None and again.tip_odds is None:
+            track.chains[start] = replace(again, tip_odds=begun.tip_odds)
     return tracks
 
 
@@ -237,6 +261,7 @@ def _accepted(
     A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
     """
     judged = min(_JUDGED_FRAMES, math.ceil(_ACCEPTED_AT_LEAST * len(found)))
+    confirmed: list[_Track] = []
     for attempt in range(_MOST_RETRIES + 1):
         wrong = [
             track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
@@ -246,10 +271,52 @@ def _accepted(
         if not wrong or attempt == _MOST_RETRIES or not any(entry.chains for entry in found):
             break
         sure = [track for track in tracks if len(track.chains) >= judged]
+        confirmed += [track for track in sure if track.confirmed]
         start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in sure))
         seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
         tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
+    for track in confirmed:
+        # Followed in another order, it may have ended at other places, and the judge may have rejected those.
+        if not any(_meet(track, other) for other in tracks):
+            tracks.append(track)
     return tracks
+
+
+def _meet(track: _Track, other: _Track) -> bool:
+    """Return whether two tracks share electrodes in a frame."""
+    return any(
+        _overlaps(chain, [other.chains[frame]]) for frame, chain in track.chains.items() if frame in other.chains
+    )
+
+
+def _complete(
+    track: _Track, tracks: Sequence[_Track], frame_times_ms: Array, catheters: int, search: ChainSearch
+) -> None:
+    """Search an accepted track in the frames that lack it.
+
+    The search goes from one frame to the next and ends where a frame does not show the catheter. The whole run shows it, so these
+    frames only have to show its contrast.
+    """
+    for frames in (range(len(frame_times_ms)), range(len(frame_times_ms) - 1, -1, -1)):
+        before: int | None = None
+        shift, elapsed = np.zeros(2), np.inf
+        for frame in frames:
+            if frame not in track.chains and before is not None:
+                others = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
+                since = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
+                expected = _KEPT_VELOCITY * shift * (since / elapsed)
+                if len(others) < catheters and since < _STALE_MS:
+                    known = track.chains[before]
+                    found = search(frame, known, expected, _reach_px(since), others, confirmed=True)
+                    if found is not None and not _overlaps(found, others):
+                        track.chains[frame] = found
+            if frame not in track.chains:
+                before = None
+                continue
+            if before is not None:
+                shift = _mean_shift(track.chains[before], track.chains[frame])
+                elapsed = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
+            before = frame
 
 
 def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
@@ -378,6 +445,19 @@ def _advance(
     by_hand = any(chain.manual for chain in entry.chains)
     present: list[Chain] = []
     bent: list[tuple[int, Chain]] = []
+    if search is not None and not by_hand:
+        sure = [
+            chain
+            for chain, number in zip(entry.chains, numbers, strict=True)
+            if number >= 0 and tracks[number].confirmed
+        ]
+        for number, track in enumerate(tracks):
+            if track.confirmed and number not in numbers:
+                _search(track, entry.frame, time_ms, catheters, search, present, sure)
+        numbers = [
+            -1 if number >= 0 and not tracks[number].confirmed and _overlaps(chain, present) else number
+            for chain, number in zip(entry.chains, numbers, strict=True)
+        ]
     for chain, number, other_way in zip(entry.chains, numbers, turned, strict=True):
         if number < 0:
             continue
@@ -396,23 +476,45 @@ def _advance(
         shift, reach = _expected(track, time_ms)
         recovered = search(entry.frame, track.chain, shift, reach, present) if search is not None else None
         if recovered is not None and not _is_bent(track, recovered, time_ms) and not _overlaps(recovered, present):
-            chain = replace(recovered, kinds=chain.kinds)
+            chain = replace(recovered, kinds=chain.kinds, tip_odds=chain.tip_odds)
         _extend(track, chain, entry.frame, time_ms)
         present.append(chain)
     loose = [chain for chain, number in zip(entry.chains, numbers, strict=True) if number < 0]
     if search is not None and not by_hand:
         for number, track in enumerate(tracks):
-            if number in numbers or len(present) >= catheters:
-                continue
-            shift, reach = _expected(track, time_ms)
-            recovered = search(entry.frame, track.chain, shift, reach, present)
-            if recovered is not None and not _overlaps(recovered, present):
-                _extend(track, recovered, entry.frame, time_ms)
-                present.append(recovered)
+            if number not in numbers and not track.confirmed:
+                _search(track, entry.frame, time_ms, catheters, search, present)
     for chain in loose:
         if chain.manual or (entry.manual_needed is None and not _overlaps(chain, present)):
             present.append(chain)
             tracks.append(_Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain}))
+
+
+def _search(
+    track: _Track,
+    frame: int,
+    time_ms: float,
+    catheters: int,
+    search: ChainSearch,
+    present: list[Chain],
+    others: Sequence[Chain] = (),
+) -> None:
+    """Search a track that got no chain of its frame.
+
+    Where it is found, it is added to ``present``. ``others`` : chains that count as present, too.
+    """
+    taken = [*present, *others]
+    if len(taken) >= catheters:
+        return
+    shift, reach = _expected(track, time_ms)
+    recovered = search(frame, track.chain, shift, reach, taken, confirmed=track.confirmed)
+    if recovered is None or _overlaps(recovered, taken):
+        return
+    is_faint = np.median(recovered.scores) < _FAINT * track.chain.scores.max()
+    # Far from an old place there may be anything.
+    if not is_faint or abs(time_ms - track.time_ms) < _STALE_MS:
+        _extend(track, recovered, frame, time_ms)
+        present.append(recovered)
 
 
 def _is_bent(track: _Track, chain: Chain, time_ms: float) -> bool:
@@ -435,14 +537,16 @@ def _expected(track: _Track, time_ms: float) -> tuple[Array, float]:
     elapsed = time_ms - track.time_ms
     # An old velocity says nothing about where the heart is now.
     shift = track.velocity * elapsed if abs(elapsed) < _STALE_MS else np.zeros(2)
-    return shift, min(max(_NEAREST_PX, _SPEED_PX_PER_MS * abs(elapsed)), _FARTHEST_PX)
+    return shift, _reach_px(abs(elapsed))
+
+
+def _reach_px(elapsed_ms: float) -> float:
+    return min(max(_NEAREST_PX, _SPEED_PX_PER_MS * elapsed_ms), _FARTHEST_PX)
 
 
 def _reverse(chain: Chain) -> Chain:
     """Return the same chain with its tip at the other end."""
-    return replace(
-        chain, pixels_uv=chain.pixels_uv[::-1], covariance_px2=chain.covariance_px2[::-1], scores=chain.scores[::-1]
-    )
+    return replace(chain.from_other_end(chain.electrodes[-1]), electrodes=chain.electrodes)
 
 
 def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -> tuple[list[int], list[bool]]:

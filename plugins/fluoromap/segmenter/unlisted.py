@@ -63,6 +63,8 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
     catheter : Catheter
     """
     free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
+    if len(free) < _ROW_CONTINUES:
+        return False
     seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1)
     step = _LONGEST_STEP * float(np.max(catheter.spacing_mm)) * float(seen.sum()) / float(np.sum(catheter.spacing_mm))
     for row in (chain.pixels_uv, chain.pixels_uv[::-1]):

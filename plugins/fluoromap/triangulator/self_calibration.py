@@ -157,7 +157,7 @@ def calibrate(
 
     unknowns = GANTRY_UNKNOWNS + len(gaps)
     rows = list(as_stated) if as_stated is not None else equations(GantryBelief(_AS_HEADER, usual))
-    agree = [_is_explained(one, usual, len(gaps)) for one in rows]
+    agree = _are_explained(rows, usual, len(gaps))
     if sum(agree) >= max(FEWEST_SITES, LEAST_AGREEING * len(sites)):
         # One site with wrong electrodes would pass for a heart with large beats, and widen the others' ellipsoids.
         sites = [site for site, explained in zip(sites, agree, strict=True) if explained]
@@ -241,13 +241,23 @@ def _prior(multiples: Array, usual: Array, gaps: int) -> Array:
     return whole
 
 
-def _is_explained(row: SiteEquations, usual: Array, gaps: int) -> bool:
-    """Return True where the worst gantry and the most irregular heart explain a site."""
+def _are_explained(rows: Sequence[SiteEquations], usual: Array, gaps: int) -> list[bool]:
+    """Return whether the worst gantry and most irregular heart explain sites."""
     prior = _prior(np.full(GANTRY_UNKNOWNS, LARGEST_MULTIPLE), usual, gaps)
     worst = HeartScale(max(one.breathing for one in HEART_SCALES), max(one.beats for one in HEART_SCALES))
-    covariance = row.covariance(worst) + row.slope @ prior @ row.slope.T
-    misfit = float(row.residual @ np.linalg.solve(covariance, row.residual))
-    return bool(chdtrc(len(row.residual), misfit) >= UNEXPLAINED_BELOW)
+    alike: dict[int, list[int]] = {}
+    for index, one in enumerate(rows):
+        alike.setdefault(len(one.residual), []).append(index)
+    explained = [False] * len(rows)
+    for equations, sites in alike.items():
+        slopes = np.array([rows[site].slope for site in sites])
+        covariances = np.array([rows[site].covariance(worst) for site in sites])
+        covariances += slopes @ prior @ np.swapaxes(slopes, -1, -2)
+        residuals = np.array([rows[site].residual for site in sites])
+        misfits = (residuals * np.linalg.solve(covariances, residuals[..., None])[..., 0]).sum(axis=1)
+        for site, probability in zip(sites, chdtrc(equations, misfits).tolist(), strict=True):
+            explained[site] = probability >= UNEXPLAINED_BELOW
+    return explained
 
 
 def _weigh(hearts: Sequence[Information], usual: Array, gaps: int) -> _Mixture:

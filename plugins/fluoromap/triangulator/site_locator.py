@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
 
 import numpy as np
-from scipy.special import chdtrc
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
+from fluoromap.contracts import APriori, Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.error_sources import (
     ErrorSource,
-    Share,
     bend_source,
     jacobians,
     pixel_noise_px2,
     relative_covariances_mm2,
     site_sources,
-    study_covariance,
     study_sources,
     visible_breathing,
 )
@@ -30,6 +25,7 @@ from fluoromap.triangulator.estimate import Method
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
 from fluoromap.triangulator.self_calibration import StudyBelief
 from fluoromap.triangulator.site_cycle import CycleMoments, cycle_moments, locate_cycle
+from fluoromap.triangulator.site_moment import BUDGET, Diastole, Moment, MomentErrors, errors_in_study
 from fluoromap.triangulator.spacing import spacing_mismatches
 from fluoromap.triangulator.stray_electrodes import epipolar_rows, widen_strays
 from fluoromap.triangulator.table_motion import Jump, jump_source
@@ -37,8 +33,6 @@ from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixel
 
 FAR_MM = 500.0
 """Largest plausible distance from the isocentre: two views that exceed it do not belong together."""
-DOUBTFUL_BELOW = 1e-5
-"""Probability of a site's misfit by chance below which its geometry is doubted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +83,35 @@ class SiteLocator:
         phase_known = all(view.phase is not None for view in shown)
         return Diastole(first, other, probability, shown[0].frame, shown[1].frame, phase_known)
 
+    def doubts(self, jump: Jump | None, errors: MomentErrors) -> tuple[Reason, ...]:
+        """Return the reasons to doubt all electrodes of a site."""
+        is_certain = jump is not None and jump.is_certain
+        return tuple(dict.fromkeys(reason for reason, holds in (
+            (Reason.TABLE_MOVED, is_certain or self.belief.doubt is Reason.TABLE_MOVED),
+            (Reason.GEOMETRY_DOUBTFUL, errors.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
+        ) if holds))  # fmt: skip
+
+    def a_priori(self, site: MatchedSite, diastole: Diastole, doubts: tuple[Reason, ...]) -> APriori:
+        """Return the electrodes of a site with the covariances of any study.
+
+        Parameters
+        ----------
+        site : MatchedSite
+        diastole : Diastole
+            From :meth:`diastole`, with electrodes of the chosen pairing.
+        doubts : tuple of Reason
+            From :meth:`doubts`.
+        """
+        # The study's origin depends on the other sites.
+        alone = self if self.origin is None else replace(self, origin=None)
+        moments = [moment for moment in (diastole.chosen, diastole.alternative) if moment is not None]
+        errors = errors_in_study(moments, self.any_study)
+        return APriori(alone._points(site, diastole, errors, doubts)[0])
+
     def locate(
-        self, site: MatchedSite, cameras: Cameras, jump: Jump | None, diastole: Diastole, cycle: SiteCycle | None
-    ) -> tuple[LocatedSite, SiteErrors] | None:
+        self, site: MatchedSite, cameras: Cameras, jump: Jump | None, diastole: Diastole, errors: Sequence[MomentErrors],
+        a_priori: APriori, cycle: SiteCycle | None,
+    ) -> tuple[LocatedSite, SiteErrors]:  # fmt: skip
         """Return a site in 3D and its share in the study's report.
 
         The covariances contain the errors that the study shows. Of the site only its name and notes are read, so that its tracks
@@ -104,33 +124,18 @@ class SiteLocator:
             From :meth:`cameras`.
         jump : Jump or None
         diastole : Diastole
-            From :meth:`diastole`.
+            From :meth:`diastole`, with electrodes of the chosen pairing.
+        errors : sequence of MomentErrors
+            Of the chosen pairing, then of the alternative one where there is one.
+        a_priori : APriori
+            From :meth:`a_priori`.
         cycle : SiteCycle or None
             From :meth:`cycle`.
-
-        Returns
-        -------
-        tuple of LocatedSite and SiteErrors, or None
-            None where no plausible position agrees with both views.
         """
-        first, other = diastole.chosen, diastole.alternative
-        if first is None:
-            return None
-        own = first.errors(self.belief)
-        is_certain = jump is not None and jump.is_certain
-        doubts = tuple(dict.fromkeys(reason for reason, holds in (
-            (Reason.TABLE_MOVED, is_certain or self.belief.doubt is Reason.TABLE_MOVED),
-            (Reason.GEOMETRY_DOUBTFUL, own.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
-        ) if holds))  # fmt: skip
-        points, a_priori, reference_mm = self._points(site, first, own.joint_mm2, doubts)
-        if other is not None:
-            others, any_others, other_mm = self._points(site, other, other.errors(self.belief).joint_mm2, doubts)
-            shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
-            p = diastole.probability
-            points, a_priori = (
-                add_alternative(points, others, shift, p),
-                add_alternative(a_priori, any_others, shift, p),
-            )
+        first, own = diastole.chosen, errors[0]
+        assert first is not None, "the chosen pairing has electrodes"
+        doubts = self.doubts(jump, own)
+        points, reference_mm = self._points(site, diastole, errors, doubts)
         reasons = [reason for reason, holds in (
             (Reason.NO_RESTING_CATHETER, self.catalogue.reference is None),
             (Reason.NO_REFERENCE, reference_mm is None),
@@ -149,6 +154,7 @@ class SiteLocator:
             variation=self.belief.variation,
             a_priori=a_priori,
         )
+        is_certain = jump is not None and jump.is_certain
         notes = () if is_certain or own.inflation > 1 else _breathing_note(site.site, first)
         return located, SiteErrors(len(first.labels), own.squares_mm2, notes)
 
@@ -200,27 +206,26 @@ class SiteLocator:
         )  # fmt: skip
 
     def _points(
-        self, site: MatchedSite, moment: Moment, joint: Array, doubts: tuple[Reason, ...]
-    ) -> tuple[tuple[ElectrodePoint, ...], tuple[ElectrodePoint, ...], Array | None]:
-        """Return the electrodes at diastole, the same a priori, and the reference catheter's mean (3,).
-
-        ``joint`` (N, 3, N, 3) is the covariance of all electrodes in this study.
-        """
-        in_any_study, _ = moment.joint(self.any_study)
-        if self.origin is None:
-            (points, a_priori), reference_mm = self._points_of(site, moment, (joint, in_any_study), doubts)
-        else:
-            (points,), reference_mm = self._points_of(site, moment, (joint,), doubts)
-            # The study's origin depends on the other sites.
-            (a_priori,), _ = replace(self, origin=None)._points_of(site, moment, (in_any_study,), doubts)
-        return points, a_priori, reference_mm
+        self, site: MatchedSite, diastole: Diastole, errors: Sequence[MomentErrors], doubts: tuple[Reason, ...]
+    ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
+        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
+        first, other = diastole.chosen, diastole.alternative
+        assert first is not None, "the chosen pairing has electrodes"
+        points, reference_mm = self._points_of(site, first, errors[0].joint_mm2, doubts)
+        if other is None:
+            return points, reference_mm
+        others, other_mm = self._points_of(site, other, errors[1].joint_mm2, doubts)
+        shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
+        return add_alternative(points, others, shift, diastole.probability), reference_mm
 
     def _points_of(
-        self, site: MatchedSite, moment: Moment, joints: Sequence[Array], site_doubts: tuple[Reason, ...]
-    ) -> tuple[list[tuple[ElectrodePoint, ...]], Array | None]:
-        """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located.
+        self, site: MatchedSite, moment: Moment, joint: Array, site_doubts: tuple[Reason, ...]
+    ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
+        """Return the electrodes under one pairing.
 
-        ``joints`` (N, 3, N, 3) are covariances of all electrodes; there is one tuple of points for each.
+        The second value is the reference catheter's mean (3,) where that is located.
+
+        ``joint`` (N, 3, N, 3) is the covariance of all electrodes.
         """
         labels, points = moment.labels, moment.points_mm
         reference = [
@@ -239,20 +244,21 @@ class SiteLocator:
             doubts.setdefault(catheter, []).append(reason)
         relative = None if reference_mm is None else points - reference_mm
         residuals = np.linalg.norm(moment.residuals_px, axis=2).tolist()
+        # The electrodes of a catheter have the same reasons, but for their spacings.
+        by_catheter = {
+            (catheter, mismatch): tuple(dict.fromkeys((*doubts.get(catheter, []), *mismatch, *site_doubts)))
+            for catheter in {catheter for catheter, _ in labels}
+            for mismatch in ((), (Reason.SPACING_MISMATCH,))
+        }
         reasons = [
-            tuple(dict.fromkeys((
-                *doubts.get(catheter, []), *([Reason.SPACING_MISMATCH] if i in mismatched else []), *site_doubts,
-            )))
+            by_catheter[catheter, (Reason.SPACING_MISMATCH,) if i in mismatched else ()]
             for i, (catheter, _) in enumerate(labels)
-        ]  # fmt: skip
-        shown, angles = [(a, b) for a, b in residuals], moment.ray_angles_deg.tolist()
-        found = []
-        for joint in joints:
-            relative_mm2 = None if relative is None else relative_covariances_mm2(joint, reference) + added_mm2
-            covariances = np.einsum("iaib->iab", joint)
-            found.append(
-                ElectrodePoint.of_moment(labels, points, covariances, relative, relative_mm2, shown, angles, reasons)
-            )
+        ]
+        relative_mm2 = None if relative is None else relative_covariances_mm2(joint, reference) + added_mm2
+        found = ElectrodePoint.of_moment(
+            labels, points, np.einsum("iaib->iab", joint), relative, relative_mm2, [(a, b) for a, b in residuals],
+            moment.ray_angles_deg.tolist(), reasons,
+        )  # fmt: skip
         return found, reference_mm
 
 
@@ -267,115 +273,6 @@ class SiteErrors:
     electrodes: int
     squares_mm2: tuple[float, ...]
     notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class MomentErrors:
-    """The errors of a moment in one study.
-
-    inflation : misfit over its expected value where chance does not explain it, else 1. joint_mm2 : (N, 3, N, 3) covariance of all
-    electrodes. squares_mm2 : sum of the electrodes' variances from each source, in the order of the error budget.
-    """
-
-    inflation: float
-    joint_mm2: Array
-    squares_mm2: tuple[float, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """A site at diastole: N electrodes in 3D, and how errors displace them.
-
-    The k study errors are those of :func:`~fluoromap.triangulator.error_sources.study_sources`: only their size depends on the
-    study. So a correction at another site changes no moment unless it changes the cameras.
-
-    labels : (catheter, electrode) of each electrode. points_mm : (N, 3) world. residuals_px : (N, 2 views, 2), without the
-    displacement of the heart between the runs. ray_angles_deg : (N,). breathing_mm : half of that displacement, as far as the
-    views show it.
-    own_mm2 : (3 N, 3 N) covariance of the points from pixels and from errors whose size no study shows. study_mm : (3 N, k)
-    effect of one unit of each study error. shares : (k,) their entries of the error budget. squares_mm2 : the budget of
-    ``own_mm2``.
-    apart_px : (e,) epipolar distances; empty where the method does not compare them. own_px2 : (e, e), study_px : (e, k), as above.
-    """
-
-    labels: tuple[tuple[str, int], ...]
-    points_mm: Array
-    residuals_px: Array
-    ray_angles_deg: Array
-    breathing_mm: float
-    own_mm2: Array
-    study_mm: Array
-    shares: tuple[str, ...]
-    squares_mm2: tuple[float, ...]
-    apart_px: Array
-    own_px2: Array
-    study_px: Array
-
-    def errors(self, belief: StudyBelief) -> MomentErrors:
-        """Return the errors in a study of this belief."""
-        joint, inflation = self.joint(belief)
-        squares = dict(zip(BUDGET, self.squares_mm2, strict=True))
-        # The electrodes' variances from each pair of study errors.
-        of_pairs = self._study_errors(belief) * (self.study_mm.T @ self.study_mm)
-        names, of = _members(self.shares)
-        for share, square in zip(names, ((of @ of_pairs) * of).sum(axis=1).tolist(), strict=True):
-            squares[share] += square
-        return MomentErrors(inflation, joint, tuple(squares.values()))
-
-    def joint(self, belief: StudyBelief) -> tuple[Array, float]:
-        """Return the covariance (N, 3, N, 3) of all electrodes in a study of this belief.
-
-        The second value is the inflation that it contains.
-        """
-        errors = self._study_errors(belief)
-        inflation = 1.0
-        if len(self.apart_px):
-            expected = self.own_px2 + self.study_px @ errors @ self.study_px.T
-            misfit = float(self.apart_px @ np.linalg.solve(expected, self.apart_px))
-            inflation = misfit / len(expected) if chdtrc(len(expected), misfit) < DOUBTFUL_BELOW else 1.0
-        displaced = self.study_mm @ errors
-        joint = self.own_mm2 + displaced @ self.study_mm.T
-        n = len(self.labels)
-        return (inflation * (joint + joint.T) / 2).reshape(n, 3, n, 3), inflation
-
-    def _study_errors(self, belief: StudyBelief) -> Array:
-        return _study_errors(belief, len({catheter for catheter, _ in self.labels}))
-
-
-@dataclass(frozen=True, eq=False)
-class Diastole:
-    """A site at diastole under the chosen pairing of its catheters, and under the alternative one.
-
-    chosen, alternative : None where no plausible position agrees with both views, or where there is no such pairing. probability :
-    of the alternative pairing. frame_a, frame_b : the diastolic frames, from 0. phase_known : whether both have a phase.
-    """
-
-    chosen: Moment | None
-    alternative: Moment | None
-    probability: float
-    frame_a: int
-    frame_b: int
-    phase_known: bool
-
-
-BUDGET = get_args(Share)
-"""Entries of the :class:`~fluoromap.contracts.ErrorBudget`, in its order."""
-
-
-@functools.lru_cache(maxsize=16)
-def _study_errors(belief: StudyBelief, catheters: int) -> Array:
-    """Return the covariance of the study errors.
-
-    It is the same for all sites with as many catheters.
-    """
-    return study_covariance(belief.params, belief.gantry.covariance, catheters)
-
-
-@functools.lru_cache(maxsize=16)
-def _members(shares: tuple[str, ...]) -> tuple[tuple[str, ...], Array]:
-    """Return the different shares (m,), and which errors belong to each, (m, k), 0 or 1."""
-    names = tuple(dict.fromkeys(shares))
-    return names, np.array([[own == share for own in shares] for share in names], dtype=np.float64)
 
 
 def _squares_mm2(gain: Array, noise_px2: Array, sources: Sequence[ErrorSource]) -> tuple[float, ...]:

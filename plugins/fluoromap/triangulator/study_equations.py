@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -231,7 +232,7 @@ def information(rows: Sequence[SiteEquations], linearised_at: Array, log_likelih
     for one in rows:
         alike.setdefault((one.same_beat, one.slope.shape, one.beats.shape), []).append(one)
     for (same_beat, *_), of_shape in alike.items():
-        in_hearts = _products_of_hearts(_Whitened.of(of_shape, linearised_at))
+        in_hearts = _in_hearts(_products(of_shape, linearised_at))
         for heart, scale in enumerate(HEART_SCALES):
             if scale.simultaneous and same_beat:
                 of_heart = in_hearts.still, in_hearts.still_constant
@@ -247,30 +248,71 @@ def information(rows: Sequence[SiteEquations], linearised_at: Array, log_likelih
 
 
 @dataclass(frozen=True, eq=False)
-class _Whitened:
-    """Products of the equations of s sites whose errors from pixels were made independent, with variance 1.
+class _SiteProducts:
+    """Products of one site's equations, whose errors from pixels were made independent, with variance 1.
 
-    products : (s, m, m) of all columns: u of the unknowns, the residual, p of breathing, q of beats. breathing, beats : p and q.
-    constant : log likelihood of all sites without columns.
+    With k equations, m columns (unknowns and residual), p parameters of breathing, q of beats, and for each of b breathings:
+
+    still : (m, m). log_pixels : (k,), minus their sum is the log likelihood without columns. moving : (b, m, m) without breathing.
+    log_breathing : (b, p). strengths : (b, q), in the axes of the beats' own products, where each of their parameters is separate
+    from the others. along : (b, q, m), the products of beats and columns in these axes.
     """
 
-    products: Array
-    breathing: int
-    beats: int
-    constant: float
+    still: Array
+    log_pixels: Array
+    moving: Array
+    log_breathing: Array
+    strengths: Array
+    along: Array
 
-    @classmethod
-    def of(cls, rows: Sequence[SiteEquations], linearised_at: Array) -> _Whitened:
-        """Return the products of sites whose equations have the same shapes."""
-        columns = np.array([
-            np.column_stack([one.slope, one.residual + one.slope @ linearised_at, one.breathing, one.beats])
-            for one in rows
-        ])  # fmt: skip
-        factor = np.linalg.cholesky(np.array([one.fixed for one in rows]))
-        whitened = np.linalg.solve(factor, columns)
-        constant = -np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum()
-        products = np.swapaxes(whitened, -1, -2) @ whitened
-        return cls(products, rows[0].breathing.shape[1], rows[0].beats.shape[1], float(constant))
+
+_at_header: WeakKeyDictionary[SiteEquations, _SiteProducts] = WeakKeyDictionary()
+"""The products of equations that were linearised at the header. A correction changes the equations of one site of a study."""
+
+
+def _products(rows: Sequence[SiteEquations], linearised_at: Array) -> list[_SiteProducts]:
+    """Return the products of sites whose equations have the same shapes."""
+    if linearised_at.any():
+        return _computed_products(rows, linearised_at)
+    unknown = [one for one in rows if one not in _at_header]
+    if unknown:
+        _at_header.update(zip(unknown, _computed_products(unknown, linearised_at), strict=True))
+    return [_at_header[one] for one in rows]
+
+
+def _computed_products(rows: Sequence[SiteEquations], linearised_at: Array) -> list[_SiteProducts]:
+    """Compute the products of sites whose equations have the same shapes.
+
+    Breathing and beats have few parameters. The matrix inversion lemma takes them out of the products of all hearts; it inverts
+    small matrices only.
+    """
+    columns = np.array([
+        np.column_stack([one.slope, one.residual + one.slope @ linearised_at, one.breathing, one.beats])
+        for one in rows
+    ])  # fmt: skip
+    factor = np.linalg.cholesky(np.array([one.fixed for one in rows]))
+    whitened = np.linalg.solve(factor, columns)
+    log_pixels = np.log(np.diagonal(factor, axis1=-2, axis2=-1))
+    products = np.swapaxes(whitened, -1, -2) @ whitened
+    p, q = rows[0].breathing.shape[1], rows[0].beats.shape[1]
+    kept = products.shape[-1] - p - q
+    breathing = np.arange(kept, kept + p)
+    others = np.r_[0:kept, kept + p : kept + p + q]
+    of_breathing = products[:, breathing[:, None], breathing]
+    across, of_others = products[:, breathing[:, None], others], products[:, others[:, None], others]
+    sites, b = len(rows), len(_BREATHING)
+    moving, along = np.empty((sites, b, kept, kept)), np.empty((sites, b, q, kept))
+    log_breathing, strengths = np.empty((sites, b, p)), np.empty((sites, b, q))
+    for row, breath in enumerate(_BREATHING):
+        factor = np.linalg.cholesky(np.eye(p) + breath**2 * of_breathing)
+        taken = np.linalg.solve(factor, breath * across)
+        left = of_others - np.swapaxes(taken, -1, -2) @ taken
+        log_breathing[:, row] = np.log(np.diagonal(factor, axis1=-2, axis2=-1))
+        moving[:, row] = left[:, :kept, :kept]
+        strengths[:, row], axes = np.linalg.eigh(left[:, kept:, kept:])
+        along[:, row] = np.swapaxes(axes, -1, -2) @ left[:, kept:, :kept]
+    still = products[:, :kept, :kept].copy()
+    return [_SiteProducts(*of) for of in zip(still, log_pixels, moving, log_breathing, strengths, along, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,35 +329,26 @@ class _InHearts:
     moving_constants: Array
 
 
-def _products_of_hearts(sites: _Whitened) -> _InHearts:
-    """Return the products for all hearts.
-
-    Breathing and beats have few parameters. The matrix inversion lemma takes them out of the products of all hearts; it inverts
-    small matrices only.
-    """
-    p, q = sites.breathing, sites.beats
-    kept = sites.products.shape[-1] - p - q
-    breathing = np.arange(kept, kept + p)
-    others = np.r_[0:kept, kept + p : kept + p + q]
+def _in_hearts(sites: Sequence[_SiteProducts]) -> _InHearts:
+    """Return the products of all sites for all hearts."""
+    still = np.array([one.still for one in sites]).sum(axis=0)
+    still_constant = -float(np.array([one.log_pixels for one in sites]).sum())
+    kept = len(still)
+    of_moving, log_breathing, every_strength, every_along = (
+        np.array([getattr(one, name) for one in sites]) for name in ("moving", "log_breathing", "strengths", "along")
+    )
     moving = np.empty((len(_BREATHING), len(_BEATS), kept, kept))
     constants = np.empty((len(_BREATHING), len(_BEATS)))
-    of_breathing = sites.products[:, breathing[:, None], breathing]
-    across, of_others = sites.products[:, breathing[:, None], others], sites.products[:, others[:, None], others]
-    for row, breath in enumerate(_BREATHING):
-        factor = np.linalg.cholesky(np.eye(p) + breath**2 * of_breathing)
-        taken = np.linalg.solve(factor, breath * across)
-        left = of_others - np.swapaxes(taken, -1, -2) @ taken
-        constant = sites.constant - np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum()
-        total = left[:, :kept, :kept].sum(axis=0)
-        # In the axes of the beats' own products, each of their parameters is separate from the others.
-        strengths, axes = np.linalg.eigh(left[:, kept:, kept:])
-        along = (np.swapaxes(axes, -1, -2) @ left[:, kept:, :kept]).reshape(-1, kept)
+    for row in range(len(_BREATHING)):
+        constant = still_constant - log_breathing[:, row].sum()
+        total = of_moving[:, row].sum(axis=0)
+        strengths, along = every_strength[:, row], every_along[:, row].reshape(-1, kept)
         for column, beat in enumerate(_BEATS):
             growth = 1 + beat**2 * strengths
             weighted = along * (beat**2 / growth).reshape(-1, 1)
             moving[row, column] = total - along.T @ weighted
             constants[row, column] = constant - 0.5 * np.log(growth).sum()
-    return _InHearts(sites.products[:, :kept, :kept].sum(axis=0), sites.constant, moving, constants)
+    return _InHearts(still, still_constant, moving, constants)
 
 
 def log_evidences(hearts: Sequence[Information], prior: Array) -> Array:

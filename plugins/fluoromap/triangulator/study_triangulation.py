@@ -12,6 +12,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
+    APriori,
     Array,
     Calibration,
     Context,
@@ -39,7 +40,8 @@ from fluoromap.triangulator.self_calibration import (
     study_belief,
 )
 from fluoromap.triangulator.site_cycle import NO_CYCLE, CycleMoments
-from fluoromap.triangulator.site_locator import BUDGET, Diastole, SiteErrors, SiteLocator
+from fluoromap.triangulator.site_locator import SiteErrors, SiteLocator
+from fluoromap.triangulator.site_moment import BUDGET, Diastole, Moment, MomentErrors, errors_in_study
 from fluoromap.triangulator.spacing import (
     DOUBT_LIMIT_MM,
     NO_GAPS,
@@ -254,23 +256,22 @@ def _locate_sites(
     notes: list[str],
     calibration: Calibration | None,
 ) -> Triangulation:
-    located: list[LocatedSite] = []
-    errors: list[SiteErrors] = []
     locations: list[_Location] = []
     for index, one in enumerate(work):
         context.check()
         location = _Location(*one, context)
-        found = location.locate(None)
-        if found is not None:
-            located.append(found[0])
-            locations.append(location)
-            errors.append(found[1])
-            notes += found[1].notes
-        else:
+        if location.diastole.chosen is None:
             rejected.append(RejectedSite(one[0].site, (Reason.PAIRING_FAILED,)))
+        else:
+            locations.append(location)
         context.progress((index + 1) / len(work))
-    located = _from_one_origin(located, locations, catalogue)
-    return Triangulation(tuple(located), tuple(rejected), tuple(notes), calibration, _budget(errors))
+    _compute_errors(locations)
+    found = [location.locate(None) for location in locations]
+    notes += [note for _, errors in found for note in errors.notes]
+    located = _from_one_origin([site for site, _ in found], locations, catalogue)
+    return Triangulation(
+        tuple(located), tuple(rejected), tuple(notes), calibration, _budget([errors for _, errors in found])
+    )
 
 
 class _Location:
@@ -283,33 +284,58 @@ class _Location:
     def __init__(
         self, site: MatchedSite, nominal: Cameras, jump: Jump | None, locator: SiteLocator, context: Context
     ) -> None:
-        self._site, self._jump, self._locator = site, jump, locator
+        self._site, self._jump, self._context = site, jump, context
+        self.locator = locator
         self._cameras = locator.cameras(nominal)
-        inputs = (site, jump, locator.catalogue, *self._cameras)
-        self._diastole = context.recall(Diastole, inputs, self._locate_diastole)
-        self._cycle = context.recall(SiteCycle, inputs, self._locate_cycle)
+        self._inputs = (site, jump, locator.catalogue, *self._cameras)
+        self.diastole = context.recall(Diastole, self._inputs, self._locate_diastole)
+        self._cycle = context.recall(SiteCycle, self._inputs, self._locate_cycle)
+        self.errors: list[MomentErrors] = []
 
-    def locate(self, origin: ReferenceOrigin | None) -> tuple[LocatedSite, SiteErrors] | None:
-        """Return the site in 3D, see :meth:`SiteLocator.locate`.
+    @property
+    def moments(self) -> list[Moment]:
+        """The site at diastole under the chosen pairing, then under the alternative one."""
+        return [moment for moment in (self.diastole.chosen, self.diastole.alternative) if moment is not None]
 
-        None where no plausible position agrees with both views.
-        """
-        locator = self._locator if origin is None else replace(self._locator, origin=origin)
+    def locate(self, origin: ReferenceOrigin | None) -> tuple[LocatedSite, SiteErrors]:
+        """Return the site in 3D, see :meth:`SiteLocator.locate`."""
+        locator = self.locator if origin is None else replace(self.locator, origin=origin)
+        cycle = self._cycle if self._cycle.labels else None
         return locator.locate(
-            self._site, self._cameras, self._jump, self._diastole, self._cycle if self._cycle.labels else None
-        )
+            self._site, self._cameras, self._jump, self.diastole, self.errors, self._a_priori, cycle
+        )  # fmt: skip
+
+    @functools.cached_property
+    def _a_priori(self) -> APriori:
+        doubts = self.locator.doubts(self._jump, self.errors[0])
+        inputs = (*self._inputs, self.locator.gap_doubts, doubts)
+        return self._context.recall(
+            APriori, inputs, lambda: self.locator.a_priori(self._site, self.diastole, doubts)
+        )  # fmt: skip
 
     @functools.cached_property
     def _moments(self) -> CycleMoments | None:
-        return self._locator.moments(self._site, self._cameras)
+        return self.locator.moments(self._site, self._cameras)
 
     def _locate_diastole(self) -> Diastole:
-        return self._locator.diastole(self._site, self._cameras, self._jump, self._moments)
+        return self.locator.diastole(self._site, self._cameras, self._jump, self._moments)
 
     def _locate_cycle(self) -> SiteCycle:
-        if self._moments is None or self._diastole.chosen is None:
+        if self._moments is None or self.diastole.chosen is None:
             return NO_CYCLE
-        return self._locator.cycle(self._site, self._cameras, self._jump, self._moments)
+        return self.locator.cycle(self._site, self._cameras, self._jump, self._moments)
+
+
+def _compute_errors(locations: Sequence[_Location]) -> None:
+    """Compute the errors of all sites in the study that their locator describes."""
+    alike: dict[int, list[_Location]] = {}
+    for location in locations:
+        alike.setdefault(id(location.locator), []).append(location)
+    for of_locator in alike.values():
+        moments = [moment for location in of_locator for moment in location.moments]
+        errors = iter(errors_in_study(moments, of_locator[0].locator.belief))
+        for location in of_locator:
+            location.errors = [next(errors) for _ in location.moments]
 
 
 def _from_one_origin(
@@ -324,8 +350,7 @@ def _from_one_origin(
         return list(located)
     same: list[LocatedSite] = []
     for first, location in zip(located, locations, strict=True):
-        again = location.locate(origin) if deviates(first, reference, origin) else None
-        same.append(first if again is None else again[0])
+        same.append(location.locate(origin)[0] if deviates(first, reference, origin) else first)
     return same
 
 

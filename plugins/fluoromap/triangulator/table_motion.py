@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from fluoromap.contracts import Array, View
+from fluoromap.contracts import Array, BoolArray, IntArray, View
 from fluoromap.geometry import Camera
 from fluoromap.triangulator.error_sources import ErrorSource, effect_px, jacobians
 from fluoromap.triangulator.study_equations import HeartScale
@@ -64,15 +65,17 @@ def table_jumps(
     """
     if len(sites) < FEWEST_SITES:
         return [None] * len(sites)
-    usual = _usual_places(sites, resting)
-    found = [_displacements(cameras, pixels, usual) for cameras, pixels, _ in sites]
-    scale, probabilities = _views_apart(sites, found, params)
+    moved = _displacements(sites, _usual_places(sites, resting))
+    scale, probabilities = _views_apart(moved, params)
     # Only the head-feet direction shows how far this heart breathes.
     own = params.model_copy(update={"respiration_head_feet_sd_mm": scale * params.respiration_head_feet_sd_mm})
-    return _with_boundary([
-        None if moved is None else _site_jump(cameras, moved, probability, own, params)
-        for (cameras, *_), moved, probability in zip(sites, found, probabilities, strict=True)
-    ])  # fmt: skip
+    found: list[Jump | None] = [None] * len(sites)
+    for row in np.flatnonzero(moved.is_far() | (probabilities > _POSSIBLE)):
+        site = int(moved.sites[row])
+        found[site] = _site_jump(
+            sites[site][0], moved.shared[row], moved.of_views[row], float(probabilities[row]), own, params
+        )
+    return _with_boundary(found)
 
 
 def _with_boundary(jumps: list[Jump | None]) -> list[Jump | None]:
@@ -136,80 +139,130 @@ def _usual_places(
     return {label: np.median(places, axis=0) for label, places in by_label.items() if len(places) >= FEWEST_SITES}
 
 
-def _displacements(
-    cameras: Cameras, pixels: TwoViewPixels, usual: dict[tuple[str, int], Array]
-) -> tuple[Array, Array] | None:
-    """Return the displacements of the resting catheters in view a and b.
+@dataclass(frozen=True, eq=False)
+class _Displacements:
+    """Displacements of the resting catheters at the r sites that show one.
 
-    Each is (3,), from their usual places and across the view's rays. None where the site shows no resting catheter.
+    sites : (r,) indices. shared : (r, 3) unit directions along which both views show a displacement. of_views : (r, 2, 3) in view a
+    and b, world, mm, from the usual places and across the view's rays.
     """
-    rows = [row for row, label in enumerate(pixels.labels) if label in usual]
-    if not rows:
-        return None
-    places = np.array([usual[pixels.labels[row]] for row in rows])
-    catheters = [pixels.labels[row][0] for row in rows]
-    found: list[Array] = []
-    for camera, uv in zip(cameras, pixels.pixels, strict=True):
-        jacobian = camera.jacobian(places)
-        transposed = np.swapaxes(jacobian, -1, -2)
-        inverse = transposed @ np.linalg.inv(jacobian @ transposed)
-        moved = (inverse @ (uv[rows] - camera.project(places))[..., None])[..., 0]
-        own = [[name == catheter for name in catheters] for catheter in dict.fromkeys(catheters)]
-        found.append(_common_displacement(np.array([moved[of].mean(axis=0) for of in own])))
-    return found[0], found[1]
+
+    sites: IntArray
+    shared: Array
+    of_views: Array
+
+    def is_far(self) -> BoolArray:
+        """Return where a view is displaced farther than any breath across the shared direction, (r,)."""
+        return np.asarray((np.linalg.norm(self._across(), axis=2) > _LEAST_MM).any(axis=1))
+
+    def _across(self) -> Array:
+        along = self.of_views @ self.shared[..., None]
+        across: Array = self.of_views - along * self.shared[:, None]
+        return across
 
 
-def _shared_axis(cameras: Cameras) -> Array:
-    """Return the unit direction (3,) along which both views show a displacement."""
-    shared = np.cross(cameras[0].axis_world, cameras[1].axis_world)
-    unit: Array = shared / np.linalg.norm(shared)
-    return unit
+def _displacements(
+    sites: Sequence[tuple[Cameras, TwoViewPixels, Array]], usual: dict[tuple[str, int], Array]
+) -> _Displacements:
+    """Return the displacements of the resting catheters of all sites.
+
+    Sites that show the same electrodes are computed together.
+    """
+    alike: dict[tuple[tuple[str, int], ...], list[int]] = {}
+    for index, (_, pixels, _) in enumerate(sites):
+        alike.setdefault(pixels.labels, []).append(index)
+    known, of_views = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 2, 3))]
+    for labels, members in alike.items():
+        rows, places, first = _resting_rows(labels, usual)
+        if not len(rows):
+            continue
+        catheters = [slice(start, stop) for start, stop in itertools.pairwise([*first.tolist(), len(rows)])]
+        views = []
+        for view in (0, 1):
+            matrices = np.array([sites[index][0][view].matrix for index in members])
+            uv = np.array([sites[index][1].pixels[view] for index in members])[:, rows]
+            moved = _across_rays(matrices, places, uv)
+            views.append(_common_displacements(np.stack([moved[:, own].mean(axis=1) for own in catheters], axis=1)))
+        known.append(np.array(members))
+        of_views.append(np.stack(views, axis=1))
+    indices = np.concatenate(known)
+    order = np.argsort(indices)
+    axes = np.array([[camera.axis_world for camera in sites[index][0]] for index in indices[order]]).reshape(-1, 2, 3)
+    shared = np.cross(axes[:, 0], axes[:, 1])
+    return _Displacements(
+        indices[order], shared / np.sqrt(_dot(shared, shared))[:, None], np.concatenate(of_views)[order]
+    )
 
 
-def _views_apart(
-    sites: Sequence[tuple[Cameras, TwoViewPixels, Array]],
-    found: Sequence[tuple[Array, Array] | None],
-    params: UncertaintyParams,
-) -> tuple[float, list[float]]:
-    """Return this heart's breathing, and each site's probability of a jump.
+def _dot(first: Array, second: Array) -> Array:
+    """Return the products (r,) of vectors (r, 3)."""
+    products: Array = (first[:, None] @ second[..., None])[:, 0, 0]
+    return products
+
+
+def _resting_rows(
+    labels: tuple[tuple[str, int], ...], usual: dict[tuple[str, int], Array]
+) -> tuple[IntArray, Array, IntArray]:
+    """Return the electrodes with a usual place, catheter by catheter.
+
+    They are given by rows (n,) and places (n, 3). The third value are the indices of each catheter's first one.
+    """
+    names = list(dict.fromkeys(catheter for catheter, _ in labels))
+    rows = sorted(
+        (row for row, label in enumerate(labels) if label in usual), key=lambda row: names.index(labels[row][0])
+    )
+    of = [labels[row][0] for row in rows]
+    first = [index for index, name in enumerate(of) if not index or of[index - 1] != name]
+    places = np.array([usual[labels[row]] for row in rows]).reshape(-1, 3)
+    return np.array(rows, dtype=np.int64), places, np.array(first, dtype=np.int64)
+
+
+def _across_rays(matrices: Array, places_mm: Array, uv: Array) -> Array:
+    """Return the smallest displacements (s, n, 3) that move places (n, 3) to pixels (s, n, 2).
+
+    ``matrices`` (s, 3, 4) are those of the cameras.
+    """
+    homogeneous = places_mm @ np.swapaxes(matrices[:, :, :3], -1, -2) + matrices[:, None, :, 3]
+    projected = homogeneous[..., :2] / homogeneous[..., 2:]
+    depth = places_mm @ matrices[:, 2, :3, None] + matrices[:, None, 2, 3:]
+    jacobian = (matrices[:, None, :2, :3] - projected[..., None] * matrices[:, None, 2:, :3]) / depth[..., None]
+    transposed = np.swapaxes(jacobian, -1, -2)
+    inverse = transposed @ np.linalg.inv(jacobian @ transposed)
+    moved: Array = (inverse @ (uv - projected)[..., None])[..., 0]
+    return moved
+
+
+def _views_apart(moved: _Displacements, params: UncertaintyParams) -> tuple[float, Array]:
+    """Return this heart's breathing, and the probability (r,) of a jump at each site.
 
     A jump displaces the two views of a site farther than a breath does. The breathing is a multiple of the assumed one. Breathing
     displaces the views of every site against each other; a moved table displaces those of a few sites. A few sites show the
     breathing inaccurately, so every breathing counts with its probability.
     """
-    known = [index for index, moved in enumerate(found) if moved is not None]
-    probabilities = [0.0] * len(sites)
-    if not known:
-        return 1.0, probabilities
-    apart, variance = [], []
-    for index in known:
-        (cameras, *_), moved = sites[index], found[index]
-        assert moved is not None
-        shared = _shared_axis(cameras)
-        apart.append(float(shared @ (moved[0] - moved[1])))
-        variance.append(2 * float(shared @ params.respiration_covariance_mm2() @ shared))
-    from_usual = np.array(apart) - np.median(apart)
-    spread = np.square(_BREATHING_SHARES)[:, None] * np.array(variance) + 2 * params.beat_sd_mm**2
+    if not len(moved.sites):
+        return 1.0, np.zeros(0)
+    apart = _dot(moved.shared, moved.of_views[:, 0] - moved.of_views[:, 1])
+    variance = 2 * _dot((moved.shared[:, None] @ params.respiration_covariance_mm2())[:, 0], moved.shared)
+    from_usual = apart - np.median(apart)
+    spread = np.square(_BREATHING_SHARES)[:, None] * variance + 2 * params.beat_sd_mm**2
     breath = np.log(1 - _JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread))
     jump = np.log(_JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread + _JUMP_SD_MM**2))
     either = np.logaddexp(breath, jump)
     evidence = either.sum(axis=1) + [HeartScale(share, 1.0).log_prior for share in _BREATHING_SHARES]
     weights = np.exp(evidence - logsumexp(evidence))
     far = np.abs(from_usual) / np.sqrt(2) > _LEAST_MM
-    for index, probability in zip(known, far * (weights @ np.exp(jump - either)), strict=True):
-        probabilities[index] = float(probability)
+    probabilities: Array = far * (weights @ np.exp(jump - either))
     return float(np.sqrt(weights @ np.square(_BREATHING_SHARES))), probabilities
 
 
 def _site_jump(
-    cameras: Cameras, moved: tuple[Array, Array], probability: float, own: UncertaintyParams, params: UncertaintyParams
+    cameras: Cameras, shared: Array, moved: Array, probability: float, own: UncertaintyParams, params: UncertaintyParams
 ) -> Jump | None:
     """Return the jump of a site, or None.
 
-    ``moved`` are its displacements in both views; they jumped against each other with this ``probability``. ``own`` has this
-    heart's breathing, ``params`` the assumed one.
+    ``moved`` (2, 3) are its displacements in both views; they jumped against each other with this ``probability`` along ``shared``
+    (3,). ``own`` has this heart's breathing, ``params`` the assumed one.
     """
-    shared = _shared_axis(cameras)
     strange = [
         _exceeds_breathing(one - shared * (shared @ one), camera, params)
         for one, camera in zip(moved, cameras, strict=True)
@@ -224,15 +277,17 @@ def _site_jump(
     return Jump("b" if view else "a", moved[view])
 
 
-def _common_displacement(displacements_mm: Array) -> Array:
-    """Return the displacement (3,) common to k catheters (k, 3).
+def _common_displacements(displacements_mm: Array) -> Array:
+    """Return the displacement (s, 3) common to the catheters (s, c, 3) of each site.
 
     It is their mean, or the smallest where one of them slipped.
     """
-    mean = displacements_mm.mean(axis=0)
-    if np.linalg.norm(displacements_mm - mean, axis=1).max() <= _SLIP_MM:
-        return np.asarray(mean)
-    return np.asarray(displacements_mm[np.argmin(np.linalg.norm(displacements_mm, axis=1))])
+    mean = displacements_mm.mean(axis=1)
+    away = np.linalg.norm(displacements_mm - mean[:, None], axis=2).max(axis=1)
+    for site in np.flatnonzero(away > _SLIP_MM):
+        own = displacements_mm[site]
+        mean[site] = own[np.argmin(np.linalg.norm(own, axis=1))]
+    return np.asarray(mean)
 
 
 def _exceeds_breathing(displacement_mm: Array, camera: Camera | None, params: UncertaintyParams) -> bool:

@@ -67,11 +67,14 @@ def _newest_segmentation(session: Session, study_id: str, uid: str) -> StageRow 
 def _electrodes(all_chains: tuple[Chain, ...], named: tuple[NamedChain, ...]) -> list[DetectedElectrode]:
     # A person may have deleted the correction after the job: a chain set by hand is no detection.
     chains = tuple(chain for chain in all_chains if not chain.manual)
-    of_track = {chain.track: chain.catheter for chain in named}
-    matched = [of_track.get(chain.track) if chain.track >= 0 else None for chain in chains]
+    of_track = {chain.track: chain for chain in named if chain.track >= 0}
+    matched = [of_track.get(chain.track) for chain in chains]
+    names = [None if one is None else one.catheter for one in matched]
     found: list[DetectedElectrode] = []
-    for chain, name in zip(chains, likely_names(chains, matched), strict=True):
-        for electrode, (u, v), covariance in zip(chain.electrodes, chain.pixels_uv, chain.covariance_px2, strict=True):
+    for chain, one, name in zip(chains, matched, likely_names(chains, names), strict=True):
+        # Matching may have found the tip at the other end.
+        shown = chain if one is None else one
+        for electrode, (u, v), covariance in zip(shown.electrodes, shown.pixels_uv, shown.covariance_px2, strict=True):
             sd = math.sqrt(max(float(covariance.trace()) / 2, 0.0))
             found.append(DetectedElectrode(name, electrode, float(u), float(v), sd))
     return found

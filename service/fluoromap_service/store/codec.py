@@ -11,7 +11,8 @@ when they are first read.
 
 A value also has a plain form, without compression and without the content of its blocks. Its hash identifies the value, so that
 keys with values and blocks do not depend on the compressor. Earlier versions of fluoromap stored plain forms, with the blocks
-behind them. They are read too.
+behind them. They are read too, and so are results without the fields whose
+metadata say "added later".
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ import gc
 import hashlib
 import itertools
 import math
+import threading
 import types
 import typing
 import zlib
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
@@ -67,6 +69,8 @@ _LEVEL = 1
 
 _LEAST_SEARCHED_BYTES = 256
 """Fewest bytes of one type and shape in a partial result that are searched for arrays of the result."""
+_ADDED_LATER = "added later"
+"""Key of the metadata of a field with a default that earlier contracts lack; their results are read with the default."""
 _FEW_ARRAYS = 32
 """Most arrays that are looked up one by one. For more of them, all arrays of the content are taken apart at once."""
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
@@ -145,9 +149,11 @@ class _Encoded:
 
     def packed(self, partial: Mapping[str, Block]) -> bytes:
         """Return the stored form, with partial results."""
+        own = len(self._arrays.blocks)
         numbers = {key: self._arrays.add_block(block) for key, block in sorted(partial.items())}
         every = self._arrays.blocks
-        pools, shared = _take_out(self._pools, {number: every[number] for number in numbers.values()})
+        # The blocks of the value itself hold arrays that are apart from its other ones.
+        pools, shared = _take_out(self._pools, {number: every[number] for number in numbers.values() if number >= own})
         described = [pool.packed() for pool in pools]
         blocks = [(block.sha256, len(block.content)) for block in every]
         head = _pack.encode((self._form, [pool for pool, _ in described], shared, blocks, numbers, self._tree))
@@ -174,7 +180,8 @@ def _take_out(pools: list[Pool], blocks: Mapping[int, Block]) -> tuple[list[Pool
     # One table for all blocks: a search in each of them would take the square of the number of sites.
     known: _Places = {kind: {} for kind in searched}
     for number, block in blocks.items():
-        _Content(None, block.content).add_places(number, known)
+        if not searched.isdisjoint(_searched_kinds.of(block)):
+            _Content(None, block.content).add_places(number, known)
     others, found = list[Pool](), dict[int, list[tuple[int, int]]]()
     for pool in pools:
         rest, shared = pool.without(known.get((pool.dtype, pool.shape), {}))
@@ -183,6 +190,35 @@ def _take_out(pools: list[Pool], blocks: Mapping[int, Block]) -> tuple[list[Pool
         if rest.numbers:
             others.append(rest)
     return others, [_shared_arrays(number, sorted(found[number])) for number in blocks if number in found]
+
+
+class _SearchedKinds:
+    """The types and shapes of the arrays in blocks that are searched, by the hashes of the blocks.
+
+    After a correction nearly all blocks are those of the job before.
+    """
+
+    _REMEMBERED = 8192
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._remembered: OrderedDict[str, frozenset[tuple[np.dtype[Any], tuple[int, ...]]]] = OrderedDict()
+
+    def of(self, block: Block) -> frozenset[tuple[np.dtype[Any], tuple[int, ...]]]:
+        """Return the types and shapes of a block's arrays."""
+        with self._lock:
+            known = self._remembered.get(block.sha256)
+        if known is None:
+            known = _Content(None, block.content).searched_kinds()
+        with self._lock:
+            self._remembered[block.sha256] = known
+            self._remembered.move_to_end(block.sha256)
+            while len(self._remembered) > self._REMEMBERED:
+                self._remembered.popitem(last=False)
+        return known
+
+
+_searched_kinds = _SearchedKinds()
 
 
 def _shared_arrays(block: int, numbers: Sequence[tuple[int, int]]) -> SharedArrays:
@@ -272,11 +308,16 @@ def form_of(kind: type[Any]) -> str:
 
 
 @functools.cache
-def _form_of(kind: Any) -> str:
+def _form_of(kind: Any, earlier: bool = False) -> str:
+    """Return the hash of a form, or of that without fields added later."""
     found: dict[str, list[tuple[str, str]]] = {}
     for name, one in _dataclasses_in(kind).items():
         hints = typing.get_type_hints(one)
-        fields = [(field.name, str(hints[field.name])) for field in dataclasses.fields(one)]
+        fields = [
+            (field.name, str(hints[field.name]))
+            for field in dataclasses.fields(one)
+            if not (earlier and _ADDED_LATER in field.metadata)
+        ]
         found[name] = [*fields, ("stored apart", "")] if _is_apart(one) else fields
     return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
 
@@ -372,9 +413,9 @@ class _Content:
             form, (count, columns) = read(ALIGNMENT + (length & ~_PACKED))
             if kind is None:
                 return
-            if form != form_of(kind) or count != 1:
+            if form not in (form_of(kind), _form_of(cast(Hashable, kind), earlier=True)) or count != 1:
                 raise StoredOtherwise(f"another version of the contracts stored this {kind}")
-            names = [name for name, _ in _fields_column(kind).fields]
+            names = [name for name, _ in _fields_column(kind).stored_fields(len(columns))]
             self.columns = dict(zip(names, columns, strict=True))
 
     def _read_packed(self, end: int) -> tuple[str, _Tree]:
@@ -432,6 +473,12 @@ class _Content:
         for pool in self._pools:
             by_number.update(zip(pool.numbers, pool.arrays, strict=True))
         return [by_number[number] for number in range(len(by_number))]
+
+    def searched_kinds(self) -> frozenset[tuple[np.dtype[Any], tuple[int, ...]]]:
+        """Return the types and shapes of which :meth:`add_places` adds arrays."""
+        return frozenset(
+            (pool.dtype, pool.shape) for pool in self._pools if isinstance(pool, _StoredPool) and pool.is_searched()
+        )
 
     def add_places(self, block: int, known: _Places) -> None:
         """Add the arrays of this block to the known ones.
@@ -682,6 +729,18 @@ class _DataclassColumn:
         hints = typing.get_type_hints(self._kind)
         return [(field.name, _column(hints[field.name])) for field in dataclasses.fields(cast(Any, self._kind))]
 
+    @functools.cached_property
+    def added(self) -> dict[str, Any]:
+        """Fields that earlier versions did not store, and their defaults."""
+        fields = dataclasses.fields(cast(Any, self._kind))
+        return {field.name: field.default for field in fields if _ADDED_LATER in field.metadata}
+
+    def stored_fields(self, count: int) -> list[tuple[str, _Column]]:
+        """Return the fields of which a result has so many columns."""
+        if count == len(self.fields):
+            return self.fields
+        return [(name, column) for name, column in self.fields if name not in self.added]
+
     def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         if not values:
             return 0, []
@@ -694,8 +753,11 @@ class _DataclassColumn:
         count, columns = stored
         made = list(map(object.__new__, itertools.repeat(cast(Any, self._kind), count)))
         if made:
-            for (name, column), items in zip(self.fields, columns, strict=True):
+            fields = self.stored_fields(len(columns))
+            for (name, column), items in zip(fields, columns, strict=True):
                 _set_all(made, name, column.decode(items, arrays))
+            for name, default in self.added.items() if fields is not self.fields else ():
+                _set_all(made, name, [default] * count)
         return made
 
 

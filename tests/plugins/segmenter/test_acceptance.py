@@ -33,3 +33,12 @@ def test_another_catheter_in_the_image_lowers_the_limits():
     ):
         assert acceptance.accepts(doubted, np.zeros(3)).tolist() == [False] * 3
         assert acceptance.accepts(doubted, np.zeros(3), beside=True).tolist() == expected
+
+
+def test_electrodes_outside_the_field_do_not_count_but_enough_must_lie_in_it():
+    good = np.full(4, 0.9)
+    assert IN_A_RUN.accepts(np.append(good[:3], np.nan), 2.5)
+    assert not IN_A_RUN.accepts(np.append(good[:2], [np.nan, np.nan]), 2.5)
+    assert not IN_A_RUN.accepts(np.append(np.full(3, 0.1), np.nan), 2.5)
+    assert IN_A_RUN.accepts(np.append(np.full(5, 0.9), np.full(5, np.nan)), 2.5)
+    assert not IN_A_RUN.accepts(np.append(np.full(4, 0.9), np.full(6, np.nan)), 2.5)

@@ -219,7 +219,12 @@ def test_a_catheter_that_leaves_the_field_is_missing_and_reported(beating):
     gone = found.frames[29]
     assert gone.manual_needed in (Reason.OUT_OF_FIELD, Reason.MANUAL_NEEDED)
     expected = {name: points - [start + 132, 0] for name, points in uv.items()}
-    assert len(located(gone.chains, expected)) == len(gone.chains) < 3
+    assert len(gone.chains) < 3
+    for chain in gone.chains:
+        # Another catheter may be partly outside the picture, too.
+        shown = [electrode - 1 for electrode in chain.electrodes]
+        away = [np.linalg.norm(chain.pixels_uv - points[shown], axis=1).max() for points in expected.values()]
+        assert min(away) < 5.0
 
 
 def test_foreshortened_and_crossing_catheters_are_found():

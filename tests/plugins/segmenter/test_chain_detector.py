@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
-from fluoromap.segmenter.acceptance import ScoreLimits
+from fluoromap.segmenter.acceptance import UNSEEN, ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
@@ -105,7 +106,7 @@ def drawn_without_shaft(row):
 
 def detector_of(evidence, catalogue=CATALOGUE, acceptance=IN_A_RUN):
     everywhere = np.ones(evidence.smooth.shape, np.bool_)
-    field = FieldMask(everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
+    field = FieldMask(everywhere, everywhere, everywhere, np.zeros(0, np.int64), np.zeros(0, np.int64), 1.0)
     return ChainDetector(catalogue, field, PX, lambda x: evidence, acceptance)
 
 
@@ -212,6 +213,25 @@ def test_a_chain_of_another_shape_is_refused_before_its_electrodes_are_judged(mo
     assert detector.find_again(image, other, np.zeros(2), 3.0, (), same_shape=True) is None
 
 
+class WideEvidence(Evidence):
+    """Evidence whose contrast covers electrodes, not single pixels."""
+
+    @property
+    def likeness(self):
+        return Likeness(maximum_filter(super().likeness.values, 5), 1.0, 0.0)
+
+
+def test_contrast_shows_a_confirmed_chain_that_its_frame_s_proposer_doubts():
+    catheter = row_of("cs", (60, 60), 0.3)
+    image = drawn([catheter])
+    (known,) = chains_found(image, catheter, [0.9] * 10, [0.9] * 10)
+    for contrast, is_shown in ((5.0, True), (1.0, False)):
+        detector = detector_of(WideEvidence(image, catheter, [1e-6] * 10, [1e-6] * 10, contrast=contrast))
+        assert detector.find_again(image, known, np.zeros(2), 3.0, ()) is None
+        again = detector.find_again(image, known, np.zeros(2), 3.0, (), confirmed=True)
+        assert (again is not None and lies_on(again, catheter)) == is_shown
+
+
 def test_less_likely_points_between_half_of_the_electrodes_make_a_long_chain_unlisted():
     catheter = row_of("cs", (60, 60), 0.4)
     gaps = 0.5 * (catheter[:-1] + catheter[1:])[[1, 3, 5, 7]]
@@ -246,6 +266,15 @@ def test_a_cable_that_crosses_between_electrodes_does_not_make_a_chain_unlisted(
         assert any(lies_on(chain, catheter) for chain in found)
 
 
+def test_a_chain_on_parallel_bars_is_no_catheter():
+    row = row_of("ablation", (60, 200), 0.0)
+    v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    image = drawn_without_shaft(row)
+    on_bar = (np.abs(u[..., None] - row[:, 0]).min(axis=-1) < 3.0) & (v > 200.0) & (v < 200.0 + 8.0 * PX)
+    for picture, count in ((image, 1), (np.where(on_bar, image - 0.4, image).astype(np.float32), 0)):
+        assert len(chains_found(picture, row, [0.99] * 4, [0.9] * 4)) == count
+
+
 def test_a_short_chain_may_have_a_part_of_its_shaft_between_its_electrodes():
     catheter = row_of("ablation", (60, 60), 0.3)
     shaft = 0.5 * (catheter[1:2] + catheter[2:3])
@@ -268,3 +297,57 @@ def test_a_short_catheter_with_its_shaft_is_no_long_one_where_noise_would_not_hi
     )
     (chain,) = detector_of(evidence, catalogue).search(evidence.smooth).entry(0).chains
     assert lies_on(chain, row if long else row[:6])
+
+
+def in_picture(row):
+    return ((row >= 0) & (row <= SIZE - 1)).all(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "tip", "angle", "outside"),
+    [
+        ("ablation", (352, 150), np.pi, 0),
+        ("ablation", (45, 120), np.pi, 1),
+        ("ablation", (365, 150), np.pi, 1),
+        ("cs", (95, 200), np.pi, 4),
+        ("cs", (395, 60), np.pi, 3),
+    ],
+)
+def test_a_catheter_that_is_partly_outside_the_picture_is_found(name, tip, angle, outside):
+    row = row_of(name, tip, angle)
+    shown = in_picture(row)
+    assert np.count_nonzero(~shown) == outside
+    found = chains_found(drawn([row]), row[shown], [0.99] * shown.sum(), [0.9] * shown.sum())
+    (chain,) = found
+    is_seen = chain.scores > UNSEEN
+    # The spacings that are left do not always show which end is the tip.
+    assert np.count_nonzero(is_seen) == np.count_nonzero(shown)
+    away = np.linalg.norm(chain.pixels_uv[is_seen][:, None] - row[shown], axis=2)
+    assert away.min(axis=1).max() < 5.0
+    assert not in_picture(chain.pixels_uv[~is_seen]).any()
+
+
+def test_electrodes_that_a_picture_should_show_are_not_taken_for_outside():
+    row = row_of("ablation", (120, 120), 0.4)
+    for kept in (row[1:], row[:3]):
+        assert chains_found(drawn([kept]), kept, [0.99] * 3, [0.9] * 3) == ()
+
+
+def test_a_catheter_with_too_few_electrodes_in_the_picture_is_not_found():
+    ablation = row_of("ablation", (22, 120), np.pi)
+    shown = in_picture(ablation)
+    assert np.count_nonzero(shown) == 2
+    assert chains_found(drawn([ablation]), ablation[shown], [0.99] * 2, [0.9] * 2) == ()
+
+
+def test_a_catheter_that_leaves_the_picture_is_found_again():
+    row = row_of("ablation", (62, 120), np.pi)
+    (chain,) = chains_found(drawn([row]), row, [0.99] * 4, [0.9] * 4)
+    moved = row - np.array([22.0, 0.0])
+    shown = in_picture(moved)
+    assert np.count_nonzero(shown) == 3
+    image = drawn([moved])
+    detector = detector_of(Evidence(image, moved[shown], [0.99] * 3, [0.9] * 3, contrast=12.0))
+    again = detector.find_again(image, chain, np.array([-20.0, 0.0]), 6.0, ())
+    assert np.linalg.norm(again.pixels_uv - moved, axis=1)[shown].max() < 5.0
+    assert (again.scores[~shown] == UNSEEN).all()

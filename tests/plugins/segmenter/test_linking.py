@@ -110,3 +110,23 @@ def test_the_many_chains_of_a_long_catheter_do_not_crowd_out_a_short_one():
     possible = PossibleChains((long_rows, np.arange(20, 24)[None]), (rng.uniform(5.0, 6.0, 300), np.array([4.0])))
     chosen = best_chains(possible, points, families, PX)
     assert sorted(families[chain.family].names for chain in chosen) == [("cs",), ("rv",)]
+
+
+def test_parts_of_a_long_catheter_do_not_crowd_out_a_short_one_elsewhere():
+    catalogue = Catalogue(
+        (catheter_type("decapolar-2-5-2", "cs"), catheter_type("quadripolar-2-5-2", "rv")), "cs", "rv"
+    )
+    families = catheter_families(catalogue)
+    rng = np.random.default_rng(0)
+    row, _ = straight(catalogue["cs"], (20, 60), 0.1, 0.5)
+    short, _ = straight(catalogue["rv"], (60, 250), 0.1)
+    # Two candidates for each electrode: hundreds of chains of four in the long catheter score more than the short one.
+    points = np.concatenate([row, row + rng.normal(0, 1.0, row.shape), short])
+    parts = np.sort(rng.permuted(np.tile(np.arange(10), (300, 1)), axis=1)[:, :4], axis=1)
+    parts += 10 * rng.integers(0, 2, parts.shape)
+    possible = PossibleChains(
+        (np.arange(10)[None], np.concatenate([parts, np.arange(20, 24)[None]])),
+        (np.array([12.0]), np.append(rng.uniform(5.0, 6.0, 300), 4.0)),
+    )
+    chosen = best_chains(possible, points, families, PX)
+    assert sorted(chain.candidates for chain in chosen) == [tuple(range(10)), (20, 21, 22, 23)]

@@ -46,7 +46,7 @@ def test_two_beating_catheters_keep_their_numbers_through_a_gap():
 def test_a_missing_catheter_is_carried_from_where_it_was():
     asked = []
 
-    def search(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken, confirmed=False):
         asked.append(frame)
         assert len(taken) == 1
         expected = two_beating(frame)[0]
@@ -98,7 +98,7 @@ def test_an_empty_run():
 def test_a_rejected_track_leaves_its_place_to_the_catheter_that_it_kept_out():
     right, false = chain(POINTS + 100), chain(POINTS[:, ::-1] + 300)
 
-    def search(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken, confirmed=False):
         return None if any(np.allclose(known.pixels_uv, other.pixels_uv) for other in taken) else known
 
     found = run([[false] if frame < 8 else [right] for frame in range(20)])
@@ -121,7 +121,7 @@ def test_a_part_of_a_longer_catheter_does_not_keep_it_out():
     # The mean of the frames shows four of its electrodes only, and they are found again in every frame.
     seed = FrameChains(2, (chain(long[3:7] + 2, "rv"),))
 
-    def search(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken, confirmed=False):
         return chain(long[3:7] + frame, "rv") if len(known.electrodes) == 4 else chain(long + frame, "cs")
 
     entries = track_chains(found, np.arange(6) * 100.0, 2, search, seed)
@@ -154,7 +154,7 @@ def test_a_chain_a_pair_too_far_along_its_catheter_does_not_keep_it_out():
     found = run([[chain(row[:10] + frame, "cs")] for frame in range(6)])
     seed = FrameChains(2, (chain(row[2:] + 2, "cs"),))
 
-    def search(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken, confirmed=False):
         return chain(row[2:] + frame, "cs")
 
     entries = track_chains(found, times(6), 1, search, seed)
@@ -167,7 +167,7 @@ def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():
     found = run([[chain(long + frame, "cs")] for frame in range(6)])
     seed = FrameChains(2, (chain(long[:4] + 2, "rv"),))
 
-    def search(frame, known, shift, reach_px, taken):
+    def search(frame, known, shift, reach_px, taken, confirmed=False):
         return chain(long[:4] + frame, "rv") if len(known.electrodes) == 4 else chain(long + frame, "cs")
 
     entries = track_chains(found, np.arange(6) * 100.0, 2, search, seed)
@@ -177,5 +177,31 @@ def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():
 def test_a_short_catheter_stays_where_one_frame_shows_a_longer_one_at_its_place():
     long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
     found = run([[chain(long, "cs")] if frame == 3 else [chain(long[3:7], "rv")] for frame in range(6)])
-    entries = track_chains(found, np.arange(6) * 100.0, 2, lambda *asked: asked[1])
+    entries = track_chains(found, np.arange(6) * 100.0, 2, lambda *asked, confirmed=False: asked[1])
     assert all(len(entry.chains[0].electrodes) == 4 for entry in entries)
+
+
+def only_confirmed(frame, known, shift, reach_px, taken, confirmed=False):
+    return known if confirmed else None
+
+
+def test_an_accepted_track_is_searched_by_contrast_in_the_frames_that_lack_it():
+    right = chain(POINTS + 100)
+    found = run([[right] if frame not in (0, 5, 6) else [] for frame in range(12)])
+    entries = track_chains(found, times(12), 1, only_confirmed, accepts=lambda chains: True)
+    assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
+    entries = track_chains(found, times(12), 1, only_confirmed)
+    assert [entry.frame for entry in entries if not entry.chains] == [0, 5, 6]
+
+
+def test_a_catheter_of_moved_means_is_followed_where_no_frame_shows_it_and_a_false_track_has_its_place():
+    right, false = chain(POINTS + 100), chain(POINTS[:, ::-1] + 300)
+    found = run([[false]] * 8)
+    seed = FrameChains(3, (right,))
+
+    def accepts(chains):
+        return chains[min(chains)].pixels_uv[0, 0] < 200
+
+    entries = track_chains(found, times(8), 1, only_confirmed, seed, accepts, marks_first=False)
+    assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
+    assert not any(entry.chains for entry in track_chains(found, times(8), 1, only_confirmed, seed, accepts))

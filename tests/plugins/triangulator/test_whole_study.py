@@ -27,9 +27,21 @@ from fluoromap.geometry import Camera, camera_from_gantry
 from fluoromap.phantom import FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.error_sources import study_covariance, study_sources
+from fluoromap.triangulator.estimate import JointLeastSquares
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.reference_origin import ReferenceOrigin
-from fluoromap.triangulator.study_equations import CalibrationSite, site_equations
+from fluoromap.triangulator.self_calibration import any_study_belief, header_belief
+from fluoromap.triangulator.site_locator import SiteLocator
+from fluoromap.triangulator.site_moment import Moment, errors_in_study
+from fluoromap.triangulator.study_equations import (
+    HEART_SCALES,
+    CalibrationSite,
+    Information,
+    SiteEquations,
+    gap_labels,
+    information,
+    site_equations,
+)
 from fluoromap.triangulator.two_view_pixels import pixels_in_both_views
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
@@ -521,7 +533,7 @@ def test_a_corrected_diastole_locates_its_own_site_again() -> None:
     first, *others = matched_sites(electrodes(3), np.random.default_rng(3))
     triangulator, context = MaximumLikelihood(UncertaintyParams()), _Remembering()
     triangulator.triangulate((first, *others), DEFAULT_CATALOGUE, context)
-    each = ["SiteLook", "Diastole", "SiteCycle"]
+    each = ["SiteLook", "Diastole", "SiteCycle", "APriori"]
     assert sorted(context.computed) == sorted((1 + len(others)) * each + ["StudyChecks"])
 
     context.computed.clear()
@@ -544,3 +556,61 @@ def test_the_size_of_the_study_errors_is_that_of_their_sources(breathing: float,
     sources = study_sources(CAMERAS, np.concatenate(list(points.values())), labels, DEFAULT_CATALOGUE, params, gantry)
     whole = study_covariance(params, gantry, len(points))
     np.testing.assert_allclose(whole, block_diag(*(source.covariance for source in sources)), rtol=1e-15)
+
+
+def _without_tip(pair: PhasePair) -> PhasePair:
+    """Return the pair without the first electrode of each chain."""
+
+    def shorter(chain: NamedChain) -> NamedChain:
+        return replace(
+            chain,
+            electrodes=chain.electrodes[1:],
+            pixels_uv=chain.pixels_uv[1:],
+            covariance_px2=chain.covariance_px2[1:],
+        )
+
+    a, b = (replace(view, chains=tuple(map(shorter, view.chains))) for view in (pair.a, pair.b))
+    return replace(pair, a=a, b=b)
+
+
+def _moments() -> list[Moment]:
+    sites = matched_sites(electrodes(5), np.random.default_rng(5))
+    sites = (replace(sites[0], diastole=_without_tip(sites[0].diastole)), *sites[1:])
+    params = UncertaintyParams()
+    locator = SiteLocator(JointLeastSquares(), DEFAULT_CATALOGUE, header_belief(params), any_study_belief(params), 1.5)
+    found = [locator.diastole(site, CAMERAS, None, None).chosen for site in sites]
+    assert all(moment is not None for moment in found)
+    return [moment for moment in found if moment is not None]
+
+
+def test_the_errors_of_a_site_do_not_depend_on_the_others() -> None:
+    moments, belief = _moments(), header_belief(UncertaintyParams())
+    together = errors_in_study(moments, belief)
+    assert len({moment.study_mm.shape for moment in moments}) == 2
+    for moment, found in zip(moments, together, strict=True):
+        (alone,) = errors_in_study([moment], belief)
+        assert found.inflation == alone.inflation
+        assert found.squares_mm2 == alone.squares_mm2
+        assert np.array_equal(found.joint_mm2, alone.joint_mm2)
+
+
+def test_equations_say_the_same_when_their_products_are_known() -> None:
+    gaps = gap_labels(DEFAULT_CATALOGUE, frozenset(DEFAULT_CATALOGUE.names))
+    sites = [
+        CalibrationSite(CAMERAS, pixels_in_both_views(site.diastole))
+        for site in matched_sites(electrodes(6), np.random.default_rng(6))
+    ]
+
+    def equations() -> list[SiteEquations]:
+        return [site_equations(site, site.cameras, DEFAULT_CATALOGUE, gaps, UncertaintyParams()) for site in sites]
+
+    def content(hearts: list[Information]) -> list[object]:
+        return [(heart.matrix.tolist(), heart.vector.tolist(), heart.constant) for heart in hearts]
+
+    header, others = np.zeros(14 + len(gaps)), np.zeros(len(HEART_SCALES))
+    known = equations()
+    first = information(known, header, others)
+    # One site is corrected; then the products of the others are known.
+    again = [*known[:-1], equations()[-1]]
+    assert content(information(again, header, others)) == content(first)
+    assert content(information(known[1:], header, others)) == content(information(equations()[1:], header, others))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
+from fluoromap.contracts import ADDED_LATER, Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap_service.store import array_pools, codec
@@ -356,6 +356,25 @@ def test_a_result_of_an_earlier_version_is_read() -> None:
     assert decode(_Texts, partial_results(again)["key"].content) == _Texts(("a", "b"))
     assert decode(_Apart, again).numbers.tobytes() == covariances.tobytes()
     assert plain_form(after) == plain(_Apart, [("<f8", [5, 3, 3], [0])], covariances.tobytes(), [["name"], [0], [None]])
+
+
+def test_a_result_without_the_fields_that_were_added_later_is_read() -> None:
+    """The earlier contracts have the names of today's, as in the version that stored the result."""
+
+    def contracts(*added: tuple[str, Any, Any]) -> tuple[type, type]:
+        part = dataclasses.make_dataclass("_Part", [("name", str), *added], frozen=True, slots=True)
+        parts: Any = tuple[part, ...]  # type: ignore[valid-type]
+        return part, dataclasses.make_dataclass("_Parts", [("parts", parts), *added], frozen=True)
+
+    later = dataclasses.field(default=7.0, metadata=ADDED_LATER)
+    (old_part, old), (part, parts) = contracts(), contracts(("weight", float, later))
+    content = encode(old((old_part("tip"), old_part("ring"))))
+    after = decode(parts, content)
+    assert after == parts((part("tip"), part("ring")))
+    assert [one.weight for one in after.parts] == [7.0, 7.0]
+    assert decode(parts, encode(parts((part("tip", 2.0),), 3.0))) == parts((part("tip", 2.0),), 3.0)
+    with pytest.raises(StoredOtherwise):
+        decode(old, encode(parts((part("tip"),))))
 
 
 def test_another_compressor_changes_no_hash(monkeypatch: pytest.MonkeyPatch) -> None:

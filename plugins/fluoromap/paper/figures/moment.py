@@ -134,7 +134,7 @@ def _site_at(
         catalogue=catalogue,
         frame_times_ms=run.frame_times_ms,
         observations=(matched.track_a, matched.track_b)[view],
-        a_priori=located.a_priori,
+        a_priori=located.a_priori_points,
         a_priori_frame=(located.frame_a, located.frame_b)[view],
         cycle=located.cycle,
         others=() if located.cycle is not None else others,

@@ -176,7 +176,7 @@ def _monoplane_view(
         catalogue=catalogue,
         frame_times_ms=run.frame_times_ms,
         observations=site.track_a if lateral else site.track_b,
-        a_priori=located.a_priori,
+        a_priori=located.a_priori_points,
         a_priori_frame=located.frame_a if lateral else located.frame_b,
         cycle=located.cycle,
         others=() if located.cycle is not None else tuple(one.cycle for one in study.sites if one.cycle is not None),

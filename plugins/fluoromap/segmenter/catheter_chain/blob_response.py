@@ -119,7 +119,8 @@ class BlobResponse:
         first, second, third = self.stack
         top = np.maximum(np.maximum(first, second), third).reshape(-1)
         columns = self.stack.shape[2]
-        clear = np.flatnonzero((top > np.float32(_CLEAR_SNR * self.noise.min())) & allowed.reshape(-1))
+        clear = np.flatnonzero(top > np.float32(_CLEAR_SNR * self.noise.min()))
+        clear = clear[allowed[np.divmod(clear, columns)]]
         for step in (1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns):
             clear = clear[top[clear] >= top[clear + step]]
         v, u = np.divmod(clear, columns)

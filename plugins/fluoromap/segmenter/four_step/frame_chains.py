@@ -132,6 +132,7 @@ class FourStepDetector:
         taken: Sequence[Chain],
         frame: int | None = None,
         same_shape: bool = False,
+        confirmed: bool = False,
     ) -> Chain | None:
         """Return None: the paper searches whole frames."""
         return None

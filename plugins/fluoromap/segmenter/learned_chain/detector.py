@@ -12,12 +12,7 @@ from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
-from fluoromap.segmenter.learned_chain.frame_search import (
-    AT_REST_MM,
-    AT_REST_MS,
-    SHARED_MS,
-    FrameSearch,
-)
+from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, near_distance_mm
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
 from fluoromap.segmenter.learned_chain.nearby_network import NearbyNetwork
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
@@ -80,6 +75,6 @@ def electrode_chains(
         return JointEvidence(network(x), blobs(x), px_per_mm, least_noise, faint, network.reach_cells)
 
     detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else IN_A_RUN)
-    rest_px = AT_REST_MM * px_per_mm if frame_ms <= AT_REST_MS else 0.0
+    near_px = near_distance_mm(frame_ms) * px_per_mm
     stored = StoredAnswers() if answers is None else answers
-    return FrameSearch(detector, network, blobs, len(catalogue.catheters), frame_ms <= SHARED_MS, rest_px, stored)
+    return FrameSearch(detector, network, blobs, len(catalogue.catheters), frame_ms <= SHARED_MS, near_px, stored)

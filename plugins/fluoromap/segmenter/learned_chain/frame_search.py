@@ -17,17 +17,30 @@ from fluoromap.segmenter.log_image import Image
 SHARED_MS = 21.0
 """Time between frames up to which the network's answer for one frame says where electrodes are in the next."""
 
-AT_REST_MS, AT_REST_MM = 40.0, 1.0
-"""Time between frames, and motion since the network's answer, up to which the answer serves frames of a catheter at rest."""
+_NEAR_MS, _NEAR_MM, _NEAR_MM_IN_FAST_RUNS = 40.0, 1.75, 1.0
+"""Time between frames, and motion since the network's answer, up to which the answer serves frames of a catheter near its place.
+
+Fast runs share answers already, and their frames have more noise.
+"""
 
 _MEAN_CELLS, _NEXT_FRAME_CELLS = 2, 3
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
-_AT_REST_CELLS, _MOST_AT_REST = 2, 3
-"""How far the answer may lie from a catheter at rest, and how many frames may share it."""
+_NEAR_CELLS, _MOST_NEAR = 3, 5
+"""How far the answer may lie from a catheter near its place, and how many frames may share it."""
 _REACH_PX = 6.0
 _LOOSE_PX = 3.0
 _LEAST_SHARE = 0.5
 """Least likeness of the frame itself, as a share of what it has when all frames of the mean show the catheter alike."""
+
+
+def near_distance_mm(frame_ms: float) -> float:
+    """Return the motion up to which frames share an answer.
+
+    ``frame_ms`` : longest time between frames.
+    """
+    if frame_ms > _NEAR_MS:
+        return 0.0
+    return _NEAR_MM_IN_FAST_RUNS if frame_ms <= SHARED_MS else _NEAR_MM
 
 
 _NO_FRAME = FrameChains(-2, (), Reason.MANUAL_NEEDED)
@@ -41,7 +54,7 @@ class FrameSearch:
       the mean are found again in the frame itself. Where this helps once, the following frames are searched so first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
-    - While all catheters move less than ``rest_px``, three more frames use the answer. Not so in runs whose noise hides catheters.
+    - While all catheters move less than ``near_px``, five more frames use the answer. Not so in runs whose noise hides catheters.
     - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or catheters that moved, is
       searched again with an answer of its own.
     """
@@ -51,7 +64,7 @@ class FrameSearch:
     blobs: LatestBlobs
     catheters: int
     shares: bool
-    rest_px: float = 0.0
+    near_px: float = 0.0
     answers: StoredAnswers = field(default_factory=StoredAnswers)
     _next: int = field(default=0, init=False)
     _own: NetworkResponse | None = field(default=None, init=False)
@@ -79,9 +92,9 @@ class FrameSearch:
             _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= len(self._answered.chains):
                 return entry
-        elif self._is_at_rest(frame):
-            _, entry = self._search(x, first, frame, _AT_REST_CELLS)
-            if entry.manual_needed is None and _motion_px(self._answered, entry) <= self.rest_px:
+        elif self._is_near(frame):
+            _, entry = self._search(x, first, frame, _NEAR_CELLS)
+            if entry.manual_needed is None and _motion_px(self._answered, entry) <= self.near_px:
                 return entry
         searched, entry = self._search(x, first, frame, OWN_CELLS)
         if beside and self._lacks_catheters(entry):
@@ -97,14 +110,14 @@ class FrameSearch:
             self._answered = entry
         return entry
 
-    def _is_at_rest(self, frame: int) -> bool:
+    def _is_near(self, frame: int) -> bool:
         """Return whether all catheters were clear, and hardly moved since the latest answer."""
         return (
             not self._noisy
-            and frame - self._answered.frame <= _MOST_AT_REST
+            and frame - self._answered.frame <= _MOST_NEAR
             and self._latest.frame == frame - 1
             and not self._lacks_catheters(self._answered)
-            and _motion_px(self._answered, self._latest) + self._step_px < self.rest_px
+            and _motion_px(self._answered, self._latest) + self._step_px < self.near_px
         )
 
     def _lacks_catheters(self, entry: FrameChains) -> bool:
@@ -143,7 +156,7 @@ class FrameSearch:
             # The mean has less noise, so the same catheter has more contrast over noise there.
             least = _LEAST_SHARE * np.mean(searched.seen.likeness.at(chain.pixels_uv)) / np.sqrt(averaged)
             if again is not None and np.mean(in_frame.at(again.pixels_uv)) >= least:
-                chains.append(again)
+                chains.append(replace(again, tip_odds=chain.tip_odds))
         self.network.reach_cells = OWN_CELLS
         return FrameChains(frame, tuple(chains), entry.manual_needed if chains else Reason.MANUAL_NEEDED)
 
@@ -156,13 +169,14 @@ class FrameSearch:
         taken: Sequence[Chain],
         frame: int | None = None,
         same_shape: bool = False,
+        confirmed: bool = False,
     ) -> Chain | None:
         """Return a chain of another frame at its place in this log image."""
         if frame is None:
-            return self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape)
+            return self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape, confirmed)
         self.network.remember(x, self.answers.network.of_frame(frame))
         self.blobs.remember(x, self.answers.blobs.of_frame(frame))
-        again = self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape)
+        again = self.detector.find_again(x, chain, shift, reach_px, taken, frame, same_shape, confirmed)
         self._store_blobs(x, frame)
         return again
 

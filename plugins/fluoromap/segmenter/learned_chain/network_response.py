@@ -10,6 +10,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.segmenter.gaussian_blur import repeat_edge
 from fluoromap.segmenter.learned_chain.layers import CELL_PX, HEADS, STRIDE_PX
 from fluoromap.segmenter.learned_chain.normalisation import normalise
 from fluoromap.segmenter.learned_chain.resampling import resampled
@@ -240,13 +241,14 @@ def network_scale(px_per_mm: float) -> float:
 def answer(trained: Trained, picture: Image) -> Image:
     """Return the network's answers to a normalised picture of any size, (rows / 2, columns / 2, heads), both rounded up."""
     rows, columns = picture.shape
-    padded = np.pad(picture, ((0, -rows % STRIDE_PX), (0, -columns % STRIDE_PX)), mode="edge")
+    padded = repeat_edge(picture, rows + -rows % STRIDE_PX, columns + -columns % STRIDE_PX)
     return trained.network(padded)[: -(-rows // CELL_PX), : -(-columns // CELL_PX)]
 
 
 def _highest_near(values: Image) -> Image:
     """Return the highest of each value and its eight neighbours."""
-    wide = np.pad(values, 1, constant_values=-np.inf)
+    wide = np.full((values.shape[0] + 2, values.shape[1] + 2), -np.inf, values.dtype)
+    wide[1:-1, 1:-1] = values
     across = np.maximum(np.maximum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:])
     highest: Image = np.maximum(np.maximum(across[:-2], across[1:-1]), across[2:])
     return highest

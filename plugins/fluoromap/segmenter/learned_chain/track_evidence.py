@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fluoromap.contracts import Array, Chain
+from fluoromap.contracts import Array, Chain, IntArray
+from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
@@ -20,6 +21,7 @@ from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
+from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 _AVERAGED = 8
 _PICTURES = 2
@@ -35,6 +37,8 @@ _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
 _LEAST_LONG = 0.0
 """Of the middle electrode of six or more, on average. Clutter often hides some of them: the worst electrodes do not count."""
+_MOST_OUTSIDE = 0.5
+"""Share of the frames in which an electrode may lie outside the field, where nothing shows, and still count."""
 _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
@@ -64,30 +68,34 @@ class TrackEvidence:
         recall: Recall[SectionOdds] = compute_always,
     ) -> bool:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
-
-        def odds_along(group: slice, path_uv: Array) -> Array:
-            def compute() -> SectionOdds:
-                return SectionOdds(self.log_odds_along(frames[group], path_uv, log_image))
-
-            return recall(SectionOdds, (tuple(frames[group]), path_uv), compute).log_odds
-
         usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
-        frames = sorted(frame for frame, chain in chains.items() if chain.electrodes == usual)
+        frames = [frame for frame, chain in sorted(chains.items()) if chain.electrodes == usual]
         paths = np.array([chains[frame].pixels_uv for frame in frames])
-        odds = np.array(
-            [
-                np.concatenate([odds_along(group, part) for part in _sections(paths[group])])
-                for group in _groups(len(frames))
-            ]
-        )
-        clear = sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames
+        inside = np.array([chains[frame].scores > UNSEEN for frame in frames]).mean(axis=0) >= 1.0 - _MOST_OUTSIDE
+        if np.count_nonzero(inside) < LEAST_VISIBLE:
+            return False
+
+        def odds_in(picture: IntArray) -> Array:
+            averaged = [frames[index] for index in picture]
+
+            def odds_along(path_uv: Array) -> Array:
+                def compute() -> SectionOdds:
+                    return SectionOdds(self.log_odds_along(averaged, path_uv, log_image))
+
+                return recall(SectionOdds, (tuple(averaged), path_uv), compute).log_odds
+
+            odds: Array = np.concatenate([odds_along(part) for part in _sections(paths[picture])])[inside]
+            return odds
+
+        odds = np.array([odds_in(picture) for picture in _first_and_last(len(frames))])
         middle = np.median(odds, axis=1)
-        is_long = len(usual) >= MANY_ELECTRODES
-        if clear:
+        if len(usual) >= MANY_ELECTRODES:
+            return bool(middle.mean() >= _LEAST_LONG or np.median(odds_in(_all_along(len(frames)))) >= _LEAST_LONG)
+        if sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames:
             shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
         else:
-            shown = bool(middle.mean() >= (_LEAST_LONG if is_long else _LEAST_MEDIAN))
-        return shown and (is_long or _are_electrodes(odds.mean(axis=0)))
+            shown = bool(middle.mean() >= _LEAST_MEDIAN)
+        return shown and _are_electrodes(odds.mean(axis=0))
 
     def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
         """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
@@ -126,14 +134,23 @@ def _are_electrodes(odds: Array) -> bool:
 
 def _is_clear(chain: Chain) -> bool:
     """Return whether network and contrast show a chain in its frame."""
-    return bool(np.median(chain.scores) >= _CLEAR_SCORE and chain.scores.min() >= _LEAST_CLEAR_SCORE)
+    scores = chain.scores[chain.scores > UNSEEN]
+    return bool(len(scores) and np.median(scores) >= _CLEAR_SCORE and scores.min() >= _LEAST_CLEAR_SCORE)
 
 
-def _groups(frames: int) -> list[slice]:
+def _first_and_last(frames: int) -> list[IntArray]:
     """Return the first and the last eight of a track's frames."""
     size = min(_AVERAGED, frames)
     count = min(_PICTURES, -(-frames // size))
-    return [slice(start, start + size) for start in np.linspace(0, frames - size, count).astype(np.int64).tolist()]
+    return [start + np.arange(size) for start in np.linspace(0, frames - size, count).astype(np.int64).tolist()]
+
+
+def _all_along(frames: int) -> IntArray:
+    """Return sixteen frames of a track, evenly over it.
+
+    Motion between them blurs the anatomy, which hides a catheter at rest.
+    """
+    return np.linspace(0, frames - 1, min(frames, _PICTURES * _AVERAGED)).astype(np.int64)
 
 
 def _sections(path_uv: Array) -> list[Array]:

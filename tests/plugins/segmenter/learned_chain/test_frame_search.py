@@ -65,16 +65,16 @@ class Detector:
     def image_evidence(self, x):
         return SimpleNamespace(likeness=Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0))
 
-    def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False):
+    def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False, confirmed=False):
         self.found_again.append((float(x.mean()), known))
         return chain(1.0)
 
 
-def search(level, shares, rest_px=0.0):
+def search(level, shares, near_px=0.0):
     asked = []
     network = LatestNetwork(lambda x: asked.append(float(x.mean())) or ANSWER, lambda x: SimpleNamespace(of=x))
     detector = Detector(network, level)
-    return FrameSearch(detector, network, LatestBlobs(blobs_of), 1, shares, rest_px), detector, asked
+    return FrameSearch(detector, network, LatestBlobs(blobs_of), 1, shares, near_px), detector, asked
 
 
 def test_a_frame_without_its_catheter_is_searched_in_the_mean_and_the_chain_found_again_in_the_frame():
@@ -122,27 +122,27 @@ def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
 
 
 def test_catheters_at_rest_share_an_answer_until_they_move():
-    frames, detector, asked = search(1.0, shares=False, rest_px=4.0)
-    places = [0.0, 0.5, 0.5, 0.7, 0.7, 0.7, 9.0, 9.0, 18.0, 18.0, 18.0]
+    frames, detector, asked = search(1.0, shares=False, near_px=4.0)
+    places = [0.0, 0.5, 0.5, 0.7, 0.7, 0.7, 0.7, 0.7, 9.0, 9.0, 18.0, 18.0, 18.0]
     detector.chain_at = lambda frame: places[frame]
     for frame in range(len(places)):
         detector.frame = frame
         assert frames.find_chains(X + 1, frame).chains
         asked.append(frame)
     own = [frame for before, frame in itertools.pairwise(asked) if isinstance(before, float)]
-    # Own answers: until the speed is known, after three more frames, while they move.
-    assert own == [0, 1, 5, 6, 7, 8, 9]
+    # Own answers: until the speed is known, after five more frames, while they move.
+    assert own == [0, 1, 7, 8, 9, 10, 11]
 
 
 def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
-    frames, _, asked = search(1.0, shares=False, rest_px=4.0)
+    frames, _, asked = search(1.0, shares=False, near_px=4.0)
     for frame in range(4):
         frames.find_chains(X + (1 if frame != 2 else 5), frame)
     assert asked == [1.0, 1.0, 5.0, 1.0]
 
 
 def test_in_runs_whose_noise_hides_catheters_each_frame_has_an_answer_of_its_own():
-    frames, detector, asked = search(2.0, shares=False, rest_px=4.0)
+    frames, detector, asked = search(2.0, shares=False, near_px=4.0)
     frames.find_chains(X + 1, 0, [X + 2, X + 3])
     detector.level = 1.0
     for frame in range(1, 5):

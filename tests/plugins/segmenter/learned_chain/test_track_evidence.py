@@ -8,6 +8,7 @@ import pytest
 
 from fluoromap.contracts import Chain, PixelFacts
 from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
@@ -102,3 +103,31 @@ def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_
     known = chains(np.repeat(row[None], FRAMES, axis=0))
     track = {frame: replace(chain, scores=doubted) for frame, chain in known.items()}
     assert judge(track, lambda frame: None) == accepted
+
+
+def test_electrodes_outside_the_field_do_not_count(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    row = np.stack([-10.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    known = chains(np.repeat(row[None], FRAMES, axis=0))
+    monkeypatch.setattr(
+        TrackEvidence, "log_odds_along", lambda self, frames, path_uv, log_image: np.where(path_uv[0, :, 0] > 0, 1, -9)
+    )
+    for outside, accepted in ((1, True), (2, False)):
+        scores = np.where(np.arange(4) < outside, UNSEEN, 0.3)
+        track = {frame: replace(chain, scores=scores) for frame, chain in known.items()}
+        assert judge(track, lambda frame: None) == accepted
+    assert not judge(known, lambda frame: None)
+
+
+@pytest.mark.parametrize(("electrodes", "accepted"), [(10, True), (4, False)])
+def test_a_long_catheter_at_rest_over_anatomy_is_judged_by_frames_all_along_its_track(
+    monkeypatch, electrodes, accepted
+):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, 2 * FRAMES)
+
+    def along(self, frames, path_uv, log_image):
+        return np.full(path_uv.shape[1], 0.5 if np.ptp(frames) > FRAMES else -1.5)
+
+    monkeypatch.setattr(TrackEvidence, "log_odds_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
+    assert judge(chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None) == accepted
