@@ -76,9 +76,10 @@ export class MapScene extends EventTarget {
     return dot;
   }
 
-  /** @param {string} text */
-  #label(text) {
+  /** @param {string} text @param {string} kind Class of the label: a site's changes with each drawing. */
+  #label(text, kind = "") {
     const label = document.createElement("span");
+    label.className = kind;
     label.textContent = text;
     this.labels.append(label);
     return label;
@@ -109,7 +110,7 @@ export class MapScene extends EventTarget {
   #showCatheters() {
     this.catheters.show(this.showsCatheters ? this.chosen : null);
     for (const each of this.catheterNames) each.remove();
-    this.catheterNames = this.catheters.labels.map(({ name }) => this.#label(name));
+    this.catheterNames = this.catheters.labels.map(({ name }) => this.#label(name, "catheter"));
     this.draw();
   }
 
@@ -150,9 +151,7 @@ export class MapScene extends EventTarget {
     }
     this.catheters.labels.forEach(({ at }, k) => {
       const label = this.catheterNames[k];
-      if (!label) return;
-      label.className = "catheter";
-      this.#put(label, at, taken);
+      if (label) this.#put(label, at, taken);
     });
     this.canvas.dataset["drawn"] = "yes";
   }
