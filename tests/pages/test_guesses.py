@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from playwright.sync_api import expect
 from small_runs import small_run
 
 
@@ -25,7 +26,7 @@ def test_guesses_are_confirmed_by_hand(page: Any, new_study: Callable[[Any, str]
     page.get_by_text("guess: row order").nth(1).wait_for()
     page.get_by_role("button", name="Confirm all guesses").click()
     page.get_by_text("All pairs are confirmed.").wait_for()
-    assert page.locator(".badge.guess").count() == 0
+    expect(page.locator(".badge.guess")).to_have_count(0)
     sites = page.request.get(f"{study}/sites").json()["items"]
     assert [(each["bound_by"], each["lat_ms"], each["warnings"]) for each in sites] == [
         ("explicit", 12.5, []), ("explicit", -30.0, []),
@@ -40,7 +41,7 @@ def test_a_file_that_is_no_run_is_refused_in_words(
     (tmp_path / "times.csv").write_text("site,lat_ms\nS01,late\n")
     page.locator("#files").set_input_files([tmp_path / "letter.dcm", tmp_path / "times.csv"])
     page.get_by_text("column lat_ms: must be a number").wait_for()
-    assert page.locator("li .notice.problem").count() == 2
+    expect(page.locator("li .notice.problem")).to_have_count(2)
 
 
 def test_a_folder_is_sent_without_the_files_that_are_no_runs(
@@ -56,5 +57,5 @@ def test_a_folder_is_sent_without_the_files_that_are_no_runs(
     page.locator("#folder").set_input_files(folder)
     page.get_by_text("left out: no run and no table").wait_for()
     page.get_by_text("1 of 1 sites are ready").wait_for()
-    assert page.locator("li .notice.problem").count() == 0
+    expect(page.locator("li .notice.problem")).to_have_count(0)
     assert len(page.request.get(f"{study}/instances").json()["items"]) == 2

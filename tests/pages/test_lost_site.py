@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pydicom
 import pytest
+from playwright.sync_api import expect
 
 from fluoromap_service.dicom import deterministic_uid
 from fluoromap_service.dicom.simulation import SimulatedFiles
@@ -38,7 +39,7 @@ def study_with_a_lost_site(
 def test_the_page_leads_to_the_site_that_is_not_located(page: Any, study_with_a_lost_site: str) -> None:
     page.goto(f"/studies/{study_with_a_lost_site}#map")
     page.get_by_text(f"Site {LOST} is not located.").wait_for()
-    assert page.locator("[data-lost]").count() == 1
+    expect(page.locator("[data-lost]")).to_have_count(1)
     page.get_by_role("button", name=f"Correct site {LOST}", exact=True).click()
 
     panel = page.locator("#panel-electrodes")

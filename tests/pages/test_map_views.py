@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from playwright.sync_api import expect
 
 SIDE = 512
 
@@ -103,7 +104,7 @@ def test_a_choice_in_the_table_shows_the_runs_of_the_site_and_the_way_to_the_ear
     mm = float(np.linalg.norm(at[name] - at[earliest]))
     assert words.startswith(f"From the tip at {name} to the earliest site {earliest}: {mm:.1f} mm (95 %: ")
     for catheter in ("reference", "pacing", "mapping"):
-        assert map_page.locator(".scene .labels .catheter", has_text=catheter).count() == 1
+        expect(map_page.locator(".scene .labels .catheter", has_text=catheter)).to_have_count(1)
 
 
 def test_the_map_follows_the_frames_while_they_play(map_page: Any) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from playwright.sync_api import expect
 from small_runs import edited
 
 from fluoromap.geometry import Gantry
@@ -101,4 +102,4 @@ def test_electrodes_of_real_frames_marked_from_the_tip(
     page.get_by_role("tab", name="4 Map and results").click()
     # One site makes no surface; the page says so, and what it knows about the site.
     page.get_by_text("at least four").wait_for()
-    assert page.locator("#panel-map tr[data-site=S01]").count() == 1
+    expect(page.locator("#panel-map tr[data-site=S01]")).to_have_count(1)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from playwright.sync_api import expect
+
 
 def test_a_form_has_each_parameter_and_sends_what_a_person_changed(page: Any, mapped_study: tuple[str, str]) -> None:
     sent: list[dict[str, Any]] = []
@@ -22,7 +24,7 @@ def test_a_form_has_each_parameter_and_sends_what_a_person_changed(page: Any, ma
     for name in ("catheter-chain", "four-step"):
         method.get_by_label("Method").select_option(name)
         schema = next(each["parameters"] for each in plugins if each["name"] == name)
-        assert method.locator(".fields input, .fields select").count() == len(schema["properties"])
+        expect(method.locator(".fields input, .fields select")).to_have_count(len(schema["properties"]))
     names = {each["name"] for each in plugins if each["kind"] == "fuser" and each["error"] is None}
     fuser = page.locator("fieldset", has_text="Make the map").get_by_label("Method")
     assert set(fuser.locator("option").evaluate_all("all => all.map(each => each.value)")) == names

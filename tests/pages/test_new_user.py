@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from playwright.sync_api import expect
 from small_runs import edited
 
 
@@ -41,7 +42,7 @@ def test_from_upload_over_a_correction_to_the_mesh(
 
     _compute(page)
     first_map = page.locator("#panel-map").get_by_text("total activation time").inner_text()
-    assert page.locator("#panel-map tr[data-site]").count() == 5
+    expect(page.locator("#panel-map tr[data-site]")).to_have_count(5)
 
     # Somebody drags the tip of the mapping catheter in view a of a located site.
     located = page.locator("#panel-map tr[data-grade]:not([data-grade=rejected])").first

@@ -64,4 +64,4 @@ def test_the_page_of_the_api_needs_no_network(page: Any) -> None:
     # The fixture checks that the browser asked nobody else.
     page.goto("/docs")
     page.locator("h1").wait_for()
-    assert page.get_by_text("/v1/studies/{study_id}/jobs").count() >= 1
+    page.get_by_text("/v1/studies/{study_id}/jobs").first.wait_for(state="attached")

@@ -52,7 +52,8 @@ def within_collimator(picture: Image) -> BoolArray:
     (rows, columns) bool
     """
     factor = max(1, round(min(picture.shape) / _SIZE))
-    small = gaussian(reduce_by(picture, factor), 1.0)
+    # Offset corrections and wrong BitsStored give levels below zero.
+    small = np.maximum(gaussian(reduce_by(picture, factor), 1.0), np.float32(0))
     rows, columns = small.shape
     inside = np.ones((rows, columns), dtype=np.bool_)
     if min(rows, columns) < 32:

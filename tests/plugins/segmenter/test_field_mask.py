@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from fluoromap.contracts import PixelFacts, Shutter
 from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.collimator import within_collimator
 from fluoromap.segmenter.field_mask import find_field, inside_shutter
 from fluoromap_service.dicom import open_frames, read_instance
 
@@ -46,6 +47,14 @@ def test_a_blade_and_its_penumbra_are_cut(patient):
     field = find_field(Still(patient), FACTS)
     assert not field.inside[:, :32].any()
     assert field.inside[64:192, 48:200].all()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_levels_below_zero_are_dark(patient):
+    patient[:, 190:] = -50.0
+    inside = within_collimator(patient.astype(np.float32))
+    assert inside[:, :185].all()
+    assert not inside[:, 195:].any()
 
 
 def test_a_circular_collimator_is_cut(patient):
