@@ -54,7 +54,7 @@ class BlobResponse:
         reduction = 2 if ring_mm * px_per_mm >= _LEAST_RING_PX and min(x.shape) >= 64 else 1
         small = reduce_by(x, 2) if reduction == 2 else x
         scale = px_per_mm / reduction
-        stack = np.zeros((len(_SCALES_MM), *small.shape), np.float32)
+        stack = np.empty((len(_SCALES_MM), *small.shape), np.float32)
         blurred, before, smooth = small, 0.0, small
         for level, sigma_mm in enumerate(_SCALES_MM):
             sigma = max(sigma_mm * scale, 0.7 * (level + 1))
@@ -196,7 +196,7 @@ def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
         flat[: middle.stop - columns], flat[columns - 1 : middle.stop - 1], flat[middle], flat[columns + 1 : middle.stop + 1],
         flat[2 * columns :], np.float32(0.5 * sigma**2), out.reshape(-1)[middle],
     )  # fmt: skip
-    out[:, 0] = out[:, -1] = 0
+    out[0] = out[-1] = out[:, 0] = out[:, -1] = 0
 
 
 def _noise_at_half_size(x: Image, inside: BoolArray) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -211,6 +212,6 @@ def _motion_px(before: FrameChains, after: FrameChains) -> float:
         alike = [other.pixels_uv for other in after.chains if other.electrodes == chain.electrodes]
         if not alike:
             return np.inf
-        moved = np.linalg.norm(np.array(alike) - chain.pixels_uv, axis=2).max(axis=1)
-        farthest = max(farthest, float(moved.min()))
+        away = np.array(alike) - chain.pixels_uv
+        farthest = max(farthest, math.sqrt((away * away).sum(axis=2).max(axis=1).min()))
     return farthest if len(after.chains) >= len(before.chains) else np.inf
