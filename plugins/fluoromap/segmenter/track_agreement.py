@@ -21,8 +21,8 @@ ShapeSearch = Callable[[int, Chain, Array, float], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels) -> the chain in that frame."""
 
 
-def with_common_kinds(chains: Mapping[int, Chain]) -> dict[int, Chain]:
-    """Return a track's chains with the mean of their kinds.
+def with_common_kinds(chains: Mapping[int, Chain], track: int) -> dict[int, Chain]:
+    """Return a track's chains with its number and the mean of their kinds.
 
     They are one catheter, and a single frame may be wrong about its name. Chains that were set by hand keep theirs.
     """
@@ -30,7 +30,10 @@ def with_common_kinds(chains: Mapping[int, Chain]) -> dict[int, Chain]:
     kinds = tuple(
         (name, math.fsum(chain.probability(name) for chain in chains.values()) / len(chains)) for name in names
     )
-    return {frame: chain if chain.manual else replace(chain, kinds=kinds) for frame, chain in chains.items()}
+    return {
+        frame: replace(chain, track=track, kinds=chain.kinds if chain.manual else kinds)
+        for frame, chain in chains.items()
+    }
 
 
 def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[int, Chain]:
@@ -129,7 +132,8 @@ def _compare(places: Array, others: Array) -> tuple[NDArray[np.bool_], NDArray[n
     count = shared.sum(axis=2)
     # A sort puts NaN last.
     middle = (np.maximum(count - 1, 0) // 2)[..., None, None]
-    away = np.linalg.norm(difference - np.take_along_axis(np.sort(difference, axis=2), middle, axis=2), axis=3)
+    rest = difference - np.take_along_axis(np.sort(difference, axis=2), middle, axis=2)
+    away = np.sqrt(rest[..., 0] ** 2 + rest[..., 1] ** 2)
     farthest = np.where(shared, away, 0.0).max(axis=2)
     agreeing = (away <= _SAME_PX).sum(axis=2)
     enough = count >= _SHARED_AT_LEAST * places.shape[1]

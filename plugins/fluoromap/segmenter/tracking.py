@@ -188,19 +188,22 @@ def track_chains(
     for track in tracks_kept:
         if 2 * track.reversals > track.detections and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
-        if not track.manual:
-            if search is not None:
-                track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
-            track.chains = with_common_kinds(track.chains)
+        if search is not None and not track.manual:
+            track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
+    for number, track in enumerate(tracks_kept):
+        if track.manual:
+            track.chains = {frame: replace(chain, track=number) for frame, chain in track.chains.items()}
+        else:
+            track.chains = with_common_kinds(track.chains, number)
     usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
         chains: list[Chain] = []
-        for number, track in enumerate(tracks_kept):
+        for track in tracks_kept:
             chain = track.chains.get(frame)
             room = len(chains) < catheters or (chain is not None and chain.manual)
             if chain is not None and room and (chain.manual or not _overlaps(chain, chains)):
-                chains.append(replace(chain, track=number))
+                chains.append(chain)
         missing = any(frame not in track.chains for track in usual)
         reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
         entries.append(FrameChains(frame, tuple(chains), reason))

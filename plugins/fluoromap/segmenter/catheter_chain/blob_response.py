@@ -119,7 +119,8 @@ class BlobResponse:
         first, second, third = self.stack
         top = np.maximum(np.maximum(first, second), third).reshape(-1)
         columns = self.stack.shape[2]
-        clear = np.flatnonzero(top > np.float32(_CLEAR_SNR * self.noise.min()))
+        # A little less than needed, because ``best`` is rounded.
+        clear = np.flatnonzero(self.best.reshape(-1) > np.float32(0.999 * _CLEAR_SNR))
         clear = clear[allowed[np.divmod(clear, columns)]]
         for step in (1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns):
             clear = clear[top[clear] >= top[clear + step]]
@@ -142,7 +143,7 @@ class BlobResponse:
         curved = determinant > 0
         moves[curved] /= determinant[curved, None]
         moves[~curved] = 0.0
-        tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
+        tops: Array = np.stack([u, v], axis=1) + np.minimum(np.maximum(moves, -1.0), 1.0)
         return tops
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:

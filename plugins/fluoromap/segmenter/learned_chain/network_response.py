@@ -161,8 +161,8 @@ class NetworkResponse:
         rows, columns = self.probability.shape
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
         steps = np.arange(-reach_cells, reach_cells + 1)
-        v = np.clip(middle[:, 1, None, None] + steps[:, None], 0, rows - 1)
-        u = np.clip(middle[:, 0, None, None] + steps, 0, columns - 1)
+        v = np.minimum(np.maximum(middle[:, 1, None, None] + steps[:, None], 0), rows - 1)
+        u = np.minimum(np.maximum(middle[:, 0, None, None] + steps, 0), columns - 1)
         return v, u
 
 
