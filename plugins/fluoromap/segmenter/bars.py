@@ -35,7 +35,7 @@ def follows_bars(chain_uv: Array, shaft_image: ShaftImage) -> bool:
     shaft_image : ShaftImage
     """
     px_per_mm = shaft_image.px_per_mm
-    ways = np.diff(chain_uv, axis=0)
+    ways = chain_uv[1:] - chain_uv[:-1]
     lengths = np.maximum(np.sqrt((ways * ways).sum(axis=1)), _TINY)
     first, last = (_AROUND_MM * px_per_mm / lengths[end] * ways[end] for end in (0, -1))
     corners_uv = np.concatenate([chain_uv[:1] - first, chain_uv, chain_uv[-1:] + last])
