@@ -43,7 +43,7 @@ def follows_bars(chain_uv: Array, shaft_image: ShaftImage) -> bool:
     lines_followed = np.zeros((len(chain_uv), 2, len(_BESIDE_MM)), np.bool_)
     _compare_lines(
         shaft_image.smooth, 1.0 / shaft_image.reduction, px_per_mm, corners_uv, corners_mm, _WINDOW_MM, _RAMP, _OFFSETS_MM,
-        np.empty((6, len(_WINDOW_MM))), lines_followed.reshape(len(chain_uv), -1),
+        np.empty((5, len(_WINDOW_MM))), lines_followed.reshape(len(chain_uv), -1),
     )  # fmt: skip
     on_bars = np.count_nonzero(lines_followed.all(axis=2), axis=0)
     return bool(on_bars.max() >= (1.0 - _MAY_LACK) * len(chain_uv))
@@ -56,10 +56,9 @@ def _compare_lines(smooth, scale, px_per_mm, corners_uv, corners_mm, window_mm, 
     The chain is the line through the corners; all corners but the first and the last are electrodes. Lines are compared without
     their mean and their trend: anatomy darkens the picture evenly along all of them.
 
-    offsets_mm : how far beside the chain the lines are; the first is the chain's own. scratch : for each place of the window its
-    pixel, the way across the chain for 1 mm, and the picture along the first line and along another one.
+    ramp : the trend, of norm 1. offsets_mm : how far beside the chain the lines are; the first is the chain's own. scratch : for
+    each place of the window its pixel, the way across the chain for 1 mm, and the picture on the chain without mean and trend.
     """
-    line_u, line_v, across_u, across_v, own, beside = scratch
     last_u, last_v = smooth.shape[1] - 1.0, smooth.shape[0] - 1.0
     size = window_mm.size
     for electrode in range(corners_mm.size - 2):
@@ -77,33 +76,31 @@ def _compare_lines(smooth, scale, px_per_mm, corners_uv, corners_mm, window_mm, 
                 ahead_u += end * u
                 ahead_v += end * v
                 if end == 0:
-                    line_u[i], line_v[i] = u, v
+                    scratch[0, i], scratch[1, i] = u, v
             stretch = px_per_mm / max(math.sqrt(ahead_u * ahead_u + ahead_v * ahead_v), _TINY)
-            across_u[i], across_v[i] = -stretch * ahead_v, stretch * ahead_u
+            scratch[2, i], scratch[3, i] = -stretch * ahead_v, stretch * ahead_u
         strength = 0.0
         for line in range(offsets_mm.size):
-            values = own if line == 0 else beside
-            mean = slope = 0.0
+            total = slope = square = shared = 0.0
             for i in range(size):
-                u = min(max((line_u[i] + offsets_mm[line] * across_u[i] + 0.5) * scale - 0.5, 0.0), last_u)
-                v = min(max((line_v[i] + offsets_mm[line] * across_v[i] + 0.5) * scale - 0.5, 0.0), last_v)
+                u = min(max((scratch[0, i] + offsets_mm[line] * scratch[2, i] + 0.5) * scale - 0.5, 0.0), last_u)
+                v = min(max((scratch[1, i] + offsets_mm[line] * scratch[3, i] + 0.5) * scale - 0.5, 0.0), last_v)
                 left, top = int(u), int(v)
                 right, below = min(left + 1, smooth.shape[1] - 1), min(top + 1, smooth.shape[0] - 1)
                 upper = smooth[top, left] + (u - left) * (smooth[top, right] - smooth[top, left])
                 lower = smooth[below, left] + (u - left) * (smooth[below, right] - smooth[below, left])
-                values[i] = upper + (v - top) * (lower - upper)
-                mean += values[i]
-            mean /= size
-            for i in range(size):
-                values[i] -= mean
-                slope += values[i] * ramp[i]
-            shared = square = 0.0
-            for i in range(size):
-                values[i] -= slope * ramp[i]
-                square += values[i] * values[i]
-                shared += values[i] * own[i]
+                value = upper + (v - top) * (lower - upper)
+                if line == 0:
+                    scratch[4, i] = value
+                total += value
+                slope += value * ramp[i]
+                square += value * value
+                shared += value * scratch[4, i]
+            square = max(square - total * total / size - slope * slope, 0.0)
             if line == 0:
                 strength = square
+                for i in range(size):
+                    scratch[4, i] -= total / size + slope * ramp[i]
             else:
                 least = max(_LEAST_SLOPE * strength, _LEAST_CORRELATION * math.sqrt(strength * square))
                 follows[electrode, line - 1] = shared > max(least, _TINY)
