@@ -104,7 +104,8 @@ def kind_overlap(one: Chain, other: Chain) -> float:
 
     0 : they cannot be the same catheter. 1 : their probabilities agree as far as they can.
     """
-    agreement = sum(probability * other.probability(name) for name, probability in one.kinds)
+    theirs = dict(other.kinds)
+    agreement = sum(probability * theirs.get(name, 0.0) for name, probability in one.kinds)
     squares = [sum(probability**2 for _, probability in chain.kinds) for chain in (one, other)]
     return agreement / max(*squares, 1e-9)
 

@@ -183,7 +183,8 @@ class FrameSearch:
 
     def _store_blobs(self, x: Image, frame: int) -> None:
         blobs = self.blobs.latest_for(x)
-        self.answers.blobs.store(frame, None if blobs is None else blobs.without_stack())
+        if blobs is not None and self.answers.blobs.of_frame(frame) is None:
+            self.answers.blobs.store(frame, blobs.without_stack())
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first."""
