@@ -203,7 +203,7 @@ def shaft_evidence(
 
 @functools.lru_cache(maxsize=64)
 def _shaft_pieces(electrodes: int, widest: int, tip_mm: float) -> tuple[IntArray, Array]:
-    """Return the electrodes that give the direction of each piece, and its reach; see :func:`_look_for_shafts`."""
+    """Return the pieces and their reach; see :func:`_look_for_shafts`."""
     before = 0.5 * tip_mm + _BEFORE_MM[0]
     pieces = np.array([[widest + 1, widest], [electrodes - 2, electrodes - 1], [1, 0]])
     return pieces, np.array([[-0.25, -0.75], _BEHIND_MM, [before, before + _BEFORE_MM[1]]])
