@@ -44,7 +44,7 @@ class ScoreLimits:
 
         Electrodes outside the field have NaN and do not count.
         """
-        share_seen = np.mean((scores >= self.seen) | np.isnan(scores), axis=-1)
+        share_seen = ((scores >= self.seen) | np.isnan(scores)).sum(axis=-1) / scores.shape[-1]
         allowed: BoolArray = (middle_score(scores) >= self.middle) & (share_seen >= self.least_seen)
         return allowed
 

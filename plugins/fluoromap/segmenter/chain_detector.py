@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -220,7 +221,7 @@ class ChainDetector:
         weights, variance = self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
         possible = self._without_shorter_catheters(possible, points, seen, families)
-        possible = _with_enough_places(possible, len(points) - halves, len(points))
+        possible = _with_enough_places(possible, len(points) - halves, halves)
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
             return _Linking(points, len(points), possible, linked)
@@ -252,14 +253,14 @@ class ChainDetector:
             completed.rows,
         )
         possible = self._without_shorter_catheters(possible, completed.points_uv, seen, families)
-        possible = _with_enough_places(possible, len(points) - halves, len(points))
+        possible = _with_enough_places(possible, len(points) - halves, halves)
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
         return _Linking(completed.points_uv, len(points), possible, linked)
 
     def _without_shorter_catheters(
         self, possible: PossibleChains, points_uv: Array, seen: ImageEvidence, families: tuple[CatheterFamily, ...]
     ) -> PossibleChains:
-        if not self.acceptance.strict:
+        if not self.acceptance.strict or all(family.catheter.electrodes < MANY_ELECTRODES for family in families):
             return possible
         contrast = seen.likeness.at(points_uv)
         odds = np.where(self._is_seen(points_uv), seen.kind_odds_at(points_uv), EVEN_ODDS)
@@ -304,14 +305,13 @@ class ChainDetector:
         floor = min(family.floor for family in families)
         sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
         found = [one.chain for _, one in clear]
-        all_scores = answers_for_each(seen.scores_at, [chain.pixels_uv for chain in found])
+        all_scores = answers_for_each(partial(self._scores_in_field, seen), [chain.pixels_uv for chain in found])
         accepted = []
         for (candidates, _), chain, scores in zip(clear, found, all_scores, strict=True):
             others = [other for other in found if other is not chain]
-            is_seen = self._is_seen(chain.pixels_uv)
-            if self.acceptance.accepts(np.where(is_seen, scores, np.nan), chain.scores[0], beside):
+            if self.acceptance.accepts(scores, chain.scores[0], beside):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
-                shown = np.where(is_seen, scores, UNSEEN)
+                shown = np.where(np.isnan(scores), UNSEEN, scores)
                 accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=shown)))
         chains = tuple(chain for _, chain in accepted)
         listed = np.ones(len(chains), np.bool_)
@@ -332,7 +332,7 @@ class ChainDetector:
         They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
         electrode of an unlisted catheter.
         """
-        scores = np.where(self._is_seen(linking.points_uv), seen.scores_at(linking.points_uv), np.nan)
+        scores = self._scores_in_field(seen, linking.points_uv)
         unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
         allowed = []
         for index, (family, rows, chain_scores) in enumerate(
@@ -520,6 +520,10 @@ class ChainDetector:
         """Return which points lie in the field, (n,)."""
         return _are_in(self.field.inside, points_uv)
 
+    def _scores_in_field(self, seen: ImageEvidence, points_uv: Array) -> Array:
+        """Return how clearly electrodes show at points, NaN outside the field, (n,)."""
+        return np.where(self._is_seen(points_uv), seen.scores_at(points_uv), np.nan)
+
     def _family(self, chain: Chain) -> CatheterFamily | None:
         """Return the most probable family whose catheters have exactly this chain's electrodes."""
         whole = [
@@ -536,10 +540,9 @@ class ChainDetector:
 
 def _are_in(field: BoolArray, points_uv: Array) -> BoolArray:
     """Return which points lie in a part of the image, (n,)."""
-    rows, columns = field.shape
-    u, v = np.rint(points_uv).astype(np.int64).T
-    within = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
-    inside: BoolArray = within & field[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
+    pixels = np.rint(points_uv).astype(np.int64)
+    nearest = np.minimum(np.maximum(pixels, 0), np.array(field.shape[::-1]) - 1)
+    inside: BoolArray = field[nearest[:, 1], nearest[:, 0]] & (pixels == nearest).all(axis=1)
     return inside
 
 
@@ -557,15 +560,17 @@ def _away(points_uv: Array, from_uv: Array) -> Array:
     return nearest
 
 
-def _with_enough_places(possible: PossibleChains, first_half: int, last_half: int) -> PossibleChains:
+def _with_enough_places(possible: PossibleChains, first_half: int, halves: int) -> PossibleChains:
     """Return the chains that show at least four separate places.
 
-    The candidates from ``first_half`` to before ``last_half`` are electrodes of split pairs: two of them are one place. Three
-    drops of contrast medium may lie like a pair and two rings.
+    The ``halves`` candidates from ``first_half`` on are electrodes of split pairs: two of them are one place. Three drops of
+    contrast medium may lie like a pair and two rings.
     """
+    if not halves:
+        return possible
     return possible.where(
         [
-            np.count_nonzero((rows >= first_half) & (rows < last_half), axis=1)
+            np.count_nonzero((rows >= first_half) & (rows < first_half + halves), axis=1)
             <= 2 * max(rows.shape[1] - _LEAST_PLACES, 0)
             for rows in possible.rows
         ]

@@ -161,7 +161,8 @@ def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) ->
     if not others:
         return chain.covariance_px2
     beside = np.concatenate([other.pixels_uv for other in others])
-    near = np.linalg.norm(chain.pixels_uv[:, None] - beside[None], axis=2).min(axis=1) < _NEAR_MM * px_per_mm
+    difference = chain.pixels_uv[:, None] - beside
+    near = np.sqrt((difference * difference).sum(axis=2).min(axis=1)) < _NEAR_MM * px_per_mm
     return np.where(near[:, None, None], _NEAR_FACTOR, 1.0) * chain.covariance_px2
 
 

@@ -5,6 +5,7 @@ Every function works on many chains at once; ``places`` are (n, electrodes, 2) p
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -194,13 +195,18 @@ def shaft_evidence(
     side : float
         Distance beside a shaft at which its surroundings are measured, pixels of the frame.
     """
-    last = places.shape[1] - 1
-    before = 0.5 * tip_mm + _BEFORE_MM[0]
-    pieces = np.array([[widest + 1, widest], [last - 1, last], [1, 0]])
-    reach = np.array([[-0.25, -0.75], _BEHIND_MM, [before, before + _BEFORE_MM[1]]])
     out = np.empty(len(places))
+    pieces, reach = _shaft_pieces(places.shape[1], widest, tip_mm)
     _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out)
     return out
+
+
+@functools.lru_cache(maxsize=64)
+def _shaft_pieces(electrodes: int, widest: int, tip_mm: float) -> tuple[IntArray, Array]:
+    """Return the pieces and their reach; see :func:`_look_for_shafts`."""
+    before = 0.5 * tip_mm + _BEFORE_MM[0]
+    pieces = np.array([[widest + 1, widest], [electrodes - 2, electrodes - 1], [1, 0]])
+    return pieces, np.array([[-0.25, -0.75], _BEHIND_MM, [before, before + _BEFORE_MM[1]]])
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

@@ -137,7 +137,8 @@ def evidence(probability: Array, trust: Trust = ONE_BY_ONE) -> Array:
 
     The weight is the log-odds: 0 for an even chance, between -1 and 2.2.
     """
-    return np.clip(trust.chain + trust.share * log_odds(probability), _EVIDENCE_LEAST, _EVIDENCE_MOST)
+    weight = trust.chain + trust.share * log_odds(probability)
+    return np.minimum(np.maximum(weight, _EVIDENCE_LEAST), _EVIDENCE_MOST)
 
 
 def link_candidates(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
@@ -144,7 +145,7 @@ def answers_for_each(ask: Callable[[Array], Array], places: Sequence[Array]) -> 
     if not places:
         return []
     answers = ask(np.concatenate(places))
-    ends = np.cumsum([len(points) for points in places]).tolist()
+    ends = accumulate(len(points) for points in places)
     return [answers[end - len(points) : end] for points, end in zip(places, ends, strict=True)]
 
 

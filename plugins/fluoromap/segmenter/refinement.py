@@ -38,7 +38,7 @@ _STIFFNESS = 6.0
 _LOCAL, _LEAST_SHORTENING = 0.75, 0.15
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ElectrodeFit:
     """Positions of the electrodes of several chains.
 
@@ -60,7 +60,7 @@ class ElectrodeFit:
         likelihood: Array = 0.5 * _PROFILE_SAMPLES * self.misfits.shape[1] * self.clearness
         return likelihood
 
-    @property
+    @functools.cached_property
     def clearness(self) -> Array:
         """Mean of -ln(misfit) over the electrodes, (n,).
 

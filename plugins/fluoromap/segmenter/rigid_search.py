@@ -27,10 +27,7 @@ def rigid_search(
     The points (n, 2), pixels, move by about ``shift``, at most ``reach_px`` farther, and turn by up to 8 degrees. Near
     electrodes of the chains ``taken`` it counts little: a catheter does not jump onto another.
     """
-    best = likeness.values.copy()
     offset, factor = likeness.first_px, 1.0 / likeness.cell_px
-    for chain in taken:
-        _dim(best, (chain.pixels_uv - offset) * factor, _TAKEN_MM * px_per_mm * factor)
     middle = points_uv.mean(axis=0)
     reach = int(reach_px * factor)
     steps = np.arange(-reach, reach + 1)
@@ -43,7 +40,10 @@ def rigid_search(
     places = np.rint((np.array(turns) - offset) * factor).astype(np.int64) - reach
     left, top = places.min(axis=(0, 1)).tolist()
     right, bottom = (places.max(axis=(0, 1)) + len(steps)).tolist()
-    near = _cut_out(best, left, right, top, bottom)
+    near = _cut_out(likeness.values, left, right, top, bottom)
+    if taken:
+        beside = np.concatenate([chain.pixels_uv for chain in taken])
+        _dim(near, (beside - offset) * factor - [left, top], _TAKEN_MM * px_per_mm * factor)
     highest = -np.inf
     found: Array = turns[0]
     for turned, corners in zip(turns, (places - [left, top]).tolist(), strict=True):
@@ -58,27 +58,27 @@ def rigid_search(
     return found
 
 
-def _cut_out(best: Image, left: int, right: int, top: int, bottom: int) -> Image:
+def _cut_out(values: Image, left: int, right: int, top: int, bottom: int) -> Image:
     """Return the likeness in a rectangle, limited to 12, and -5 outside the image."""
     cut: Image = np.full((bottom - top, right - left), _OUTSIDE, np.float32)
-    rows, columns = best.shape
+    rows, columns = values.shape
     u0, u1, v0, v1 = max(left, 0), min(right, columns), max(top, 0), min(bottom, rows)
     if u0 < u1 and v0 < v1:
-        cut[v0 - top : v1 - top, u0 - left : u1 - left] = np.minimum(best[v0:v1, u0:u1], np.float32(_MOST))
+        cut[v0 - top : v1 - top, u0 - left : u1 - left] = np.minimum(values[v0:v1, u0:u1], np.float32(_MOST))
     return cut
 
 
-def _dim(best: Image, places: Array, radius: float) -> None:
+def _dim(near: Image, places: Array, radius: float) -> None:
     """Lower the likeness within ``radius`` of the places, (n, 2), in place.
 
     One call of skimage.draw.disk for each place gives the same result in nine times the time.
     """
-    rows, columns = best.shape
+    rows, columns = near.shape
     steps = np.arange(-math.ceil(radius), math.ceil(radius) + 2)
     middle = np.floor(places).astype(np.int64)
     u = middle[:, 0, None, None] + steps
     v = middle[:, 1, None, None] + steps[:, None]
-    near = (u - places[:, 0, None, None]) ** 2 + (v - places[:, 1, None, None]) ** 2 <= radius * radius
-    near = near & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
-    u, v = (np.broadcast_to(axis, near.shape)[near] for axis in (u, v))
-    best[v, u] = np.minimum(best[v, u], np.float32(_TAKEN))
+    within = (u - places[:, 0, None, None]) ** 2 + (v - places[:, 1, None, None]) ** 2 <= radius * radius
+    within = within & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    u, v = (np.broadcast_to(axis, within.shape)[within] for axis in (u, v))
+    near[v, u] = np.minimum(near[v, u], np.float32(_TAKEN))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -211,7 +212,8 @@ def segment_run(
     def log_image(frame: int) -> Image:
         return field.fill(transform(run.frames[frame]))
 
-    def mean_image(averaged: Sequence[int]) -> Image:
+    @functools.cache
+    def mean_image(averaged: tuple[int, ...]) -> Image:
         total = np.zeros(run.frames.shape, np.float64)
         for index in averaged:
             total += run.frames[index].astype(np.float64)
@@ -288,7 +290,7 @@ def _detect(
     run: Run,
     detector: Detector,
     log_image: Callable[[int], Image],
-    mean_image: Callable[[Sequence[int]], Image],
+    mean_image: Callable[[tuple[int, ...]], Image],
     field: FieldMask,
     context: Context,
 ) -> RunDetections:

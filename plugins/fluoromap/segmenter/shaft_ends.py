@@ -5,6 +5,7 @@ A shaft bends, so a fan of rays is looked at beyond each end, and the darkest ra
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -68,7 +69,7 @@ def ray_depths(starts_uv: Array, angles_rad: Array, reach_mm: tuple[float, float
     shaft_image : ShaftImage
     """
     scale = 1.0 / shaft_image.reduction
-    steps = np.linspace(*reach_mm, _SAMPLES) * shaft_image.px_per_mm
+    steps = _steps(reach_mm, shaft_image.px_per_mm)
     depths: Array = np.full(angles_rad.shape, -np.inf)
     # Copies: kernels are compiled for one kind of array only.
     _measure_rays(
@@ -76,6 +77,12 @@ def ray_depths(starts_uv: Array, angles_rad: Array, reach_mm: tuple[float, float
         shaft_image.side_px * scale, shaft_image.clear, depths,
     )  # fmt: skip
     return depths
+
+
+@functools.lru_cache(maxsize=64)
+def _steps(reach_mm: tuple[float, float], px_per_mm: float) -> Array:
+    """Return the distances of a ray's samples from its point, pixels."""
+    return np.linspace(*reach_mm, _SAMPLES) * px_per_mm
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

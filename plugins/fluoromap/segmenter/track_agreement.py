@@ -21,8 +21,8 @@ ShapeSearch = Callable[[int, Chain, Array, float], Chain | None]
 """(frame, chain in another frame, expected shift, reach in pixels) -> the chain in that frame."""
 
 
-def with_common_kinds(chains: Mapping[int, Chain]) -> dict[int, Chain]:
-    """Return a track's chains with the mean of their kinds.
+def with_common_kinds(chains: Mapping[int, Chain], track: int) -> dict[int, Chain]:
+    """Return a track's chains with its number and the mean of their kinds.
 
     They are one catheter, and a single frame may be wrong about its name. Chains that were set by hand keep theirs.
     """
@@ -30,7 +30,10 @@ def with_common_kinds(chains: Mapping[int, Chain]) -> dict[int, Chain]:
     kinds = tuple(
         (name, math.fsum(chain.probability(name) for chain in chains.values()) / len(chains)) for name in names
     )
-    return {frame: chain if chain.manual else replace(chain, kinds=kinds) for frame, chain in chains.items()}
+    return {
+        frame: replace(chain, track=track, kinds=chain.kinds if chain.manual else kinds)
+        for frame, chain in chains.items()
+    }
 
 
 def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[int, Chain]:
@@ -124,13 +127,16 @@ def _compare(places: Array, others: Array) -> tuple[NDArray[np.bool_], NDArray[n
 
     Both are (chains, others). Two chains differ in some electrodes where half of them agree after the median shift.
     """
-    difference = places[:, None] - others[None]
-    shared = np.isfinite(difference[..., 0])
-    count = shared.sum(axis=2)
+    # Electrodes come first: NumPy reduces long stretches of memory fast. (electrodes, 2, chains, others).
+    mine, theirs = (np.ascontiguousarray(np.moveaxis(side, 0, -1)) for side in (places, others))
+    difference = mine[..., :, None] - theirs[..., None, :]
+    shared = np.isfinite(difference[:, 0])
+    count = shared.sum(axis=0)
     # A sort puts NaN last.
-    middle = (np.maximum(count - 1, 0) // 2)[..., None, None]
-    away = np.linalg.norm(difference - np.take_along_axis(np.sort(difference, axis=2), middle, axis=2), axis=3)
-    farthest = np.where(shared, away, 0.0).max(axis=2)
-    agreeing = (away <= _SAME_PX).sum(axis=2)
+    middle = (np.maximum(count - 1, 0) // 2)[None, None]
+    rest = difference - np.take_along_axis(np.sort(difference, axis=0), middle, axis=0)
+    away = np.sqrt(rest[:, 0] ** 2 + rest[:, 1] ** 2)
+    farthest = np.where(shared, away, 0.0).max(axis=0)
+    agreeing = (away <= _SAME_PX).sum(axis=0)
     enough = count >= _SHARED_AT_LEAST * places.shape[1]
     return enough & (farthest < _DISPLACED_PX), enough & (farthest >= _DISPLACED_PX) & (2 * agreeing >= count)

@@ -87,14 +87,9 @@ def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tupl
     Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
     more electrodes counts half: clutter and merged pairs displace some of a long catheter.
     """
-    if one.electrodes == other.electrodes:
-        mine, theirs = one.pixels_uv, other.pixels_uv
-    else:
-        common = sorted(set(one.electrodes) & set(other.electrodes))
-        if not common:
-            return np.inf, np.inf
-        mine = one.pixels_uv[[one.electrodes.index(number) for number in common]]
-        theirs = other.pixels_uv[[other.electrodes.index(number) for number in common]]
+    mine, theirs = _common_places(one, other)
+    if not len(mine):
+        return np.inf, np.inf
     difference = theirs - mine if shift is None else theirs - mine - shift
     mean = difference.sum(axis=0) / len(difference)
     rest = difference - mean
@@ -109,7 +104,8 @@ def kind_overlap(one: Chain, other: Chain) -> float:
 
     0 : they cannot be the same catheter. 1 : their probabilities agree as far as they can.
     """
-    agreement = sum(probability * other.probability(name) for name, probability in one.kinds)
+    theirs = dict(other.kinds)
+    agreement = sum(probability * theirs.get(name, 0.0) for name, probability in one.kinds)
     squares = [sum(probability**2 for _, probability in chain.kinds) for chain in (one, other)]
     return agreement / max(*squares, 1e-9)
 
@@ -188,19 +184,22 @@ def track_chains(
     for track in tracks_kept:
         if 2 * track.reversals > track.detections and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
-        if not track.manual:
-            if search is not None:
-                track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
-            track.chains = with_common_kinds(track.chains)
+        if search is not None and not track.manual:
+            track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
+    for number, track in enumerate(tracks_kept):
+        if track.manual:
+            track.chains = {frame: replace(chain, track=number) for frame, chain in track.chains.items()}
+        else:
+            track.chains = with_common_kinds(track.chains, number)
     usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
     entries = []
     for frame in range(len(found)):
         chains: list[Chain] = []
-        for number, track in enumerate(tracks_kept):
+        for track in tracks_kept:
             chain = track.chains.get(frame)
             room = len(chains) < catheters or (chain is not None and chain.manual)
             if chain is not None and room and (chain.manual or not _overlaps(chain, chains)):
-                chains.append(replace(chain, track=number))
+                chains.append(chain)
         missing = any(frame not in track.chains for track in usual)
         reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
         entries.append(FrameChains(frame, tuple(chains), reason))
@@ -299,23 +298,25 @@ def _complete(
     """
     for frames in (range(len(frame_times_ms)), range(len(frame_times_ms) - 1, -1, -1)):
         before: int | None = None
-        shift, elapsed = np.zeros(2), np.inf
+        moved: tuple[int, int] | None = None
         for frame in frames:
             if frame not in track.chains and before is not None:
                 others = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
                 since = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
-                expected = _KEPT_VELOCITY * shift * (since / elapsed)
                 if len(others) < catheters and since < _STALE_MS:
-                    known = track.chains[before]
-                    found = search(frame, known, expected, _reach_px(since), others, confirmed=True)
+                    expected = np.zeros(2)
+                    if moved is not None:
+                        elapsed = abs(float(frame_times_ms[moved[1]] - frame_times_ms[moved[0]]))
+                        shift = _mean_shift(track.chains[moved[0]], track.chains[moved[1]])
+                        expected = _KEPT_VELOCITY * shift * (since / elapsed)
+                    found = search(frame, track.chains[before], expected, _reach_px(since), others, confirmed=True)
                     if found is not None and not _overlaps(found, others):
                         track.chains[frame] = found
             if frame not in track.chains:
                 before = None
                 continue
             if before is not None:
-                shift = _mean_shift(track.chains[before], track.chains[frame])
-                elapsed = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
+                moved = before, frame
             before = frame
 
 
@@ -330,6 +331,7 @@ def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
         against += found[frame].manual_needed is None and any(
             _overlaps(chain, [other]) if len(other.electrodes) > len(chain.electrodes) else _is_displaced(chain, other)
             for other in found[frame].chains
+            if other is not chain
         )
     return not track.manual and against > max(track.detections, _LEAST_AGAINST - 1)
 
@@ -419,12 +421,20 @@ def _first_velocity(chains: dict[int, Chain], frame_times_ms: Array) -> Array:
 
 
 def _mean_shift(one: Chain, other: Chain) -> Array:
-    common = [number for number in one.electrodes if number in other.electrodes]
-    if not common:
+    mine, theirs = _common_places(one, other)
+    if not len(mine):
         return np.zeros(2)
-    mine = one.pixels_uv[[one.electrodes.index(number) for number in common]]
-    moved: Array = (other.pixels_uv[[other.electrodes.index(number) for number in common]] - mine).mean(axis=0)
+    moved: Array = (theirs - mine).sum(axis=0) / len(mine)
     return moved
+
+
+def _common_places(one: Chain, other: Chain) -> tuple[Array, Array]:
+    """Return the places in two chains of the electrodes that both have, (n, 2)."""
+    if one.electrodes == other.electrodes:
+        return one.pixels_uv, other.pixels_uv
+    common = sorted(set(one.electrodes) & set(other.electrodes))
+    mine, theirs = (chain.pixels_uv[[chain.electrodes.index(number) for number in common]] for chain in (one, other))
+    return mine, theirs
 
 
 def _overlaps(chain: Chain, others: Sequence[Chain]) -> bool:

@@ -65,8 +65,9 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
     free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
     if len(free) < _ROW_CONTINUES:
         return False
-    seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1)
-    step = _LONGEST_STEP * float(np.max(catheter.spacing_mm)) * float(seen.sum()) / float(np.sum(catheter.spacing_mm))
+    way = np.diff(chain.pixels_uv, axis=0)
+    seen = float(np.sqrt((way * way).sum(axis=1)).sum())
+    step = _LONGEST_STEP * max(catheter.spacing_mm) * seen / sum(catheter.spacing_mm)
     for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
         before = row[-3] if len(row) > 2 else row[-2]
         count = _count_onwards(row[-1], before, free, step)
@@ -131,5 +132,6 @@ def not_on(points_uv: Array, chains: Sequence[Chain], px_per_mm: float) -> Array
 def _apart(points_uv: Array, taken_uv: Array, distance: float) -> BoolArray:
     if not len(points_uv):
         return np.zeros(0, np.bool_)
-    away: BoolArray = np.linalg.norm(points_uv[:, None] - taken_uv[None], axis=2).min(axis=1) > distance
+    difference = points_uv[:, None] - taken_uv
+    away: BoolArray = np.sqrt((difference * difference).sum(axis=2).min(axis=1)) > distance
     return away

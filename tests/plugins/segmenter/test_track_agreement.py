@@ -93,7 +93,8 @@ def test_a_long_track_is_compared_with_some_of_its_frames():
 
 def test_the_frames_of_a_track_agree_on_its_name():
     kinds = [(("cs", 0.9), ("rv", 0.1)), (("cs", 0.3), ("rv", 0.7)), (("cs", 0.9), ("rv", 0.1)), (("cs", 1.0),)]
-    agreed = with_common_kinds({frame: replace(chain(ROW), kinds=said) for frame, said in enumerate(kinds)})
+    agreed = with_common_kinds({frame: replace(chain(ROW), kinds=said) for frame, said in enumerate(kinds)}, track=2)
+    assert {found.track for found in agreed.values()} == {2}
     assert [found.probability("cs") for found in agreed.values()] == pytest.approx([0.775] * 4)
 
 

@@ -54,7 +54,7 @@ class BlobResponse:
         reduction = 2 if ring_mm * px_per_mm >= _LEAST_RING_PX and min(x.shape) >= 64 else 1
         small = reduce_by(x, 2) if reduction == 2 else x
         scale = px_per_mm / reduction
-        stack = np.zeros((len(_SCALES_MM), *small.shape), np.float32)
+        stack = np.empty((len(_SCALES_MM), *small.shape), np.float32)
         blurred, before, smooth = small, 0.0, small
         for level, sigma_mm in enumerate(_SCALES_MM):
             sigma = max(sigma_mm * scale, 0.7 * (level + 1))
@@ -119,7 +119,8 @@ class BlobResponse:
         first, second, third = self.stack
         top = np.maximum(np.maximum(first, second), third).reshape(-1)
         columns = self.stack.shape[2]
-        clear = np.flatnonzero(top > np.float32(_CLEAR_SNR * self.noise.min()))
+        # A little less than needed, because ``best`` is rounded.
+        clear = np.flatnonzero(self.best.reshape(-1) > np.float32(0.999 * _CLEAR_SNR))
         clear = clear[allowed[np.divmod(clear, columns)]]
         for step in (1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns):
             clear = clear[top[clear] >= top[clear + step]]
@@ -142,7 +143,7 @@ class BlobResponse:
         curved = determinant > 0
         moves[curved] /= determinant[curved, None]
         moves[~curved] = 0.0
-        tops: Array = np.stack([u, v], axis=1) + np.clip(moves, -1.0, 1.0)
+        tops: Array = np.stack([u, v], axis=1) + np.minimum(np.maximum(moves, -1.0), 1.0)
         return tops
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
@@ -196,7 +197,7 @@ def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
         flat[: middle.stop - columns], flat[columns - 1 : middle.stop - 1], flat[middle], flat[columns + 1 : middle.stop + 1],
         flat[2 * columns :], np.float32(0.5 * sigma**2), out.reshape(-1)[middle],
     )  # fmt: skip
-    out[:, 0] = out[:, -1] = 0
+    out[0] = out[-1] = out[:, 0] = out[:, -1] = 0
 
 
 def _noise_at_half_size(x: Image, inside: BoolArray) -> float:

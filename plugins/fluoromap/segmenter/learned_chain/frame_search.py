@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -182,7 +183,8 @@ class FrameSearch:
 
     def _store_blobs(self, x: Image, frame: int) -> None:
         blobs = self.blobs.latest_for(x)
-        self.answers.blobs.store(frame, None if blobs is None else blobs.without_stack())
+        if blobs is not None and self.answers.blobs.of_frame(frame) is None:
+            self.answers.blobs.store(frame, blobs.without_stack())
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first."""
@@ -211,6 +213,6 @@ def _motion_px(before: FrameChains, after: FrameChains) -> float:
         alike = [other.pixels_uv for other in after.chains if other.electrodes == chain.electrodes]
         if not alike:
             return np.inf
-        moved = np.linalg.norm(np.array(alike) - chain.pixels_uv, axis=2).max(axis=1)
-        farthest = max(farthest, float(moved.min()))
+        away = np.array(alike) - chain.pixels_uv
+        farthest = max(farthest, math.sqrt((away * away).sum(axis=2).max(axis=1).min()))
     return farthest if len(after.chains) >= len(before.chains) else np.inf

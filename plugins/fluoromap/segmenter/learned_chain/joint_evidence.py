@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence
 from fluoromap.segmenter.log_image import Image
@@ -76,21 +76,21 @@ class JointEvidence:
         network. Places that the network proposed in another frame are not used.
         """
         blobs = self.blobs.proposals(allowed, expected)
-        blobs = _taken(blobs, self.scores_at(blobs.points_uv) >= _LEAST_PROBABILITY)
-        blobs = Proposals(blobs.points_uv, self.probability_at(blobs.points_uv), blobs.covariance_px2)
-        if self.reach_cells > 1:
-            return _taken(blobs, np.argsort(-blobs.probability, kind="stable"))
-        proposed = self.network.proposals(allowed, expected)
-        if len(blobs) and len(proposed):
-            away = np.linalg.norm(proposed.points_uv[:, None] - blobs.points_uv[None], axis=2).min(axis=1)
-            proposed = _taken(proposed, away > _APART_MM * self.px_per_mm)
-        probability = np.concatenate([blobs.probability, proposed.probability])
-        together = Proposals(
-            np.concatenate([blobs.points_uv, proposed.points_uv]),
-            probability,
-            np.concatenate([blobs.covariance_px2, proposed.covariance_px2]),
-        )
-        return _taken(together, np.argsort(-probability, kind="stable"))
+        of_network, contrast = self._ask(blobs.points_uv)
+        likely = self._scores(of_network, contrast) >= _LEAST_PROBABILITY
+        points_uv, covariance_px2 = blobs.points_uv[likely], blobs.covariance_px2[likely]
+        probability = _probability(_mean_odds(of_network, contrast)[likely])
+        if self.reach_cells == 1:
+            proposed = self.network.proposals(allowed, expected)
+            away = np.ones(len(proposed), np.bool_)
+            if len(points_uv) and len(proposed):
+                difference = proposed.points_uv[:, None] - points_uv
+                away = np.sqrt((difference * difference).sum(axis=2).min(axis=1)) > _APART_MM * self.px_per_mm
+            points_uv = np.concatenate([points_uv, proposed.points_uv[away]])
+            probability = np.concatenate([probability, proposed.probability[away]])
+            covariance_px2 = np.concatenate([covariance_px2, proposed.covariance_px2[away]])
+        order = np.argsort(-probability, kind="stable")
+        return Proposals(points_uv[order], probability[order], covariance_px2[order])
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
         """Return both electrodes of pairs that were proposed as one.
@@ -112,16 +112,16 @@ class JointEvidence:
         """Return the network's logit of a tip electrode at points, (n,)."""
         return self.network.tip_logits_at(points_uv, self.reach_cells)
 
-    def _network_at(self, points_uv: Array) -> Array:
-        return self.network.probability_at(points_uv, self.reach_cells)
+    def _ask(self, points_uv: Array) -> tuple[Array, Array]:
+        """Return the network's log-odds of electrodes at points, and the contrast there, both (n,)."""
+        return log_odds(self.network.probability_at(points_uv, self.reach_cells)), self.blobs.scores_at(points_uv)
 
     def probability_at(self, points_uv: Array) -> Array:
         """Return the probability of electrodes at points, (n,).
 
         Its log-odds are the mean of those of the network and twice those of the contrast.
         """
-        probability: Array = 1.0 / (1.0 + np.exp(-self._odds_at(points_uv)))
-        return probability
+        return _probability(_mean_odds(*self._ask(points_uv)))
 
     def kind_odds_at(self, points_uv: Array) -> Array:
         """Return the log-odds by which electrodes differ from other blobs, (n,).
@@ -129,13 +129,8 @@ class JointEvidence:
         They are those of :meth:`probability_at` with limited contrast: in a clear picture shafts and cables have as much contrast
         over noise as electrodes.
         """
-        return self._odds_at(points_uv, _ENOUGH_CONTRAST)
-
-    def _odds_at(self, points_uv: Array, most_contrast: float = np.inf) -> Array:
-        of_network = log_odds(self._network_at(points_uv))
-        contrast = np.minimum(self.blobs.scores_at(points_uv), most_contrast)
-        odds: Array = _EVEN_SHARE * (of_network + 2.0 * log_odds(probability_of_contrast(contrast)))
-        return odds
+        of_network, contrast = self._ask(points_uv)
+        return _mean_odds(of_network, np.minimum(contrast, _ENOUGH_CONTRAST))
 
     def unseen_probability_at(self, points_uv: Array) -> Array:
         """Return the same, but 0 where a proposed electrode has the place."""
@@ -154,12 +149,18 @@ class JointEvidence:
 
         What is clearly visible and yet not clear to the network is no electrode.
         """
-        contrast = self.blobs.scores_at(points_uv)
-        excuse = self.faint_log_odds * np.clip((_CLEAR - contrast) / (_CLEAR - _FAINT), 0.0, 1.0)
-        odds = log_odds(self._network_at(points_uv)) + excuse
-        scores: Array = 1.0 / (1.0 + np.exp(-odds))
-        return scores
+        return self._scores(*self._ask(points_uv))
+
+    def _scores(self, of_network: Array, contrast: Array) -> Array:
+        doubt = np.minimum(np.maximum((_CLEAR - contrast) / (_CLEAR - _FAINT), 0.0), 1.0)
+        return _probability(of_network + self.faint_log_odds * doubt)
 
 
-def _taken(proposals: Proposals, which: IntArray | BoolArray) -> Proposals:
-    return Proposals(proposals.points_uv[which], proposals.probability[which], proposals.covariance_px2[which])
+def _mean_odds(of_network: Array, contrast: Array) -> Array:
+    odds: Array = _EVEN_SHARE * (of_network + 2.0 * log_odds(probability_of_contrast(contrast)))
+    return odds
+
+
+def _probability(log_odds_of_electrodes: Array) -> Array:
+    probability: Array = 1.0 / (1.0 + np.exp(-log_odds_of_electrodes))
+    return probability

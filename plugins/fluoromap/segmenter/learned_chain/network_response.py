@@ -161,8 +161,8 @@ class NetworkResponse:
         rows, columns = self.probability.shape
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
         steps = np.arange(-reach_cells, reach_cells + 1)
-        v = np.clip(middle[:, 1, None, None] + steps[:, None], 0, rows - 1)
-        u = np.clip(middle[:, 0, None, None] + steps, 0, columns - 1)
+        v = np.minimum(np.maximum(middle[:, 1, None, None] + steps[:, None], 0), rows - 1)
+        u = np.minimum(np.maximum(middle[:, 0, None, None] + steps, 0), columns - 1)
         return v, u
 
 
@@ -205,7 +205,9 @@ def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, 
 
     Each has 0.03 or more and is 1.2 cells from all better ones.
     """
-    v, u = np.nonzero((probability >= _LEAST_PROBABILITY) & (probability >= _highest_near(probability)))
+    v, u = np.nonzero(probability >= _LEAST_PROBABILITY)
+    highest = probability[v, u] >= highest_near(probability, np.stack([u, v], axis=1), 1)
+    v, u = v[highest], u[highest]
     best = np.argsort(-probability[v, u], kind="stable")[: 2 * _MOST]
     v, u = v[best], u[best]
     said = answers[v, u].astype(np.float64)
@@ -243,15 +245,6 @@ def answer(trained: Trained, picture: Image) -> Image:
     rows, columns = picture.shape
     padded = repeat_edge(picture, rows + -rows % STRIDE_PX, columns + -columns % STRIDE_PX)
     return trained.network(padded)[: -(-rows // CELL_PX), : -(-columns // CELL_PX)]
-
-
-def _highest_near(values: Image) -> Image:
-    """Return the highest of each value and its eight neighbours."""
-    wide = np.full((values.shape[0] + 2, values.shape[1] + 2), -np.inf, values.dtype)
-    wide[1:-1, 1:-1] = values
-    across = np.maximum(np.maximum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:])
-    highest: Image = np.maximum(np.maximum(across[:-2], across[1:-1]), across[2:])
-    return highest
 
 
 def _apart(cells: Array) -> BoolArray:

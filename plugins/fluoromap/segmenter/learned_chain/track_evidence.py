@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fluoromap.contracts import Array, Chain, IntArray
-from fluoromap.segmenter.acceptance import UNSEEN
+from fluoromap.segmenter.acceptance import UNSEEN, middle_score
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
@@ -135,7 +135,7 @@ def _are_electrodes(odds: Array) -> bool:
 def _is_clear(chain: Chain) -> bool:
     """Return whether network and contrast show a chain in its frame."""
     scores = chain.scores[chain.scores > UNSEEN]
-    return bool(len(scores) and np.median(scores) >= _CLEAR_SCORE and scores.min() >= _LEAST_CLEAR_SCORE)
+    return bool(len(scores) and middle_score(scores) >= _CLEAR_SCORE and scores.min() >= _LEAST_CLEAR_SCORE)
 
 
 def _first_and_last(frames: int) -> list[IntArray]:
