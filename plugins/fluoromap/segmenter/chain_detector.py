@@ -83,6 +83,11 @@ class _FittedSet:
     unlisted: tuple[CandidateChain, ...]
     sure: bool
 
+    @property
+    def explained(self) -> int:
+        """Number of the chains' electrodes."""
+        return sum(len(chain.electrodes) for chain in self.chains)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchedImage:
@@ -95,11 +100,6 @@ class SearchedImage:
     seen: ImageEvidence
     proposed: Proposals
     found: _FittedSet
-
-    @property
-    def explained(self) -> int:
-        """Number of the chains' electrodes."""
-        return sum(len(chain.electrodes) for chain in self.found.chains)
 
     def entry(self, frame: int) -> FrameChains:
         """Return the chains, or the reason why there are none."""
@@ -155,7 +155,7 @@ class ChainDetector:
         if len(with_edge) == len(proposed):
             return searched
         other = SearchedImage(x, seen, with_edge, self._chains_of(x, seen, with_edge))
-        return other if other.explained > searched.explained else searched
+        return other if other.found.explained > searched.found.explained else searched
 
     def split_pairs(self, searched: SearchedImage) -> SearchedImage:
         """Search an image again with pairs split into two electrodes.
@@ -164,7 +164,7 @@ class ChainDetector:
         more electrodes.
         """
         # Split pairs must not make a part of an unlisted catheter a listed one.
-        if searched.explained >= self._electrodes or searched.found.unlisted:
+        if searched.found.explained >= self._electrodes or searched.found.unlisted:
             return searched
         halves = searched.seen.halves_of_pairs(self.field.candidates)
         if not len(halves):
@@ -172,7 +172,7 @@ class ChainDetector:
         proposed = searched.proposed.with_more(halves)
         found = self._chains_of(searched.x, searched.seen, proposed, len(halves))
         split = replace(searched, found=self._with_known_places(found, searched.found.chains))
-        return split if split.explained > searched.explained else searched
+        return split if split.found.explained > searched.found.explained else searched
 
     def _with_known_places(self, found: _FittedSet, known: Sequence[Chain]) -> _FittedSet:
         """Return the chains, but known ones at their places.
@@ -208,7 +208,7 @@ class ChainDetector:
             again = self._link_without_rejected(seen, linking, result, families)
             if not set(again.chains) <= set(result.candidates):
                 other = self._fit(x, seen, proposed, again, families)
-                result = other if len(other.chains) > len(result.chains) else result
+                result = other if other.explained > result.explained else result
         return result
 
     def _link(
@@ -329,17 +329,17 @@ class ChainDetector:
     ) -> _Linking:
         """Link again without the chains that would be rejected.
 
-        They took the places of catheters. A chain that only now gets its place must be good for itself, and it has no
-        electrode of an unlisted catheter.
+        They took the places of catheters. A chain that only now gets its place must be good for itself. It has no electrode
+        of an unlisted catheter, unless it has more electrodes than the chain that was part of one.
         """
         scores = self._scores_in_field(seen, linking.points_uv)
-        unlisted = [candidate for chain in result.unlisted for candidate in chain.candidates]
         allowed = []
         for index, (family, rows, chain_scores) in enumerate(
             zip(families, linking.possible.rows, linking.possible.scores, strict=True)
         ):
             good = (chain_scores >= family.floor + _GOOD_ALONE) & self.acceptance.accepts(scores[rows], chain_scores)
-            good &= ~np.isin(rows, unlisted).any(axis=1)
+            unlisted = [one.candidates for one in result.unlisted if len(one.candidates) >= rows.shape[1]]
+            good &= ~np.isin(rows, [candidate for candidates in unlisted for candidate in candidates]).any(axis=1)
             for chain in linking.chains:
                 if chain.family == index:
                     good[(rows == np.array(chain.candidates)).all(axis=1)] = chain in result.candidates

@@ -65,16 +65,15 @@ class _Track:
     """A catheter along the run.
 
     chain, time_ms : the chain that was assigned last, and its time. velocity : (2,) pixels a millisecond, forwards in time.
-    detections : number of frames in which the segmenter found it. reversals : number of those with the tip at the other
-    end.
-    from_seed : whether the seed contains it.
+    detections : number of frames in which the segmenter found it. direction : sum of their log-odds that the tip is the
+    track's first electrode. from_seed : whether the seed contains it.
     """
 
     chain: Chain
     time_ms: float
     velocity: Array
     detections: int = 1
-    reversals: int = 0
+    direction: float = 0.0
     from_seed: bool = False
     confirmed: bool = False
     manual: bool = False
@@ -144,8 +143,8 @@ def track_chains(
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
     accepts : TrackJudge, optional
         Decides about each track of four or more frames, and of half of the frames in short runs. Where it rejects one, the run is
-        tracked again without the track's chains, twice at most. An accepted track has chains in half of the frames. All tracks are
-        accepted by default.
+        tracked again without the track's chains, twice at most. An accepted track has chains in half of the frames; one of six or
+        more electrodes may get them from a search that needs their contrast only. All tracks are accepted by default.
     marks_first : bool
         Whether a frame with a mark precedes the seed. Not so where the seed's chains were already followed from the marks.
 
@@ -181,8 +180,17 @@ def track_chains(
         for track in tracks_kept:
             if not track.manual:
                 _complete(track, tracks_kept, frame_times_ms, catheters, search)
+        rare = [track for track in tracks if track not in tracks_kept and len(track.chains) >= _judged_frames(found)]
+        for track in sorted(filter(_is_long, rare), key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
+            parts = [other for other in tracks_kept if _is_part(other, track)]
+            if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
+                # Anatomy rarely has so long a row: frames that lack the track may show it, and it is judged again with them.
+                others = [other for other in tracks_kept if other not in parts]
+                _complete(track, others, frame_times_ms, catheters, search)
+                if len(track.chains) >= least and accepts(track.chains):
+                    tracks_kept = [*others, track]
     for track in tracks_kept:
-        if 2 * track.reversals > track.detections and not track.manual:
+        if track.direction < 0 and not track.manual:
             track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
         if search is not None and not track.manual:
             track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
@@ -259,7 +267,7 @@ def _accepted(
 
     A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
     """
-    judged = min(_JUDGED_FRAMES, math.ceil(_ACCEPTED_AT_LEAST * len(found)))
+    judged = _judged_frames(found)
     confirmed: list[_Track] = []
     for attempt in range(_MOST_RETRIES + 1):
         wrong = [
@@ -281,11 +289,25 @@ def _accepted(
     return tracks
 
 
+def _judged_frames(found: Sequence[FrameChains]) -> int:
+    """Return in how many frames a track is judged."""
+    return min(_JUDGED_FRAMES, math.ceil(_ACCEPTED_AT_LEAST * len(found)))
+
+
 def _meet(track: _Track, other: _Track) -> bool:
     """Return whether two tracks share electrodes in a frame."""
     return any(
         _overlaps(chain, [other.chains[frame]]) for frame, chain in track.chains.items() if frame in other.chains
     )
+
+
+def _is_long(track: _Track) -> bool:
+    return len(track.chain.electrodes) >= MANY_ELECTRODES
+
+
+def _is_part(track: _Track, other: _Track) -> bool:
+    """Return whether a track lies on electrodes of a track with more electrodes."""
+    return not track.manual and len(track.chain.electrodes) < len(other.chain.electrodes) and _meet(track, other)
 
 
 def _complete(
@@ -303,7 +325,7 @@ def _complete(
             if frame not in track.chains and before is not None:
                 others = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
                 since = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
-                if len(others) < catheters and since < _STALE_MS:
+                if len(others) < catheters:
                     expected = np.zeros(2)
                     if moved is not None:
                         elapsed = abs(float(frame_times_ms[moved[1]] - frame_times_ms[moved[0]]))
@@ -472,8 +494,8 @@ def _advance(
         if number < 0:
             continue
         tracks[number].detections += 1
+        tracks[number].direction += -_tip_odds(chain) if other_way else _tip_odds(chain)
         if other_way:
-            tracks[number].reversals += 1
             chain = _reverse(chain)
         if search is not None and not by_hand and (other_way or _is_bent(tracks[number], chain, time_ms)):
             bent.append((number, chain))
@@ -497,7 +519,9 @@ def _advance(
     for chain in loose:
         if chain.manual or (entry.manual_needed is None and not _overlaps(chain, present)):
             present.append(chain)
-            tracks.append(_Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain}))
+            track = _Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain})
+            track.direction = _tip_odds(chain)
+            tracks.append(track)
 
 
 def _search(
@@ -525,6 +549,14 @@ def _search(
     if not is_faint or abs(time_ms - track.time_ms) < _STALE_MS:
         _extend(track, recovered, frame, time_ms)
         present.append(recovered)
+
+
+def _tip_odds(chain: Chain) -> float:
+    """Return the log-odds that a chain's tip is its first electrode.
+
+    It is 1 where the chain says nothing.
+    """
+    return 1.0 if chain.tip_odds is None else chain.tip_odds
 
 
 def _is_bent(track: _Track, chain: Chain, time_ms: float) -> bool:

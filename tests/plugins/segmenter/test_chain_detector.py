@@ -128,6 +128,16 @@ def test_a_chain_that_would_be_rejected_does_not_take_a_catheter_s_place():
     assert lies_on(found[0], catheter)
 
 
+def test_a_part_of_a_longer_catheter_gives_its_electrodes_back_to_it():
+    catheter, vessel = row_of("cs", (60, 60), 0.3), row_of("cs", (60, 250), -0.2)
+    points = np.concatenate([catheter, vessel])
+    # The vessel takes the place of the decapolar catheter, whose electrodes then look like one of the ablation catheter.
+    probability, scores = [0.8] * 10 + [0.99] * 10, [0.9] * 10 + [0.05] * 10
+    found = chains_found(drawn([catheter, vessel]), points, probability, scores)
+    assert len(found) == 1
+    assert lies_on(found[0], catheter)
+
+
 def test_a_doubted_catheter_is_accepted_beside_a_sure_one_only():
     ablation, cs = row_of("ablation", (60, 250), -0.2), row_of("cs", (60, 60), 0.3)
     acceptance = replace(IN_A_RUN, scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7))

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
@@ -57,6 +58,13 @@ def test_a_missing_catheter_is_carried_from_where_it_was():
     entries = track_chains(run(found), times(40), 3, search)
     assert sorted(asked) == [12, 13, 14, 15]
     assert [len(entry.chains) for entry in entries[11:17]] == [2, 2, 1, 2, 2, 2]
+
+
+def test_sure_frames_decide_where_the_tip_of_a_track_is():
+    odds = [2.0 if frame < 4 else 0.1 for frame in range(9)]
+    found = run([[chain(POINTS if frame < 4 else POINTS[::-1], tip_odds=odds[frame])] for frame in range(9)])
+    for entry in track_chains(found, times(9), 1):
+        np.testing.assert_allclose(entry.chains[0].pixels_uv, POINTS)
 
 
 def test_another_kind_is_another_track():
@@ -185,12 +193,13 @@ def only_confirmed(frame, known, shift, reach_px, taken, confirmed=False):
     return known if confirmed else None
 
 
-def test_an_accepted_track_is_searched_by_contrast_in_the_frames_that_lack_it():
-    right = chain(POINTS + 100)
+@pytest.mark.parametrize("frame_ms", [16.7, 66.7, 133.3])
+def test_an_accepted_track_is_searched_by_contrast_in_the_frames_that_lack_it(frame_ms):
+    right, at_ms = chain(POINTS + 100), np.arange(12) * frame_ms
     found = run([[right] if frame not in (0, 5, 6) else [] for frame in range(12)])
-    entries = track_chains(found, times(12), 1, only_confirmed, accepts=lambda chains: True)
+    entries = track_chains(found, at_ms, 1, only_confirmed, accepts=lambda chains: True)
     assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
-    entries = track_chains(found, times(12), 1, only_confirmed)
+    entries = track_chains(found, at_ms, 1, only_confirmed)
     assert [entry.frame for entry in entries if not entry.chains] == [0, 5, 6]
 
 
@@ -205,3 +214,33 @@ def test_a_catheter_of_moved_means_is_followed_where_no_frame_shows_it_and_a_fal
     entries = track_chains(found, times(8), 1, only_confirmed, seed, accepts, marks_first=False)
     assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
     assert not any(entry.chains for entry in track_chains(found, times(8), 1, only_confirmed, seed, accepts))
+
+
+def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
+    long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
+    whole, part = chain(long, "cs"), chain(long[3:7], "rv")
+    found = run([[whole] if frame < 5 else [part] for frame in range(16)])
+    accepted = {10}
+
+    def accepts(chains):
+        return len(chains[min(chains)].electrodes) in accepted
+
+    def tracked():
+        entries = track_chains(found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), accepts)
+        return [[len(one.electrodes) for one in entry.chains] for entry in entries]
+
+    assert tracked() == [[10]] * 16
+    accepted.add(4)
+    assert tracked() == [[10]] * 16
+    # Not where the judge doubts it in the frames that were added.
+    entries = track_chains(
+        found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), lambda chains: len(chains) < 15
+    )
+    assert [len(one.electrodes) for one in entries[-1].chains] == [4]
+
+
+def test_a_short_catheter_that_few_frames_show_may_be_anatomy():
+    found = run([[chain(POINTS + 100)] if frame < 5 else [] for frame in range(16)])
+    assert not any(
+        entry.chains for entry in track_chains(found, times(16), 1, only_confirmed, None, lambda chains: True)
+    )
