@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -61,6 +62,29 @@ def test_a_process_does_not_read_a_file_again_that_it_stored(data_dir: Path, mon
     sha256 = _stored(b"content")
     monkeypatch.setattr(files, "sha256_of", never)
     assert files.is_whole(sha256)
+
+
+def test_a_process_does_not_read_a_long_file_that_another_process_stored(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Path] = []
+
+    def sha256_of(path: Path) -> str:
+        read.append(path)
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+    long, short = _stored(bytes(files._LONG_BYTES)), _stored(b"content")
+    # What another process knows: the database alone.
+    files._checked.clear()
+    monkeypatch.setattr(files, "sha256_of", sha256_of)
+    assert files.is_whole(long)
+    assert not read
+    assert files.is_whole(short)
+    assert read == [files.path_of(short)]
+    files._checked.clear()
+    with files.path_of(long).open("r+b") as stream:
+        stream.write(b"damage")
+    assert not files.is_whole(long)
 
 
 def test_storing_the_same_content_mends_a_damaged_file(data_dir: Path) -> None:
