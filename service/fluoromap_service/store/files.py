@@ -248,30 +248,44 @@ def lock(session: Session) -> None:
         session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _FILES_LOCK})
 
 
-def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
+def keep(session: Session, path: Path, *, sha256: str | None = None, durable: bool = True) -> str:
     """Move an incoming file to its content address; return its hash.
 
-    The file's row is added. A caller that knows the hash gives it. Then the transaction does not read a long file
-    again. A file that is already there is replaced, because it may be damaged.
+    The file's row is added. A file that is already there is replaced, because it may be damaged.
+
+    Parameters
+    ----------
+    session : Session
+    path : Path
+    sha256 : str, optional
+        Hash of the content. With it the transaction does not read a long file again.
+    durable : bool
+        Whether to flush the file to disk. Without it a crash of the machine may damage the file, so only what can be made again
+        needs no flush.
     """
     sha256 = sha256 or sha256_of(path)
     lock(session)
     target = path_of(sha256)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("rb") as stream:
-        os.fsync(stream.fileno())
+    if durable:
+        _flush(path)
     path.replace(target)
-    folder = os.open(target.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    if durable:
+        _flush(target.parent)
     # This process has just read or written the whole content.
     state = _state_of(target)
     _remember_check(sha256, state)
-    session.merge(File(sha256=sha256, state=list(state)))
+    session.merge(File(sha256=sha256, state=list(state) if durable else None))
     session.flush()
     return sha256
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 _STATE = select(File.state).where(File.sha256 == bindparam("sha256"))
