@@ -152,13 +152,19 @@ def is_whole(sha256: str) -> bool:
 
 
 def _state_of(path: Path) -> tuple[int, ...]:
-    """Return what every change of a file changes: inode, size, and the times of the last changes."""
+    """Return the state of a file, which changes with its content.
+
+    It is the inode, the size, and the times of the last changes.
+    """
     facts = path.stat()
     return facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
 
 
 def _is_checked(sha256: str, state: tuple[int, ...]) -> bool:
-    """Return whether this process has checked the file in this state, or any process has stored the long file in it."""
+    """Return whether the content of the file in this state is known.
+
+    This process has checked it, or any process has stored and flushed the long file in this state.
+    """
     with _checked_lock:
         if _checked.get(sha256) == state:
             _checked.move_to_end(sha256)

@@ -21,7 +21,10 @@ def add(session: Session, amounts: Mapping[str, float]) -> None:
 
 @functools.cache
 def _addition(dialect: str) -> Insert:
-    """Return the statement that adds one amount, built and compiled once: each end of a stage runs it."""
+    """Return the statement that adds one amount.
+
+    It is built and compiled once, because each end of a stage runs it.
+    """
     insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
     statement = insert(Tally)
     return statement.on_conflict_do_update(
