@@ -13,6 +13,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
+from fluoromap import registry
 from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
@@ -199,6 +200,8 @@ async def _warm_up() -> None:
     for stage in PIPELINE:
         await run_in_threadpool(prepare, stage.result)
     await run_in_threadpool(report_page.prepare)
+    # The first job would wait for the imports of all plugins.
+    await run_in_threadpool(registry.plugins)
 
 
 async def _repeat(failure: str, act: Callable[[], object], seconds: float) -> None:

@@ -24,6 +24,7 @@ from sqlalchemy import bindparam, delete, exists, select, text
 from sqlalchemy.orm import Session
 
 from fluoromap_service.settings import settings
+from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import File, Instance, Rendering, StageResult, StageRow
 from fluoromap_service.store.private_folder import make_private_folder
 
@@ -31,6 +32,8 @@ CHUNK_BYTES = 1 << 20
 ABANDONED_SECONDS = 5.0
 """Age of an incoming file without a lock at which nobody can be about to lock it."""
 _REMEMBERED_CHECKS = 4096
+_LONG_BYTES = 1 << 20
+"""A query of the database takes as long as reading and hashing a file of this size."""
 _FILES_LOCK = 0x66696C65  # "file" in ASCII; any number that no other lock of this database uses
 _checked: OrderedDict[str, tuple[int, ...]] = OrderedDict()
 _checked_lock = threading.Lock()
@@ -133,7 +136,7 @@ def sha256_of(path: Path) -> str:
 def is_whole(sha256: str) -> bool:
     """Return whether a file exists and its content has the hash of its address.
 
-    A process reads a file again only when the file has changed since it last did so.
+    A process reads a file again only when the file has changed since it last did so, or since any process stored a long file.
     """
     path = path_of(sha256)
     try:
@@ -149,17 +152,31 @@ def is_whole(sha256: str) -> bool:
 
 
 def _state_of(path: Path) -> tuple[int, ...]:
+    """Return the state of a file, which changes with its content.
+
+    It is the inode, the size, and the times of the last changes.
+    """
     facts = path.stat()
     return facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
 
 
 def _is_checked(sha256: str, state: tuple[int, ...]) -> bool:
-    """Return whether this process has checked the file in this state."""
+    """Return whether the content of the file in this state is known.
+
+    This process has checked it, or any process has stored and flushed the long file in this state.
+    """
     with _checked_lock:
-        if _checked.get(sha256) != state:
-            return False
-        _checked.move_to_end(sha256)
-        return True
+        if _checked.get(sha256) == state:
+            _checked.move_to_end(sha256)
+            return True
+    if state[1] < _LONG_BYTES:
+        return False
+    with reading() as session:
+        stored = session.scalar(_STATE, {"sha256": sha256})
+    if stored != list(state):
+        return False
+    _remember_check(sha256, state)
+    return True
 
 
 def _remember_check(sha256: str, state: tuple[int, ...]) -> None:
@@ -237,33 +254,47 @@ def lock(session: Session) -> None:
         session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _FILES_LOCK})
 
 
-def keep(session: Session, path: Path, *, sha256: str | None = None) -> str:
+def keep(session: Session, path: Path, *, sha256: str | None = None, durable: bool = True) -> str:
     """Move an incoming file to its content address; return its hash.
 
-    The file's row is added. A caller that knows the hash gives it. Then the transaction does not read a long file
-    again. A file that is already there is replaced, because it may be damaged.
+    The file's row is added. A file that is already there is replaced, because it may be damaged.
+
+    Parameters
+    ----------
+    session : Session
+    path : Path
+    sha256 : str, optional
+        Hash of the content. With it the transaction does not read a long file again.
+    durable : bool
+        Whether to flush the file to disk. Without it a crash of the machine may damage the file, so only what can be made again
+        needs no flush.
     """
     sha256 = sha256 or sha256_of(path)
     lock(session)
     target = path_of(sha256)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("rb") as stream:
-        os.fsync(stream.fileno())
+    if durable:
+        _flush(path)
     path.replace(target)
-    folder = os.open(target.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    if durable:
+        _flush(target.parent)
     # This process has just read or written the whole content.
-    _remember_check(sha256, _state_of(target))
-    if session.scalar(_ROW, {"sha256": sha256}) is None:
-        session.add(File(sha256=sha256))
-        session.flush()
+    state = _state_of(target)
+    _remember_check(sha256, state)
+    session.merge(File(sha256=sha256, state=list(state) if durable else None))
+    session.flush()
     return sha256
 
 
-_ROW = select(File.sha256).where(File.sha256 == bindparam("sha256"))
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+_STATE = select(File.state).where(File.sha256 == bindparam("sha256"))
 
 
 def keep_bytes(session: Session, content: bytes) -> str:

@@ -100,6 +100,7 @@ class File(Base):
 
     __tablename__ = "file"
     sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    state: Mapped[list[Any] | None]  # inode, size and times of the file on disk when it was stored
 
 
 class Study(Base):

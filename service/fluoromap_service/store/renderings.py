@@ -69,7 +69,7 @@ def kept_file(job_id: str, depends_on: dict[str, Any], write: Callable[[IO[bytes
         sha256 = files.sha256_of(path)
         try:
             with writing() as session:
-                files.keep(session, path, sha256=sha256)
+                files.keep(session, path, sha256=sha256, durable=False)
                 row = session.scalar(select(Rendering).where(Rendering.key == key))
                 if row is None:
                     session.add(Rendering(job_id=job_id, key=key, sha256=sha256))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 
-from sqlalchemy import select
+from sqlalchemy import Insert, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
@@ -13,14 +14,21 @@ from fluoromap_service.store.models import Tally
 
 def add(session: Session, amounts: Mapping[str, float]) -> None:
     """Add an amount to each named sum, within the caller's transaction."""
-    insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     # In one order, so that no two transactions wait for each other.
     rows = [{"name": name, "value": amounts[name]} for name in sorted(amounts)]
-    statement = insert(Tally).values(rows)
-    session.execute(
-        statement.on_conflict_do_update(
-            index_elements=["name"], set_={"value": Tally.value + statement.excluded["value"]}
-        )
+    session.execute(_addition(session.get_bind().dialect.name), rows)
+
+
+@functools.cache
+def _addition(dialect: str) -> Insert:
+    """Return the statement that adds one amount.
+
+    It is built and compiled once, because each end of a stage runs it.
+    """
+    insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
+    statement = insert(Tally)
+    return statement.on_conflict_do_update(
+        index_elements=["name"], set_={"value": Tally.value + statement.excluded["value"]}
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -61,6 +62,32 @@ def test_a_process_does_not_read_a_file_again_that_it_stored(data_dir: Path, mon
     sha256 = _stored(b"content")
     monkeypatch.setattr(files, "sha256_of", never)
     assert files.is_whole(sha256)
+
+
+def test_a_process_does_not_read_a_long_file_that_another_process_flushed(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stored(content: bytes, *, durable: bool = True) -> str:
+        with files.incoming() as path, writing() as session:
+            path.write_bytes(content)
+            return files.keep(session, path, durable=durable)
+
+    def sha256_of(path: Path) -> str:
+        read.append(path.name)
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+    read: list[str] = []
+    long, short = stored(bytes(files._LONG_BYTES)), stored(b"content")
+    not_flushed = stored(b"1" * files._LONG_BYTES, durable=False)
+    # What another process knows: the database alone.
+    files._checked.clear()
+    monkeypatch.setattr(files, "sha256_of", sha256_of)
+    assert all(map(files.is_whole, (long, short, not_flushed)))
+    assert read == [short, not_flushed]
+    files._checked.clear()
+    with files.path_of(long).open("r+b") as stream:
+        stream.write(b"damage")
+    assert not files.is_whole(long)
 
 
 def test_storing_the_same_content_mends_a_damaged_file(data_dir: Path) -> None:

@@ -48,7 +48,7 @@ def test_a_change_counts_from_its_commit_on(data_dir: Path) -> None:
 def test_another_program_commits(data_dir: Path) -> None:
     before = last_change()
     other = sqlite3.connect(data_dir / "fluoromap.sqlite")
-    other.execute("INSERT INTO file VALUES ('x')")
+    other.execute("INSERT INTO file (sha256) VALUES ('x')")
     other.commit()
     other.close()
     assert last_change() != before
