@@ -34,6 +34,8 @@ ABANDONED_SECONDS = 5.0
 _REMEMBERED_CHECKS = 4096
 _LONG_BYTES = 1 << 20
 """A query of the database takes as long as reading and hashing a file of this size."""
+_RECENT_NS = 3600 * 10**9
+"""What was flushed within an hour is believed to be on disk as it was written; later a disk may have decayed."""
 _FILES_LOCK = 0x66696C65  # "file" in ASCII; any number that no other lock of this database uses
 _checked: OrderedDict[str, tuple[int, ...]] = OrderedDict()
 _checked_lock = threading.Lock()
@@ -136,7 +138,8 @@ def sha256_of(path: Path) -> str:
 def is_whole(sha256: str) -> bool:
     """Return whether a file exists and its content has the hash of its address.
 
-    A process reads a file again only when the file has changed since it last did so, or since any process stored a long file.
+    A process reads a file again only when the file has changed since it last did so, or since any process stored a long file within
+    the last hour.
     """
     path = path_of(sha256)
     try:
@@ -163,13 +166,14 @@ def _state_of(path: Path) -> tuple[int, ...]:
 def _is_checked(sha256: str, state: tuple[int, ...]) -> bool:
     """Return whether the content of the file in this state is known.
 
-    This process has checked it, or any process has stored and flushed the long file in this state.
+    This process has checked it, or any process has stored and flushed the long file in this state a short time ago.
     """
     with _checked_lock:
         if _checked.get(sha256) == state:
             _checked.move_to_end(sha256)
             return True
-    if state[1] < _LONG_BYTES:
+    *_, size, _, changed_ns = state
+    if size < _LONG_BYTES or time.time_ns() - changed_ns > _RECENT_NS:
         return False
     with reading() as session:
         stored = session.scalar(_STATE, {"sha256": sha256})

@@ -64,7 +64,7 @@ def test_a_process_does_not_read_a_file_again_that_it_stored(data_dir: Path, mon
     assert files.is_whole(sha256)
 
 
-def test_a_process_does_not_read_a_long_file_that_another_process_flushed(
+def test_a_process_does_not_read_a_long_file_that_another_process_has_just_flushed(
     data_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stored(content: bytes, *, durable: bool = True) -> str:
@@ -84,6 +84,12 @@ def test_a_process_does_not_read_a_long_file_that_another_process_flushed(
     monkeypatch.setattr(files, "sha256_of", sha256_of)
     assert all(map(files.is_whole, (long, short, not_flushed)))
     assert read == [short, not_flushed]
+    files._checked.clear()
+    with monkeypatch.context() as later:
+        in_an_hour = files.path_of(long).stat().st_ctime_ns + files._RECENT_NS + 1
+        later.setattr(files.time, "time_ns", lambda: in_an_hour)
+        assert files.is_whole(long)
+    assert read == [short, not_flushed, long]
     files._checked.clear()
     with files.path_of(long).open("r+b") as stream:
         stream.write(b"damage")
