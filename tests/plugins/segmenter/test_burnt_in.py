@@ -12,6 +12,7 @@ from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 FACTS = PixelFacts(True, 8, False)
+LIKE_ELECTRODES = {(60, 60): "ID 0012345", (60, 90): "o o o o", (250, 380): "H H E E F F", (80, 300): "LIH 11.1.19"}
 LINES = {(12, 12): "LAO 30 CRAN 12", (300, 400): "F 15/s  74 kV 8 mA", (40, 420): "ID 001234"}
 
 
@@ -47,10 +48,10 @@ def stored(level, quality=None):
     return np.asarray(picture)
 
 
-def letters(size=14.0):
-    """Return the opacity of the text, 0 to 1."""
+def letters(size=14.0, lines=LINES):
+    """Return the opacity of lines of text, 0 to 1."""
     layer = Image.new("L", (512, 512))
-    for place, line in LINES.items():
+    for place, line in lines.items():
         ImageDraw.Draw(layer).text(place, line, fill=255, font=ImageFont.load_default(size))
     return np.asarray(layer) / 255.0
 
@@ -110,9 +111,10 @@ def test_the_field_hides_text():
 
 
 @pytest.mark.parametrize("grey", [255, 0])
-def test_text_is_no_catheter(grey):
-    opacity = letters(18.0)
-    frames = [stored(level * (1 - opacity) + grey * opacity) for level in anatomy(6, 4.0)]
-    run = Run(Frames(frames), np.arange(6) * 66.7, 3.4, FACTS)
+@pytest.mark.parametrize("frames", [1, 5])
+def test_text_is_no_catheter(grey, frames):
+    opacity = letters(13.0, LIKE_ELECTRODES)
+    pictures = [stored(level * (1 - opacity) + grey * opacity) for level in anatomy(frames, 4.0)]
+    run = Run(Frames(pictures), np.arange(frames) * 66.7, 3.4, FACTS)
     found = LearnedChain().segment(run, DEFAULT_CATALOGUE, {}, Silent())
     assert not any(entry.chains for entry in found.frames)
