@@ -11,13 +11,13 @@ from fluoromap.contracts import Array
 from fluoromap.segmenter.linking import ShaftImage
 
 _STEP_MM, _BEYOND_MM, _AHEAD_MM, _ANATOMY_MM = 0.25, 2.0, 2.0, 6.0
-_BESIDE_MM = np.linspace(2.0, 4.5, 6)
-_OFFSETS_MM = np.concatenate([[0.0], _BESIDE_MM, -_BESIDE_MM])
-_LEAST_CORRELATION, _LEAST_SHARE = 0.45, 0.3
+BESIDE_MM, ACROSS_MM = np.linspace(2.0, 4.5, 6), np.linspace(5.0, 9.0, 9)
+"""Distances of lines from a chain: those on the bars, and those that may lie on the other wall of a probe."""
+_LEAST_CORRELATION, _LEAST_SHARE, _LEAST_SHARE_ACROSS = 0.45, 0.3, 0.35
 _TINY = 1e-12
 
 
-def products_beside(chain_uv: Array, shaft_image: ShaftImage) -> Array:
+def products_beside(chain_uv: Array, shaft_image: ShaftImage, beside_mm: Array = BESIDE_MM) -> Array:
     """Compare the picture along a chain with the picture beside it.
 
     Parameters
@@ -25,11 +25,13 @@ def products_beside(chain_uv: Array, shaft_image: ShaftImage) -> Array:
     chain_uv : (electrodes, 2)
         Pixels.
     shaft_image : ShaftImage
+    beside_mm : (lines,)
+        Distances of the lines to the left and to the right.
 
     Returns
     -------
     (2, lines, electrodes, 3)
-        Of lines 2 to 4.5 mm to the left and to the right, around each electrode: sum of products with the chain's own line, sum of
+        Of the lines to the left and to the right, around each electrode: sum of products with the chain's own line, sum of
         the own line's squares, sum of the line's squares. Only differences over 6 mm count: anatomy changes more slowly. The
         products of several pictures add.
     """
@@ -51,14 +53,15 @@ def products_beside(chain_uv: Array, shaft_image: ShaftImage) -> Array:
     ahead = after - before
     ahead *= px_per_mm / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), _TINY)
     across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
-    depths = _values(line + _OFFSETS_MM[:, None, None] * across, shaft_image)
+    offsets_mm = np.concatenate([[0.0], beside_mm, -beside_mm])
+    depths = _values(line + offsets_mm[:, None, None] * across, shaft_image)
     depths -= ndimage.uniform_filter1d(depths, 2 * margin + 1, axis=1)
     depths, at_mm = depths[:, margin:-margin], at_mm[margin:-margin]
     own, beside = depths[:1], depths[1:]
     squares = np.stack([beside * own, np.broadcast_to(own * own, beside.shape), beside * beside], axis=-1)
     is_nearest = np.abs(at_mm[:, None] - places_mm).argmin(axis=1)[:, None] == np.arange(len(places_mm))
     products: Array = np.einsum("lnp,ne->lep", squares, is_nearest)
-    return products.reshape(2, len(_BESIDE_MM), len(places_mm), 3)
+    return products.reshape(2, len(beside_mm), len(places_mm), 3)
 
 
 def follows_bars(products: Array) -> bool:
@@ -73,11 +76,30 @@ def follows_bars(products: Array) -> bool:
     products : (2, lines, electrodes, 3)
         See :func:`products_beside`.
     """
-    shared, own, beside = np.moveaxis(products.sum(axis=2, keepdims=True) - products, -1, 0)
-    correlation = (shared / np.sqrt(np.maximum(own * beside, _TINY))).min(axis=1)
-    share = (shared / np.maximum(own, _TINY)).mean(axis=1)
-    follows = (correlation >= _LEAST_CORRELATION) & (share >= _LEAST_SHARE)
+    correlation, share = _without_each(products)
+    follows = (correlation.min(axis=1) >= _LEAST_CORRELATION) & (share.mean(axis=1) >= _LEAST_SHARE)
     return bool(follows.all(axis=1).any())
+
+
+def has_other_wall(products: Array) -> bool:
+    """Return whether a chain's electrodes are the ends of a tube's bars.
+
+    Often only the walls of the tube are dark enough to show its bars. A line at the other wall follows the line along the chain,
+    with 0.35 of its contrast or more. Another catheter rarely has electrodes beside each of the chain's.
+
+    Parameters
+    ----------
+    products : (2, lines, electrodes, 3)
+        See :func:`products_beside`, for :data:`ACROSS_MM`.
+    """
+    correlation, share = _without_each(products)
+    return bool(((correlation >= _LEAST_CORRELATION) & (share >= _LEAST_SHARE_ACROSS)).all(axis=2).any())
+
+
+def _without_each(products: Array) -> tuple[Array, Array]:
+    """Return correlations and shares of contrast without each of the electrodes, (2, lines, electrodes)."""
+    shared, own, beside = np.moveaxis(products.sum(axis=2, keepdims=True) - products, -1, 0)
+    return shared / np.sqrt(np.maximum(own * beside, _TINY)), shared / np.maximum(own, _TINY)
 
 
 def _values(points_uv: Array, shaft_image: ShaftImage) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoromap.segmenter.bars import follows_bars, products_beside
+from fluoromap.segmenter.bars import ACROSS_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.linking import ShaftImage
 
 PX = 3.2
@@ -94,3 +94,27 @@ def test_an_even_image_shows_no_bars():
 
 def test_electrodes_at_one_place_have_an_answer():
     assert not on_bars(np.repeat(ON_BARS[:1], 4, axis=0), shafts(rings()))
+
+
+def other_wall(shaft_image):
+    return has_other_wall(products_beside(ON_BARS, shaft_image, ACROSS_MM))
+
+
+@pytest.mark.parametrize("wide_mm", [7.0, 9.0])
+def test_ends_of_bars_have_an_other_wall(wide_mm):
+    beside = (U - START[0]) / PX
+    is_end = (np.abs(beside) < 1.0) | (np.abs(beside - wide_mm) < 1.0)
+    near = np.min([np.abs(V - v) for v in ON_BARS[:, 1]], axis=0) < PX
+    assert other_wall(shafts(0.3 * (near & is_end), noise=0.05))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_a_catheter_has_no_other_wall(noise):
+    assert not other_wall(shafts(rings(), noise=noise))
+    uneven = START + np.outer([0.0, 2.5, 9.0, 11.5], [0.0, PX]) + np.array([8.0 * PX, 6.0])
+    assert not other_wall(shafts(rings() + rings(uneven), noise=noise))
+
+
+@pytest.mark.parametrize("electrode", range(4))
+def test_a_cable_across_a_catheter_is_no_other_wall(electrode):
+    assert not other_wall(shafts(rings() + 0.4 * (np.abs(V - ON_BARS[electrode, 1]) < PX)))

@@ -14,7 +14,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
-from fluoromap.segmenter.bars import follows_bars, products_beside
+from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -50,11 +50,13 @@ _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 class SectionOdds:
     """The evidence for a part of a track, in the mean of some frames.
 
-    log_odds : (n,) of its electrodes. beside : see :func:`~fluoromap.segmenter.bars.products_beside`.
+    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
+    distances.
     """
 
     log_odds: Array
     beside: Array
+    across: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -99,8 +101,7 @@ class TrackEvidence:
             return odds
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
-        beside = [np.concatenate([section.beside for section in sections], axis=2) for sections in pictures]
-        if follows_bars(np.sum(beside, axis=0)):
+        if _is_probe(pictures):
             return False
         odds = np.array([odds_of(sections) for sections in pictures])
         middle = np.median(odds, axis=1)
@@ -132,8 +133,9 @@ class TrackEvidence:
         total /= len(frames)
         seen = NetworkResponse.of_reduced(total, self.trained, scale)
         shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
-        beside = products_beside((middle - first + 0.5) * scale - 0.5, shafts)
-        return SectionOdds(log_odds(seen.probability_at(middle - first)), beside)
+        chain_uv = (middle - first + 0.5) * scale - 0.5
+        beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
+        return SectionOdds(log_odds(seen.probability_at(middle - first)), beside, across)
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
@@ -143,6 +145,16 @@ class TrackEvidence:
             if len(self._reduced) > _KEPT_FRAMES:
                 self._reduced.popitem(last=False)
         return small
+
+
+def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
+    """Return whether pictures of a track show an echo probe.
+
+    Each picture has sections.
+    """
+    beside = np.sum([np.concatenate([section.beside for section in sections], axis=2) for sections in pictures], axis=0)
+    across = np.sum([np.concatenate([section.across for section in sections], axis=2) for sections in pictures], axis=0)
+    return follows_bars(beside) or has_other_wall(across)
 
 
 def _are_electrodes(odds: Array) -> bool:

@@ -46,7 +46,7 @@ def chains(path_uv):
 
 def evidence(odds):
     """Return the evidence of log-odds (n,) for electrodes with nothing beside them."""
-    return SectionOdds(odds, np.zeros((2, 6, len(odds), 3)))
+    return SectionOdds(odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)))
 
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
@@ -140,17 +140,15 @@ def test_a_long_catheter_at_rest_over_anatomy_is_judged_by_frames_all_along_its_
     assert judge(chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None) == accepted
 
 
-def test_a_track_along_parallel_bars_is_no_catheter(monkeypatch):
+@pytest.mark.parametrize("lines", ["beside", "across"])
+def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
-    bars = np.zeros((2, 6, 4, 3))
-    bars[0] = 0.6, 1.0, 1.0
-
-    def along(self, frames, path_uv, log_image):
-        return replace(evidence(np.full(4, 3.0)), beside=bars)
-
     known = chains(np.repeat(row[None], FRAMES, axis=0))
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    nothing = evidence(np.full(4, 3.0))
+    bars = np.zeros(getattr(nothing, lines).shape)
+    bars[0] = 0.6, 1.0, 1.0
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: replace(nothing, **{lines: bars}))
     assert not judge(known, lambda frame: None)
-    bars[:] = 0.0
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: nothing)
     assert judge(known, lambda frame: None)
