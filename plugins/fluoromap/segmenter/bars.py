@@ -5,102 +5,105 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from scipy import ndimage
 
 from fluoromap.contracts import Array
 from fluoromap.segmenter.linking import ShaftImage
 
-_AROUND_MM = 2.0
-_WINDOW_MM = np.linspace(-_AROUND_MM, _AROUND_MM, 17)
-_RAMP = _WINDOW_MM / np.linalg.norm(_WINDOW_MM)
-_BESIDE_MM = np.linspace(2.0, 4.0, 5)
-_OFFSETS_MM = np.concatenate([[0.0], _BESIDE_MM, -_BESIDE_MM])
-_LEAST_SLOPE, _LEAST_CORRELATION = 0.15, 0.7
-_MAY_LACK = 0.25
+_STEP_MM, _BEYOND_MM, _AHEAD_MM, _ANATOMY_MM = 0.25, 2.0, 2.0, 6.0
+BESIDE_MM, ACROSS_MM = np.linspace(2.0, 4.5, 6), np.linspace(5.0, 9.0, 9)
+"""Distances of lines from a chain: those on the bars, and those that may lie on the other wall of a probe."""
+_LEAST_CORRELATION, _LEAST_SHARE, _LEAST_SHARE_ACROSS = 0.45, 0.3, 0.35
 _TINY = 1e-12
 
 
-def follows_bars(chain_uv: Array, shaft_image: ShaftImage) -> bool:
-    """Return whether a chain's electrodes are places on parallel bars.
-
-    A ring ends 1.2 mm beside the middle of its catheter. Bars go on, and so do the gaps between them: 2 to 4 mm beside three
-    quarters of the electrodes, on one side of the chain, the image follows the image along the chain. Its contrast may be as
-    little as 0.15 of that on the chain: the bars are of tubes, whose walls are darkest. A cable that crosses the chain is beside
-    one or two electrodes, a shaft along it has no gaps.
+def products_beside(chain_uv: Array, shaft_image: ShaftImage, beside_mm: Array = BESIDE_MM) -> Array:
+    """Compare the picture along a chain with the picture beside it.
 
     Parameters
     ----------
     chain_uv : (electrodes, 2)
-        Pixels, those in the field.
+        Pixels.
     shaft_image : ShaftImage
+    beside_mm : (lines,)
+        Distances of the lines to the left and to the right.
+
+    Returns
+    -------
+    (2, lines, electrodes, 3)
+        Of the lines to the left and to the right, around each electrode: sum of products with the chain's own line, sum of
+        the own line's squares, sum of the line's squares. Only differences over 6 mm count: anatomy changes more slowly. The
+        products of several pictures add.
     """
     px_per_mm = shaft_image.px_per_mm
-    ways = chain_uv[1:] - chain_uv[:-1]
-    lengths = np.maximum(np.sqrt((ways * ways).sum(axis=1)), _TINY)
-    first, last = (_AROUND_MM * px_per_mm / lengths[end] * ways[end] for end in (0, -1))
-    corners_uv = np.concatenate([chain_uv[:1] - first, chain_uv, chain_uv[-1:] + last])
-    corners_mm = np.cumsum(np.concatenate([[-_AROUND_MM, _AROUND_MM], lengths / px_per_mm, [_AROUND_MM]]))
-    lines_followed = np.zeros((len(chain_uv), 2, len(_BESIDE_MM)), np.bool_)
-    _compare_lines(
-        shaft_image.smooth, 1.0 / shaft_image.reduction, px_per_mm, corners_uv, corners_mm, _WINDOW_MM, _RAMP, _OFFSETS_MM,
-        np.empty((5, len(_WINDOW_MM))), lines_followed.reshape(len(chain_uv), -1),
-    )  # fmt: skip
-    on_bars = np.count_nonzero(lines_followed.all(axis=2), axis=0)
-    return bool(on_bars.max() >= (1.0 - _MAY_LACK) * len(chain_uv))
+    ways = np.diff(chain_uv, axis=0)
+    lengths = np.maximum(np.linalg.norm(ways, axis=1), _TINY)
+    reach = _BEYOND_MM + 0.5 * _ANATOMY_MM + _AHEAD_MM
+    first, last = (
+        reach * px_per_mm * way / length for way, length in zip(ways[[0, -1]], lengths[[0, -1]], strict=True)
+    )
+    corners = np.concatenate([chain_uv[:1] - first, chain_uv, chain_uv[-1:] + last])
+    places_mm = np.concatenate([[0.0], np.cumsum(lengths)]) / px_per_mm
+    corners_mm = np.concatenate([[-reach], places_mm, [places_mm[-1] + reach]])
+    margin = round(0.5 * _ANATOMY_MM / _STEP_MM)
+    count = math.ceil((places_mm[-1] + 2 * _BEYOND_MM) / _STEP_MM) + 1
+    at_mm = _STEP_MM * np.arange(-margin, count + margin) - _BEYOND_MM
+    ways_mm = np.stack([at_mm, at_mm + _AHEAD_MM, at_mm - _AHEAD_MM])
+    line, after, before = np.stack([np.interp(ways_mm, corners_mm, axis) for axis in corners.T], axis=-1)
+    ahead = after - before
+    ahead *= px_per_mm / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), _TINY)
+    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+    offsets_mm = np.concatenate([[0.0], beside_mm, -beside_mm])
+    depths = _values(line + offsets_mm[:, None, None] * across, shaft_image)
+    depths -= ndimage.uniform_filter1d(depths, 2 * margin + 1, axis=1)
+    depths, at_mm = depths[:, margin:-margin], at_mm[margin:-margin]
+    own, beside = depths[:1], depths[1:]
+    squares = np.stack([beside * own, np.broadcast_to(own * own, beside.shape), beside * beside], axis=-1)
+    is_nearest = np.abs(at_mm[:, None] - places_mm).argmin(axis=1)[:, None] == np.arange(len(places_mm))
+    products: Array = np.einsum("lnp,ne->lep", squares, is_nearest)
+    return products.reshape(2, len(beside_mm), len(places_mm), 3)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _compare_lines(smooth, scale, px_per_mm, corners_uv, corners_mm, window_mm, ramp, offsets_mm, scratch, follows):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write which lines beside each electrode follow the line along the chain.
+def follows_bars(products: Array) -> bool:
+    """Return whether a chain's electrodes are places on parallel bars.
 
-    The chain is the line through the corners; all corners but the first and the last are electrodes. Lines are compared without
-    their mean and their trend: anatomy darkens the picture evenly along all of them.
+    A ring ends 1.2 mm beside the middle of its catheter. Bars go on, and so do the gaps between them: on one side of the chain all
+    lines follow the line along it, with 0.3 of its contrast or more. They do so without any one of the electrodes too: a cable
+    that crosses the chain is beside one of them. A shaft along the chain has no gaps.
 
-    ramp : the trend, of norm 1. offsets_mm : how far beside the chain the lines are; the first is the chain's own. scratch : for
-    each place of the window its pixel, the way across the chain for 1 mm, and the picture on the chain without mean and trend.
+    Parameters
+    ----------
+    products : (2, lines, electrodes, 3)
+        See :func:`products_beside`.
     """
-    last_u, last_v = smooth.shape[1] - 1.0, smooth.shape[0] - 1.0
-    size = window_mm.size
-    for electrode in range(corners_mm.size - 2):
-        for i in range(size):
-            ahead_u = ahead_v = 0.0
-            for end in range(-1, 2):
-                mm = corners_mm[electrode + 1] + window_mm[i] + end * _AROUND_MM
-                before = 0
-                while before < corners_mm.size - 2 and corners_mm[before + 1] < mm:
-                    before += 1
-                length = max(corners_mm[before + 1] - corners_mm[before], _TINY)
-                share = min(max((mm - corners_mm[before]) / length, 0.0), 1.0)
-                u = corners_uv[before, 0] + share * (corners_uv[before + 1, 0] - corners_uv[before, 0])
-                v = corners_uv[before, 1] + share * (corners_uv[before + 1, 1] - corners_uv[before, 1])
-                ahead_u += end * u
-                ahead_v += end * v
-                if end == 0:
-                    scratch[0, i], scratch[1, i] = u, v
-            stretch = px_per_mm / max(math.sqrt(ahead_u * ahead_u + ahead_v * ahead_v), _TINY)
-            scratch[2, i], scratch[3, i] = -stretch * ahead_v, stretch * ahead_u
-        strength = 0.0
-        for line in range(offsets_mm.size):
-            total = slope = square = shared = 0.0
-            for i in range(size):
-                u = min(max((scratch[0, i] + offsets_mm[line] * scratch[2, i] + 0.5) * scale - 0.5, 0.0), last_u)
-                v = min(max((scratch[1, i] + offsets_mm[line] * scratch[3, i] + 0.5) * scale - 0.5, 0.0), last_v)
-                left, top = int(u), int(v)
-                right, below = min(left + 1, smooth.shape[1] - 1), min(top + 1, smooth.shape[0] - 1)
-                upper = smooth[top, left] + (u - left) * (smooth[top, right] - smooth[top, left])
-                lower = smooth[below, left] + (u - left) * (smooth[below, right] - smooth[below, left])
-                value = upper + (v - top) * (lower - upper)
-                if line == 0:
-                    scratch[4, i] = value
-                total += value
-                slope += value * ramp[i]
-                square += value * value
-                shared += value * scratch[4, i]
-            square = max(square - total * total / size - slope * slope, 0.0)
-            if line == 0:
-                strength = square
-                for i in range(size):
-                    scratch[4, i] -= total / size + slope * ramp[i]
-            else:
-                least = max(_LEAST_SLOPE * strength, _LEAST_CORRELATION * math.sqrt(strength * square))
-                follows[electrode, line - 1] = shared > max(least, _TINY)
+    correlation, share = _without_each(products)
+    follows = (correlation.min(axis=1) >= _LEAST_CORRELATION) & (share.mean(axis=1) >= _LEAST_SHARE)
+    return bool(follows.all(axis=1).any())
+
+
+def has_other_wall(products: Array) -> bool:
+    """Return whether a chain's electrodes are the ends of a tube's bars.
+
+    Often only the walls of the tube are dark enough to show its bars. A line at the other wall follows the line along the chain,
+    with 0.35 of its contrast or more. Another catheter rarely has electrodes beside each of the chain's.
+
+    Parameters
+    ----------
+    products : (2, lines, electrodes, 3)
+        See :func:`products_beside`, for :data:`ACROSS_MM`.
+    """
+    correlation, share = _without_each(products)
+    return bool(((correlation >= _LEAST_CORRELATION) & (share >= _LEAST_SHARE_ACROSS)).all(axis=2).any())
+
+
+def _without_each(products: Array) -> tuple[Array, Array]:
+    """Return correlations and shares of contrast without each of the electrodes, (2, lines, electrodes)."""
+    shared, own, beside = np.moveaxis(products.sum(axis=2, keepdims=True) - products, -1, 0)
+    return shared / np.sqrt(np.maximum(own * beside, _TINY)), shared / np.maximum(own, _TINY)
+
+
+def _values(points_uv: Array, shaft_image: ShaftImage) -> Array:
+    """Return the smooth image at points (..., 2), pixels of the frame."""
+    u, v = np.moveaxis((points_uv + 0.5) / shaft_image.reduction - 0.5, -1, 0)
+    values: Array = ndimage.map_coordinates(shaft_image.smooth, [v, u], np.float64, order=1, mode="nearest")
+    return values

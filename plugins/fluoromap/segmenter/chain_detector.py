@@ -13,7 +13,7 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import UNSEEN, Acceptance, shows_enough
-from fluoromap.segmenter.bars import follows_bars
+from fluoromap.segmenter.bars import follows_bars, products_beside
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
@@ -363,7 +363,7 @@ class ChainDetector:
         for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
             family = self._family(chain)
             is_seen = chain.scores > UNSEEN
-            if family is None or follows_bars(chain.pixels_uv[is_seen], self._shafts(seen)):
+            if family is None or follows_bars(products_beside(chain.pixels_uv[is_seen], self._shafts(seen))):
                 continue
             onwards = EVEN_ODDS
             own = own[is_seen]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,6 +12,7 @@ from scipy import ndimage
 from skimage.measure import points_in_poly
 
 from fluoromap.contracts import Array, BoolArray, FrameSource, IntArray, PixelFacts, Shutter
+from fluoromap.segmenter.burnt_in import burnt_in_text
 from fluoromap.segmenter.collimator import within_collimator
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
@@ -33,7 +35,7 @@ class FieldMask:
 
     inside : the eroded field; candidates : pixels where electrodes may lie; with_edge : the same and those near the edge;
     all (rows, columns).
-    outside, nearest : flat indices of the pixels outside and, for each, of the nearest pixel inside.
+    outside, nearest : flat indices of the pixels outside the field or on burnt-in text and, for each, of the nearest other pixel.
     mean_level : mean stored grey level inside, over the sampled frames.
     """
 
@@ -45,9 +47,9 @@ class FieldMask:
     mean_level: float
 
     def fill(self, x: Image) -> Image:
-        """Overwrite the pixels outside the field by their nearest inside values, in place.
+        """Overwrite the pixels outside the field and on text, in place.
 
-        Without this the filters respond to the edge of the collimator.
+        Each gets the nearest value inside. Without this the filters respond to the edge of the collimator and to letters.
         """
         if self.outside.size:
             flat = x.reshape(-1)
@@ -61,9 +63,13 @@ def find_field(frames: FrameSource, facts: PixelFacts) -> FieldMask:
     Shutter attributes are used where the header has them. Otherwise the median of at most 9 evenly spaced frames is cut
     at 6 % of its bright level, and at straight and circular collimator edges that are fitted to it. A grey level alone
     either keeps the penumbra of the collimator or removes dark parts of the patient. The field is eroded by 10 px. All
-    steps use half the size.
+    steps use half the size. Burnt-in text is filled before: beyond the collimator's edge it is as bright as the field.
     """
-    median = _median_of_samples(frames)
+    samples = [frames[index] for index in evenly_spaced_frames(len(frames), _MEDIAN_OF)]
+    text = reduce_by(burnt_in_text(samples).astype(np.float32), 2) > 0
+    median = _median(samples)
+    if text.any():
+        median = median[tuple(_nearest_place(text))]
     if facts.shutter is not None:
         v, u = 2.0 * np.mgrid[0 : median.shape[0], 0 : median.shape[1]] + 0.5
         field = inside_shutter(facts.shutter, u, v)
@@ -73,7 +79,7 @@ def find_field(frames: FrameSource, facts: PixelFacts) -> FieldMask:
     field = _largest_part(field)
     if np.count_nonzero(field) < 0.02 * field.size:
         field = np.ones(median.shape, dtype=np.bool_)
-    return _build_mask(field, median, frames.shape)
+    return _build_mask(field, text, median, frames.shape)
 
 
 def evenly_spaced_frames(count: int, most: int = _SAMPLES) -> list[int]:
@@ -118,12 +124,17 @@ def bright_region(median: Image) -> BoolArray:
     return _largest_part(smooth > _DARK * np.percentile(smooth, 95))
 
 
-def _median_of_samples(frames: FrameSource) -> Image:
-    chosen = evenly_spaced_frames(len(frames), _MEDIAN_OF)
-    stack = np.stack([reduce_by(frames[index].astype(np.float32), 2) for index in chosen], axis=2)
+def _median(samples: Sequence[NDArray[np.generic]]) -> Image:
+    stack = np.stack([reduce_by(frame.astype(np.float32), 2) for frame in samples], axis=2)
     stack.sort(axis=2)
-    median: Image = stack[:, :, len(chosen) // 2].copy()
+    median: Image = stack[:, :, len(samples) // 2].copy()
     return median
+
+
+def _nearest_place(hidden: BoolArray) -> IntArray:
+    """Return row and column of the nearest pixel that is not hidden, (2, rows, columns)."""
+    nearest = ndimage.distance_transform_edt(hidden, return_distances=False, return_indices=True)
+    return np.asarray(nearest, np.int64)
 
 
 def _largest_part(field: BoolArray) -> BoolArray:
@@ -136,7 +147,7 @@ def _largest_part(field: BoolArray) -> BoolArray:
     return filled
 
 
-def _build_mask(half: BoolArray, median: Image, shape: tuple[int, int]) -> FieldMask:
+def _build_mask(half: BoolArray, text: BoolArray, median: Image, shape: tuple[int, int]) -> FieldMask:
     inside = half
     if not half.all():  # the distance transform needs a background
         eroded = ndimage.distance_transform_edt(np.pad(half, 1, mode="edge"))[1:-1, 1:-1] > 0.5 * _ERODE_PX
@@ -144,14 +155,15 @@ def _build_mask(half: BoolArray, median: Image, shape: tuple[int, int]) -> Field
     # A candidate also needs a margin to the border of the image: half an electrode cannot be located.
     to_edge = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
     candidates, with_edge = (
-        _double_size(to_edge > 0.5 * min(margin, min(shape) // 8), shape) for margin in (MARGIN_PX, EDGE_PX)
+        _double_size((to_edge > 0.5 * min(margin, min(shape) // 8)) & ~text, shape) for margin in (MARGIN_PX, EDGE_PX)
     )
     whole = _double_size(inside, shape)
-    outside = np.flatnonzero(~whole)
+    hidden = ~inside | text
+    outside = np.flatnonzero(_double_size(hidden, shape))
     nearest = np.zeros(0, dtype=np.int64)
     if outside.size:
-        v, u = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        nearest = _double_size(2 * (v.astype(np.int64) * shape[1] + u), shape).ravel()[outside]
+        v, u = _nearest_place(hidden)
+        nearest = _double_size(2 * (v * shape[1] + u), shape).ravel()[outside]
     return FieldMask(whole, candidates, with_edge, outside, nearest, float(median[inside].mean()))
 
 

@@ -14,9 +14,12 @@ import numpy as np
 
 from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN, middle_score
+from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
+from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import log_odds
@@ -28,6 +31,7 @@ _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
+_SMOOTH_PX = 1.0
 _LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
 """Log-odds of the middle electrode, on average over the pictures; of the worst electrode."""
 _LEAST_WHERE_CLEAR = -1.07
@@ -44,9 +48,15 @@ _CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 @dataclass(frozen=True, eq=False)
 class SectionOdds:
-    """The log-odds (n,) of the electrodes of a part of a track, in the mean of some frames."""
+    """The evidence for a part of a track, in the mean of some frames.
+
+    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
+    distances.
+    """
 
     log_odds: Array
+    beside: Array
+    across: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -75,30 +85,41 @@ class TrackEvidence:
         if np.count_nonzero(inside) < LEAST_VISIBLE:
             return False
 
-        def odds_in(picture: IntArray) -> Array:
+        def sections_in(picture: IntArray) -> list[SectionOdds]:
             averaged = [frames[index] for index in picture]
 
-            def odds_along(path_uv: Array) -> Array:
+            def section_along(path_uv: Array) -> SectionOdds:
                 def compute() -> SectionOdds:
-                    return SectionOdds(self.log_odds_along(averaged, path_uv, log_image))
+                    return self.evidence_along(averaged, path_uv, log_image)
 
-                return recall(SectionOdds, (tuple(averaged), path_uv), compute).log_odds
+                return recall(SectionOdds, (tuple(averaged), path_uv), compute)
 
-            odds: Array = np.concatenate([odds_along(part) for part in _sections(paths[picture])])[inside]
+            return [section_along(part) for part in _sections(paths[picture])]
+
+        def odds_of(sections: Sequence[SectionOdds]) -> Array:
+            odds: Array = np.concatenate([section.log_odds for section in sections])[inside]
             return odds
 
-        odds = np.array([odds_in(picture) for picture in _first_and_last(len(frames))])
+        pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
+        if _is_probe(pictures):
+            return False
+        odds = np.array([odds_of(sections) for sections in pictures])
         middle = np.median(odds, axis=1)
         if len(usual) >= MANY_ELECTRODES:
-            return bool(middle.mean() >= _LEAST_LONG or np.median(odds_in(_all_along(len(frames)))) >= _LEAST_LONG)
+            return bool(
+                middle.mean() >= _LEAST_LONG or np.median(odds_of(sections_in(_all_along(len(frames))))) >= _LEAST_LONG
+            )
         if sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames:
             shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
         else:
             shown = bool(middle.mean() >= _LEAST_MEDIAN)
         return shown and _are_electrodes(odds.mean(axis=0))
 
-    def log_odds_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> Array:
-        """Return the log-odds of electrodes in the mean of these frames, moved along ``path_uv`` (frames, electrodes, 2)."""
+    def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
+        """Return the evidence for electrodes in the mean of these frames.
+
+        The frames are moved along ``path_uv`` (frames, electrodes, 2).
+        """
         scale = network_scale(self.px_per_mm)
         middle = path_uv[len(frames) // 2]
         first = np.floor(middle.min(axis=0) - _MARGIN_PX / scale)
@@ -111,7 +132,10 @@ class TrackEvidence:
             add_moved(small, turn, offset, total)
         total /= len(frames)
         seen = NetworkResponse.of_reduced(total, self.trained, scale)
-        return log_odds(seen.probability_at(middle - first))
+        shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
+        chain_uv = (middle - first + 0.5) * scale - 0.5
+        beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
+        return SectionOdds(log_odds(seen.probability_at(middle - first)), beside, across)
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
@@ -121,6 +145,16 @@ class TrackEvidence:
             if len(self._reduced) > _KEPT_FRAMES:
                 self._reduced.popitem(last=False)
         return small
+
+
+def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
+    """Return whether pictures of a track show an echo probe.
+
+    Each picture has sections.
+    """
+    beside = np.sum([np.concatenate([section.beside for section in sections], axis=2) for sections in pictures], axis=0)
+    across = np.sum([np.concatenate([section.across for section in sections], axis=2) for sections in pictures], axis=0)
+    return follows_bars(beside) or has_other_wall(across)
 
 
 def _are_electrodes(odds: Array) -> bool:

@@ -11,7 +11,7 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
+from fluoromap.segmenter.learned_chain.track_evidence import SectionOdds, TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.log_image import LogTransform
 
@@ -44,13 +44,18 @@ def chains(path_uv):
     }
 
 
+def evidence(odds):
+    """Return the evidence of log-odds (n,) for electrodes with nothing beside them."""
+    return SectionOdds(odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)))
+
+
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
     trained = read_weights(Path(SHIPPED))
     judge = TrackEvidence(trained, PX_PER_MM, FRAMES)
     alone = [NetworkResponse.of_image(image, trained, PX_PER_MM) for image in images]
     for path_uv in noisy.truth.pixels_uv.values():
         assert judge(chains(path_uv), lambda frame: images[frame])
-        odds = judge.log_odds_along(list(range(FRAMES)), path_uv, lambda frame: images[frame])
+        odds = judge.evidence_along(list(range(FRAMES)), path_uv, lambda frame: images[frame]).log_odds
         single = [np.median(seen.probability_at(points)) for seen, points in zip(alone, path_uv, strict=True)]
         assert 1.0 / (1.0 + np.exp(-np.median(odds))) > np.median(single)
 
@@ -95,9 +100,9 @@ def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
 
     def along(self, frames, path_uv, log_image):
-        return np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -4.0)
+        return evidence(np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -4.0))
 
-    monkeypatch.setattr(TrackEvidence, "log_odds_along", along)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     doubted = np.full(electrodes, 0.3)
     known = chains(np.repeat(row[None], FRAMES, axis=0))
@@ -109,9 +114,11 @@ def test_electrodes_outside_the_field_do_not_count(monkeypatch):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
     row = np.stack([-10.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     known = chains(np.repeat(row[None], FRAMES, axis=0))
-    monkeypatch.setattr(
-        TrackEvidence, "log_odds_along", lambda self, frames, path_uv, log_image: np.where(path_uv[0, :, 0] > 0, 1, -9)
-    )
+
+    def along(self, frames, path_uv, log_image):
+        return evidence(np.where(path_uv[0, :, 0] > 0, 1, -9))
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     for outside, accepted in ((1, True), (2, False)):
         scores = np.where(np.arange(4) < outside, UNSEEN, 0.3)
         track = {frame: replace(chain, scores=scores) for frame, chain in known.items()}
@@ -126,8 +133,22 @@ def test_a_long_catheter_at_rest_over_anatomy_is_judged_by_frames_all_along_its_
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, 2 * FRAMES)
 
     def along(self, frames, path_uv, log_image):
-        return np.full(path_uv.shape[1], 0.5 if np.ptp(frames) > FRAMES else -1.5)
+        return evidence(np.full(path_uv.shape[1], 0.5 if np.ptp(frames) > FRAMES else -1.5))
 
-    monkeypatch.setattr(TrackEvidence, "log_odds_along", along)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None) == accepted
+
+
+@pytest.mark.parametrize("lines", ["beside", "across"])
+def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    known = chains(np.repeat(row[None], FRAMES, axis=0))
+    nothing = evidence(np.full(4, 3.0))
+    bars = np.zeros(getattr(nothing, lines).shape)
+    bars[0] = 0.6, 1.0, 1.0
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: replace(nothing, **{lines: bars}))
+    assert not judge(known, lambda frame: None)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: nothing)
+    assert judge(known, lambda frame: None)
