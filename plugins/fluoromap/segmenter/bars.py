@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import ndimage
+from numba import njit
 
 from fluoromap.contracts import Array
 from fluoromap.segmenter.linking import ShaftImage
 
-_STEP_MM, _BEYOND_MM, _AHEAD_MM, _ANATOMY_MM = 0.25, 2.0, 2.0, 6.0
+_STEP_MM, _BEYOND_MM, _AHEAD_MM = 0.25, 2.0, 2.0
+_MARGIN = 12
+"""Samples before and after each other one whose mean is anatomy: together 6 mm."""
 BESIDE_MM, ACROSS_MM = np.linspace(2.0, 4.5, 6), np.linspace(5.0, 9.0, 9)
 """Distances of lines from a chain: those on the bars, and those that may lie on the other wall of a probe."""
 _LEAST_CORRELATION, _LEAST_SHARE, _LEAST_SHARE_ACROSS = 0.45, 0.3, 0.35
@@ -36,32 +38,75 @@ def products_beside(chain_uv: Array, shaft_image: ShaftImage, beside_mm: Array =
         products of several pictures add.
     """
     px_per_mm = shaft_image.px_per_mm
-    ways = np.diff(chain_uv, axis=0)
-    lengths = np.maximum(np.linalg.norm(ways, axis=1), _TINY)
-    reach = _BEYOND_MM + 0.5 * _ANATOMY_MM + _AHEAD_MM
-    first, last = (
-        reach * px_per_mm * way / length for way, length in zip(ways[[0, -1]], lengths[[0, -1]], strict=True)
-    )
-    corners = np.concatenate([chain_uv[:1] - first, chain_uv, chain_uv[-1:] + last])
-    places_mm = np.concatenate([[0.0], np.cumsum(lengths)]) / px_per_mm
-    corners_mm = np.concatenate([[-reach], places_mm, [places_mm[-1] + reach]])
-    margin = round(0.5 * _ANATOMY_MM / _STEP_MM)
-    count = math.ceil((places_mm[-1] + 2 * _BEYOND_MM) / _STEP_MM) + 1
-    at_mm = _STEP_MM * np.arange(-margin, count + margin) - _BEYOND_MM
-    ways_mm = np.stack([at_mm, at_mm + _AHEAD_MM, at_mm - _AHEAD_MM])
-    line, after, before = np.stack([np.interp(ways_mm, corners_mm, axis) for axis in corners.T], axis=-1)
-    ahead = after - before
-    ahead *= px_per_mm / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), _TINY)
-    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+    ways = chain_uv[1:] - chain_uv[:-1]
+    lengths = np.maximum(np.sqrt((ways * ways).sum(axis=1)), _TINY)
+    reach = _BEYOND_MM + _MARGIN * _STEP_MM + _AHEAD_MM
+    first, last = (reach * px_per_mm / lengths[end] * ways[end] for end in (0, -1))
+    corners_uv = np.concatenate([chain_uv[:1] - first, chain_uv, chain_uv[-1:] + last])
+    corners_mm = np.cumsum(np.concatenate([[-reach, reach], lengths / px_per_mm, [reach]]))
+    samples = math.ceil((corners_mm[-2] + 2 * _BEYOND_MM) / _STEP_MM) + 1 + 2 * _MARGIN
     offsets_mm = np.concatenate([[0.0], beside_mm, -beside_mm])
-    depths = _values(line + offsets_mm[:, None, None] * across, shaft_image)
-    depths -= ndimage.uniform_filter1d(depths, 2 * margin + 1, axis=1)
-    depths, at_mm = depths[:, margin:-margin], at_mm[margin:-margin]
-    own, beside = depths[:1], depths[1:]
-    squares = np.stack([beside * own, np.broadcast_to(own * own, beside.shape), beside * beside], axis=-1)
-    is_nearest = np.abs(at_mm[:, None] - places_mm).argmin(axis=1)[:, None] == np.arange(len(places_mm))
-    products: Array = np.einsum("lnp,ne->lep", squares, is_nearest)
-    return products.reshape(2, len(beside_mm), len(places_mm), 3)
+    products: Array = np.zeros((2, len(beside_mm), len(chain_uv), 3))
+    _add_products(
+        shaft_image.smooth, 1.0 / shaft_image.reduction, px_per_mm, corners_uv, corners_mm, offsets_mm,
+        np.empty((len(offsets_mm), samples)), products.reshape(-1, len(chain_uv), 3),
+    )  # fmt: skip
+    return products
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_products(smooth, scale, px_per_mm, corners_uv, corners_mm, offsets_mm, depths, products):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the products of :func:`products_beside`, (lines, electrodes, 3).
+
+    The chain is the line through the corners; all corners but the first and the last are electrodes. offsets_mm : how far beside
+    the chain the lines are; the first is the chain's own. depths : (lines + 1, samples) the picture along the lines, overwritten.
+    """
+    last_u, last_v = smooth.shape[1] - 1.0, smooth.shape[0] - 1.0
+    lines, samples = depths.shape
+    for i in range(samples):
+        u = v = ahead_u = ahead_v = 0.0
+        for end in range(-1, 2):
+            mm = (i - _MARGIN) * _STEP_MM - _BEYOND_MM + end * _AHEAD_MM
+            corner = 0
+            while corner < corners_mm.size - 2 and corners_mm[corner + 1] < mm:
+                corner += 1
+            share = (mm - corners_mm[corner]) / max(corners_mm[corner + 1] - corners_mm[corner], _TINY)
+            share = min(max(share, 0.0), 1.0)
+            at_u = corners_uv[corner, 0] + share * (corners_uv[corner + 1, 0] - corners_uv[corner, 0])
+            at_v = corners_uv[corner, 1] + share * (corners_uv[corner + 1, 1] - corners_uv[corner, 1])
+            ahead_u += end * at_u
+            ahead_v += end * at_v
+            if end == 0:
+                u, v = at_u, at_v
+        stretch = px_per_mm / max(math.sqrt(ahead_u * ahead_u + ahead_v * ahead_v), _TINY)
+        for line in range(lines):
+            across = stretch * offsets_mm[line]
+            x = min(max((u - across * ahead_v + 0.5) * scale - 0.5, 0.0), last_u)
+            y = min(max((v + across * ahead_u + 0.5) * scale - 0.5, 0.0), last_v)
+            left, top = int(x), int(y)
+            right, below = min(left + 1, smooth.shape[1] - 1), min(top + 1, smooth.shape[0] - 1)
+            upper = smooth[top, left] + (x - left) * (smooth[top, right] - smooth[top, left])
+            lower = smooth[below, left] + (x - left) * (smooth[below, right] - smooth[below, left])
+            depths[line, i] = upper + (y - top) * (lower - upper)
+    window = 2 * _MARGIN + 1
+    own = np.zeros(samples)
+    for line in range(lines):
+        electrode, anatomy = 0, 0.0
+        for i in range(window - 1):
+            anatomy += depths[line, i]
+        for i in range(_MARGIN, samples - _MARGIN):
+            anatomy += depths[line, i + _MARGIN]
+            depth = depths[line, i] - anatomy / window
+            anatomy -= depths[line, i - _MARGIN]
+            if line == 0:
+                own[i] = depth
+                continue
+            mm = (i - _MARGIN) * _STEP_MM - _BEYOND_MM
+            while electrode < corners_mm.size - 3 and corners_mm[electrode + 2] - mm < mm - corners_mm[electrode + 1]:
+                electrode += 1
+            products[line - 1, electrode, 0] += depth * own[i]
+            products[line - 1, electrode, 1] += own[i] * own[i]
+            products[line - 1, electrode, 2] += depth * depth
 
 
 def follows_bars(products: Array) -> bool:
@@ -100,10 +145,3 @@ def _without_each(products: Array) -> tuple[Array, Array]:
     """Return correlations and shares of contrast without each of the electrodes, (2, lines, electrodes)."""
     shared, own, beside = np.moveaxis(products.sum(axis=2, keepdims=True) - products, -1, 0)
     return shared / np.sqrt(np.maximum(own * beside, _TINY)), shared / np.maximum(own, _TINY)
-
-
-def _values(points_uv: Array, shaft_image: ShaftImage) -> Array:
-    """Return the smooth image at points (..., 2), pixels of the frame."""
-    u, v = np.moveaxis((points_uv + 0.5) / shaft_image.reduction - 0.5, -1, 0)
-    values: Array = ndimage.map_coordinates(shaft_image.smooth, [v, u], np.float64, order=1, mode="nearest")
-    return values
