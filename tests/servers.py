@@ -32,7 +32,7 @@ from redis import Redis
 
 START_SECONDS = 60
 _SSL_REQUEST = bytes([0, 0, 0, 8, 4, 210, 22, 47])
-"""PostgreSQL's request for encryption; the server answers it with one byte as soon as it accepts connections."""
+"""PostgreSQL's request for encryption; the server answers it with one byte as soon as its port is open."""
 _ATTEMPTS = 3
 
 
@@ -129,7 +129,9 @@ def _start_postgresql(folder: Path) -> tuple[str, dict[str, Any]]:
         return [programs / "postgres", "-D", data, "-p", str(port), *(f"-c{option}" for option in options)]
 
     port, server = _launch(launch, _SSL_REQUEST, home, environment, as_user)
-    return f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres", server
+    url = f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres"
+    _wait_until(lambda: _accepts(url), "the test server postgresql did not start in time; try its command by hand")
+    return url, server
 
 
 def _start_redis(folder: Path) -> tuple[str, dict[str, Any]]:
@@ -179,6 +181,17 @@ def _answers(port: int, greeting: bytes) -> bool:
     with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5) as connection:
         connection.sendall(greeting)
         return bool(connection.recv(1))
+    return False
+
+
+def _accepts(url: str) -> bool:
+    """Return whether PostgreSQL accepts a session.
+
+    It answers its first bytes before it has started.
+    """
+    server = sqlalchemy.create_engine(url, poolclass=sqlalchemy.NullPool)
+    with suppress(sqlalchemy.exc.OperationalError), server.connect():
+        return True
     return False
 
 

@@ -52,7 +52,11 @@ def test_from_upload_over_a_correction_to_the_mesh(
     page.locator(".view[data-view=a][data-frames]").wait_for()
     shown = page.request.get(f"{study}/sites/{site}").json()
     frames = page.request.get(f"{study}/instances/{shown['view_a']}/electrodes").json()
-    frame = next(each for each in frames if any(e["catheter"] == "mapping" for e in each["electrodes"]))
+    # In the frame that the map uses, so that the correction moves the site.
+    job = page.request.get(f"/v1/jobs?study={study.split('/')[-1]}").json()["items"][0]["id"]
+    overlays = page.request.get(f"/v1/jobs/{job}/overlays").json()["overlays"]
+    used = next(each["frame"] for each in overlays if (each["site"], each["view"]) == (site, "a"))
+    frame = next(each for each in frames if each["frame"] == used)
     tip = next(e for e in frame["electrodes"] if e["catheter"] == "mapping" and e["electrode"] == 1)
     page.get_by_label("Frame of view a").fill(str(frame["frame"]))
     drag_pixel(page, "a", (tip["u_px"], tip["v_px"]), (tip["u_px"] + 10, tip["v_px"] + 8))
