@@ -2,6 +2,7 @@ import io
 
 import numpy as np
 import pytest
+from frame_sources import Frames
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
@@ -14,20 +15,6 @@ from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 FACTS = PixelFacts(True, 8, False)
 LIKE_ELECTRODES = {(60, 60): "ID 0012345", (60, 90): "o o o o", (250, 380): "H H E E F F", (80, 300): "LIH 11.1.19"}
 LINES = {(12, 12): "LAO 30 CRAN 12", (300, 400): "F 15/s  74 kV 8 mA", (40, 420): "ID 001234"}
-
-
-class Frames:
-    def __init__(self, frames):
-        self.frames, self.shape = frames, frames[0].shape
-
-    def __len__(self):
-        return len(self.frames)
-
-    def __getitem__(self, index):
-        return self.frames[index]
-
-    def __iter__(self):
-        return iter(self.frames)
 
 
 def anatomy(frames, noise=8.0):
