@@ -22,12 +22,14 @@ A foreshortened catheter has a smaller ratio, a catheter nearer to the source a 
 _END_SLACK = 0.55, 1.1
 _SPREAD = 0.6
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
+_MANY_SPACINGS, _MOST_CURVED_PER_MM, _MOST_BENT = 5, 0.25, 1.6
+"""A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""
 _PARTIAL = 1500
 _GROWN = 60000
 _MOST_TRIES = 300000
 
 
-def find_paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
+def find_paths(points: Array, weights: Array, spacing_px: Array, px_per_mm: float) -> IntArray:
     """Return all paths with spacings and bends that a catheter can show.
 
     Of each length the search continues with the 1500 paths of the largest weight.
@@ -39,10 +41,11 @@ def find_paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
     """
     kept, ratios = np.empty((len(points), len(spacing_px) + 1), np.int64), np.empty((len(points), len(spacing_px)))
     kept[:, 0] = np.arange(len(points))
+    cosines = _least_cosines(spacing_px / px_per_mm)
     for step in range(len(spacing_px)):
         most = min(len(kept) * len(points), _GROWN)
         longer, more = np.empty((most, kept.shape[1]), np.int64), np.empty((most, ratios.shape[1]))
-        count = _grow(points, spacing_px, step, kept, ratios, longer, more)
+        count = _grow(points, spacing_px, step, cosines[step], kept, ratios, longer, more)
         kept, ratios = longer[:count], more[:count]
         if count > _PARTIAL:
             values = weights[kept[:, : step + 2]].sum(axis=1)
@@ -53,8 +56,17 @@ def find_paths(points: Array, weights: Array, spacing_px: Array) -> IntArray:
     return possible
 
 
+def _least_cosines(spacing_mm: Array) -> Array:
+    """Return the cosine of the largest bend at the first electrode of each gap, (gaps,)."""
+    least = np.full(len(spacing_mm), _LEAST_COSINE)
+    if len(spacing_mm) >= _MANY_SPACINGS:
+        bends = _MOST_CURVED_PER_MM * 0.5 * (spacing_mm[:-1] + spacing_mm[1:])
+        least[1:] = np.minimum(least[1:], np.cos(np.minimum(bends, _MOST_BENT)))
+    return least
+
+
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _grow(points, spacing_px, step, least_cosine, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write all paths with one more electrode; return their number.
 
     Their spacing ratios are written too.
@@ -70,7 +82,7 @@ def _grow(points, spacing_px, step, kept, ratios, longer, more):  # type: ignore
             bu = points[last, 0] - points[kept[row, step - 1], 0]
             bv = points[last, 1] - points[kept[row, step - 1], 1]
             before = spacing_px[step - 1]
-        straight = _LEAST_COSINE * math.sqrt(bu * bu + bv * bv)
+        straight = least_cosine * math.sqrt(bu * bu + bv * bv)
         for i in range(points.shape[0]):
             du = points[i, 0] - points[last, 0]
             dv = points[i, 1] - points[last, 1]

@@ -206,7 +206,7 @@ def possible_chains(
         if len(points) >= family.catheter.electrodes:
             spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
             searched = sure if completed else len(points)
-            paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px)
+            paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px, shaft_image.px_per_mm)
             if completed:
                 paths = np.concatenate([paths, completed[index]])
             scores = chain_scores.score_paths(

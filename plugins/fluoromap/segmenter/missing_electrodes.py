@@ -129,7 +129,7 @@ def _incomplete_chains(
     elif electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1:
         for number in range(electrodes):
             arc_mm = np.delete(catheter.arc_lengths_mm, number)
-            paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm)
+            paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm, px_per_mm)
             found.append(_IncompleteChains(paths, np.array([number]), _curve_weights(catheter, number) @ points[paths]))
     return found
 
