@@ -254,7 +254,7 @@ class ChainDetector:
         )
         possible = self._without_shorter_catheters(possible, completed.points_uv, seen, families)
         possible = _with_enough_places(possible, len(points) - halves, halves)
-        linked = best_chains(possible, completed.points_uv, families, self.px_per_mm)
+        linked = best_chains(possible, completed.points_uv, families, self.px_per_mm, len(points))
         return _Linking(completed.points_uv, len(points), possible, linked)
 
     def _without_shorter_catheters(
@@ -345,7 +345,7 @@ class ChainDetector:
                     good[(rows == np.array(chain.candidates)).all(axis=1)] = chain in result.candidates
             allowed.append(good)
         possible = linking.possible.where(allowed)
-        chains = best_chains(possible, linking.points_uv, families, self.px_per_mm)
+        chains = best_chains(possible, linking.points_uv, families, self.px_per_mm, linking.proposed)
         return replace(linking, possible=possible, chains=chains)
 
     def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:

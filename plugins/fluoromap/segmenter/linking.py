@@ -156,7 +156,7 @@ def link_candidates(
     See :func:`possible_chains` for the parameters and :func:`best_chains` for the set.
     """
     possible = possible_chains(points_uv, weights, variance_px2, shaft_image, families, sure, slack, completed)
-    return best_chains(possible, points_uv, families, shaft_image.px_per_mm)
+    return best_chains(possible, points_uv, families, shaft_image.px_per_mm, sure)
 
 
 def possible_chains(
@@ -220,12 +220,17 @@ def possible_chains(
 
 
 def best_chains(
-    possible: PossibleChains, points_uv: Array, families: Sequence[CatheterFamily], px_per_mm: float
+    possible: PossibleChains,
+    points_uv: Array,
+    families: Sequence[CatheterFamily],
+    px_per_mm: float,
+    sure: int | None = None,
 ) -> tuple[CandidateChain, ...]:
     """Return the best set of these chains, best first.
 
     The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
-    weaker catheter is not dropped, nor a part of a long one preferred. Crossing catheters may share one candidate at a
+    weaker catheter is not dropped, nor a part of a long one preferred. Only the first ``sure`` candidates add to it so, all by
+    default: a chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain. Crossing catheters may share one candidate at a
     price, but two chains must not lie at the same place. A set has at most as many chains of a family as the catalogue
     has catheters.
     """
@@ -234,7 +239,7 @@ def best_chains(
     most = max(_LEAST_OF_FAMILY, _BEST // len(families))
     likely = possible.where([np.isfinite(scores) for scores in possible.scores])
     compared = [np.argsort(-scores, kind="stable")[:most] for scores in likely.scores]
-    chosen = _best_set(likely, compared, points, families, px_per_mm)
+    chosen = _best_set(likely, compared, points, families, px_per_mm, sure)
     # Nor must parts of a long catheter crowd out another one of their own family, which lies elsewhere.
     for _ in range(len(families)):
         if len(chosen) in (0, sum(len(family.names) for family in families)):
@@ -248,7 +253,7 @@ def best_chains(
             of_family = [chain.candidates for chain in chosen if chain.family == index]
             own = [np.flatnonzero((paths == np.array(candidates)).all(axis=1))[:1] for candidates in of_family]
             compared.append(np.concatenate([*own, elsewhere[np.argsort(-scores[elsewhere], kind="stable")[:most]]]))
-        more = _best_set(likely, compared, points, families, px_per_mm)
+        more = _best_set(likely, compared, points, families, px_per_mm, sure)
         if len(more) <= len(chosen):
             break
         chosen = more
@@ -261,6 +266,7 @@ def _best_set(
     points: Array,
     families: Sequence[CatheterFamily],
     px_per_mm: float,
+    sure: int | None,
 ) -> tuple[CandidateChain, ...]:
     """Return the best set of some chains, best first.
 
@@ -274,7 +280,9 @@ def _best_set(
     within = np.full((len(scores), longest), -1, np.int64)
     for index, (rows, paths) in enumerate(zip(compared, possible.rows, strict=True)):
         within[family == index, : paths.shape[1]] = paths[rows]
-    values = scores + np.array([each.worth for each in families])[family]
+    of_each = np.array([each.worth / each.catheter.electrodes for each in families])[family]
+    counted = within >= 0 if sure is None else (within >= 0) & (within < sure)
+    values = scores + of_each * counted.sum(axis=1)
     order = np.argsort(-values, kind="stable")
     within, family, scores = within[order], family[order], scores[order]
     chosen = chain_search.best_set(
