@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fluoromap.contracts import Array, IntArray
+from fluoromap.contracts import Array, BoolArray, IntArray
 
 SHORTEST, LONGEST = 0.35, 1.12
 """Limits of the ratio between the spacing in the image and the same spacing across the rays at the isocentre.
@@ -24,6 +24,8 @@ _SPREAD = 0.6
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
 _MANY_SPACINGS, _MOST_CURVED_PER_MM, _MOST_BENT = 5, 0.25, 1.6
 """A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""
+_MANY_ELECTRODES, _INTERLEAVED, _IN_LINE = 6, 2, 0.55
+"""Chains can take turns only where the catalogue has a catheter of many electrodes."""
 _PARTIAL = 1500
 _GROWN = 60000
 _MOST_TRIES = 300000
@@ -112,7 +114,8 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     """Return how many candidates each two chains have in common, (n, n).
 
     ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may
-    give two candidates. Rows of ``chosen`` are filled up with -1.
+    give two candidates. So it is where two or more electrodes of one chain lie between those of the other: one of several chains
+    that take turns along a catheter with more electrodes. Rows of ``chosen`` are filled up with -1.
     """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)
@@ -122,9 +125,25 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     square = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
     near = (member @ (square < near_px * near_px).astype(np.float32) > 0).astype(np.float32)
     close = member @ near.T >= most
+    if chosen.shape[1] >= _MANY_ELECTRODES:
+        between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
+        close |= between.astype(np.float32) @ member.T >= _INTERLEAVED
     common: IntArray = (member @ member.T).astype(np.int64)
     common[close | close.T] += most
     return common
+
+
+def _lies_between(chosen: IntArray, points: Array, places: Array, near_px: float) -> BoolArray:
+    """Return which places lie near the line between the first and the last electrode of each chain, (n, places)."""
+    starts, ends = points[chosen[:, :-1]], points[chosen[:, 1:]]
+    is_gap = chosen[:, 1:] >= 0
+    along = ends - starts
+    away = places[:, None, None] - starts
+    share = (away * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
+    beside = away - share[..., None] * along
+    within = (share > 0) & (share < 1) & ((beside * beside).sum(axis=-1) < near_px * near_px) & is_gap
+    lies: BoolArray = within.any(axis=-1).T
+    return lies
 
 
 def best_set(values: Array, shared: IntArray, family: IntArray, capacity: IntArray, price: float) -> IntArray:
