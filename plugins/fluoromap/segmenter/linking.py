@@ -230,9 +230,9 @@ def best_chains(
 
     The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
     weaker catheter is not dropped, nor a part of a long one preferred. Only the first ``sure`` candidates add to it so, all by
-    default: a chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain. Crossing catheters may share one candidate at a
-    price, but two chains must not lie at the same place. A set has at most as many chains of a family as the catalogue
-    has catheters.
+    default: a chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain.
+    Crossing catheters may share one candidate at a price, but two chains must not lie at the same place. A set has at most as
+    many chains of a family as the catalogue has catheters.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
     # A long catheter has many chains that differ in one electrode: they must not crowd out the other families.
