@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from fluoromap.contracts import (
     Array,
     LocatedSite,
-    MatchedSite,
+    MatchedRuns,
     Matching,
     NamedChain,
     Triangulation,
@@ -49,8 +49,8 @@ class LocatedView:
 class MapPlacement:
     """The map in one view of a located site.
 
-    site : of the view, in 3D. matched : its named catheters; None where it has none. tracks_sha256 : hash of the stored tracks of
-    the site; None where it has none.
+    site : of the view, in 3D. matched : its runs with named catheters; None where it has none. tracks_sha256 : hash of the stored
+    tracks of the site; None where it has none.
     """
 
     view: LocatedView
@@ -58,7 +58,7 @@ class MapPlacement:
     triangulation: Triangulation
     snapshot: Snapshot
     site: LocatedSite
-    matched: MatchedSite | None
+    matched: MatchedRuns | None
     tracks_sha256: str | None
 
     @property
@@ -160,7 +160,7 @@ def placement_of(session: Session, job: Job, uid: str) -> MapPlacement:
         raise not_found("overlay: the run is no view of a located site")
     site = next(each for each in triangulation.sites if each.site == view.site)
     matching = load(Matching, done_stage(session, job, "match"))
-    matched = next((each for each in matching.sites if each.site == view.site), None)
+    matched = next((each.runs for each in matching.sites if each.site == view.site), None)
     return MapPlacement(
         view=view,
         finished=finished,
@@ -181,11 +181,11 @@ def _views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView
 
 
 @lru_cache(maxsize=_REMEMBERED_VIEWS)
-def _chains(site: MatchedSite, view: View) -> Mapping[int, Mapping[str, NamedChain]]:
+def _chains(runs: MatchedRuns, view: View) -> Mapping[int, Mapping[str, NamedChain]]:
     """Return the catheters that each frame of the track shows, by name."""
-    # The service remembers the site, so it would keep the decoded tracks of all sites.
-    site = undecoded(site)
-    track = site.track_a if view == "a" else site.track_b
+    # The service remembers the runs, so it would keep the decoded tracks of all sites.
+    runs = undecoded(runs)
+    track = runs.track_a if view == "a" else runs.track_b
     return {each.frame: {chain.catheter: chain for chain in each.chains} for each in track}
 
 
