@@ -15,6 +15,7 @@ from fluoromap.contracts import (
     MatchedRuns,
     Matching,
     NamedChain,
+    Observation,
     Triangulation,
     View,
 )
@@ -73,7 +74,7 @@ class MapPlacement:
         """
         if self.matched is None:
             return {}
-        diastole = getattr(self.matched.diastole, self.view.view)
+        diastole = _diastole(self.matched, self.view.view)
         # The track is long, and most overlays show diastole. The pair has each catheter of the track.
         if frame == diastole.frame:
             return {chain.catheter: chain for chain in diastole.chains}
@@ -178,6 +179,14 @@ def _views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView
         for site in triangulation.sites
         for view in VIEWS
     ]
+
+
+@lru_cache(maxsize=_REMEMBERED_VIEWS)
+def _diastole(runs: MatchedRuns, view: View) -> Observation:
+    """Return the diastolic frame of the pair that located the site."""
+    # The service remembers the runs, so it would keep the arrays of all sites.
+    pair = undecoded(runs).diastole
+    return pair.a if view == "a" else pair.b
 
 
 @lru_cache(maxsize=_REMEMBERED_VIEWS)
