@@ -129,7 +129,9 @@ def _calibration_row(
         sites, truth = still_sites(study, angle_deg, offset_mm, rng)
         located = MaximumLikelihood(UncertaintyParams()).triangulate(sites, catalogue, Silent())
         assert located.calibration is not None
-        header = np.concatenate([triangulate_linear(site.camera_a, site.camera_b, *_pixels(site)) for site in sites])
+        header = np.concatenate(
+            [triangulate_linear(site.runs.camera_a, site.runs.camera_b, *_pixels(site)) for site in sites]
+        )
         found = _positions(located)
         figures.append([
             _rms(header - truth), _rms(_aligned(header, truth) - truth), located.calibration.epipolar_before_px,
