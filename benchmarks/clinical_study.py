@@ -166,8 +166,8 @@ def _pure(folder: Path, spec: StudySpec, segmenter: str) -> dict[str, float]:
             for view in VIEWS:
                 shown_view = MonoplaneView(
                     site=matched.site, view=view, camera=at_site.camera(view), catalogue=DEFAULT_CATALOGUE,
-                    frame_times_ms=getattr(matched, f"frame_times_{view}_ms"),
-                    observations=getattr(matched, f"track_{view}"),
+                    frame_times_ms=getattr(matched.runs, f"frame_times_{view}_ms"),
+                    observations=getattr(matched.runs, f"track_{view}"),
                     a_priori=at_site.a_priori_points, a_priori_frame=at_site.diastolic_frame(view),
                     cycle=at_site.cycle, others=others,
                 )  # fmt: skip

@@ -162,7 +162,7 @@ def point_samples(heart: Heart) -> Iterator[Sample]:
 
 def misidentified(matched: MatchedSite, truth: SimulatedSite, label: tuple[str, int]) -> bool:
     """Return whether a view took something else for this electrode at diastole."""
-    for observation, run in zip((matched.diastole.a, matched.diastole.b), truth.runs, strict=True):
+    for observation, run in zip((matched.runs.diastole.a, matched.runs.diastole.b), truth.runs, strict=True):
         for chain in observation.chains:
             if chain.catheter == label[0] and label[1] in chain.electrodes:
                 pixel = chain.pixels_uv[chain.electrodes.index(label[1])]

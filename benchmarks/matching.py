@@ -253,8 +253,8 @@ def _score_pairs(result: Score, matching: Matching, study: Study, offered: Mappi
     number = {runs.site: index for index, runs in enumerate(study.sites)}
     for site in matching.sites:
         pixels = study.pixels[number[site.site]]
-        shown = _true_names(site.diastole, pixels)
-        other = None if site.alternative is None else _true_names(site.alternative.diastole, pixels)
+        shown = _true_names(site.runs.diastole, pixels)
+        other = None if site.runs.alternative is None else _true_names(site.runs.alternative.diastole, pixels)
         wrong_here = False
         for name in NAMES:
             true = shown.get(name)
@@ -276,7 +276,7 @@ def _score_pairs(result: Score, matching: Matching, study: Study, offered: Mappi
                 wrong_here = True
                 result.kept += other is not None and other.get(name, ("", ""))[0] == other.get(name, ("", "."))[1]
             result.flagged += noted
-        result.stated.append((0.0 if site.alternative is None else site.alternative.probability, wrong_here))
+        result.stated.append((0.0 if site.runs.alternative is None else site.runs.alternative.probability, wrong_here))
 
 
 def _true_names(pair: PhasePair, pixels: tuple[Truth, Truth]) -> dict[str, tuple[str, str]]:

@@ -118,7 +118,7 @@ def score_study(conditions: Conditions) -> StudyScore:
 def misnamed_catheters(matched: MatchedSite, truth: ClinicalSite) -> frozenset[str]:
     """Return the names that either view gave to another catheter at diastole."""
     wrong = set()
-    for observation, run in zip((matched.diastole.a, matched.diastole.b), truth.runs, strict=True):
+    for observation, run in zip((matched.runs.diastole.a, matched.runs.diastole.b), truth.runs, strict=True):
         for chain in observation.chains:
             place = run.pixels_uv[chain.catheter][observation.frame][[number - 1 for number in chain.electrodes]]
             if np.linalg.norm(chain.pixels_uv - place, axis=1).max() > 3 * NEAR_PX:
@@ -234,8 +234,8 @@ def monoplane_view(
         view=name,
         camera=site.camera_b if view else site.camera_a,
         catalogue=study.catalogue,
-        frame_times_ms=matched.frame_times_b_ms if view else matched.frame_times_a_ms,
-        observations=matched.track_b if view else matched.track_a,
+        frame_times_ms=matched.runs.frame_times_b_ms if view else matched.runs.frame_times_a_ms,
+        observations=matched.runs.track_b if view else matched.runs.track_a,
         a_priori=site.a_priori_points,
         a_priori_frame=site.frame_b if view else site.frame_a,
         cycle=site.cycle,

@@ -77,8 +77,8 @@ def _tracks(matching: Matching, triangulation: Triangulation) -> list[SiteTracks
                 view=view,  # type: ignore[arg-type]
                 camera=getattr(site, f"camera_{view}"),
                 catalogue=DEFAULT_CATALOGUE,
-                frame_times_ms=getattr(matched, f"frame_times_{view}_ms"),
-                observations=getattr(matched, f"track_{view}"),
+                frame_times_ms=getattr(matched.runs, f"frame_times_{view}_ms"),
+                observations=getattr(matched.runs, f"track_{view}"),
                 a_priori=site.a_priori_points,
                 a_priori_frame=getattr(site, f"frame_{view}"),
                 cycle=site.cycle,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
-from fluoromap.contracts import MatchedSite, NamedChain, Observation, PhasePair, Silent, Triangulation
+from fluoromap.contracts import MatchedRuns, MatchedSite, NamedChain, Observation, PhasePair, Silent, Triangulation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.matching.two_view import triangulate_linear
 from fluoromap.phantom import FRONTAL, LATERAL, SimulatedStudy, StudySpec, simulate_study
@@ -129,7 +129,9 @@ def _calibration_row(
         sites, truth = still_sites(study, angle_deg, offset_mm, rng)
         located = MaximumLikelihood(UncertaintyParams()).triangulate(sites, catalogue, Silent())
         assert located.calibration is not None
-        header = np.concatenate([triangulate_linear(site.camera_a, site.camera_b, *_pixels(site)) for site in sites])
+        header = np.concatenate(
+            [triangulate_linear(site.runs.camera_a, site.runs.camera_b, *_pixels(site)) for site in sites]
+        )
         found = _positions(located)
         figures.append([
             _rms(header - truth), _rms(_aligned(header, truth) - truth), located.calibration.epipolar_before_px,
@@ -157,7 +159,8 @@ def still_sites(
     for site in study.sites:
         points = site.truth.diastole_mm
         a, b = (_observation(one, points, rng) for one in true)
-        sites.append(MatchedSite(site.name, *cameras, PhasePair(0.8, a, b), (), (a,), (b,), np.zeros(1), np.zeros(1)))
+        runs = MatchedRuns(*cameras, PhasePair(0.8, a, b), (), (a,), (b,), np.zeros(1), np.zeros(1))
+        sites.append(MatchedSite(site.name, runs))
         truth.append(np.concatenate([points[name] for name in points]))
     return tuple(sites), np.concatenate(truth)
 
@@ -176,7 +179,8 @@ def _observation(camera: Camera, points: Any, rng: np.random.Generator) -> Obser
 
 
 def _pixels(site: MatchedSite) -> tuple[Array, Array]:
-    a, b = (np.concatenate([chain.pixels_uv for chain in view.chains]) for view in (site.diastole.a, site.diastole.b))
+    views = site.runs.diastole.a, site.runs.diastole.b
+    a, b = (np.concatenate([chain.pixels_uv for chain in view.chains]) for view in views)
     return a, b
 
 

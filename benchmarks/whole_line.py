@@ -150,7 +150,7 @@ def _segment(run: SimulatedRun, catalogue: Catalogue, segmenter: Segmenter) -> S
 
 
 def _is_seen(matched: MatchedSite, name: str, view: int) -> bool:
-    observation = (matched.diastole.a, matched.diastole.b)[view]
+    observation = (matched.runs.diastole.a, matched.runs.diastole.b)[view]
     return any(chain.catheter == name for chain in observation.chains)
 
 

@@ -407,19 +407,17 @@ class Alternative:
 
 
 @dataclass(frozen=True, eq=False)
-class MatchedSite:
-    """One site with its catheters named in both views.
+class MatchedRuns:
+    """The two runs of a site, with their catheters named in both views.
 
     diastole : the pair that locates the site. cycle : pairs over the cardiac cycle by rising phase; empty where unknown.
     track_a, track_b : every frame of each run, for tracking in a single view.
-    notes : (catheter, reason) of catheters that are missing or doubtful here.
     alternative : the next best pairing of the catheters across the views, unless it can be ruled out.
     """
 
     stored_apart: ClassVar[bool] = True
-    """Each site is stored by itself: a job stores an unchanged site again without decoding it."""
+    """The runs of each site are stored by themselves: a job stores unchanged ones again without decoding them."""
 
-    site: str
     camera_a: Camera
     camera_b: Camera
     diastole: PhasePair
@@ -428,8 +426,20 @@ class MatchedSite:
     track_b: tuple[Observation, ...]
     frame_times_a_ms: Array
     frame_times_b_ms: Array
-    notes: tuple[tuple[str, Reason], ...] = ()
     alternative: Alternative | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedSite:
+    """One site with its catheters named in both views.
+
+    notes : (catheter, reason) of catheters that are missing or doubtful here. They may change at all sites when a person names a
+    catheter at one of them, and then no runs change.
+    """
+
+    site: str
+    runs: MatchedRuns
+    notes: tuple[tuple[str, Reason], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,7 +131,7 @@ def tracked(name: str) -> object:
     site, place = matched_sites(study())[0], located().sites[0]
     view = MonoplaneView(
         site=site.site, view="a", camera=place.camera_a, catalogue=DEFAULT_CATALOGUE,
-        frame_times_ms=site.frame_times_a_ms, observations=site.track_a, a_priori=place.points,
+        frame_times_ms=site.runs.frame_times_a_ms, observations=site.runs.track_a, a_priori=place.points,
         a_priori_frame=place.frame_a, cycle=None, others=tuple(other.cycle for other in located().sites[1:] if other.cycle),
     )  # fmt: skip
     return build_monoplane(name, {}).track(view, Silent())

@@ -37,20 +37,24 @@ def _view(matched: MatchedSite | None = None, **changes: Any) -> TrackedView:
     return replace(view, **changes)
 
 
+def _with_runs(site: MatchedSite, **changes: Any) -> MatchedSite:
+    return replace(site, runs=replace(site.runs, **changes))
+
+
 def _stored() -> MatchedSite:
     return decode(Matching, encode(matching())).sites[0]
 
 
 def test_every_field_of_a_view_is_part_of_its_key() -> None:
     site, located = matching().sites[0], triangulation().sites[0]
-    without = replace(site, track_a=tuple(Observation(frame, None, ()) for frame in range(len(site.track_a))))
+    without = tuple(Observation(frame, None, ()) for frame in range(len(site.runs.track_a)))
     changed = {
         "site": _view(replace(site, site="S02")),
         "view": _view(view="b"),
         "camera": _view(camera=located.camera("b")),
         "catalogue": _view(catalogue=replace(CATALOGUE, mapping="reference", reference="mapping")),
-        "frame_times_ms": _view(replace(site, frame_times_a_ms=site.frame_times_a_ms + 1.0)),
-        "observations": _view(without),
+        "frame_times_ms": _view(_with_runs(site, frame_times_a_ms=site.runs.frame_times_a_ms + 1.0)),
+        "observations": _view(_with_runs(site, track_a=without)),
         "a_priori": _view(a_priori=APriori(located.points[:-1])),
         "a_priori_frame": _view(a_priori_frame=0),
         "cycle": _view(cycle=CYCLE),
@@ -64,8 +68,9 @@ def test_every_field_of_a_view_is_part_of_its_key() -> None:
 
 def test_other_parts_of_a_matched_site_do_not_change_the_key() -> None:
     site = matching().sites[0]
-    for changes in ({"notes": (("mapping", Reason.IDENTITY_UNCERTAIN),)}, {"track_b": site.track_b[::-1]}):
-        assert _view(replace(site, **changes)).content() == _view(site).content()
+    noted = replace(site, notes=(("mapping", Reason.IDENTITY_UNCERTAIN),))
+    for other in (noted, _with_runs(site, track_b=site.runs.track_b[::-1])):
+        assert _view(other).content() == _view(site).content()
 
 
 def test_the_frames_of_an_unchanged_site_are_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,14 +88,14 @@ def test_the_frames_of_an_unchanged_site_are_decoded_once(monkeypatch: pytest.Mo
 def test_a_solver_gets_the_frames_and_the_remembered_site_keeps_none() -> None:
     site = _stored()
     shown = _view(site).decoded()
-    expected = matching().sites[0]
+    expected = matching().sites[0].runs
     assert plain_form(shown) == plain_form(
         MonoplaneView(
             "S01", "a", _view().camera, CATALOGUE, expected.frame_times_a_ms, expected.track_a, _view().a_priori.points, 1,
             None, (),
         )
     )  # fmt: skip
-    assert "track_a" not in vars(site)
+    assert "track_a" not in vars(site.runs)
 
 
 def test_the_stages_of_all_sites_read_the_same_rows_once(data_dir: Any) -> None:

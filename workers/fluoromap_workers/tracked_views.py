@@ -65,7 +65,8 @@ class TrackedView:
         """
         hashes: dict[str, Any] = {
             "frames_sha256": _hashes.of(
-                (block_hash(self.matched), self.view), partial(_frames, self.matched, self.view)
+                (block_hash(self.matched.runs), f"{self.matched.site}-{self.view}"),
+                partial(_frames, self.matched, self.view),
             ),
             "points_sha256": _hashes.of((block_hash(self.a_priori), "a_priori"), partial(_points, self.a_priori)),
         }
@@ -97,11 +98,11 @@ class _Frames:
 
 
 def _frames(matched: MatchedSite, view: View) -> _Frames:
-    # The worker remembers the site, so it would keep the decoded frames of all sites.
-    site = undecoded(matched)
+    # The worker remembers the runs, so it would keep the decoded frames of all sites.
+    runs = undecoded(matched.runs)
     if view == "a":
-        return _Frames(site.site, site.frame_times_a_ms, site.track_a)
-    return _Frames(site.site, site.frame_times_b_ms, site.track_b)
+        return _Frames(matched.site, runs.frame_times_a_ms, runs.track_a)
+    return _Frames(matched.site, runs.frame_times_b_ms, runs.track_b)
 
 
 def _points(a_priori: APriori) -> APriori:
@@ -109,7 +110,7 @@ def _points(a_priori: APriori) -> APriori:
 
     They move no electrode, and naming a catheter at one site must not redo the others.
     """
-    # As with the frames: the worker remembers the site.
+    # As with the frames: the worker remembers the points.
     return APriori(tuple(map(_without_name_doubts, undecoded(a_priori).points)))
 
 

@@ -16,6 +16,7 @@ from fluoromap.contracts import (
     Chain,
     Context,
     IntArray,
+    MatchedRuns,
     MatchedSite,
     Matching,
     NamedChain,
@@ -73,12 +74,11 @@ class _NamedSite:
     notes: tuple[tuple[str, Reason], ...]
 
     def content(self, catalogue: Catalogue) -> tuple[object, ...]:
-        """Return everything that the matched site depends on."""
-        runs = self.compared.runs
+        """Return everything that the matched runs depend on."""
         # The order of the names is part of the result.
         pairs = tuple(self.pairs.items())
         alternative = None if self.alternative is None else (tuple(self.alternative.items()), self.probability)
-        return runs.site, *runs.content, catalogue, pairs, tuple(self.turned.items()), alternative, self.notes
+        return *self.compared.runs.content, catalogue, pairs, tuple(self.turned.items()), alternative
 
 
 class _Views:
@@ -114,7 +114,7 @@ def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Contex
     catalogue : Catalogue
         Of the study.
     context : Context
-        For progress and cancellation. It recalls the comparisons and matched sites that did not change.
+        For progress and cancellation. It recalls the comparisons and matched runs that did not change.
 
     Returns
     -------
@@ -147,9 +147,9 @@ def match_study(sites: Sequence[SiteRuns], catalogue: Catalogue, context: Contex
     for index, named in enumerate(_name_all(sound, groups, catalogue)):
         context.check()
         if catalogue.mapping in named.pairs:
-            matched.append(
-                context.recall(MatchedSite, named.content(catalogue), partial(_matched, named, catalogue, views))
-            )
+            own = context.recall(MatchedRuns, named.content(catalogue), partial(_matched, named, catalogue, views))
+            missing = [(name, Reason.CATHETER_NOT_FOUND) for name in catalogue.names if name not in named.pairs]
+            matched.append(MatchedSite(named.compared.runs.site, own, (*missing, *named.notes)))
         else:
             reason = Reason.CATHETER_NOT_FOUND if named.pairs else Reason.PAIRING_FAILED
             rejected.append(RejectedSite(named.compared.runs.site, (reason,)))
@@ -269,7 +269,7 @@ def _ways(table: PairTable, pair: tuple[int, int]) -> tuple[bool, bool]:
     return bool(table.turned[pair][0]), bool(table.turned[pair][1])
 
 
-def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) -> MatchedSite:
+def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) -> MatchedRuns:
     runs = named.compared.runs
     views = views_of_sites.of(runs)
     assert isinstance(views, SiteViews), "the views were compared"
@@ -288,9 +288,7 @@ def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) ->
         }
         other_a, other_b = _in_views((a, b), named.alternative, other_turned)
         alternative = Alternative(_at_diastole(catalogue, other_a, other_b, a.phases, phases_b), named.probability)
-    missing = [(name, Reason.CATHETER_NOT_FOUND) for name in catalogue.names if name not in named.pairs]
-    return MatchedSite(
-        site=runs.site,
+    return MatchedRuns(
         camera_a=runs.camera_a,
         camera_b=runs.camera_b,
         diastole=_at_diastole(catalogue, in_a, in_b, a.phases, phases_b),
@@ -299,7 +297,6 @@ def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) ->
         track_b=track_b,
         frame_times_a_ms=a.segmentation.frame_times_ms,
         frame_times_b_ms=b.segmentation.frame_times_ms,
-        notes=(*missing, *named.notes),
         alternative=alternative,
     )
 

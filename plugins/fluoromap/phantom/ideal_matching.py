@@ -10,6 +10,7 @@ from fluoromap.contracts import (
     Array,
     Chain,
     FrameChains,
+    MatchedRuns,
     MatchedSite,
     NamedChain,
     Observation,
@@ -49,19 +50,17 @@ def matched_sites(
         )
         tracks = tuple(_observations(own, of_run, noise_px) for own, of_run in zip(pixels, phases, strict=True))
         a, b = (min(track, key=_phase_from_rest) for track in tracks)
-        sites.append(
-            MatchedSite(
-                site=site.name,
-                camera_a=cameras[0],
-                camera_b=cameras[1],
-                diastole=PhasePair(a.phase, a, b),
-                cycle=pair_by_phase(*tracks),
-                track_a=tracks[0],
-                track_b=tracks[1],
-                frame_times_a_ms=site.runs[0].frame_times_ms,
-                frame_times_b_ms=site.runs[1].frame_times_ms,
-            )
+        runs = MatchedRuns(
+            camera_a=cameras[0],
+            camera_b=cameras[1],
+            diastole=PhasePair(a.phase, a, b),
+            cycle=pair_by_phase(*tracks),
+            track_a=tracks[0],
+            track_b=tracks[1],
+            frame_times_a_ms=site.runs[0].frame_times_ms,
+            frame_times_b_ms=site.runs[1].frame_times_ms,
         )
+        sites.append(MatchedSite(site.name, runs))
     return tuple(sites)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.contracts import Array, MatchedSite, Observation
+from fluoromap.contracts import Array, MatchedRuns, Observation
 from fluoromap.geometry import Camera
 from fluoromap.matching.beats import cycle_spread
 
@@ -48,11 +48,11 @@ class BeatScatter:
         return likelihood
 
 
-def beat_scatter(site: MatchedSite) -> tuple[BeatScatter, ...]:
+def beat_scatter(runs: MatchedRuns) -> tuple[BeatScatter, ...]:
     """Return the scatter in each run that shows at least two beats."""
     views = (
-        (site.track_a, site.camera_a, site.diastole.a.phase),
-        (site.track_b, site.camera_b, site.diastole.b.phase),
+        (runs.track_a, runs.camera_a, runs.diastole.a.phase),
+        (runs.track_b, runs.camera_b, runs.diastole.b.phase),
     )
     found = (_scatter(track, camera, phase) if phase is not None else None for track, camera, phase in views)
     return tuple(one for one in found if one is not None)

@@ -8,7 +8,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import APriori, Array, ElectrodePoint, LocatedSite, MatchedSite, PhasePair, SiteCycle
+from fluoromap.contracts import (
+    APriori,
+    Array,
+    ElectrodePoint,
+    LocatedSite,
+    MatchedRuns,
+    MatchedSite,
+    PhasePair,
+    SiteCycle,
+)
 from fluoromap.reasons import Reason
 from fluoromap.triangulator.alternatives import add_alternative
 from fluoromap.triangulator.error_sources import (
@@ -34,6 +43,9 @@ from fluoromap.triangulator.two_view_pixels import Cameras, TwoViewPixels, pixel
 FAR_MM = 500.0
 """Largest plausible distance from the isocentre: two views that exceed it do not belong together."""
 
+Notes = tuple[tuple[str, Reason], ...]
+"""The notes of a matched site: (catheter, reason)."""
+
 
 @dataclass(frozen=True, eq=False)
 class SiteLocator:
@@ -58,14 +70,14 @@ class SiteLocator:
         """Return the cameras of a site as the study shows them, from those of the headers."""
         return self.belief.gantry.cameras(nominal)
 
-    def moments(self, site: MatchedSite, cameras: Cameras) -> CycleMoments | None:
+    def moments(self, runs: MatchedRuns, cameras: Cameras) -> CycleMoments | None:
         """Return the moments of a site's cycle; None where the views show too few."""
-        known = _phase(site.diastole) is not None
-        return cycle_moments(site.cycle, cameras, self.method) if known else None
+        known = _phase(runs.diastole) is not None
+        return cycle_moments(runs.cycle, cameras, self.method) if known else None
 
-    def cycle(self, site: MatchedSite, cameras: Cameras, jump: Jump | None, moments: CycleMoments) -> SiteCycle:
+    def cycle(self, runs: MatchedRuns, cameras: Cameras, jump: Jump | None, moments: CycleMoments) -> SiteCycle:
         """Locate a site at the moments of its cycle."""
-        rest = _phase(site.diastole)
+        rest = _phase(runs.diastole)
         assert rest is not None, "the site has moments"
         return locate_cycle(
             moments, rest, cameras, self.catalogue, self.any_study.params, self.method,
@@ -73,13 +85,13 @@ class SiteLocator:
         )  # fmt: skip
 
     def diastole(
-        self, site: MatchedSite, cameras: Cameras, jump: Jump | None, moments: CycleMoments | None
+        self, runs: MatchedRuns, cameras: Cameras, jump: Jump | None, moments: CycleMoments | None
     ) -> Diastole:
         """Locate a site at diastole, under both pairings of its catheters."""
-        first = self._moment(site.diastole, cameras, moments, jump)
-        other = self._moment(site.alternative.diastole, cameras, moments, jump) if site.alternative else None
-        shown = site.diastole.a, site.diastole.b
-        probability = site.alternative.probability if site.alternative else 0.0
+        first = self._moment(runs.diastole, cameras, moments, jump)
+        other = self._moment(runs.alternative.diastole, cameras, moments, jump) if runs.alternative else None
+        shown = runs.diastole.a, runs.diastole.b
+        probability = runs.alternative.probability if runs.alternative else 0.0
         phase_known = all(view.phase is not None for view in shown)
         return Diastole(first, other, probability, shown[0].frame, shown[1].frame, phase_known)
 
@@ -91,12 +103,13 @@ class SiteLocator:
             (Reason.GEOMETRY_DOUBTFUL, errors.inflation > 1 or self.belief.doubt is Reason.GEOMETRY_DOUBTFUL),
         ) if holds))  # fmt: skip
 
-    def a_priori(self, site: MatchedSite, diastole: Diastole, doubts: tuple[Reason, ...]) -> APriori:
+    def a_priori(self, notes: Notes, diastole: Diastole, doubts: tuple[Reason, ...]) -> APriori:
         """Return the electrodes of a site with the covariances of any study.
 
         Parameters
         ----------
-        site : MatchedSite
+        notes : tuple of (str, Reason)
+            Of the matched site.
         diastole : Diastole
             From :meth:`diastole`, with electrodes of the chosen pairing.
         doubts : tuple of Reason
@@ -106,7 +119,7 @@ class SiteLocator:
         alone = self if self.origin is None else replace(self, origin=None)
         moments = [moment for moment in (diastole.chosen, diastole.alternative) if moment is not None]
         errors = errors_in_study(moments, self.any_study)
-        return APriori(alone._points(site, diastole, errors, doubts)[0])
+        return APriori(alone._points(notes, diastole, errors, doubts)[0])
 
     def locate(
         self, site: MatchedSite, cameras: Cameras, jump: Jump | None, diastole: Diastole, errors: Sequence[MomentErrors],
@@ -114,7 +127,7 @@ class SiteLocator:
     ) -> tuple[LocatedSite, SiteErrors]:  # fmt: skip
         """Return a site in 3D and its share in the study's report.
 
-        The covariances contain the errors that the study shows. Of the site only its name and notes are read, so that its tracks
+        The covariances contain the errors that the study shows. Of the site only its name and notes are read, so that its runs
         are not decoded.
 
         Parameters
@@ -135,7 +148,7 @@ class SiteLocator:
         first, own = diastole.chosen, errors[0]
         assert first is not None, "the chosen pairing has electrodes"
         doubts = self.doubts(jump, own)
-        points, reference_mm = self._points(site, diastole, errors, doubts)
+        points, reference_mm = self._points(site.notes, diastole, errors, doubts)
         reasons = [reason for reason, holds in (
             (Reason.NO_RESTING_CATHETER, self.catalogue.reference is None),
             (Reason.NO_REFERENCE, reference_mm is None),
@@ -206,20 +219,20 @@ class SiteLocator:
         )  # fmt: skip
 
     def _points(
-        self, site: MatchedSite, diastole: Diastole, errors: Sequence[MomentErrors], doubts: tuple[Reason, ...]
+        self, notes: Notes, diastole: Diastole, errors: Sequence[MomentErrors], doubts: tuple[Reason, ...]
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
         """Return the electrodes at diastole, and the reference catheter's mean (3,) where that is located."""
         first, other = diastole.chosen, diastole.alternative
         assert first is not None, "the chosen pairing has electrodes"
-        points, reference_mm = self._points_of(site, first, errors[0].joint_mm2, doubts)
+        points, reference_mm = self._points_of(notes, first, errors[0].joint_mm2, doubts)
         if other is None:
             return points, reference_mm
-        others, other_mm = self._points_of(site, other, errors[1].joint_mm2, doubts)
+        others, other_mm = self._points_of(notes, other, errors[1].joint_mm2, doubts)
         shift = None if reference_mm is None or other_mm is None else other_mm - reference_mm
         return add_alternative(points, others, shift, diastole.probability), reference_mm
 
     def _points_of(
-        self, site: MatchedSite, moment: Moment, joint: Array, site_doubts: tuple[Reason, ...]
+        self, notes: Notes, moment: Moment, joint: Array, site_doubts: tuple[Reason, ...]
     ) -> tuple[tuple[ElectrodePoint, ...], Array | None]:
         """Return the electrodes under one pairing.
 
@@ -240,7 +253,7 @@ class SiteLocator:
             reference_mm, added_mm2 = by_offsets
         mismatched = spacing_mismatches(points, labels, self.catalogue, self.spacing_limit_mm)
         doubts: dict[str, list[Reason]] = {name: [reason] for name, reason in self.gap_doubts.items()}
-        for catheter, reason in site.notes:
+        for catheter, reason in notes:
             doubts.setdefault(catheter, []).append(reason)
         relative = None if reference_mm is None else points - reference_mm
         residuals = np.linalg.norm(moment.residuals_px, axis=2).tolist()

@@ -18,6 +18,7 @@ from fluoromap.contracts import (
     Context,
     ErrorBudget,
     LocatedSite,
+    MatchedRuns,
     MatchedSite,
     RejectedSite,
     SiteCycle,
@@ -198,7 +199,10 @@ def _looks(
     sites: Sequence[MatchedSite], catalogue: Catalogue, context: Context, params: UncertaintyParams
 ) -> list[SiteLook]:
     return [
-        context.recall(SiteLook, (site, catalogue), partial(_first_look, site, catalogue, params)) for site in sites
+        context.recall(
+            SiteLook, (site.site, site.runs, catalogue), partial(_first_look, site.site, site.runs, catalogue, params)
+        )
+        for site in sites
     ]
 
 
@@ -210,16 +214,16 @@ def _usable_sites(
     return usable, rejected, [look.note for look in looks if look.note is not None]
 
 
-def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyParams) -> SiteLook:
+def _first_look(name: str, runs: MatchedRuns, catalogue: Catalogue, params: UncertaintyParams) -> SiteLook:
     """Locate a site for the checks of the study.
 
     The result says why a site cannot be located.
     """
-    cameras, pixels = (site.camera_a, site.camera_b), pixels_in_both_views(site.diastole)
-    nothing = SiteLook(site.site, *cameras, pixels, np.zeros((0, 3)), NO_GAPS, _same_beat(site))
+    cameras, pixels = (runs.camera_a, runs.camera_b), pixels_in_both_views(runs.diastole)
+    nothing = SiteLook(name, *cameras, pixels, np.zeros((0, 3)), NO_GAPS, _same_beat(runs))
     angle = ray_angle_deg(*cameras)
     if angle < PARALLEL_BELOW_DEG:
-        note = f"{site.site}: the views are {angle:.0f} degrees apart; at least 20 are needed."
+        note = f"{name}: the views are {angle:.0f} degrees apart; at least 20 are needed."
         return replace(nothing, reasons=(Reason.VIEWS_PARALLEL,), note=note)
     if catalogue.mapping not in pixels.catheters:
         return replace(nothing, reasons=(Reason.CATHETER_NOT_FOUND,))
@@ -229,20 +233,20 @@ def _first_look(site: MatchedSite, catalogue: Catalogue, params: UncertaintyPara
     pixels = widen_strays(cameras, pixels, points, sources)
     alone = Estimate(points, separate_gain(cameras, points))
     between = site_gaps(pixels, points, alone.covariance_mm2(pixel_noise_px2(pixels.covariances)), catalogue)
-    look = replace(nothing, pixels=pixels, points_mm=points, gaps=between, scatter=beat_scatter(site))
+    look = replace(nothing, pixels=pixels, points_mm=points, gaps=between, scatter=beat_scatter(runs))
     gaps = gap_labels(catalogue, frozenset(catalogue.names))
     return replace(look, equations=site_equations(look.for_calibration, cameras, catalogue, gaps, params))
 
 
-def _same_beat(site: MatchedSite) -> bool:
+def _same_beat(runs: MatchedRuns) -> bool:
     """Return True where the diastolic frames show the same beat.
 
     This holds if both runs began together.
     """
-    frame_a, frame_b = site.diastole.a.frame, site.diastole.b.frame
-    if frame_a >= len(site.frame_times_a_ms) or frame_b >= len(site.frame_times_b_ms):
+    frame_a, frame_b = runs.diastole.a.frame, runs.diastole.b.frame
+    if frame_a >= len(runs.frame_times_a_ms) or frame_b >= len(runs.frame_times_b_ms):
         return False
-    return bool(abs(site.frame_times_a_ms[frame_a] - site.frame_times_b_ms[frame_b]) < _SAME_BEAT_MS)
+    return bool(abs(runs.frame_times_a_ms[frame_a] - runs.frame_times_b_ms[frame_b]) < _SAME_BEAT_MS)
 
 
 _Work = tuple[MatchedSite, Cameras, Jump | None, SiteLocator]
@@ -277,8 +281,8 @@ def _locate_sites(
 class _Location:
     """The location of one site.
 
-    Its diastole and its cycle depend on the site and its cameras alone; they are recalled where these did not change. Other sites
-    change only the size of the errors, from which the covariances follow quickly.
+    Its diastole and its cycle depend on its runs and its cameras alone; they are recalled where these did not change. Other sites
+    change only the notes and the size of the errors. The reasons and covariances follow from them quickly.
     """
 
     def __init__(
@@ -287,7 +291,7 @@ class _Location:
         self._site, self._jump, self._context = site, jump, context
         self.locator = locator
         self._cameras = locator.cameras(nominal)
-        self._inputs = (site, jump, locator.catalogue, *self._cameras)
+        self._inputs = (site.runs, jump, locator.catalogue, *self._cameras)
         self.diastole = context.recall(Diastole, self._inputs, self._locate_diastole)
         self._cycle = context.recall(SiteCycle, self._inputs, self._locate_cycle)
         self.errors: list[MomentErrors] = []
@@ -308,22 +312,21 @@ class _Location:
     @functools.cached_property
     def _a_priori(self) -> APriori:
         doubts = self.locator.doubts(self._jump, self.errors[0])
-        inputs = (*self._inputs, self.locator.gap_doubts, doubts)
-        return self._context.recall(
-            APriori, inputs, lambda: self.locator.a_priori(self._site, self.diastole, doubts)
-        )  # fmt: skip
+        notes = self._site.notes
+        inputs = (*self._inputs, self.locator.gap_doubts, notes, doubts)
+        return self._context.recall(APriori, inputs, lambda: self.locator.a_priori(notes, self.diastole, doubts))
 
     @functools.cached_property
     def _moments(self) -> CycleMoments | None:
-        return self.locator.moments(self._site, self._cameras)
+        return self.locator.moments(self._site.runs, self._cameras)
 
     def _locate_diastole(self) -> Diastole:
-        return self.locator.diastole(self._site, self._cameras, self._jump, self._moments)
+        return self.locator.diastole(self._site.runs, self._cameras, self._jump, self._moments)
 
     def _locate_cycle(self) -> SiteCycle:
         if self._moments is None or self.diastole.chosen is None:
             return NO_CYCLE
-        return self.locator.cycle(self._site, self._cameras, self._jump, self._moments)
+        return self.locator.cycle(self._site.runs, self._cameras, self._jump, self._moments)
 
 
 def _compute_errors(locations: Sequence[_Location]) -> None:

@@ -91,8 +91,8 @@ def _named_chains(session: Session, job_id: str, uid: str) -> dict[int, tuple[Na
     }
     for site in load(Matching, stage).sites:
         if site.site in views:
-            # The service remembers the site, so it would keep the decoded tracks.
-            shown = undecoded(site)
+            # The service remembers the runs, so it would keep the decoded tracks.
+            shown = undecoded(site.runs)
             track = shown.track_a if views[site.site] == "a" else shown.track_b
             return {frame: observation.chains for frame, observation in enumerate(track)}
     return {}

@@ -12,9 +12,10 @@ from sqlalchemy.orm import Session
 from fluoromap.contracts import (
     Array,
     LocatedSite,
-    MatchedSite,
+    MatchedRuns,
     Matching,
     NamedChain,
+    Observation,
     Triangulation,
     View,
 )
@@ -49,8 +50,8 @@ class LocatedView:
 class MapPlacement:
     """The map in one view of a located site.
 
-    site : of the view, in 3D. chains : frame, counted from 0 -> catheter -> the electrodes that the frame shows. tracks_sha256 :
-    hash of the stored tracks of the site; None where it has none.
+    site : of the view, in 3D. matched : its runs with named catheters; None where it has none. tracks_sha256 : hash of the stored
+    tracks of the site; None where it has none.
     """
 
     view: LocatedView
@@ -58,13 +59,26 @@ class MapPlacement:
     triangulation: Triangulation
     snapshot: Snapshot
     site: LocatedSite
-    chains: Mapping[int, Mapping[str, NamedChain]]
+    matched: MatchedRuns | None
     tracks_sha256: str | None
 
     @property
     def camera(self) -> Camera:
         """Camera of the view, for stored pixels."""
         return self.site.camera(self.view.view)
+
+    def shown(self, frame: int) -> Mapping[str, NamedChain]:
+        """Return the electrodes that a frame shows, by their catheter.
+
+        The frame counts from 0. At diastole those of the pair that located the site count.
+        """
+        if self.matched is None:
+            return {}
+        diastole = _diastole(self.matched, self.view.view)
+        # The track is long, and most overlays show diastole. The pair has each catheter of the track.
+        if frame == diastole.frame:
+            return {chain.catheter: chain for chain in diastole.chains}
+        return _chains(self.matched, self.view.view).get(frame, {})
 
     def shift_mm(self, frame: int) -> Array:
         """Return the shift (3,) of the map in a frame.
@@ -73,13 +87,13 @@ class MapPlacement:
         """
         mean_mm = np.zeros(3) if self.finished.reference_mm is None else self.finished.reference_mm
         reference = self.snapshot.reference
-        shown = None if reference is None else self.chains.get(frame, {}).get(reference)
+        shown = None if reference is None else self.shown(frame).get(reference)
         return map_shift_mm(self.site, self.camera, shown, self._tracked_mm(frame), mean_mm)
 
     def tip_uv(self, frame: int) -> Array | None:
         """Return the pixel (2,) of the mapping tip in a frame from 0 on."""
         mapping = self.snapshot.mapping
-        shown = self.chains.get(frame, {}).get(mapping)
+        shown = self.shown(frame).get(mapping)
         return tip_pixel(self.site, self.camera, mapping, shown, self.shift_mm(frame))
 
     def electrodes_uv(self, frame: int) -> dict[str, Array]:
@@ -87,7 +101,7 @@ class MapPlacement:
 
         They begin at the tip. The frame counts from 0. A catheter that it does not show has none.
         """
-        shown = self.chains.get(frame, {})
+        shown = self.shown(frame)
         return {
             catheter.name: shown[catheter.name].pixels_uv[np.argsort(shown[catheter.name].electrodes)]
             if catheter.name in shown
@@ -147,14 +161,14 @@ def placement_of(session: Session, job: Job, uid: str) -> MapPlacement:
         raise not_found("overlay: the run is no view of a located site")
     site = next(each for each in triangulation.sites if each.site == view.site)
     matching = load(Matching, done_stage(session, job, "match"))
-    matched = next((each for each in matching.sites if each.site == view.site), None)
+    matched = next((each.runs for each in matching.sites if each.site == view.site), None)
     return MapPlacement(
         view=view,
         finished=finished,
         triangulation=triangulation,
         snapshot=snapshot,
         site=site,
-        chains={} if matched is None else _chains(matched, view.view),
+        matched=matched,
         tracks_sha256=_tracks_sha256(session, job, site.site),
     )
 
@@ -168,19 +182,20 @@ def _views(triangulation: Triangulation, snapshot: Snapshot) -> list[LocatedView
 
 
 @lru_cache(maxsize=_REMEMBERED_VIEWS)
-def _chains(site: MatchedSite, view: View) -> Mapping[int, Mapping[str, NamedChain]]:
-    """Return the catheters that each frame shows, by name.
+def _diastole(runs: MatchedRuns, view: View) -> Observation:
+    """Return the diastolic frame of the pair that located the site."""
+    # The service remembers the runs, so it would keep the arrays of all sites.
+    pair = undecoded(runs).diastole
+    return pair.a if view == "a" else pair.b
 
-    At diastole those of the pair that located the site count.
-    """
-    # The service remembers the site, so it would keep the decoded tracks of all sites.
-    site = undecoded(site)
-    diastole, track = (site.diastole.a, site.track_a) if view == "a" else (site.diastole.b, site.track_b)
-    chains: dict[int, dict[str, NamedChain]] = {}
-    for observation in (diastole, *track):
-        for chain in observation.chains:
-            chains.setdefault(observation.frame, {}).setdefault(chain.catheter, chain)
-    return chains
+
+@lru_cache(maxsize=_REMEMBERED_VIEWS)
+def _chains(runs: MatchedRuns, view: View) -> Mapping[int, Mapping[str, NamedChain]]:
+    """Return the catheters that each frame of the track shows, by name."""
+    # The service remembers the runs, so it would keep the decoded tracks of all sites.
+    runs = undecoded(runs)
+    track = runs.track_a if view == "a" else runs.track_b
+    return {each.frame: {chain.catheter: chain for chain in each.chains} for each in track}
 
 
 def _tracks_sha256(session: Session, job: Job, site: str) -> str | None:

@@ -345,6 +345,7 @@ def prepare(kind: type[Any]) -> None:
     for one in _dataclasses_in(kind).values():
         _ = _fields_column(one).fields
         if _is_apart(one):
+            form_of(one)
             _deferred_kind(one)
 
 
@@ -413,7 +414,8 @@ class _Content:
             form, (count, columns) = read(ALIGNMENT + (length & ~_PACKED))
             if kind is None:
                 return
-            if form not in (form_of(kind), _form_of(cast(Hashable, kind), earlier=True)) or count != 1:
+            # The earlier form is looked up only where it may be needed: a first overlay would wait for that.
+            if (form != form_of(kind) and form != _form_of(cast(Hashable, kind), earlier=True)) or count != 1:
                 raise StoredOtherwise(f"another version of the contracts stored this {kind}")
             names = [name for name, _ in _fields_column(kind).stored_fields(len(columns))]
             self.columns = dict(zip(names, columns, strict=True))

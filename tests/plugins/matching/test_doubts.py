@@ -28,8 +28,11 @@ def level(study) -> None:  # type: ignore[no-untyped-def]
 
 
 def apart_mm(site: MatchedSite, truth: np.ndarray, catheter: str = "reference") -> float:
-    a, b = (next(one for one in seen.chains if one.catheter == catheter) for seen in (site.diastole.a, site.diastole.b))
-    points = triangulate_linear(site.camera_a, site.camera_b, a.pixels_uv, b.pixels_uv)
+    a, b = (
+        next(one for one in seen.chains if one.catheter == catheter)
+        for seen in (site.runs.diastole.a, site.runs.diastole.b)
+    )
+    points = triangulate_linear(site.runs.camera_a, site.runs.camera_b, a.pixels_uv, b.pixels_uv)
     return float(np.linalg.norm(points.mean(axis=0) - truth.mean(axis=0)))
 
 
@@ -38,20 +41,20 @@ def test_a_pairing_that_cannot_be_ruled_out_is_kept(heart, seed: int) -> None:  
     study = heart(seed=seed, breathing_mm=0.0)
     level(study)
     (site,) = match_study((study.site("S0"),), DEFAULT_CATALOGUE, Silent()).sites
-    assert site.alternative is not None
-    assert 0.02 < site.alternative.probability <= 0.5
+    assert site.runs.alternative is not None
+    assert 0.02 < site.runs.alternative.probability <= 0.5
     told = {catheter for catheter, reason in site.notes if reason is Reason.IDENTITY_UNCERTAIN}
     assert told == LOOK_ALIKES
     for name in LOOK_ALIKES:
         chosen, other = (
             [next(one.pixels_uv for one in seen.chains if one.catheter == name) for seen in (pair.a, pair.b)]
-            for pair in (site.diastole, site.alternative.diastole)
+            for pair in (site.runs.diastole, site.runs.alternative.diastole)
         )
         # One view's chain is another catheter's in the alternative.
         assert [np.allclose(*views) for views in zip(chosen, other, strict=True)].count(False) == 1
     mapping = [
         next(one.pixels_uv for one in pair.a.chains if one.catheter == "mapping")
-        for pair in (site.diastole, site.alternative.diastole)
+        for pair in (site.runs.diastole, site.runs.alternative.diastole)
     ]
     assert np.array_equal(*mapping)
 
@@ -65,8 +68,11 @@ def test_the_other_sites_decide_what_one_cannot(heart) -> None:  # type: ignore[
     sites = (doubtful, *(study.site(f"S{i}") for i in range(1, 5)))
     alone = match_study(sites[:1], DEFAULT_CATALOGUE, Silent()).sites[0]
     together = match_study(sites, DEFAULT_CATALOGUE, Silent()).sites
-    assert alone.alternative is not None
-    assert together[0].alternative is None or together[0].alternative.probability < alone.alternative.probability / 4
+    assert alone.runs.alternative is not None
+    assert (
+        together[0].runs.alternative is None
+        or together[0].runs.alternative.probability < alone.runs.alternative.probability / 4
+    )
     places = [min(apart_mm(site, study.truth[site.site][name]) for name in LOOK_ALIKES) for site in together]
     assert max(places) < 3
 
@@ -74,7 +80,7 @@ def test_the_other_sites_decide_what_one_cannot(heart) -> None:  # type: ignore[
 def test_right_pairs_leave_no_alternative(heart) -> None:  # type: ignore[no-untyped-def]
     study = heart(seed=5)
     matching = match_study(tuple(study.site(f"S{i}") for i in range(4)), DEFAULT_CATALOGUE, Silent())
-    assert [site.alternative for site in matching.sites] == [None] * 4
+    assert [site.runs.alternative for site in matching.sites] == [None] * 4
 
 
 def changed(segmentation: Segmentation, change) -> Segmentation:  # type: ignore[no-untyped-def]
@@ -140,15 +146,15 @@ def test_catheters_that_all_look_alike_are_matched_all_the_same(heart) -> None: 
         "mapping",
     )
     (site,) = match_study((study.site("S0"),), alike, Silent()).sites
-    assert {chain.catheter for chain in site.diastole.a.chains} == set(alike.names)
-    for chain in site.diastole.a.chains:
-        other = next(one for one in site.diastole.b.chains if one.catheter == chain.catheter)
+    assert {chain.catheter for chain in site.runs.diastole.a.chains} == set(alike.names)
+    for chain in site.runs.diastole.a.chains:
+        other = next(one for one in site.runs.diastole.b.chains if one.catheter == chain.catheter)
         nearest = {
             min(
                 study.truth["S0"],
                 key=lambda name: np.abs(camera.project(study.truth["S0"][name]) - seen.pixels_uv).mean(),
             )
-            for camera, seen in ((site.camera_a, chain), (site.camera_b, other))
+            for camera, seen in ((site.runs.camera_a, chain), (site.runs.camera_b, other))
         }
         assert len(nearest) == 1
     assert {reason for _, reason in site.notes} == {Reason.IDENTITY_UNCERTAIN}
@@ -191,11 +197,12 @@ def test_chains_without_their_tip_are_paired_by_the_electrodes_they_have(heart) 
     assert len(matching.sites) == 4
     site = next(one for one in matching.sites if one.site == "S2")
     truth = study.truth["S2"]
-    for chain in site.diastole.b.chains:
+    for chain in site.runs.diastole.b.chains:
         assert chain.electrodes == (2, 3, 4)
-        apart = np.linalg.norm(chain.pixels_uv - site.camera_b.project(truth[chain.catheter][1:]), axis=1)
+        apart = np.linalg.norm(chain.pixels_uv - site.runs.camera_b.project(truth[chain.catheter][1:]), axis=1)
         others = [
-            np.linalg.norm(chain.pixels_uv - site.camera_b.project(one[1:]), axis=1).mean() for one in truth.values()
+            np.linalg.norm(chain.pixels_uv - site.runs.camera_b.project(one[1:]), axis=1).mean()
+            for one in truth.values()
         ]
         assert apart.mean() == min(others)
 

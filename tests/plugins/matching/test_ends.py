@@ -48,7 +48,7 @@ def with_tip(  # type: ignore[no-untyped-def]
 
 def pixels(site: MatchedSite, view: int) -> Array:
     """Return the diastolic places of the reference catheter's electrodes, (4, 2)."""
-    (chain,) = (one for one in (site.diastole.a, site.diastole.b)[view].chains if one.catheter == NAME)
+    (chain,) = (one for one in (site.runs.diastole.a, site.runs.diastole.b)[view].chains if one.catheter == NAME)
     assert chain.electrodes == (1, 2, 3, 4)
     return chain.pixels_uv
 
@@ -73,7 +73,7 @@ def test_the_other_view_corrects_a_wrong_end_everywhere(heart, view: int) -> Non
     (site,) = match(runs)
     assert agrees(site, right, 0)
     assert agrees(site, right, 1)
-    track = (site.track_a, site.track_b)[view]
+    track = (site.runs.track_a, site.runs.track_b)[view]
     told = (right.segmentation_a, right.segmentation_b)[view]
     assert told is not None
     for seen, entry in zip(track, told.frames, strict=True):

@@ -19,10 +19,10 @@ def named_right(site: MatchedSite, truth: dict[str, np.ndarray], names: tuple[st
 
     Breathing moves a catheter by less, an exchange of names by more.
     """
-    a = {chain.catheter: chain for chain in site.diastole.a.chains}
-    b = {chain.catheter: chain for chain in site.diastole.b.chains}
+    a = {chain.catheter: chain for chain in site.runs.diastole.a.chains}
+    b = {chain.catheter: chain for chain in site.runs.diastole.b.chains}
     for name in names:
-        points = triangulate_linear(site.camera_a, site.camera_b, a[name].pixels_uv, b[name].pixels_uv)
+        points = triangulate_linear(site.runs.camera_a, site.runs.camera_b, a[name].pixels_uv, b[name].pixels_uv)
         if np.linalg.norm(points.mean(axis=0) - truth[name].mean(axis=0)) > 15:
             return False
     return True
@@ -37,8 +37,8 @@ def test_all_sites_are_all_named_and_paired_right(heart, angles: tuple[float, fl
     for site in matching.sites:
         assert named_right(site, study.truth[site.site], ("reference", "pacing", "mapping"))
         assert ("reference", Reason.IDENTITY_BY_MOTION) in site.notes
-        assert len(site.track_a) == len(site.frame_times_a_ms) == 80
-        assert all(len(seen.chains) == 3 for seen in site.track_b)
+        assert len(site.runs.track_a) == len(site.runs.frame_times_a_ms) == 80
+        assert all(len(seen.chains) == 3 for seen in site.runs.track_b)
 
 
 def test_sites_that_were_matched_before_get_the_same_answer_beside_others(heart) -> None:  # type: ignore[no-untyped-def]
@@ -47,7 +47,7 @@ def test_sites_that_were_matched_before_get_the_same_answer_beside_others(heart)
     def answer(sites: list[SiteRuns]) -> list[object]:
         matched = match_study(tuple(sites), DEFAULT_CATALOGUE, Silent()).sites
         return [
-            (site.notes, [(c.catheter, c.pixels_uv.tolist()) for seen in site.track_a for c in seen.chains])
+            (site.notes, [(c.catheter, c.pixels_uv.tolist()) for seen in site.runs.track_a for c in seen.chains])
             for site in matched
         ]
 
@@ -95,7 +95,7 @@ def test_chains_without_track_numbers_are_followed_by_nearness(heart) -> None:  
     (site,) = match_study((study.site("S01"),), DEFAULT_CATALOGUE, Silent()).sites
     truth = study.truth["S01"]
     assert named_right(site, truth, ("mapping",))
-    for track, camera in ((site.track_a, site.camera_a), (site.track_b, site.camera_b)):
+    for track, camera in ((site.runs.track_a, site.runs.camera_a), (site.runs.track_b, site.runs.camera_b)):
         for seen in track:
             chain = next(chain for chain in seen.chains if chain.catheter == "mapping")
             # Motion 5 mm, breathing some mm more; a neighbour would be farther.
@@ -109,14 +109,14 @@ def test_both_views_count_the_cardiac_cycle_from_the_same_moment(heart, r_waves:
     for site in matching.sites:
         start_a, start_b = study.starts[site.site]
         apart = []
-        for pair in site.cycle:
+        for pair in site.runs.cycle:
             a = start_a + pair.a.frame / 60 * study.rate_hz
             b = start_b + pair.b.frame / 60 * study.rate_hz
             apart.append(abs((a - b + 0.5) % 1.0 - 0.5))
         assert len(apart) > 50
         # Half a frame is 0.015 of this cycle.
         assert np.mean(apart) < 0.03
-        phases = [pair.phase for pair in site.cycle]
+        phases = [pair.phase for pair in site.runs.cycle]
         assert phases == sorted(phases)
         assert phases[0] >= 0
         assert phases[-1] < 1
@@ -126,10 +126,10 @@ def test_diastole_comes_with_its_frames_and_phase(heart) -> None:  # type: ignor
     study = heart(seed=6)
     runs = study.site("S01")
     (site,) = match_study((runs,), DEFAULT_CATALOGUE, Silent()).sites
-    assert site.diastole.a.frame == runs.segmentation_a.diastole.frame
-    assert site.diastole.b.frame == runs.segmentation_b.diastole.frame
+    assert site.runs.diastole.a.frame == runs.segmentation_a.diastole.frame
+    assert site.runs.diastole.b.frame == runs.segmentation_b.diastole.frame
     # Systole begins at phase 0 and lasts 0.45 of this cycle; the marked moment is 0.75.
-    assert site.diastole.phase == pytest.approx(0.75, abs=0.1)
+    assert site.runs.diastole.phase == pytest.approx(0.75, abs=0.1)
 
 
 def without_diastole(segmentation: Segmentation) -> Segmentation:
@@ -141,8 +141,8 @@ def test_without_a_diastolic_mean_the_quietest_frame_replaces_it(heart) -> None:
     runs = study.site("S01")
     runs = replace(runs, segmentation_a=without_diastole(runs.segmentation_a))
     (site,) = match_study((runs,), DEFAULT_CATALOGUE, Silent()).sites
-    assert runs.segmentation_a.motion[site.diastole.a.frame] == runs.segmentation_a.motion.min()
-    assert len(site.diastole.a.chains) == 3
+    assert runs.segmentation_a.motion[site.runs.diastole.a.frame] == runs.segmentation_a.motion.min()
+    assert len(site.runs.diastole.a.chains) == 3
     assert named_right(site, study.truth["S01"], ("reference", "pacing", "mapping"))
 
 
@@ -151,13 +151,13 @@ def test_a_catheter_missing_in_the_diastolic_mean_is_taken_from_a_quiet_frame(he
     runs = study.site("S01")
     mean = runs.segmentation_b.diastole
     (site,) = match_study((runs,), DEFAULT_CATALOGUE, Silent()).sites
-    mapping = next(chain for chain in site.diastole.b.chains if chain.catheter == "mapping")
+    mapping = next(chain for chain in site.runs.diastole.b.chains if chain.catheter == "mapping")
     left = tuple(chain for chain in mean.chains if not np.allclose(chain.pixels_uv, mapping.pixels_uv))
     segmentation = replace(runs.segmentation_b, diastole=FrameChains(mean.frame, left))
     (again,) = match_study((replace(runs, segmentation_b=segmentation),), DEFAULT_CATALOGUE, Silent()).sites
-    found = next(chain for chain in again.diastole.b.chains if chain.catheter == "mapping")
+    found = next(chain for chain in again.runs.diastole.b.chains if chain.catheter == "mapping")
     assert found.pixels_uv == pytest.approx(mapping.pixels_uv, abs=5)
-    assert again.diastole.b.frame in runs.segmentation_b.diastole_frames
+    assert again.runs.diastole.b.frame in runs.segmentation_b.diastole_frames
 
 
 def keep(segmentation: Segmentation, wanted) -> Segmentation:  # type: ignore[no-untyped-def]
@@ -219,8 +219,8 @@ def test_marks_that_hold_only_some_electrodes_pair_by_their_numbers(heart) -> No
         runs, segmentation_a=only(runs.segmentation_a, [0, 1, 3]), segmentation_b=only(runs.segmentation_b, [0, 2, 3])
     )
     (site,) = match_study((runs,), DEFAULT_CATALOGUE, Silent()).sites
-    assert site.diastole.a.chains[0].electrodes == (1, 2, 4)
-    assert site.diastole.b.chains[0].electrodes == (1, 3, 4)
+    assert site.runs.diastole.a.chains[0].electrodes == (1, 2, 4)
+    assert site.runs.diastole.b.chains[0].electrodes == (1, 3, 4)
 
 
 def empty(segmentation: Segmentation, why: Reason | None) -> Segmentation:
@@ -290,7 +290,7 @@ def test_a_mark_that_contradicts_everything_else_is_reported_not_dropped_silentl
 def test_named_chains_carry_the_track_of_the_segmenter(heart) -> None:  # type: ignore[no-untyped-def]
     runs = heart(seed=2).site("S01")
     (site,) = match_study((runs,), DEFAULT_CATALOGUE, Silent()).sites
-    for segmentation, track in ((runs.segmentation_a, site.track_a), (runs.segmentation_b, site.track_b)):
+    for segmentation, track in ((runs.segmentation_a, site.runs.track_a), (runs.segmentation_b, site.runs.track_b)):
         assert segmentation is not None
         for entry, observation in zip(segmentation.frames, track, strict=True):
             by_track = {chain.track: chain for chain in entry.chains}
@@ -322,7 +322,7 @@ def test_a_corrected_site_alone_is_compared_and_matched_again(heart, monkeypatch
     context = _Remembering()
     match_study(sites, DEFAULT_CATALOGUE, context)
     assert gathered == ["S00", "S01", "S02"]
-    assert context.computed == ["SiteComparison"] * 3 + ["MatchedSite"] * 3
+    assert context.computed == ["SiteComparison"] * 3 + ["MatchedRuns"] * 3
 
     gathered.clear()
     context.computed.clear()
@@ -334,5 +334,24 @@ def test_a_corrected_site_alone_is_compared_and_matched_again(heart, monkeypatch
     sites[1] = replace(sites[1], segmentation_a=replace(segmentation, frames=tuple(frames)))
     again = match_study(sites, DEFAULT_CATALOGUE, context)
     assert gathered == ["S01"]
-    assert context.computed == ["SiteComparison", "MatchedSite"]
+    assert context.computed == ["SiteComparison", "MatchedRuns"]
+    assert repr(again) == repr(match_study(sites, DEFAULT_CATALOGUE, Silent()))
+
+
+def test_a_name_that_a_person_confirms_matches_no_other_site_again(heart, mark) -> None:  # type: ignore[no-untyped-def]
+    study = heart(seed=1)
+    sites = [study.site(f"S{i:02d}") for i in range(5)]
+    context = _Remembering()
+    before = match_study(sites, DEFAULT_CATALOGUE, context)
+    doubt = ("reference", Reason.IDENTITY_BY_MOTION)
+    assert all(doubt in site.notes for site in before.sites)
+
+    context.computed.clear()
+    segmentation = sites[1].segmentation_a
+    assert segmentation is not None
+    pixels = sites[1].camera_a.project(study.truth["S01"]["reference"])
+    sites[1] = replace(sites[1], segmentation_a=mark(segmentation, pixels, "reference", 5))
+    again = match_study(sites, DEFAULT_CATALOGUE, context)
+    assert context.computed == ["SiteComparison", "MatchedRuns"]
+    assert not any(doubt in site.notes for site in again.sites)
     assert repr(again) == repr(match_study(sites, DEFAULT_CATALOGUE, Silent()))

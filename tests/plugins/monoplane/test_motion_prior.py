@@ -53,14 +53,14 @@ def _study(
     )
     matched = matched_sites(study)
     located = Linear(UncertaintyParams.model_validate(EXACT)).triangulate(matched, DEFAULT_CATALOGUE, Silent()).sites
-    site, visible = located[0], matched[0]
+    site, runs = located[0], matched[0].runs
     views = (
         MonoplaneView(
-            "S01", "a", site.camera_a, DEFAULT_CATALOGUE, visible.frame_times_a_ms, visible.track_a, site.points, site.frame_a,
+            "S01", "a", site.camera_a, DEFAULT_CATALOGUE, runs.frame_times_a_ms, runs.track_a, site.points, site.frame_a,
             site.cycle, (),
         ),
         MonoplaneView(
-            "S01", "b", site.camera_b, DEFAULT_CATALOGUE, visible.frame_times_b_ms, visible.track_b, site.points, site.frame_b,
+            "S01", "b", site.camera_b, DEFAULT_CATALOGUE, runs.frame_times_b_ms, runs.track_b, site.points, site.frame_b,
             site.cycle, (),
         ),
     )  # fmt: skip

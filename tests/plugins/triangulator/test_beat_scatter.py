@@ -29,15 +29,15 @@ def test_the_scatter_of_regular_runs_shows_the_variation_of_the_beats(beat_scale
     found = []
     for seed in (1, 2):
         sites = matched(replace(Conditions.draw(seed, (), sites=5), beat_scale=beat_scale))
-        runs = [run for site in sites for run in beat_scatter(site)]
+        runs = [run for site in sites for run in beat_scatter(site.runs)]
         assert sum(run.degrees for run in runs) > 30
         found.append(scales[int(np.argmax(sum(run.log_likelihood(PHANTOM_BEATS * scales) for run in runs)))])
     assert np.exp(np.mean(np.log(found))) == pytest.approx(beat_scale, rel=0.25)
 
 
 def test_a_run_without_a_second_beat_shows_nothing() -> None:
-    site = matched(Conditions.draw(1, (), sites=4))[0]
-    still = replace(site, track_a=site.track_a[:3], track_b=site.track_b[:3])
+    runs = matched(Conditions.draw(1, (), sites=4))[0].runs
+    still = replace(runs, track_a=runs.track_a[:3], track_b=runs.track_b[:3])
     assert beat_scatter(still) == ()
 
 

@@ -9,6 +9,7 @@ from fluoromap.contracts import (
     Alternative,
     Array,
     Grade,
+    MatchedRuns,
     MatchedSite,
     NamedChain,
     Observation,
@@ -58,13 +59,13 @@ def observation(
 
 
 def site(
-    a: Observation, b: Observation, cameras: tuple[Camera, Camera], cycle: tuple[PhasePair, ...] = (), **changes: object
-) -> MatchedSite:
-    values: dict[str, object] = {
-        "site": "S01", "camera_a": cameras[0], "camera_b": cameras[1], "diastole": PhasePair(a.phase, a, b),
-        "cycle": cycle, "track_a": (a,), "track_b": (b,), "frame_times_a_ms": np.zeros(1), "frame_times_b_ms": np.zeros(1),
-    }  # fmt: skip
-    return MatchedSite(**{**values, **changes})  # type: ignore[arg-type]
+    a: Observation, b: Observation, cameras: tuple[Camera, Camera], cycle: tuple[PhasePair, ...] = (),
+    notes: tuple[tuple[str, Reason], ...] = (), alternative: Alternative | None = None,
+) -> MatchedSite:  # fmt: skip
+    pair = PhasePair(a.phase, a, b)
+    return MatchedSite(
+        "S01", MatchedRuns(*cameras, pair, cycle, (a,), (b,), np.zeros(1), np.zeros(1), alternative), notes
+    )
 
 
 LATERAL_AND_FRONTAL = (camera(90), camera(0))

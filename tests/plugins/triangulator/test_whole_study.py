@@ -15,6 +15,7 @@ from fluoromap.contracts import (
     CHI2_95_3D,
     Array,
     Grade,
+    MatchedRuns,
     MatchedSite,
     NamedChain,
     Observation,
@@ -88,10 +89,13 @@ def matched_sites(
         moved = {name: at + (shifts or {}).get(index, np.zeros(3)) for name, at in points.items()}
         a, b = observation(CAMERAS[0], points, rng, noise_px), observation(true_b, moved, rng, noise_px)
         pair = PhasePair(0.8, a, b)
-        sites.append(
-            MatchedSite(f"S{index + 1:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
-        )
+        runs = MatchedRuns(*CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+        sites.append(MatchedSite(f"S{index + 1:02d}", runs))
     return tuple(sites)
+
+
+def with_diastole(site: MatchedSite, diastole: PhasePair) -> MatchedSite:
+    return replace(site, runs=replace(site.runs, diastole=diastole))
 
 
 def observation(by: Camera, points: Points, rng: np.random.Generator, noise_px: float = NOISE_PX) -> Observation:
@@ -179,9 +183,8 @@ def test_a_wrong_gantry_is_shared_by_both_views() -> None:
         for index, points in enumerate(by_site):
             a, b = (observation(camera, points, rng) for camera in cameras)
             pair = PhasePair(0.8, a, b)
-            sites.append(
-                MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
-            )
+            runs = MatchedRuns(*CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+            sites.append(MatchedSite(f"S{index:02d}", runs))
         answer = located(tuple(sites))
         assert answer.calibration is not None
         assert answer.calibration.applied
@@ -208,7 +211,7 @@ def unequal_pixels(sites: tuple[MatchedSite, ...], rng: np.random.Generator) -> 
     found = []
     for site in sites:
         views = []
-        for view in (site.diastole.a, site.diastole.b):
+        for view in (site.runs.diastole.a, site.runs.diastole.b):
             chains = []
             for chain in view.chains:
                 sd_px = rng.choice([0.06, 0.15, 0.8], len(chain.electrodes), p=[0.7, 0.2, 0.1])
@@ -216,7 +219,7 @@ def unequal_pixels(sites: tuple[MatchedSite, ...], rng: np.random.Generator) -> 
                 covariances = sd_px[:, None, None] ** 2 * np.eye(2)
                 chains.append(replace(chain, pixels_uv=pixels, covariance_px2=covariances))
             views.append(replace(view, chains=tuple(chains)))
-        found.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+        found.append(with_diastole(site, replace(site.runs.diastole, a=views[0], b=views[1])))
     return tuple(found)
 
 
@@ -250,13 +253,13 @@ def test_a_site_with_wrong_electrodes_leaves_the_uncertainty_of_the_others(seed:
     by_site = electrodes(seed, sites=8)
     sites = list(matched_sites(by_site, np.random.default_rng(seed)))
     before = located(tuple(sites))
-    view = sites[2].diastole.b
+    view = sites[2].runs.diastole.b
     chains = [
         replace(chain, pixels_uv=chain.pixels_uv + np.array([[0, 20], [0, 0], [0, 0], [0, -20]]))
         for chain in view.chains
     ]
     wrong = replace(view, chains=tuple(chains))
-    sites[2] = replace(sites[2], diastole=replace(sites[2].diastole, b=wrong))
+    sites[2] = with_diastole(sites[2], replace(sites[2].runs.diastole, b=wrong))
     answer = located(tuple(sites))
     assert Reason.GEOMETRY_DOUBTFUL in answer.sites[2].reasons
     for index in (0, 1, 3, 4, 5, 6, 7):
@@ -282,7 +285,7 @@ def test_beats_that_displace_catheters_are_no_doubt_where_pixels_are_known_unequ
     by_site, sites = electrodes(seed), []
     for points, site in zip(by_site, matched_sites(by_site, rng), strict=True):
         views = []
-        for camera, view in zip(CAMERAS, (site.diastole.a, site.diastole.b), strict=True):
+        for camera, view in zip(CAMERAS, (site.runs.diastole.a, site.runs.diastole.b), strict=True):
             chains = []
             for chain in view.chains:
                 sd_px = rng.choice([0.05, 0.1, 0.6], len(chain.electrodes))
@@ -290,7 +293,7 @@ def test_beats_that_displace_catheters_are_no_doubt_where_pixels_are_known_unequ
                 pixels = camera.project(points[chain.catheter]) + beat_px + rng.normal(size=(4, 2)) * sd_px[:, None]
                 chains.append(replace(chain, pixels_uv=pixels, covariance_px2=sd_px[:, None, None] ** 2 * np.eye(2)))
             views.append(replace(view, chains=tuple(chains)))
-        sites.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+        sites.append(with_diastole(site, replace(site.runs.diastole, a=views[0], b=views[1])))
     answer = located(tuple(sites))
     assert len(answer.sites) == len(sites)
     assert not any(Reason.GEOMETRY_DOUBTFUL in site.reasons for site in answer.sites)
@@ -303,13 +306,13 @@ def test_pixels_known_well_do_not_hide_how_far_whole_catheters_move(seed: int) -
     by_site, sites = electrodes(seed), []
     for site in matched_sites(by_site, rng, noise_px=0.05):
         views = []
-        for camera, view in zip(CAMERAS, (site.diastole.a, site.diastole.b), strict=True):
+        for camera, view in zip(CAMERAS, (site.runs.diastole.a, site.runs.diastole.b), strict=True):
             chains = [
                 replace(chain, pixels_uv=chain.pixels_uv + follows * rng.normal(0, 0.25 * camera.px_per_mm, 2))
                 for chain in view.chains
             ]
             views.append(replace(view, chains=tuple(chains)))
-        sites.append(replace(site, diastole=replace(site.diastole, a=views[0], b=views[1])))
+        sites.append(with_diastole(site, replace(site.runs.diastole, a=views[0], b=views[1])))
     assert located(tuple(sites)).sites[0].variation.beats > 0.75
 
 
@@ -317,7 +320,7 @@ def test_an_electrodes_own_bend_is_no_beat() -> None:
     """It does not grow with the beats, else precise pixels would show calm beats where whole catheters move."""
     (site,) = matched_sites(electrodes(74, sites=1), np.random.default_rng(74))
     params = UncertaintyParams(beat_sd_mm=0.0)
-    pixels = pixels_in_both_views(site.diastole)
+    pixels = pixels_in_both_views(site.runs.diastole)
     equations = site_equations(CalibrationSite(CAMERAS, pixels), CAMERAS, DEFAULT_CATALOGUE, (), params)
     assert (equations.beats == 0).all()
     assert np.linalg.eigvalsh(equations.fixed - np.diag(equations.pixel_variance)).min() > 0
@@ -434,9 +437,8 @@ def test_a_gantry_that_no_electrode_shows_is_in_the_ellipsoids() -> None:
                 for camera, of_view in zip(CAMERAS, turns, strict=True)
             )
             pair = PhasePair(0.8, a, b)
-            sites.append(
-                MatchedSite(f"S{index:02d}", *CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
-            )
+            runs = MatchedRuns(*CAMERAS, pair, (), (a,), (b,), np.zeros(1), np.full(1, ANOTHER_BEAT_MS))
+            sites.append(MatchedSite(f"S{index:02d}", runs))
         answer = located(tuple(sites))
         found, true = errors(answer, by_site)
         covariances = np.array([point.covariance_mm2 for site in answer.sites for point in site.points])
@@ -467,9 +469,9 @@ def without(site: MatchedSite, catheter: str, hidden: tuple[int, ...]) -> Matche
             chain, electrodes=numbers, pixels_uv=chain.pixels_uv[kept], covariance_px2=chain.covariance_px2[kept]
         )
 
-    seen = site.diastole.a
+    seen = site.runs.diastole.a
     seen = replace(seen, chains=tuple(chain for old in seen.chains if (chain := visible(old)).electrodes))
-    return replace(site, diastole=replace(site.diastole, a=seen))
+    return with_diastole(site, replace(site.runs.diastole, a=seen))
 
 
 @pytest.mark.parametrize("hidden", [(1, 2), (3, 4), (4,)])
@@ -537,20 +539,35 @@ def test_a_corrected_diastole_locates_its_own_site_again() -> None:
     assert sorted(context.computed) == sorted((1 + len(others)) * each + ["StudyChecks"])
 
     context.computed.clear()
-    chains = first.diastole.a.chains
+    chains = first.runs.diastole.a.chains
     moved = replace(chains[0], pixels_uv=chains[0].pixels_uv + 0.5)
-    pair = replace(first.diastole, a=replace(first.diastole.a, chains=(moved, *chains[1:])))
-    corrected = (replace(first, diastole=pair), *others)
+    pair = replace(first.runs.diastole, a=replace(first.runs.diastole.a, chains=(moved, *chains[1:])))
+    corrected = (with_diastole(first, pair), *others)
     again = triangulator.triangulate(corrected, DEFAULT_CATALOGUE, context)
     assert sorted(context.computed) == sorted([*each, "StudyChecks"])
     assert repr(again) == repr(located(corrected))
+
+
+def test_a_note_at_all_sites_locates_none_of_them_again() -> None:
+    sites = matched_sites(electrodes(3), np.random.default_rng(3))
+    triangulator, context = MaximumLikelihood(UncertaintyParams()), _Remembering()
+    triangulator.triangulate(sites, DEFAULT_CATALOGUE, context)
+
+    context.computed.clear()
+    noted = tuple(replace(site, notes=(("reference", Reason.IDENTITY_BY_MOTION),)) for site in sites)
+    again = triangulator.triangulate(noted, DEFAULT_CATALOGUE, context)
+    # The reasons are part of the a-priori points, which follow quickly.
+    assert context.computed == ["APriori"] * len(sites)
+    assert repr(again) == repr(located(noted))
+    for site in again.sites:
+        assert all((Reason.IDENTITY_BY_MOTION in at.reasons) == (at.catheter == "reference") for at in site.points)
 
 
 @pytest.mark.parametrize(("breathing", "beats"), [(1.0, 1.0), (0.3, 1.6)])
 def test_the_size_of_the_study_errors_is_that_of_their_sources(breathing: float, beats: float) -> None:
     points = electrodes(4)[0]
     (site, *_) = matched_sites([points], np.random.default_rng(4))
-    labels = pixels_in_both_views(site.diastole).labels
+    labels = pixels_in_both_views(site.runs.diastole).labels
     params = UncertaintyParams().scaled(breathing, beats)
     gantry = np.cov(np.random.default_rng(0).normal(size=(14, 40)))
     sources = study_sources(CAMERAS, np.concatenate(list(points.values())), labels, DEFAULT_CATALOGUE, params, gantry)
@@ -575,10 +592,10 @@ def _without_tip(pair: PhasePair) -> PhasePair:
 
 def _moments() -> list[Moment]:
     sites = matched_sites(electrodes(5), np.random.default_rng(5))
-    sites = (replace(sites[0], diastole=_without_tip(sites[0].diastole)), *sites[1:])
+    sites = (with_diastole(sites[0], _without_tip(sites[0].runs.diastole)), *sites[1:])
     params = UncertaintyParams()
     locator = SiteLocator(JointLeastSquares(), DEFAULT_CATALOGUE, header_belief(params), any_study_belief(params), 1.5)
-    found = [locator.diastole(site, CAMERAS, None, None).chosen for site in sites]
+    found = [locator.diastole(site.runs, CAMERAS, None, None).chosen for site in sites]
     assert all(moment is not None for moment in found)
     return [moment for moment in found if moment is not None]
 
@@ -597,7 +614,7 @@ def test_the_errors_of_a_site_do_not_depend_on_the_others() -> None:
 def test_equations_say_the_same_when_their_products_are_known() -> None:
     gaps = gap_labels(DEFAULT_CATALOGUE, frozenset(DEFAULT_CATALOGUE.names))
     sites = [
-        CalibrationSite(CAMERAS, pixels_in_both_views(site.diastole))
+        CalibrationSite(CAMERAS, pixels_in_both_views(site.runs.diastole))
         for site in matched_sites(electrodes(6), np.random.default_rng(6))
     ]
 

@@ -19,6 +19,7 @@ from fluoromap.contracts import (
     ChamberMap,
     ElectrodePoint,
     LocatedSite,
+    MatchedRuns,
     MatchedSite,
     Matching,
     NamedChain,
@@ -264,8 +265,7 @@ def _observation(view: str, frame: int) -> Observation:
 
 def matching() -> Matching:
     times = np.arange(FRAMES, dtype=np.float64)
-    site = MatchedSite(
-        site="S01",
+    runs = MatchedRuns(
         camera_a=camera("a"),
         camera_b=camera("b"),
         diastole=PhasePair(None, _observation("a", DIASTOLE), _observation("b", DIASTOLE)),
@@ -275,7 +275,7 @@ def matching() -> Matching:
         frame_times_a_ms=times,
         frame_times_b_ms=times,
     )
-    return Matching((site,), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
+    return Matching((MatchedSite("S01", runs),), (RejectedSite("S02", (Reason.PAIRING_FAILED,)),))
 
 
 def triangulation(reference_mm: Any = REFERENCE_MM) -> Triangulation:

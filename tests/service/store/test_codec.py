@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import typing
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -221,6 +222,18 @@ def test_a_deferred_value_of_another_form_says_so() -> None:
     value = deferred(Segmentation, "hash", lambda: encode(_whole()))
     with pytest.raises(StoredOtherwise):
         _ = value.frames
+
+
+def test_no_types_are_looked_up_while_a_prepared_kind_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    content = encode(_whole())
+    codec._form_of.cache_clear()
+    codec.prepare(_Whole)
+
+    def never(*_: object) -> object:
+        raise AssertionError("the types are looked up")
+
+    monkeypatch.setattr(typing, "get_type_hints", never)
+    assert decode(_Whole, content).parts[1].name == "b"
 
 
 def test_an_undecoded_copy_has_the_fields_and_the_hash_of_its_value() -> None:

@@ -133,7 +133,7 @@ def _site_at(
         camera=(located.camera_a, located.camera_b)[view],
         catalogue=catalogue,
         frame_times_ms=run.frame_times_ms,
-        observations=(matched.track_a, matched.track_b)[view],
+        observations=(matched.runs.track_a, matched.runs.track_b)[view],
         a_priori=located.a_priori_points,
         a_priori_frame=(located.frame_a, located.frame_b)[view],
         cycle=located.cycle,

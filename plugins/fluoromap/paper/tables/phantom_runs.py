@@ -16,6 +16,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import (
     Array,
     LocatedSite,
+    MatchedRuns,
     MatchedSite,
     MonoplaneView,
     NamedChain,
@@ -126,8 +127,7 @@ def _matched_site(site: SimulatedSite, rng: np.random.Generator) -> MatchedSite:
     tracks = tuple(_track(run, rng) for run in site.runs)
     diastole = tuple(track[_diastolic_frame(track)] for track in tracks)
     cameras = tuple(camera_from_gantry(run.gantry) for run in site.runs)
-    return MatchedSite(
-        site=site.name,
+    runs = MatchedRuns(
         camera_a=cameras[0],
         camera_b=cameras[1],
         diastole=PhasePair(diastole[0].phase, diastole[0], diastole[1]),
@@ -137,6 +137,7 @@ def _matched_site(site: SimulatedSite, rng: np.random.Generator) -> MatchedSite:
         frame_times_a_ms=site.runs[0].frame_times_ms,
         frame_times_b_ms=site.runs[1].frame_times_ms,
     )
+    return MatchedSite(site.name, runs)
 
 
 def _track(run: SimulatedRun, rng: np.random.Generator) -> tuple[Observation, ...]:
@@ -175,7 +176,7 @@ def _monoplane_view(
         camera=located.camera_a if lateral else located.camera_b,
         catalogue=catalogue,
         frame_times_ms=run.frame_times_ms,
-        observations=site.track_a if lateral else site.track_b,
+        observations=site.runs.track_a if lateral else site.runs.track_b,
         a_priori=located.a_priori_points,
         a_priori_frame=located.frame_a if lateral else located.frame_b,
         cycle=located.cycle,

@@ -108,7 +108,7 @@ def get_placement(job_id: JobId, uid: InstanceUid, caller: Reader) -> Placement:
                 frame=frame + 1,
                 shift_mm=placement.shift_mm(frame).tolist(),
                 tip_px=_pixel(placement.tip_uv(frame)),
-                electrodes=_electrodes(placement.chains.get(frame, {})),
+                electrodes=_electrodes(placement.shown(frame)),
             )
             for frame in range(count)
         ],

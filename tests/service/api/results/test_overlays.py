@@ -167,8 +167,8 @@ def test_the_reference_may_be_shown_in_part(study: FinishedStudy, shown: tuple[i
     chosen = [number - 1 for number in shown]
     chain = NamedChain("reference", shown, pixels[chosen], np.tile(np.eye(2), (len(shown), 1, 1)))
     site = whole.sites[0]
-    diastole = replace(site.diastole, a=replace(site.diastole.a, chains=(chain,)))
-    study.end("match", None, replace(whole, sites=(replace(site, diastole=diastole),)))
+    diastole = replace(site.runs.diastole, a=replace(site.runs.diastole.a, chains=(chain,)))
+    study.end("match", None, replace(whole, sites=(replace(site, runs=replace(site.runs, diastole=diastole)),)))
     study.end("triangulate", None, triangulation())
     study.end("fuse", None, map_result())
     # The third was not located: it does not show where the catheter is.

@@ -24,8 +24,8 @@ def _matching(pixels_uv: Array) -> Matching:
     before = matching()
     (site,) = before.sites
     named = NamedChain("reference", (1, 2), pixels_uv, COVARIANCE, track=0)
-    track = tuple(replace(seen, chains=(named,)) for seen in site.track_a)
-    return replace(before, sites=(replace(site, track_a=track),))
+    track = tuple(replace(seen, chains=(named,)) for seen in site.runs.track_a)
+    return replace(before, sites=(replace(site, runs=replace(site.runs, track_a=track)),))
 
 
 def test_detected_electrodes_have_the_numbers_of_matching(client: TestClient, study: FinishedStudy) -> None:
