@@ -19,7 +19,8 @@ from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
-from fluoromap.segmenter.tracking import ChainSearch, TrackJudge, chain_distance, track_chains
+from fluoromap.segmenter.tracking import track_chains
+from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance
 
 T = TypeVar("T")
 

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.track_agreement import ShapeSearch, with_common_kinds, with_common_shape
+from fluoromap.segmenter.track_completion import completed
+from fluoromap.segmenter.tracks import (
+    KEPT_VELOCITY,
+    SAME_PLACE_PX,
+    ChainSearch,
+    Track,
+    TrackJudge,
+    chain_distance,
+    count_shared,
+    farthest_px,
+    kind_overlap,
+    mean_shift,
+    meet,
+    overlaps,
+    reverse,
+)
 
-_SPEED_PX_PER_MS = 13.0 / 16.7
-_FARTHEST_PX = 45.0
-_NEAREST_PX = 13.0
 _BEND_PX = 8.0
 _STIFF_PX = 3.5
 _BENDING_PX_PER_MS = 0.05
-_KEPT_VELOCITY = 0.6
 _STALE_MS = 50.0
 _FAINT = 0.12
 """Share of its best score at an older place below which a chain far from there is something else."""
@@ -29,7 +39,6 @@ _OTHER_KIND = 6.0
 _IMPOSSIBLE = 1e6
 _CONFIRMED_PX = 18.0
 _CONFIRMERS = 60
-_SAME_PLACE_PX = 4.0
 _SEEN_AT_LEAST = 0.2
 _RECOVERED_AT_LEAST = 0.5
 _LONG_RUN = 5
@@ -37,76 +46,6 @@ _REVERSED_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
-_DISPLACED_WEIGHT = 0.5
-
-
-class ChainSearch(Protocol):
-    """Search for a chain of another frame."""
-
-    def __call__(
-        self,
-        frame: int,
-        chain: Chain,
-        shift: Array,
-        reach_px: float,
-        taken: Sequence[Chain],
-        same_shape: bool = False,
-        confirmed: bool = False,
-    ) -> Chain | None:
-        """Return the chain in a frame; see :meth:`~fluoromap.segmenter.run_segmentation.Detector.find_again`."""
-
-
-TrackJudge = Callable[[Mapping[int, Chain]], bool]
-"""frame -> chain of one track -> whether the run shows a catheter there."""
-
-
-@dataclass(slots=True, eq=False)
-class _Track:
-    """A catheter along the run.
-
-    chain, time_ms : the chain that was assigned last, and its time. velocity : (2,) pixels a millisecond, forwards in time.
-    detections : number of frames in which the segmenter found it. direction : sum of their log-odds that the tip is the
-    track's first electrode. from_seed : whether the seed contains it.
-    """
-
-    chain: Chain
-    time_ms: float
-    velocity: Array
-    detections: int = 1
-    direction: float = 0.0
-    from_seed: bool = False
-    confirmed: bool = False
-    manual: bool = False
-    chains: dict[int, Chain] = field(default_factory=dict)
-
-
-def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
-    """Return mean shift and largest remaining distance between two chains, pixels.
-
-    Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
-    more electrodes counts half: clutter and merged pairs displace some of a long catheter.
-    """
-    mine, theirs = _common_places(one, other)
-    if not len(mine):
-        return np.inf, np.inf
-    difference = theirs - mine if shift is None else theirs - mine - shift
-    mean = difference.sum(axis=0) / len(difference)
-    rest = difference - mean
-    away = np.sort(np.sqrt((rest * rest).sum(axis=1)))
-    if len(away) >= MANY_ELECTRODES:
-        away[-(len(away) // 5) :] *= _DISPLACED_WEIGHT
-    return float(np.sqrt(mean @ mean)), float(away.max())
-
-
-def kind_overlap(one: Chain, other: Chain) -> float:
-    """Return how well the kinds of two chains agree.
-
-    0 : they cannot be the same catheter. 1 : their probabilities agree as far as they can.
-    """
-    theirs = dict(other.kinds)
-    agreement = sum(probability * theirs.get(name, 0.0) for name, probability in one.kinds)
-    squares = [sum(probability**2 for _, probability in chain.kinds) for chain in (one, other)]
-    return agreement / max(*squares, 1e-9)
 
 
 def track_chains(
@@ -177,21 +116,11 @@ def track_chains(
     ]
     tracks_kept.sort(key=lambda track: -track.detections)
     if accepts is not None and search is not None:
-        for track in tracks_kept:
-            if not track.manual:
-                _complete(track, tracks_kept, frame_times_ms, catheters, search)
         rare = [track for track in tracks if track not in tracks_kept and len(track.chains) >= _judged_frames(found)]
-        for track in sorted(filter(_is_long, rare), key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
-            parts = [other for other in tracks_kept if _is_part(other, track)]
-            if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
-                # Anatomy rarely has so long a row: frames that lack the track may show it, and it is judged again with them.
-                others = [other for other in tracks_kept if other not in parts]
-                _complete(track, others, frame_times_ms, catheters, search)
-                if len(track.chains) >= least and accepts(track.chains):
-                    tracks_kept = [*others, track]
+        tracks_kept = completed(tracks_kept, rare, least, frame_times_ms, catheters, search, accepts)
     for track in tracks_kept:
         if track.direction < 0 and not track.manual:
-            track.chains = {frame: _reverse(chain) for frame, chain in track.chains.items()}
+            track.chains = {frame: reverse(chain) for frame, chain in track.chains.items()}
         if search is not None and not track.manual:
             track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
     for number, track in enumerate(tracks_kept):
@@ -206,7 +135,7 @@ def track_chains(
         for track in tracks_kept:
             chain = track.chains.get(frame)
             room = len(chains) < catheters or (chain is not None and chain.manual)
-            if chain is not None and room and (chain.manual or not _overlaps(chain, chains)):
+            if chain is not None and room and (chain.manual or not overlaps(chain, chains)):
                 chains.append(chain)
         missing = any(frame not in track.chains for track in usual)
         reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
@@ -221,17 +150,17 @@ def _follow(
     search: ChainSearch | None,
     seed: FrameChains | None,
     marks_first: bool,
-) -> list[_Track]:
+) -> list[Track]:
     """Return all tracks, false ones too."""
     marked = [entry.frame for entry in found if any(chain.manual for chain in entry.chains)]
-    tracks: list[_Track] = []
+    tracks: list[Track] = []
     begun_with: tuple[Chain, ...] = ()
     if seed is not None and seed.chains and not (marked and marks_first):
         start = seed.frame
         at = float(frame_times_ms[start])
         begun_with = seed.chains
         tracks = [
-            _Track(chain, at, np.zeros(2), detections=0, from_seed=True, confirmed=not marks_first)
+            Track(chain, at, np.zeros(2), detections=0, from_seed=True, confirmed=not marks_first)
             for chain in begun_with
         ]
     else:
@@ -255,20 +184,20 @@ def _follow(
 
 
 def _accepted(
-    tracks: list[_Track],
+    tracks: list[Track],
     found: Sequence[FrameChains],
     frame_times_ms: Array,
     catheters: int,
     search: ChainSearch | None,
     accepts: TrackJudge,
     marks_first: bool,
-) -> list[_Track]:
+) -> list[Track]:
     """Return the tracks without wrong ones.
 
     A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
     """
     judged = _judged_frames(found)
-    confirmed: list[_Track] = []
+    confirmed: list[Track] = []
     for attempt in range(_MOST_RETRIES + 1):
         wrong = [
             track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
@@ -284,7 +213,7 @@ def _accepted(
         tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     for track in confirmed:
         # Followed in another order, it may have ended at other places, and the judge may have rejected those.
-        if not any(_meet(track, other) for other in tracks):
+        if not any(meet(track, other) for other in tracks):
             tracks.append(track)
     return tracks
 
@@ -294,55 +223,7 @@ def _judged_frames(found: Sequence[FrameChains]) -> int:
     return min(_JUDGED_FRAMES, math.ceil(_ACCEPTED_AT_LEAST * len(found)))
 
 
-def _meet(track: _Track, other: _Track) -> bool:
-    """Return whether two tracks share electrodes in a frame."""
-    return any(
-        _overlaps(chain, [other.chains[frame]]) for frame, chain in track.chains.items() if frame in other.chains
-    )
-
-
-def _is_long(track: _Track) -> bool:
-    return len(track.chain.electrodes) >= MANY_ELECTRODES
-
-
-def _is_part(track: _Track, other: _Track) -> bool:
-    """Return whether a track lies on electrodes of a track with more electrodes."""
-    return not track.manual and len(track.chain.electrodes) < len(other.chain.electrodes) and _meet(track, other)
-
-
-def _complete(
-    track: _Track, tracks: Sequence[_Track], frame_times_ms: Array, catheters: int, search: ChainSearch
-) -> None:
-    """Search an accepted track in the frames that lack it.
-
-    The search goes from one frame to the next and ends where a frame does not show the catheter. The whole run shows it, so these
-    frames only have to show its contrast.
-    """
-    for frames in (range(len(frame_times_ms)), range(len(frame_times_ms) - 1, -1, -1)):
-        before: int | None = None
-        moved: tuple[int, int] | None = None
-        for frame in frames:
-            if frame not in track.chains and before is not None:
-                others = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
-                since = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
-                if len(others) < catheters:
-                    expected = np.zeros(2)
-                    if moved is not None:
-                        elapsed = abs(float(frame_times_ms[moved[1]] - frame_times_ms[moved[0]]))
-                        shift = _mean_shift(track.chains[moved[0]], track.chains[moved[1]])
-                        expected = _KEPT_VELOCITY * shift * (since / elapsed)
-                    found = search(frame, track.chains[before], expected, _reach_px(since), others, confirmed=True)
-                    if found is not None and not _overlaps(found, others):
-                        track.chains[frame] = found
-            if frame not in track.chains:
-                before = None
-                continue
-            if before is not None:
-                moved = before, frame
-            before = frame
-
-
-def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
+def _is_outvoted(track: Track, found: Sequence[FrameChains]) -> bool:
     """Return whether more frames show a longer or displaced chain there.
 
     They are compared with the frames that show the track's own chain. A chain of the seed or of the first frame can be a part of
@@ -351,7 +232,7 @@ def _is_outvoted(track: _Track, found: Sequence[FrameChains]) -> bool:
     against = 0
     for frame, chain in track.chains.items():
         against += found[frame].manual_needed is None and any(
-            _overlaps(chain, [other]) if len(other.electrodes) > len(chain.electrodes) else _is_displaced(chain, other)
+            overlaps(chain, [other]) if len(other.electrodes) > len(chain.electrodes) else _is_displaced(chain, other)
             for other in found[frame].chains
             if other is not chain
         )
@@ -366,16 +247,16 @@ def _is_displaced(chain: Chain, other: Chain) -> bool:
     count = len(chain.electrodes)
     if len(other.electrodes) != count:
         return False
-    shared = _count_shared(chain, other)
+    shared = count_shared(chain, other)
     return 2 * shared >= count and shared <= count - 2
 
 
-def _starts(chain: Chain, frame: int, tracks: Sequence[_Track]) -> bool:
+def _starts(chain: Chain, frame: int, tracks: Sequence[Track]) -> bool:
     """Return whether one of these tracks began with this chain of the seed."""
-    return any(track.from_seed and _overlaps(chain, [track.chains[frame]]) for track in tracks if frame in track.chains)
+    return any(track.from_seed and overlaps(chain, [track.chains[frame]]) for track in tracks if frame in track.chains)
 
 
-def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
+def _without(entry: FrameChains, wrong: Sequence[Track]) -> FrameChains:
     """Return a frame's chains without those of wrong tracks."""
     places = [track.chains[entry.frame] for track in wrong if entry.frame in track.chains]
     return replace(
@@ -385,14 +266,14 @@ def _without(entry: FrameChains, wrong: Sequence[_Track]) -> FrameChains:
             for chain in entry.chains
             if chain.manual
             or all(
-                chain.electrodes != place.electrodes or sum(chain_distance(chain, place)) > _SAME_PLACE_PX
+                chain.electrodes != place.electrodes or sum(chain_distance(chain, place)) > SAME_PLACE_PX
                 for place in places
             )
         ),
     )
 
 
-def _search_beside(track: _Track, tracks: Sequence[_Track], search: ChainSearch) -> ShapeSearch:
+def _search_beside(track: Track, tracks: Sequence[Track], search: ChainSearch) -> ShapeSearch:
     """Return the search for a track's chain among the chains of the other tracks."""
 
     def beside(frame: int, chain: Chain, shift: Array, reach_px: float) -> Chain | None:
@@ -436,42 +317,14 @@ def _first_velocity(chains: dict[int, Chain], frame_times_ms: Array) -> Array:
     if after is None:
         return np.zeros(2)
     return (
-        _KEPT_VELOCITY
-        * _mean_shift(chains[first], after)
+        KEPT_VELOCITY
+        * mean_shift(chains[first], after)
         / max(float(frame_times_ms[first + 1] - frame_times_ms[first]), 1e-6)
     )
 
 
-def _mean_shift(one: Chain, other: Chain) -> Array:
-    mine, theirs = _common_places(one, other)
-    if not len(mine):
-        return np.zeros(2)
-    moved: Array = (theirs - mine).sum(axis=0) / len(mine)
-    return moved
-
-
-def _common_places(one: Chain, other: Chain) -> tuple[Array, Array]:
-    """Return the places in two chains of the electrodes that both have, (n, 2)."""
-    if one.electrodes == other.electrodes:
-        return one.pixels_uv, other.pixels_uv
-    common = sorted(set(one.electrodes) & set(other.electrodes))
-    mine, theirs = (chain.pixels_uv[[chain.electrodes.index(number) for number in common]] for chain in (one, other))
-    return mine, theirs
-
-
-def _overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
-    """Return whether two or more electrodes lie on electrodes of another chain."""
-    return any(_count_shared(chain, other) >= 2 for other in others)
-
-
-def _count_shared(chain: Chain, other: Chain) -> int:
-    """Count the electrodes of a chain that lie on electrodes of another."""
-    apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
-    return int(np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < _SAME_PLACE_PX**2))
-
-
 def _advance(
-    tracks: list[_Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None
+    tracks: list[Track], entry: FrameChains, time_ms: float, catheters: int, search: ChainSearch | None
 ) -> None:  # fmt: skip
     numbers, turned = _assign(tracks, entry.chains, time_ms)
     by_hand = any(chain.manual for chain in entry.chains)
@@ -487,7 +340,7 @@ def _advance(
             if track.confirmed and number not in numbers:
                 _search(track, entry.frame, time_ms, catheters, search, present, sure)
         numbers = [
-            -1 if number >= 0 and not tracks[number].confirmed and _overlaps(chain, present) else number
+            -1 if number >= 0 and not tracks[number].confirmed and overlaps(chain, present) else number
             for chain, number in zip(entry.chains, numbers, strict=True)
         ]
     for chain, number, other_way in zip(entry.chains, numbers, turned, strict=True):
@@ -496,7 +349,7 @@ def _advance(
         tracks[number].detections += 1
         tracks[number].direction += -_tip_odds(chain) if other_way else _tip_odds(chain)
         if other_way:
-            chain = _reverse(chain)
+            chain = reverse(chain)
         if search is not None and not by_hand and (other_way or _is_bent(tracks[number], chain, time_ms)):
             bent.append((number, chain))
         else:
@@ -507,7 +360,7 @@ def _advance(
         track = tracks[number]
         shift, reach = _expected(track, time_ms)
         recovered = search(entry.frame, track.chain, shift, reach, present) if search is not None else None
-        if recovered is not None and not _is_bent(track, recovered, time_ms) and not _overlaps(recovered, present):
+        if recovered is not None and not _is_bent(track, recovered, time_ms) and not overlaps(recovered, present):
             chain = replace(recovered, kinds=chain.kinds, tip_odds=chain.tip_odds)
         _extend(track, chain, entry.frame, time_ms)
         present.append(chain)
@@ -517,15 +370,15 @@ def _advance(
             if number not in numbers and not track.confirmed:
                 _search(track, entry.frame, time_ms, catheters, search, present)
     for chain in loose:
-        if chain.manual or (entry.manual_needed is None and not _overlaps(chain, present)):
+        if chain.manual or (entry.manual_needed is None and not overlaps(chain, present)):
             present.append(chain)
-            track = _Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain})
+            track = Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain})
             track.direction = _tip_odds(chain)
             tracks.append(track)
 
 
 def _search(
-    track: _Track,
+    track: Track,
     frame: int,
     time_ms: float,
     catheters: int,
@@ -542,7 +395,7 @@ def _search(
         return
     shift, reach = _expected(track, time_ms)
     recovered = search(frame, track.chain, shift, reach, taken, confirmed=track.confirmed)
-    if recovered is None or _overlaps(recovered, taken):
+    if recovered is None or overlaps(recovered, taken):
         return
     is_faint = np.median(recovered.scores) < _FAINT * track.chain.scores.max()
     # Far from an old place there may be anything.
@@ -559,39 +412,30 @@ def _tip_odds(chain: Chain) -> float:
     return 1.0 if chain.tip_odds is None else chain.tip_odds
 
 
-def _is_bent(track: _Track, chain: Chain, time_ms: float) -> bool:
+def _is_bent(track: Track, chain: Chain, time_ms: float) -> bool:
     """Return whether the shape changed faster than a heart bends a catheter."""
     allowed = _STIFF_PX + _BENDING_PX_PER_MS * abs(time_ms - track.time_ms)
     return chain_distance(track.chain, chain)[1] > min(allowed, _BEND_PX)
 
 
-def _extend(track: _Track, chain: Chain, frame: int, time_ms: float) -> None:
+def _extend(track: Track, chain: Chain, frame: int, time_ms: float) -> None:
     elapsed = time_ms - track.time_ms
     if elapsed != 0:
-        track.velocity = _KEPT_VELOCITY * _mean_shift(track.chain, chain) / elapsed
+        track.velocity = KEPT_VELOCITY * mean_shift(track.chain, chain) / elapsed
     track.chain, track.time_ms = chain, time_ms
     track.manual |= chain.manual
     track.chains[frame] = chain
 
 
-def _expected(track: _Track, time_ms: float) -> tuple[Array, float]:
+def _expected(track: Track, time_ms: float) -> tuple[Array, float]:
     """Return the expected shift of a track and its largest error, pixels."""
     elapsed = time_ms - track.time_ms
     # An old velocity says nothing about where the heart is now.
     shift = track.velocity * elapsed if abs(elapsed) < _STALE_MS else np.zeros(2)
-    return shift, _reach_px(abs(elapsed))
+    return shift, farthest_px(abs(elapsed))
 
 
-def _reach_px(elapsed_ms: float) -> float:
-    return min(max(_NEAREST_PX, _SPEED_PX_PER_MS * elapsed_ms), _FARTHEST_PX)
-
-
-def _reverse(chain: Chain) -> Chain:
-    """Return the same chain with its tip at the other end."""
-    return replace(chain.from_other_end(chain.electrodes[-1]), electrodes=chain.electrodes)
-
-
-def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -> tuple[list[int], list[bool]]:
+def _assign(tracks: Sequence[Track], chains: Sequence[Chain], time_ms: float) -> tuple[list[int], list[bool]]:
     """Return the track number of each chain and whether the chain is reversed.
 
     The number is -1 where no track fits.
@@ -614,7 +458,7 @@ def _assign(tracks: Sequence[_Track], chains: Sequence[Chain], time_ms: float) -
             elif not chain.manual and (away <= gate or chain.electrodes != track.chain.electrodes):
                 # Turned, the same electrodes have the same mean shift.
                 if row not in others:
-                    others[row] = _reverse(chain)
+                    others[row] = reverse(chain)
                 away, bent = chain_distance(track.chain, others[row], shift)
                 if away <= gate and bent <= _BEND_PX:
                     cost[row, column] = away + 2.0 * bent + unlike + _REVERSED_PX

@@ -1,0 +1,101 @@
+"""Completion of tracks: an accepted catheter is searched in the frames that lack it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fluoromap.contracts import Array
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.tracks import (
+    KEPT_VELOCITY,
+    ChainSearch,
+    Track,
+    TrackJudge,
+    farthest_px,
+    mean_shift,
+    meet,
+    overlaps,
+)
+
+
+def completed(
+    kept: Sequence[Track],
+    rare: Sequence[Track],
+    least: float,
+    frame_times_ms: Array,
+    catheters: int,
+    search: ChainSearch,
+    accepts: TrackJudge,
+) -> list[Track]:
+    """Return the tracks with chains in the frames that lacked them.
+
+    Parameters
+    ----------
+    kept : sequence of Track
+        Accepted tracks.
+    rare : sequence of Track
+        Tracks that too few frames show. A long one may replace tracks of its parts that have fewer electrodes together: anatomy
+        rarely has so long a row. It is judged again with the frames that the search adds.
+    least : float
+        In how many frames a track is seen.
+    frame_times_ms : (n,)
+    catheters : int
+        Number of catheters in the catalogue: the largest number of chains of one frame.
+    search : ChainSearch
+    accepts : TrackJudge
+    """
+    tracks = list(kept)
+    for track in tracks:
+        if not track.manual:
+            _complete(track, tracks, frame_times_ms, catheters, search)
+    for track in sorted(filter(_is_long, rare), key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
+        parts = [other for other in tracks if _is_part(other, track)]
+        if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
+            others = [other for other in tracks if other not in parts]
+            _complete(track, others, frame_times_ms, catheters, search)
+            if len(track.chains) >= least and accepts(track.chains):
+                tracks = [*others, track]
+    return tracks
+
+
+def _complete(
+    track: Track, tracks: Sequence[Track], frame_times_ms: Array, catheters: int, search: ChainSearch
+) -> None:
+    """Search an accepted track in the frames that lack it.
+
+    The search goes from one frame to the next and ends where a frame does not show the catheter. The whole run shows it, so these
+    frames only have to show its contrast.
+    """
+    for frames in (range(len(frame_times_ms)), range(len(frame_times_ms) - 1, -1, -1)):
+        before: int | None = None
+        moved: tuple[int, int] | None = None
+        for frame in frames:
+            if frame not in track.chains and before is not None:
+                others = [other.chains[frame] for other in tracks if other is not track and frame in other.chains]
+                since = abs(float(frame_times_ms[frame] - frame_times_ms[before]))
+                if len(others) < catheters:
+                    expected = np.zeros(2)
+                    if moved is not None:
+                        elapsed = abs(float(frame_times_ms[moved[1]] - frame_times_ms[moved[0]]))
+                        shift = mean_shift(track.chains[moved[0]], track.chains[moved[1]])
+                        expected = KEPT_VELOCITY * shift * (since / elapsed)
+                    found = search(frame, track.chains[before], expected, farthest_px(since), others, confirmed=True)
+                    if found is not None and not overlaps(found, others):
+                        track.chains[frame] = found
+            if frame not in track.chains:
+                before = None
+                continue
+            if before is not None:
+                moved = before, frame
+            before = frame
+
+
+def _is_part(track: Track, other: Track) -> bool:
+    """Return whether a track lies on electrodes of a track with more electrodes."""
+    return not track.manual and len(track.chain.electrodes) < len(other.chain.electrodes) and meet(track, other)
+
+
+def _is_long(track: Track) -> bool:
+    return len(track.chain.electrodes) >= MANY_ELECTRODES

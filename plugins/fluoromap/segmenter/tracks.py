@@ -1,0 +1,135 @@
+"""Tracks: one catheter's chains along a run, and how chains of different frames compare."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+
+KEPT_VELOCITY = 0.6
+"""Share of a track's last velocity that is expected to last."""
+SAME_PLACE_PX = 4.0
+"""Distance below which electrodes of two chains are one."""
+
+_SPEED_PX_PER_MS = 13.0 / 16.7
+_FARTHEST_PX = 45.0
+_NEAREST_PX = 13.0
+_DISPLACED_WEIGHT = 0.5
+
+
+class ChainSearch(Protocol):
+    """Search for a chain of another frame."""
+
+    def __call__(
+        self,
+        frame: int,
+        chain: Chain,
+        shift: Array,
+        reach_px: float,
+        taken: Sequence[Chain],
+        same_shape: bool = False,
+        confirmed: bool = False,
+    ) -> Chain | None:
+        """Return the chain in a frame; see :meth:`~fluoromap.segmenter.run_segmentation.Detector.find_again`."""
+
+
+TrackJudge = Callable[[Mapping[int, Chain]], bool]
+"""frame -> chain of one track -> whether the run shows a catheter there."""
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """A catheter along the run.
+
+    chain, time_ms : the chain that was assigned last, and its time. velocity : (2,) pixels a millisecond, forwards in time.
+    detections : number of frames in which the segmenter found it. direction : sum of their log-odds that the tip is the
+    track's first electrode. from_seed : whether the seed contains it.
+    """
+
+    chain: Chain
+    time_ms: float
+    velocity: Array
+    detections: int = 1
+    direction: float = 0.0
+    from_seed: bool = False
+    confirmed: bool = False
+    manual: bool = False
+    chains: dict[int, Chain] = field(default_factory=dict)
+
+
+def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
+    """Return mean shift and largest remaining distance between two chains, pixels.
+
+    Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
+    more electrodes counts half: clutter and merged pairs displace some of a long catheter.
+    """
+    mine, theirs = _common_places(one, other)
+    if not len(mine):
+        return np.inf, np.inf
+    difference = theirs - mine if shift is None else theirs - mine - shift
+    mean = difference.sum(axis=0) / len(difference)
+    rest = difference - mean
+    away = np.sort(np.sqrt((rest * rest).sum(axis=1)))
+    if len(away) >= MANY_ELECTRODES:
+        away[-(len(away) // 5) :] *= _DISPLACED_WEIGHT
+    return float(np.sqrt(mean @ mean)), float(away.max())
+
+
+def kind_overlap(one: Chain, other: Chain) -> float:
+    """Return how well the kinds of two chains agree.
+
+    0 : they cannot be the same catheter. 1 : their probabilities agree as far as they can.
+    """
+    theirs = dict(other.kinds)
+    agreement = sum(probability * theirs.get(name, 0.0) for name, probability in one.kinds)
+    squares = [sum(probability**2 for _, probability in chain.kinds) for chain in (one, other)]
+    return agreement / max(*squares, 1e-9)
+
+
+def mean_shift(one: Chain, other: Chain) -> Array:
+    """Return the mean shift (2,) from one chain to another, pixels; 0 where they share no electrodes."""
+    mine, theirs = _common_places(one, other)
+    if not len(mine):
+        return np.zeros(2)
+    moved: Array = (theirs - mine).sum(axis=0) / len(mine)
+    return moved
+
+
+def _common_places(one: Chain, other: Chain) -> tuple[Array, Array]:
+    """Return the places in two chains of the electrodes that both have, (n, 2)."""
+    if one.electrodes == other.electrodes:
+        return one.pixels_uv, other.pixels_uv
+    common = sorted(set(one.electrodes) & set(other.electrodes))
+    mine, theirs = (chain.pixels_uv[[chain.electrodes.index(number) for number in common]] for chain in (one, other))
+    return mine, theirs
+
+
+def overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
+    """Return whether two or more electrodes lie on electrodes of another chain."""
+    return any(count_shared(chain, other) >= 2 for other in others)
+
+
+def count_shared(chain: Chain, other: Chain) -> int:
+    """Count the electrodes of a chain that lie on electrodes of another."""
+    apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
+    return int(np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < SAME_PLACE_PX**2))
+
+
+def meet(track: Track, other: Track) -> bool:
+    """Return whether two tracks share electrodes in a frame."""
+    return any(overlaps(chain, [other.chains[frame]]) for frame, chain in track.chains.items() if frame in other.chains)
+
+
+def farthest_px(elapsed_ms: float) -> float:
+    """Return how far from its expected place a catheter may be after a time."""
+    return min(max(_NEAREST_PX, _SPEED_PX_PER_MS * elapsed_ms), _FARTHEST_PX)
+
+
+def reverse(chain: Chain) -> Chain:
+    """Return the same chain with its tip at the other end."""
+    return replace(chain.from_other_end(chain.electrodes[-1]), electrodes=chain.electrodes)
