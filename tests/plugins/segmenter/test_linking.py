@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
+from fluoromap.segmenter.chain_search import find_paths
 from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.linking import (
     PossibleChains,
@@ -130,3 +131,46 @@ def test_parts_of_a_long_catheter_do_not_crowd_out_a_short_one_elsewhere():
     )
     chosen = best_chains(possible, points, families, PX)
     assert sorted(chain.candidates for chain in chosen) == [tuple(range(10)), (20, 21, 22, 23)]
+
+
+def bent(catheter, tip, turn_deg, at):
+    """Return the electrodes of a catheter that bends once, at the electrode ``at``."""
+    angles = np.where(np.arange(catheter.electrodes - 1) < at, 0.0, np.deg2rad(turn_deg))
+    steps = np.array(catheter.spacing_mm)[:, None] * PX * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([[tip], tip + np.cumsum(steps, axis=0)])
+
+
+@pytest.mark.parametrize(("name", "is_found"), [("decapolar-2-5-2", True), ("quadripolar-2-5-2", False)])
+def test_only_a_long_catheter_may_bend_sharply_between_a_pair_and_a_gap(name, is_found):
+    catheter = catheter_type(name, "bent")
+    points = bent(catheter, np.array([30.0, 30.0]), 64.0, 2 if name.startswith("quad") else 4)
+    spacing_px = np.array(catheter.spacing_mm) * PX
+    paths = find_paths(points, np.ones(len(points)), spacing_px, PX)
+    assert any((path == np.arange(len(points))).all() for path in paths) == is_found
+
+
+def test_a_whole_catheter_is_worth_more_than_a_displaced_chain_with_a_part_of_another():
+    catalogue = Catalogue((catheter_type("decapolar-2-5-2", "cs"), catheter_type("ablation-4", "map")), "cs", "map")
+    row, _ = straight(catalogue["cs"], (20, 60), 0.1, 0.5)
+    beyond = row[-1] + np.outer([1.0, 2.0], row[-1] - row[-2])
+    points = np.concatenate([row, beyond, row[2:4] + 3.0])
+    long_rows = np.array([np.arange(10), np.arange(2, 12)])
+    possible = PossibleChains((long_rows, np.array([[0, 1, 12, 13]])), (np.array([13.7, 7.2]), np.array([4.0])))
+    families = catheter_families(catalogue)
+    assert [chain.candidates for chain in best_chains(possible, points, families, PX)] == [
+        tuple(range(2, 12)), (0, 1, 12, 13)
+    ]  # fmt: skip
+    (whole,) = best_chains(possible, points, families, PX, sure=10)
+    assert whole.candidates == tuple(range(10))
+
+
+def test_chains_do_not_take_turns_along_one_line():
+    catalogue = Catalogue(
+        (catheter_type("hexapolar-2-5-2", "hexa"), catheter_type("quadripolar-5-5-5", "quad")), "hexa", "quad"
+    )
+    points = np.array([20.0, 60.0]) + np.outer(np.arange(8) * 4.0 * PX, [np.cos(0.1), np.sin(0.1)])
+    possible = PossibleChains(
+        (np.array([[0, 1, 3, 4, 6, 7]]), np.array([[2, 3, 5, 6]])), (np.array([6.0]), np.array([5.0]))
+    )
+    (only,) = best_chains(possible, points, catheter_families(catalogue), PX)
+    assert only.candidates == (0, 1, 3, 4, 6, 7)
