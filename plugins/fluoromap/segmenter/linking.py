@@ -13,6 +13,7 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import log_odds
 
 _EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
@@ -229,8 +230,9 @@ def best_chains(
     """Return the best set of these chains, best first.
 
     The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
-    weaker catheter is not dropped, nor a part of a long one preferred. Only the first ``sure`` candidates add to it so, all by
-    default: a chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain.
+    weaker catheter is not dropped, nor a part of a long one preferred. Among long catheters only the first
+    ``sure`` candidates add to it so, all by default: a chain that lies two electrodes too far along its catheter would leave two of
+    them to a part of another chain.
     Crossing catheters may share one candidate at a price, but two chains must not lie at the same place. A set has at most as
     many chains of a family as the catalogue has catheters.
     """
@@ -281,7 +283,9 @@ def _best_set(
     for index, (rows, paths) in enumerate(zip(compared, possible.rows, strict=True)):
         within[family == index, : paths.shape[1]] = paths[rows]
     of_each = np.array([each.worth / each.catheter.electrodes for each in families])[family]
-    counted = within >= 0 if sure is None else (within >= 0) & (within < sure)
+    counted = within >= 0
+    if sure is not None and longest >= MANY_ELECTRODES:
+        counted &= within < sure
     values = scores + of_each * counted.sum(axis=1)
     order = np.argsort(-values, kind="stable")
     within, family, scores = within[order], family[order], scores[order]
