@@ -134,7 +134,7 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
 
 
 def _lies_between(chosen: IntArray, points: Array, places: Array, near_px: float) -> BoolArray:
-    """Return which places lie near the line between the first and the last electrode of each chain, (n, places)."""
+    """Return which places lie along which chain, (n, places)."""
     starts, ends = points[chosen[:, :-1]], points[chosen[:, 1:]]
     is_gap = chosen[:, 1:] >= 0
     along = ends - starts

@@ -92,7 +92,7 @@ def kind_overlap(one: Chain, other: Chain) -> float:
 
 
 def mean_shift(one: Chain, other: Chain) -> Array:
-    """Return the mean shift (2,) from one chain to another, pixels; 0 where they share no electrodes."""
+    """Return the mean shift (2,) between two chains, pixels; 0 where none is shared."""
     mine, theirs = _common_places(one, other)
     if not len(mine):
         return np.zeros(2)
