@@ -230,11 +230,10 @@ def best_chains(
     """Return the best set of these chains, best first.
 
     The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
-    weaker catheter is not dropped, nor a part of a long one preferred. Among long catheters only the first
-    ``sure`` candidates add to it so, all by default: a chain that lies two electrodes too far along its catheter would leave two of
-    them to a part of another chain.
-    Crossing catheters may share one candidate at a price, but two chains must not lie at the same place. A set has at most as
-    many chains of a family as the catalogue has catheters.
+    weaker catheter is not dropped, nor a part of a long one preferred. The first ``sure`` candidates were proposed,
+    all by default; of the others only those count that a chain needs, see :func:`_needless`. Crossing catheters may share one
+    candidate at a price, but two chains must not exclude each other, see :func:`~fluoromap.segmenter.chain_search.count_shared`.
+    A set has at most as many chains of a family as the catalogue has catheters.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
     # A long catheter has many chains that differ in one electrode: they must not crowd out the other families.
@@ -283,10 +282,10 @@ def _best_set(
     for index, (rows, paths) in enumerate(zip(compared, possible.rows, strict=True)):
         within[family == index, : paths.shape[1]] = paths[rows]
     of_each = np.array([each.worth / each.catheter.electrodes for each in families])[family]
-    counted = within >= 0
+    electrodes = (within >= 0).sum(axis=1)
     if sure is not None and longest >= MANY_ELECTRODES:
-        counted &= within < sure
-    values = scores + of_each * counted.sum(axis=1)
+        electrodes -= _needless(within, family, sure)
+    values = scores + of_each * electrodes
     order = np.argsort(-values, kind="stable")
     within, family, scores = within[order], family[order], scores[order]
     chosen = chain_search.best_set(
@@ -304,6 +303,25 @@ def _best_set(
         )
         for row in chosen.tolist()
     )
+
+
+def _needless(chosen: IntArray, family: IntArray, sure: int) -> IntArray:
+    """Return how many electrodes of each chain nobody proposed and nobody needs, (n,).
+
+    A chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain. So a
+    long chain needs as many such electrodes as the chain of its family that has the fewest of them and half of its
+    candidates. A short one needs none. Rows of ``chosen`` are filled up with -1.
+    """
+    needless: IntArray = (chosen >= sure).sum(axis=1)
+    for index in np.unique(family):
+        own = np.flatnonzero(family == index)
+        electrodes = np.count_nonzero(chosen[own[0]] >= 0)
+        if electrodes >= MANY_ELECTRODES:
+            member = np.zeros((len(own), chosen.max() + 1), np.float32)
+            member[np.arange(len(own))[:, None], chosen[own, :electrodes]] = 1.0
+            alike = member @ member.T >= electrodes / 2
+            needless[own] -= np.where(alike, needless[own], electrodes).min(axis=1)
+    return needless
 
 
 def chain_score(

@@ -19,6 +19,9 @@ from fluoromap.segmenter.tracks import (
     overlaps,
 )
 
+_NOT_SEEN_MS = 20.0
+"""How long noise may hide a catheter before the search ends."""
+
 
 def completed(
     kept: Sequence[Track],
@@ -65,8 +68,8 @@ def _complete(
 ) -> None:
     """Search an accepted track in the frames that lack it.
 
-    The search goes from one frame to the next and ends where a frame does not show the catheter. The whole run shows it, so these
-    frames only have to show its contrast.
+    The search goes from one frame to the next and ends where a frame does not show the catheter; at 50 frames a second and more,
+    where two in a row do not. The whole run shows it, so these frames only have to show its contrast.
     """
     for frames in (range(len(frame_times_ms)), range(len(frame_times_ms) - 1, -1, -1)):
         before: int | None = None
@@ -85,7 +88,8 @@ def _complete(
                     if found is not None and not overlaps(found, others):
                         track.chains[frame] = found
             if frame not in track.chains:
-                before = None
+                if before is not None and abs(frame_times_ms[frame] - frame_times_ms[before]) > _NOT_SEEN_MS:
+                    before = None
                 continue
             if before is not None:
                 moved = before, frame
