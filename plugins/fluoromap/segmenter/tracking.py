@@ -13,6 +13,7 @@ from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.track_agreement import ShapeSearch, with_common_kinds, with_common_shape
 from fluoromap.segmenter.track_completion import completed
+from fluoromap.segmenter.track_names import surplus
 from fluoromap.segmenter.tracks import (
     KEPT_VELOCITY,
     SAME_PLACE_PX,
@@ -202,6 +203,7 @@ def _accepted(
         wrong = [
             track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
         ]
+        wrong += surplus([track for track in tracks if track not in wrong and len(track.chains) >= judged])
         tracks = [track for track in tracks if track not in wrong]
         found = [_without(entry, wrong) for entry in found]
         if not wrong or attempt == _MOST_RETRIES or not any(entry.chains for entry in found):
