@@ -66,7 +66,7 @@ def electrode_chains(
     least_noise = _COARSE_NOISE if pixels.bits_stored <= _COARSE_BITS else 0.0
 
     network = LatestNetwork(
-        lambda x: NetworkResponse.of_image(x, trained, px_per_mm), lambda x: NearbyNetwork(x, trained, px_per_mm)
+        lambda x: NetworkResponse.of_image(x, trained, px_per_mm, thoroughly=alone), lambda x: NearbyNetwork(x, trained, px_per_mm)
     )
     blobs = LatestBlobs(lambda x: BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm))
 

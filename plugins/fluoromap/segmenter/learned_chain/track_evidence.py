@@ -131,7 +131,7 @@ class TrackEvidence:
             small = self._small(frame, log_image, scale)
             add_moved(small, turn, offset, total)
         total /= len(frames)
-        seen = NetworkResponse.of_reduced(total, self.trained, scale)
+        seen = NetworkResponse.of_reduced(total, self.trained, scale, thoroughly=True)
         shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
