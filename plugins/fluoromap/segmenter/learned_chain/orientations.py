@@ -1,4 +1,4 @@
-"""The network asked about a picture in all its orientations: what it says of one and denies of another is luck."""
+"""The network asked about a picture in several orientations: what it says of one and denies of another is luck."""
 
 from __future__ import annotations
 
@@ -9,43 +9,53 @@ import numpy as np
 from fluoromap.segmenter.learned_chain.layers import HEADS
 from fluoromap.segmenter.log_image import Image
 
+ALL_ORIENTATIONS = 8
+
 _OFFSET_U, _OFFSET_V = HEADS.index("offset_u"), HEADS.index("offset_v")
 _TRANSPOSED = [{_OFFSET_U: _OFFSET_V, _OFFSET_V: _OFFSET_U}.get(head, head) for head in range(len(HEADS))]
+_ORIENTATIONS = [
+    (mirrored_u, mirrored_u != other, transposed)
+    for transposed in (False, True)
+    for other in (False, True)
+    for mirrored_u in (False, True)
+]
+"""Mirrored in u, mirrored in v, transposed; the first two are the picture as it is and turned by 180 degrees."""
 
 
-def mean_answer(network: Callable[[Image], Image], picture: Image) -> Image:
-    """Return the mean of a network's answers to a picture in its eight orientations.
+def mean_answer(network: Callable[[Image], Image], picture: Image, orientations: int) -> Image:
+    """Return the mean of a network's answers to a picture in its first orientations.
 
     Parameters
     ----------
     network : as :class:`~fluoromap.segmenter.learned_chain.forward.ElectrodeNetwork`
     picture : (rows, columns) float32
+    orientations : int
+        1 to 8.
 
     Returns
     -------
     (rows / 2, columns / 2, heads) float32, in the orientation of the picture.
     """
-    rows, columns = picture.shape
-    total = np.zeros((rows // 2, columns // 2, len(HEADS)), np.float32)
-    for mirrored_u in (False, True):
-        for mirrored_v in (False, True):
-            turned = _mirrored(picture, 0) if mirrored_v else picture
-            turned = _mirrored(turned, 1) if mirrored_u else turned
-            of_turned = network(np.ascontiguousarray(turned))
-            of_turned = of_turned + network(np.ascontiguousarray(turned.T)).transpose(1, 0, 2)[..., _TRANSPOSED]
-            if mirrored_u:
-                of_turned = of_turned[:, ::-1]
-                of_turned[..., _OFFSET_U] *= -1.0
-            if mirrored_v:
-                of_turned = of_turned[::-1]
-                of_turned[..., _OFFSET_V] *= -1.0
-            total += of_turned
-    total /= 8.0
-    return total
+    total: Image | None = None
+    for mirrored_u, mirrored_v, transposed in _ORIENTATIONS[:orientations]:
+        turned = _mirrored(picture, 1) if mirrored_u else picture
+        turned = _mirrored(turned, 0) if mirrored_v else turned
+        answers = network(np.ascontiguousarray(turned.T if transposed else turned))
+        if transposed:
+            answers = answers.transpose(1, 0, 2)[..., _TRANSPOSED]
+        if mirrored_u:
+            answers = answers[:, ::-1]
+            answers[..., _OFFSET_U] *= -1.0
+        if mirrored_v:
+            answers = answers[::-1]
+            answers[..., _OFFSET_V] *= -1.0
+        total = answers if total is None else total + answers
+    assert total is not None
+    return total if orientations == 1 else total / np.float32(orientations)
 
 
 def _mirrored(picture: Image, axis: int) -> Image:
-    """Return a picture mirrored so that cells of 2 x 2 px lie on cells.
+    """Return a picture mirrored so that cells lie on cells.
 
     A cell answers for places around its first pixel, so the last row or column is repeated, not the first.
     """
