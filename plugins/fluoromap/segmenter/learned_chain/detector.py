@@ -16,6 +16,7 @@ from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearc
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
 from fluoromap.segmenter.learned_chain.nearby_network import NearbyNetwork
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.learned_chain.orientations import ALL_ORIENTATIONS
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import Trust
 from fluoromap.segmenter.log_image import Image
@@ -65,8 +66,10 @@ def electrode_chains(
     ring_mm = min(catheter.ring_mm for catheter in catalogue.catheters)
     least_noise = _COARSE_NOISE if pixels.bits_stored <= _COARSE_BITS else 0.0
 
+    orientations = ALL_ORIENTATIONS if alone else 1
     network = LatestNetwork(
-        lambda x: NetworkResponse.of_image(x, trained, px_per_mm), lambda x: NearbyNetwork(x, trained, px_per_mm)
+        lambda x: NetworkResponse.of_image(x, trained, px_per_mm, orientations),
+        lambda x: NearbyNetwork(x, trained, px_per_mm),
     )
     blobs = LatestBlobs(lambda x: BlobResponse.of_image(x, field.inside, ring_mm, px_per_mm))
 

@@ -13,6 +13,7 @@ from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.gaussian_blur import repeat_edge
 from fluoromap.segmenter.learned_chain.layers import CELL_PX, HEADS, STRIDE_PX
 from fluoromap.segmenter.learned_chain.normalisation import normalise
+from fluoromap.segmenter.learned_chain.orientations import mean_answer
 from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.log_image import Image
@@ -74,18 +75,22 @@ class NetworkResponse:
         return self.answers.nbytes + self.probability.nbytes
 
     @classmethod
-    def of_image(cls, x: Image, trained: Trained, px_per_mm: float) -> NetworkResponse:
-        """Ask the network about a log image, reduced to the network's scale."""
+    def of_image(cls, x: Image, trained: Trained, px_per_mm: float, orientations: int = 1) -> NetworkResponse:
+        """Ask the network about a log image, reduced to the network's scale.
+
+        ``orientations`` : see :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
+        """
         scale = network_scale(px_per_mm)
-        return cls.of_reduced(resampled(x, scale), trained, scale)
+        return cls.of_reduced(resampled(x, scale), trained, scale, orientations)
 
     @classmethod
-    def of_reduced(cls, small: Image, trained: Trained, scale: float) -> NetworkResponse:
+    def of_reduced(cls, small: Image, trained: Trained, scale: float, orientations: int = 1) -> NetworkResponse:
         """Ask the network about a reduced log image.
 
-        It has ``scale`` times the size of the frame.
+        It has ``scale`` times the size of the frame. ``orientations`` : see
+        :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
         """
-        answers = answer(trained, normalise(small))
+        answers = answer(trained, normalise(small), orientations)
         probability = electrode_probability(trained, answers)
         cell_px, first_px = cell_grid(scale)
         found = _peaks(probability, answers, cell_px, first_px, trained.variance_gain)
@@ -240,11 +245,15 @@ def network_scale(px_per_mm: float) -> float:
     return 1.0 if _TAKEN_AS_IS[0] <= scale <= _TAKEN_AS_IS[1] else scale
 
 
-def answer(trained: Trained, picture: Image) -> Image:
-    """Return the network's answers to a normalised picture of any size, (rows / 2, columns / 2, heads), both rounded up."""
+def answer(trained: Trained, picture: Image, orientations: int = 1) -> Image:
+    """Return the network's answers to a normalised picture of any size, (rows / 2, columns / 2, heads), both rounded up.
+
+    ``orientations`` : see :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
+    """
     rows, columns = picture.shape
     padded = repeat_edge(picture, rows + -rows % STRIDE_PX, columns + -columns % STRIDE_PX)
-    return trained.network(padded)[: -(-rows // CELL_PX), : -(-columns // CELL_PX)]
+    answers = mean_answer(trained.network, padded, orientations)
+    return answers[: -(-rows // CELL_PX), : -(-columns // CELL_PX)]
 
 
 def _apart(cells: Array) -> BoolArray:

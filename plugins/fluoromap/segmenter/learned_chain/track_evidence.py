@@ -27,6 +27,7 @@ from fluoromap.segmenter.run_segmentation import Recall, compute_always
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 _AVERAGED = 8
+_ORIENTATIONS = 2
 _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
@@ -131,7 +132,7 @@ class TrackEvidence:
             small = self._small(frame, log_image, scale)
             add_moved(small, turn, offset, total)
         total /= len(frames)
-        seen = NetworkResponse.of_reduced(total, self.trained, scale)
+        seen = NetworkResponse.of_reduced(total, self.trained, scale, _ORIENTATIONS)
         shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
