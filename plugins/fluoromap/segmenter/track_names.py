@@ -17,8 +17,8 @@ _AT_ONE_TIME = 0.5
 def surplus(tracks: Sequence[Track]) -> list[Track]:
     """Return the tracks for which the study has no catheter left.
 
-    No single frame shows more catheters of a kind than the study has, but tracks that began in different frames may. Those that were
-    found in fewer frames are left over. Tracks that were set by hand keep their names.
+    No single frame shows more catheters of a kind than the study has, but tracks that began in different frames may. Those that
+    were found in fewer frames are left over. Tracks that were set by hand keep their names.
     """
     left_over: list[Track] = []
     kept: list[tuple[Track, frozenset[str]]] = []
