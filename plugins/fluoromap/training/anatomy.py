@@ -11,6 +11,7 @@ from numpy.random import Generator
 from PIL import Image as PillowImage
 from scipy.ndimage import affine_transform
 
+from fluoromap.contracts import Array
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.training.drawing import Canvas, Image
 from fluoromap.training.randomness import between, chance, random_curve, scaled, smooth_field
@@ -64,7 +65,11 @@ def _draw_spine(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
     half, pitch = between(random, 12.0, 20.0) * px_per_mm, between(random, 24.0, 34.0) * px_per_mm
     dark = between(random, 0.1, 0.45)
     reach = 1.5 * canvas.size
-    canvas.stroke(np.array([middle - axis * reach, middle + axis * reach]), half, dark, flat=True)
+    along = np.arange(-reach, reach, pitch / 8.0)
+    waist = 1.0 - between(random, 0.0, 0.12) * np.sin(math.pi * along / pitch) ** 2
+    canvas.stroke(middle + along[:, None] * axis, half * waist, dark, flat=True)
+    if chance(random, 0.5):
+        _draw_aorta(random, canvas, px_per_mm, middle + along[:, None] * axis, square * half)
     for number in range(-math.ceil(reach / pitch), math.ceil(reach / pitch) + 1):
         at = middle + axis * (number * pitch)
         plate = np.array([at - square * half, at + square * half])
@@ -74,6 +79,14 @@ def _draw_spine(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
             wide = between(random, 2.0, 4.0) * px_per_mm
             canvas.disc(place, 1.4 * wide, wide, angle, dark * between(random, 0.1, 0.5), 1.5, 2.0)
             canvas.disc(place, 0.9 * wide, 0.6 * wide, angle, -dark * between(random, 0.0, 0.3), 1.5, 2.0)
+
+
+def _draw_aorta(random: Generator, canvas: Canvas, px_per_mm: float, line: Array, edge: Array) -> None:
+    """Draw the descending aorta: its border runs beside the spine's and crosses it."""
+    half, side = between(random, 9.0, 14.0) * px_per_mm, float(random.choice([-1.0, 1.0]))
+    wave = np.sin(np.arange(len(line)) / between(random, 5.0, 20.0) + between(random, 0.0, 6.3))
+    away = between(random, 0.3, 1.1) + between(random, 0.0, 0.3) * wave
+    canvas.stroke(line + side * away[:, None] * edge, half, between(random, 0.03, 0.2), flat=True)
 
 
 def _draw_borders(random: Generator, canvas: Canvas, px_per_mm: float) -> None:

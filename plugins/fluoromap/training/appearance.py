@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ from PIL import ImageDraw
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.training.drawing import Image
 from fluoromap.training.exposure import Exposure
+from fluoromap.training.printing import compressed, printed
 from fluoromap.training.randomness import between, chance, scaled, smooth_field
 
 _LETTERS = "ABLRAO0123456789.mmsTIHx+-:/"
@@ -57,7 +57,7 @@ def take_picture(random: Generator, things: Image, body: Image, exposure: Exposu
         grey += np.float32(between(random, 0.2, 2.5)) * (grey - gaussian(grey, between(random, 0.8, 6.0)))
     if chance(random, 0.15):
         grey = gaussian(grey, between(random, 0.5, 1.3))
-    return Picture(_stored(random, grey), float(noise.std()), gaussian(intensity, 4.0))
+    return Picture(_stored(random, grey, exposure.printed), float(noise.std()), gaussian(intensity, 4.0))
 
 
 def _collimator(random: Generator, size: int) -> Image:
@@ -89,15 +89,18 @@ def _grey_levels(random: Generator, intensity: Image) -> Image:
     return power
 
 
-def _stored(random: Generator, grey: Image) -> NDArray[np.uint8]:
+def _stored(random: Generator, grey: Image, in_print: bool) -> NDArray[np.uint8]:
     """Convert grey values to a stored picture.
 
-    The steps are window, local vendor contrast, burnt-in text, 8 bit, and JPEG or a codec's blocks.
+    The steps are window, local vendor contrast, burnt-in text, 8 bit, a publication's print, and JPEG.
     """
     if chance(random, 0.1):
         grey = grey * (1.0 + between(random, 0.0, 0.3) * smooth_field(random, len(grey), 40.0))
-    low, high = np.percentile(grey[::2, ::2], [between(random, 0.0, 2.0), between(random, 98.0, 100.0)])
-    width = (high - low) * (between(random, 1.0, 3.0) if chance(random, 0.6) else 1.0) + 1e-9
+    hard = 2.0 if in_print else 1.0
+    low, high = np.percentile(
+        grey[::2, ::2], [between(random, 0.0, 2.0 * hard), 100.0 - between(random, 0.0, 2.0 * hard)]
+    )
+    width = (high - low) * (between(random, 1.0, 3.0) if chance(random, 0.6 / hard) else 1.0) + 1e-9
     start = between(random, 0.0, 1.0) * (width - (high - low))
     levels = np.clip((grey - low + start) / width, 0.0, 1.0) * 255.0
     picture = PillowImage.fromarray(levels.astype(np.uint8))
@@ -105,8 +108,8 @@ def _stored(random: Generator, grey: Image) -> NDArray[np.uint8]:
         text = "".join(random.choice(list(_LETTERS), int(random.integers(2, 9))))
         u, v = random.integers(-10, len(grey), 2)
         ImageDraw.Draw(picture).text((float(u), float(v)), text, fill=int(random.choice([0, 230, 255])))
+    if in_print:
+        picture = printed(random, picture)
     if chance(random, 0.5):
-        stored = io.BytesIO()
-        picture.save(stored, "JPEG", quality=int(between(random, 30.0, 96.0)))
-        picture = PillowImage.open(stored)
+        picture = compressed(picture, int(between(random, 30.0, 96.0)))
     return np.asarray(picture, dtype=np.uint8)

@@ -86,6 +86,34 @@ class Canvas:
             edge_px,
         )  # fmt: skip
 
+    def ring(
+        self,
+        at_uv: Array,
+        angle: float,
+        half_px: float,
+        radius_px: float,
+        strength: float,
+        hollow: float,
+        shortening: float,
+    ) -> None:
+        """Add a thin-walled ring that is seen obliquely: both its openings show.
+
+        Parameters
+        ----------
+        at_uv : (2,)
+        angle : float
+            Direction of its axis in the image.
+        half_px, radius_px : float
+            Half its length and its outer radius in space.
+        strength : float
+            Attenuation where a ray touches the inside of a ring that lies in the image plane.
+        hollow : float
+            Inner radius over outer radius, above 0.
+        shortening : float
+            Length seen over length in space, above 0 and below 1.
+        """
+        _ring(self.depth, float(at_uv[0]), float(at_uv[1]), angle, half_px, radius_px, strength, hollow, shortening)
+
     def disc(
         self, at_uv: Array, half_u: float, half_v: float, angle: float, strength: float, edge_px: float, power: float
     ) -> None:
@@ -170,6 +198,34 @@ def _band(depth, at_u, at_v, angle, half, radius, strength, hollow, dome, edge):
                 profile = (profile - math.sqrt(max(hollow * hollow - q, 0.0))) / rim
             kept = min(max((end - abs(along)) / edge + 0.5, 0.0), 1.0)
             depth[v, u] += strength * profile * kept * beside
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _ring(depth, at_u, at_v, angle, half, radius, strength, hollow, shortening):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the length of each ray within the wall.
+
+    At the place p square to the axis in the plane of ray and axis, a ray that passes the middle at ``along`` is at
+    (along + p * tilt) / shortening on the axis. The wall is where p lies between the inner and the outer circle.
+    """
+    rows, columns = depth.shape
+    tilt = math.sqrt(1.0 - shortening * shortening)
+    reach = half * shortening + radius + 1.0
+    cosine, sine = math.cos(angle), math.sin(angle)
+    inner = hollow * radius
+    scale = strength / (8.0 * math.sqrt(radius * radius - inner * inner) * shortening)
+    for v in range(max(int(at_v - reach), 0), min(int(at_v + reach) + 2, rows)):
+        for u in range(max(int(at_u - reach), 0), min(int(at_u + reach) + 2, columns)):
+            length = 0.0
+            for quarter in range(4):
+                du, dv = u - at_u + 0.5 * (quarter % 2) - 0.25, v - at_v + 0.5 * (quarter // 2) - 0.25
+                along, across = du * cosine + dv * sine, dv * cosine - du * sine
+                outside = radius * radius - across * across
+                if outside <= 0.0:
+                    continue
+                far, near = math.sqrt(outside), math.sqrt(max(inner * inner - across * across, 0.0))
+                first, last = (-half * shortening - along) / tilt, (half * shortening - along) / tilt
+                length += max(min(last, far) - max(first, near), 0.0) + max(min(last, -near) - max(first, -far), 0.0)
+            depth[v, u] += scale * length
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

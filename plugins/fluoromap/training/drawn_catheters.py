@@ -11,6 +11,7 @@ from numpy.random import Generator
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array
+from fluoromap.training.courses import beside, to_border
 from fluoromap.training.drawing import Canvas
 from fluoromap.training.randomness import Curve, between, chance, loop_curve, random_curve, scaled
 
@@ -19,6 +20,13 @@ LABEL_COLUMNS = 6
 
 _STEP_MM = 0.5
 _DARKEST_SHAFT = 1.5
+_MOST_OBLIQUE = 2.2
+_OTHER_BRAID = 0.3
+_IN_PLANE, _LEAST_SEEN = 0.97, 0.2
+"""Shortening from which on a ring shows none of its openings, and the least that is drawn."""
+_SIDE_BY_SIDE = 0.2
+_LONG_TIP_MM, _MERGED_TIPS = 3.0, 0.4
+"""A long tip's thermocouple and leads often make one dark bar of the tip and the next ring."""
 _FRENCH_RADII_MM = 0.67, 0.83, 1.0, 1.0, 1.0, 1.17, 1.17, 1.33
 
 
@@ -50,20 +58,22 @@ def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Desi
     if kind < 0.30:
         electrodes, tip = (4 if chance(random, 0.85) else int(random.integers(2, 4))), between(random, 3.0, 8.5)
     elif kind < 0.54:
-        electrodes, tip = 4, between(random, 1.0, 2.5)
+        electrodes, tip = 4, _diagnostic_tip(random)
     elif kind < 0.64:
-        electrodes, tip = int(random.integers(5, 9)), between(random, 1.0, 2.5)
-    elif kind < 0.86:
-        electrodes, tip = 10, between(random, 1.0, 2.5)
-    elif kind < 0.92:
-        electrodes, tip = int(random.choice([12, 14, 16, 20])), between(random, 1.0, 2.2)
-    elif kind < 0.97:
+        electrodes, tip = int(random.integers(5, 9)), _diagnostic_tip(random)
+    elif kind < 0.89:
+        electrodes, tip = 10, _diagnostic_tip(random)
+    elif kind < 0.95:
+        electrodes, tip = int(random.choice([12, 14, 16, 20])), _diagnostic_tip(random)
+    else:
         electrodes, tip = int(random.integers(8, 21)), ring
         return _design(np.full(electrodes - 1, scaled(random, 1.5, 6.0)), ring, tip, loop=True)
-    else:
-        electrodes, tip = 2, between(random, 1.0, 3.0)
-        return _design(np.array([between(random, 6.0, 12.0)]), scaled(random, 2.0, 4.0), tip)
     return _design(_gaps(random, electrodes - 1), ring, tip)
+
+
+def _diagnostic_tip(random: Generator) -> float:
+    """Draw the length of a tip electrode, mm: mostly about 2, longer than the rings."""
+    return between(random, 1.7, 2.4) if chance(random, 0.6) else between(random, 1.0, 2.5)
 
 
 def _gaps(random: Generator, count: int) -> Array:
@@ -91,23 +101,43 @@ def _design(gaps_mm: Array, ring_mm: float, tip_mm: float, loop: bool = False) -
     return Design(starts + 0.5 * lengths, lengths, loop)
 
 
-def draw_catheter(
-    random: Generator, canvas: Canvas, px_per_mm: float, design: Design, metal_between: tuple[float, float]
+def draw_catheters(
+    random: Generator, canvas: Canvas, px_per_mm: float, designs: Sequence[Design], metal_between: tuple[float, float]
 ) -> Array:
-    """Draw one catheter somewhere in the scene, its electrodes of an attenuation in ``metal_between``.
+    """Draw catheters somewhere in the scene, their electrodes of attenuations in ``metal_between``.
+
+    Some lie beside the one drawn before, as in the coronary sinus or in one sheath.
 
     Returns
     -------
-    (electrodes, LABEL_COLUMNS) one row an electrode, from the tip on.
+    (electrodes, LABEL_COLUMNS) one row an electrode, catheter after catheter, from the tip on.
     """
-    curve = _course(random, design, canvas.size / px_per_mm)
-    centres, headings, shortenings = curve.at(design.centres_mm)
-    anchor = int(random.integers(len(centres)))
-    origin = random.uniform(0.05, 0.95, 2) * canvas.size - centres[anchor] * px_per_mm
-    line, places = curve.points_mm * px_per_mm + origin, centres * px_per_mm + origin
+    labels = [np.zeros((0, LABEL_COLUMNS))]
+    course: Curve | None = None
+    for design in designs:
+        companion = None if course is None or not chance(random, _SIDE_BY_SIDE) else _companion(random, course, design)
+        course = companion or _course(random, design, canvas.size / px_per_mm)
+        labels.append(_draw_along(random, canvas, px_per_mm, design, course, metal_between))
+    return np.concatenate(labels)
+
+
+def _companion(random: Generator, course: Curve, design: Design) -> Curve | None:
+    """Draw a course beside another one that is long enough."""
+    ahead = scaled(random, 1.0, 30.0)
+    needed = ahead + float(design.centres_mm[-1]) + 15.0
+    return None if design.loop or len(course.points_mm) * course.step_mm < needed else beside(random, course, ahead)
+
+
+def _draw_along(
+    random: Generator, canvas: Canvas, px_per_mm: float, design: Design, course: Curve,
+    metal_between: tuple[float, float],
+) -> Array:  # fmt: skip
+    course = to_border(course, canvas.size / px_per_mm)
+    centres, headings, shortenings = course.at(design.centres_mm)
+    line, places = course.points_mm * px_per_mm, centres * px_per_mm
     radius = float(random.choice(_FRENCH_RADII_MM)) * px_per_mm
     metal = scaled(random, *metal_between)
-    _draw_shaft(random, canvas, line, radius, metal, px_per_mm)
+    _draw_shaft(random, canvas, line, _shaft_depth(random, course, design), radius, metal, px_per_mm)
     labels = _draw_electrodes(random, canvas, design, places, headings, shortenings, radius, metal, px_per_mm)
     behind = float(design.centres_mm[-1]) + between(random, 3.0, 45.0)
     if chance(random, 0.2):
@@ -116,19 +146,39 @@ def draw_catheter(
 
 
 def _course(random: Generator, design: Design, scene_mm: float) -> Curve:
+    """Draw a course from the tip on, with one of the electrodes in the scene."""
     length = float(design.centres_mm[-1])
-    shaft = between(random, 0.6, 2.2) * scene_mm
+    shaft = between(random, 0.4, 1.5) * scene_mm
     if design.loop:
         turns = between(random, 0.75, 1.05)
-        return loop_curve(random, max(length / (2.0 * math.pi * turns), 5.0), turns, shaft, _STEP_MM)
-    return random_curve(
-        random, length + shaft, _STEP_MM, between(random, 0.3, 1.8), tilt_change=between(random, 0.0, 0.6)
-    )
+        curve = loop_curve(random, max(length / (2.0 * math.pi * turns), 5.0), turns, shaft, _STEP_MM)
+    else:
+        curve = random_curve(
+            random, length + shaft, _STEP_MM, between(random, 0.3, 1.8), tilt_change=between(random, 0.0, 0.6)
+        )
+    centres, _, _ = curve.at(design.centres_mm)
+    return curve.moved(random.uniform(0.05, 0.95, 2) * scene_mm - centres[int(random.integers(len(centres)))])
 
 
-def _draw_shaft(random: Generator, canvas: Canvas, line: Array, radius: float, metal: float, px_per_mm: float) -> None:
+def _shaft_depth(random: Generator, course: Curve, design: Design) -> Array:
+    """Return the shaft's attenuation along its course.
+
+    It is 1 where the shaft lies in the image plane: a ray runs a longer way through a shaft that is seen obliquely. Behind the
+    bendable end some shafts have another braid.
+    """
+    depth: Array = np.minimum(1.0 / course.shortening, _MOST_OBLIQUE)
+    if chance(random, _OTHER_BRAID):
+        from_mm = float(design.centres_mm[-1]) + between(random, 4.0, 50.0)
+        arc = np.arange(len(depth)) * course.step_mm
+        depth *= 1.0 + between(random, -0.4, 1.2) * np.clip((arc - from_mm) / 2.0, 0.0, 1.0)
+    return depth
+
+
+def _draw_shaft(
+    random: Generator, canvas: Canvas, line: Array, depth: Array, radius: float, metal: float, px_per_mm: float
+) -> None:
     kind = random.random()
-    if kind < 0.1:
+    if kind < 0.06:
         strength = 0.0
     elif kind < 0.82:
         strength = min(min(metal, _DARKEST_SHAFT) * between(random, 0.04, 0.7), 0.8)
@@ -136,9 +186,9 @@ def _draw_shaft(random: Generator, canvas: Canvas, line: Array, radius: float, m
         strength = between(random, 0.02, 0.3)
     if strength > 0:
         hollow = between(random, 0.5, 0.85) if chance(random, 0.3) else 0.0
-        canvas.stroke(line, radius * between(random, 0.8, 1.0), strength, hollow)
+        canvas.stroke(line, radius * between(random, 0.8, 1.0), strength * depth, hollow)
     if chance(random, 0.35):
-        canvas.stroke(line[2:], between(random, 0.1, 0.3) * px_per_mm, scaled(random, 0.05, 0.5))
+        canvas.stroke(line[2:], between(random, 0.1, 0.3) * px_per_mm, scaled(random, 0.05, 0.5) * depth[2:])
 
 
 def _draw_electrodes(
@@ -152,18 +202,31 @@ def _draw_electrodes(
     labels = np.zeros((len(places), LABEL_COLUMNS))
     if chance(random, 0.25):
         _fill_gaps(random, canvas, places, wide, metal, px_per_mm)
+    elif design.lengths_mm[0] >= _LONG_TIP_MM and chance(random, _MERGED_TIPS):
+        _fill_gap(canvas, places[0], places[1], wide, between(random, 0.6, 1.0) * metal)
     for number, (place, heading, shortening) in enumerate(zip(places, headings, shortenings, strict=True)):
         length = float(design.lengths_mm[number])
         tilted = math.sqrt(max(0.0, 1.0 - shortening * shortening))
         half = 0.5 * length * px_per_mm * shortening + 0.45 * wide * tilted
-        # A ray runs a longer way through a band that is seen obliquely.
-        strength = metal * between(random, 0.8, 1.2) * min(2.2, 1.0 + 0.3 * length * (1.0 / shortening - 1.0))
+        even = metal * between(random, 0.8, 1.2)
         if number and chance(random, 0.02):
-            strength *= between(random, 0.2, 0.6)
-        canvas.band(
-            place, float(heading) + math.pi, half, wide, strength, tip_hollow if number == 0 else hollow,
-            number == 0 and not design.loop, edge,
-        )  # fmt: skip
+            even *= between(random, 0.2, 0.6)
+        # A ray runs a longer way through a band that is seen obliquely.
+        strength = even * min(_MOST_OBLIQUE, 1.0 + 0.3 * length * (1.0 / shortening - 1.0))
+        own_hollow = tip_hollow if number == 0 else hollow
+        if own_hollow > 0.0 and shortening < _IN_PLANE:
+            canvas.ring(
+                place,
+                float(heading),
+                0.5 * length * px_per_mm,
+                wide,
+                even,
+                own_hollow,
+                max(float(shortening), _LEAST_SEEN),
+            )
+        else:
+            dome = number == 0 and not design.loop
+            canvas.band(place, float(heading) + math.pi, half, wide, strength, own_hollow, dome, edge)
         labels[number] = place[0], place[1], float(number == 0), strength, half, wide
     return labels
 
@@ -176,13 +239,15 @@ def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, me
     share = between(random, 0.3, 0.95)
     only_tip = chance(random, 0.5)
     for number in range(1 if only_tip else len(places) - 1):
-        step = places[number + 1] - places[number]
-        length = float(np.linalg.norm(step))
+        length = float(np.linalg.norm(places[number + 1] - places[number]))
         if length < 5.0 * px_per_mm and chance(random, 0.8):
-            middle = 0.5 * (places[number] + places[number + 1])
-            canvas.band(
-                middle, math.atan2(step[1], step[0]), 0.25 * length, 0.95 * wide, share * metal, 0.0, False, 0.7
-            )
+            _fill_gap(canvas, places[number], places[number + 1], wide, share * metal)
+
+
+def _fill_gap(canvas: Canvas, place: Array, following: Array, wide: float, strength: float) -> None:
+    step = following - place
+    heading, quarter = math.atan2(step[1], step[0]), 0.25 * float(np.linalg.norm(step))
+    canvas.band(0.5 * (place + following), heading, quarter, 0.95 * wide, strength, 0.0, False, 0.7)
 
 
 def _draw_sheath(random: Generator, canvas: Canvas, line: Array, radius: float, px_per_mm: float) -> None:

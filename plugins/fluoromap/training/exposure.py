@@ -14,6 +14,8 @@ from fluoromap.training.randomness import between, chance, scaled
 
 _POOR = 0.45
 _STORED_PLAIN = 0.7
+_PRINTED = 0.22
+_FRONTAL_CLEAR = 0.3
 _DETECTORS = 1.0, 1.0, 1.25, 1.3, 1.4, 1.6, 1.8, 2.0
 _GRAIN_FROM_PX = 0.35
 
@@ -25,7 +27,8 @@ class Exposure:
     photons : mean count in a pixel of the scene. scatter : scattered over primary photons. metal : range of the attenuation of
     electrodes, log units. detector : detector pixels in a pixel of the scene, along a row. grain_px : blur of the noise by
     detector and processing. gain : of the noise, above 1 where processing sharpens it. frontal : through ribs and spine.
-    plain : stored as the detector read it, 12 bits without window, sharpening and compression.
+    plain : stored as the detector read it, 12 bits without window, sharpening and compression. printed : copied from a publication,
+    where it is not plain.
     """
 
     photons: float
@@ -36,6 +39,7 @@ class Exposure:
     gain: float
     frontal: bool
     plain: bool
+    printed: bool
 
     def noise(self, random: Generator, intensity: Image) -> Image:
         """Draw the quantum noise of an intensity whose mean is 1.
@@ -68,6 +72,7 @@ def random_exposure(random: Generator) -> Exposure:
             gain=between(random, 0.9, 1.2),
             frontal=chance(random, 0.7),
             plain=plain,
+            printed=chance(random, _PRINTED),
         )
     return Exposure(
         photons=scaled(random, 60.0, 10000.0),
@@ -76,6 +81,7 @@ def random_exposure(random: Generator) -> Exposure:
         detector=1.0,
         grain_px=between(random, 0.0, 1.2),
         gain=between(random, 0.8, 2.0),
-        frontal=False,
+        frontal=chance(random, _FRONTAL_CLEAR),
         plain=False,
+        printed=chance(random, _PRINTED),
     )

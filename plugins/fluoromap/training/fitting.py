@@ -15,7 +15,7 @@ from torch import Tensor
 from fluoromap.training.network import ElectrodeNetwork, losses
 from fluoromap.training.targets import Prepared, training_pair
 
-BATCH = 16
+BATCH = 12
 STEPS_A_SHARD = 120
 
 _SHARDS_KEPT = 8

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 -- the name that PyTorch's own documentation uses
 from torch import Tensor, nn
 
-from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS, HEADS
+from fluoromap.segmenter.learned_chain.layers import AROUND, CONVOLUTIONS, HEADS
 
 EPSILON = 1e-5
 
@@ -14,7 +14,7 @@ EPSILON = 1e-5
 class ElectrodeNetwork(nn.Module):
     """Proposes electrodes on a grid of 2 px from pictures of about 3.2 px/mm.
 
-    Features at a half, a quarter and an eighth of the size; what the eighth has seen of the surroundings (26 mm) is added to the
+    Features at a half, a quarter and an eighth of the size; what the eighth has seen of the surroundings (60 mm) is added to the
     quarter, which answers for the 2 x 2 cells of 2 px that it covers. Layers are those of
     :data:`~fluoromap.segmenter.learned_chain.layers.CONVOLUTIONS`; all but the last two are followed by batch normalisation
     and a rectifier.
@@ -48,7 +48,7 @@ class ElectrodeNetwork(nn.Module):
         half = self._layer("at_half", x)
         quarter = self._layer("at_quarter_again", self._layer("at_quarter", half))
         eighth = self._layer("at_eighth", quarter)
-        for name in ("around_1", "around_2", "around_3"):
+        for name in AROUND:
             eighth = eighth + self._layer(name, eighth)
         wide = F.interpolate(self._layer("back", eighth), scale_factor=2.0, mode="nearest")
         merged = self._layer("merged", quarter + wide)

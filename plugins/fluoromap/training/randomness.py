@@ -28,11 +28,16 @@ def chance(random: Generator, probability: float) -> bool:
     return bool(random.random() < probability)
 
 
+def whole(random: Generator, mean: float) -> int:
+    """Draw one of the two whole numbers around ``mean``."""
+    return int(mean) + int(chance(random, mean - int(mean)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """A smooth curve in space seen along the rays.
 
-    points_mm : (n, 2) its shadow at the isocentre, from (0, 0) on. step_mm : arc length from point to point in space.
+    points_mm : (n, 2) its shadow at the isocentre. step_mm : arc length from point to point in space.
     heading : (n,) direction in the image, radians. shortening : (n,) length seen over length in space.
     """
 
@@ -46,6 +51,24 @@ class Curve:
         own = np.arange(len(self.points_mm)) * self.step_mm
         places = np.stack([np.interp(arc_mm, own, self.points_mm[:, axis]) for axis in (0, 1)], axis=1)
         return places, np.interp(arc_mm, own, self.heading), np.interp(arc_mm, own, self.shortening)
+
+    @classmethod
+    def along(cls, heading: Array, shortening: Array, step_mm: float, start_mm: Array) -> Curve:
+        """Return the curve of these directions from ``start_mm`` on."""
+        points = np.empty((len(heading), 2))
+        points[0] = start_mm
+        seen = shortening[:-1] * step_mm
+        points[1:, 0] = start_mm[0] + np.cumsum(np.cos(heading[:-1]) * seen)
+        points[1:, 1] = start_mm[1] + np.cumsum(np.sin(heading[:-1]) * seen)
+        return cls(points, step_mm, heading, shortening)
+
+    def moved(self, by_mm: Array) -> Curve:
+        """Return the curve moved by a vector."""
+        return Curve(self.points_mm + by_mm, self.step_mm, self.heading, self.shortening)
+
+    def backward(self) -> Curve:
+        """Return the curve from its end to its beginning."""
+        return Curve(self.points_mm[::-1], self.step_mm, self.heading[::-1] + math.pi, self.shortening[::-1])
 
 
 def random_curve(
@@ -70,7 +93,7 @@ def random_curve(
     heading += arc * (bend * 0.012 * float(random.normal()))
     slope = between(random, 0.0, 1.25) if tilt is None else tilt
     slopes = slope + tilt_change * np.sin(2.0 * math.pi * arc / scaled(random, 30.0, 150.0) + between(random, 0.0, 6.3))
-    return _curve(heading, np.maximum(np.abs(np.cos(slopes)), 0.24), step_mm)
+    return Curve.along(heading, np.maximum(np.abs(np.cos(slopes)), 0.24), step_mm, np.zeros(2))
 
 
 def loop_curve(random: Generator, radius_mm: float, turns: float, shaft_mm: float, step_mm: float) -> Curve:
@@ -91,14 +114,7 @@ def loop_curve(random: Generator, radius_mm: float, turns: float, shaft_mm: floa
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     turned = directions @ _rotation(random).T
     heading = np.unwrap(np.arctan2(turned[:, 1], turned[:, 0]))
-    return _curve(heading, np.maximum(np.hypot(turned[:, 0], turned[:, 1]), 0.15), step_mm)
-
-
-def _curve(heading: Array, shortening: Array, step_mm: float) -> Curve:
-    steps = np.stack([np.cos(heading), np.sin(heading)], axis=1) * (shortening * step_mm)[:, None]
-    points = np.zeros_like(steps)
-    np.cumsum(steps[:-1], axis=0, out=points[1:])
-    return Curve(points, step_mm, heading, shortening)
+    return Curve.along(heading, np.maximum(np.hypot(turned[:, 0], turned[:, 1]), 0.15), step_mm, np.zeros(2))
 
 
 def _rotation(random: Generator) -> Array:

@@ -15,9 +15,10 @@ from fluoromap.training.anatomy import anatomy, from_backgrounds
 from fluoromap.training.appearance import Picture, take_picture
 from fluoromap.training.distractors import draw_distractors
 from fluoromap.training.drawing import Canvas, Image
-from fluoromap.training.drawn_catheters import LABEL_COLUMNS, draw_catheter, random_design
+from fluoromap.training.drawn_catheters import LABEL_COLUMNS, draw_catheters, random_design
 from fluoromap.training.exposure import random_exposure
-from fluoromap.training.randomness import between, chance, scaled
+from fluoromap.training.leads import draw_lead
+from fluoromap.training.randomness import between, chance, scaled, whole
 
 SCALES_PX_PER_MM = 2.3, 4.6
 """Of the pictures; the network sees frames of 3.0 to 6.5 px/mm reduced to its own scale, and that scale is often misjudged."""
@@ -25,6 +26,10 @@ CLEAR = 6.5
 """Contrast over noise, summed over an electrode, from which on the network has to find it."""
 
 _WITHOUT_CATHETER = 0.28
+_CATHETERS = 1, 1, 2, 2, 3
+_LEADS = 0.15
+_CALIBRATED_PX = 160.0
+"""Size of a scene for which numbers of things hold; a larger one has more, so that they lie as densely."""
 _OWN_BACKGROUND = 0.6
 
 
@@ -63,13 +68,16 @@ def make_scene(
     canvas = Canvas.empty(size)
     in_front = chance(random, 0.5)
     if in_front:
-        draw_distractors(random, canvas, px_per_mm)
-    labels = [np.zeros((0, LABEL_COLUMNS))]
+        draw_distractors(random, canvas, px_per_mm, size / _CALIBRATED_PX)
+    drawn = np.zeros((0, LABEL_COLUMNS))
     if not chance(random, _WITHOUT_CATHETER):
-        for _ in range(int(random.choice([1, 1, 2, 2, 3]))):
-            labels.append(draw_catheter(random, canvas, px_per_mm, random_design(random, catalogue), exposure.metal))
+        count = whole(random, float(random.choice(_CATHETERS)) * size * size / _CALIBRATED_PX**2)
+        designs = [random_design(random, catalogue) for _ in range(max(count, 1))]
+        drawn = draw_catheters(random, canvas, px_per_mm, designs, exposure.metal)
+    for _ in range(whole(random, _LEADS * size / _CALIBRATED_PX)):
+        drawn = np.concatenate([drawn, draw_lead(random, canvas, px_per_mm)])
     if not in_front:
-        draw_distractors(random, canvas, px_per_mm)
+        draw_distractors(random, canvas, px_per_mm, size / _CALIBRATED_PX)
     if backgrounds and chance(random, _OWN_BACKGROUND):
         body = from_backgrounds(random, size, backgrounds) + between(random, 0.0, 0.6) * anatomy(
             random, size, px_per_mm, exposure.frontal
@@ -77,10 +85,10 @@ def make_scene(
     else:
         body = anatomy(random, size, px_per_mm, exposure.frontal)
     picture = take_picture(random, canvas.depth, body, exposure)
-    drawn = np.concatenate(labels)
     inside = ((drawn[:, :2] > -8.0) & (drawn[:, :2] < size + 8.0)).all(axis=1)
     drawn = drawn[inside]
-    return Scene(picture.pixels, drawn[:, :2], drawn[:, 2] > 0, _clearness(picture, drawn) / (1.0 + exposure.scatter))
+    clearness = _clearness(picture, drawn) / (1.0 + exposure.scatter)
+    return Scene(picture.pixels, drawn[:, :2], drawn[:, 2] > 0, clearness)
 
 
 def _clearness(picture: Picture, drawn: Array) -> Array:

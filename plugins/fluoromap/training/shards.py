@@ -16,7 +16,7 @@ from fluoromap.training.scenes import make_scene
 from fluoromap.training.targets import Prepared
 
 SCENES_A_SHARD = 480
-SCENE_PX = 160
+SCENE_PX = 192
 
 _AHEAD = 3
 

@@ -6,9 +6,12 @@ from PIL import Image
 
 from fluoromap.catheters import catheter_type
 from fluoromap.training.anatomy import read_backgrounds
+from fluoromap.training.courses import entering
 from fluoromap.training.distractors import draw_distractors
 from fluoromap.training.drawing import Canvas
-from fluoromap.training.drawn_catheters import design_of, draw_catheter, random_design
+from fluoromap.training.drawn_catheters import LABEL_COLUMNS, design_of, draw_catheters, random_design
+from fluoromap.training.printing import printed
+from fluoromap.training.randomness import between, random_curve
 from fluoromap.training.scenes import CLEAR, make_scene
 from fluoromap.training.targets import Prepared, training_pair
 
@@ -24,7 +27,7 @@ def test_labels_lie_on_drawn_electrodes():
     for seed in range(12):
         random = np.random.default_rng(seed)
         canvas = Canvas.empty(160)
-        labels = draw_catheter(random, canvas, 3.2, random_design(random), (0.2, 2.3))
+        labels = draw_catheters(random, canvas, 3.2, [random_design(random)], (0.2, 2.3))
         for u, v in np.rint(labels[:, :2]).astype(int):
             if 2 <= u < 158 and 2 <= v < 158:
                 assert canvas.depth[v - 1 : v + 2, u - 1 : u + 2].max() > 0.03
@@ -40,7 +43,7 @@ def test_distractors_darken_scenes_and_have_no_labels():
 def test_a_lab_s_catheter_has_its_own_spacings():
     deca = catheter_type("decapolar-2-5-2", "cs")
     np.testing.assert_allclose(np.diff(design_of(deca).centres_mm), deca.spacing_mm)
-    labels = draw_catheter(np.random.default_rng(0), Canvas.empty(200), 3.0, design_of(deca), (0.2, 2.3))
+    labels = draw_catheters(np.random.default_rng(0), Canvas.empty(200), 3.0, [design_of(deca)], (0.2, 2.3))
     seen = np.linalg.norm(np.diff(labels[:, :2], axis=0), axis=1) / 3.0
     assert (seen <= np.asarray(deca.spacing_mm) * 1.02).all()
 
@@ -54,6 +57,51 @@ def test_a_lab_s_frames_are_read_and_an_empty_folder_is_named(tmp_path):
     assert make_scene(np.random.default_rng(0), 96, backgrounds=(frame,)).pixels.shape == (96, 96)
 
 
+def test_a_course_leaves_the_scene_from_any_heading():
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        curve = random_curve(random, between(random, 20.0, 120.0), 0.5, 1.8)
+        course = entering(random, 60.0, curve, 40.0)
+        end = course.points_mm[-1]
+        assert ((end < 0.0) | (end > 60.0)).any()
+        assert np.abs(np.diff(course.heading)).max() < 0.2
+        seen = np.linalg.norm(np.diff(course.points_mm, axis=0), axis=1)
+        np.testing.assert_allclose(seen, course.shortening[:-1] * course.step_mm)
+
+
+def test_catheters_beside_each_other_keep_their_own_spacings():
+    deca = design_of(catheter_type("decapolar-2-5-2", "cs"))
+    for seed in range(20):
+        labels = draw_catheters(np.random.default_rng(seed), Canvas.empty(160), 3.0, [deca] * 3, (0.2, 2.3))
+        assert labels.shape == (30, LABEL_COLUMNS)
+        seen = np.linalg.norm(np.diff(labels[:, :2].reshape(3, 10, 2), axis=1), axis=2) / 3.0
+        assert (seen <= np.diff(deca.centres_mm) * 1.02).all()
+
+
+def test_a_larger_scene_has_its_electrodes_as_densely():
+    density = {}
+    for size, seeds in ((128, 160), (256, 40)):
+        inside = 0
+        for seed in range(seeds):
+            scene = make_scene(np.random.default_rng([5, seed]), size)
+            inside += np.count_nonzero(((scene.electrodes_uv > 0) & (scene.electrodes_uv < size)).all(axis=1))
+        density[size] = inside / (seeds * size * size)
+    assert 0.67 < density[256] / density[128] < 1.5
+
+
+def test_a_printed_picture_keeps_its_size_and_its_places():
+    levels = np.full((120, 120), 200, np.uint8)
+    levels[58:63, 38:43] = 20
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        picture = np.asarray(printed(random, Image.fromarray(levels)))
+        assert picture.shape == levels.shape
+        assert picture.dtype == np.uint8
+        if np.abs(picture[50:70, 30:50].astype(int) - levels[50:70, 30:50]).max() < 120:
+            v, u = np.nonzero(picture[50:70, 30:50] < 110)
+            np.testing.assert_allclose([u.mean() + 30, v.mean() + 50], [40, 60], atol=0.8)
+
+
 def test_targets_stand_where_the_electrodes_are():
     for seed in range(20):
         scene = make_scene(np.random.default_rng([3, seed]), 160)
@@ -63,3 +111,18 @@ def test_targets_stand_where_the_electrodes_are():
         apart = {tuple(place) for place in np.rint(scene.electrodes_uv[inside] / 4).tolist()}
         assert np.count_nonzero(target[0] == 1.0) >= len(apart) // 2
         assert (np.abs(target[1:3]) <= 1.5).all()
+
+
+def test_a_ring_has_the_same_metal_from_every_side():
+    wall = 2.0 * np.pi * 5.0**2 * (1.0 - 0.8**2) * 4.0 / (2.0 * 5.0 * np.sqrt(1.0 - 0.8**2))
+    for shortening in (0.95, 0.7, 0.4, 0.2):
+        canvas = Canvas.empty(60)
+        canvas.ring(np.array([30.3, 29.6]), 0.7, 4.0, 5.0, 1.0, 0.8, shortening)
+        assert canvas.depth.sum() == pytest.approx(wall, rel=0.02)
+
+
+def test_an_obliquely_seen_ring_is_open():
+    canvas = Canvas.empty(60)
+    canvas.ring(np.array([30.0, 30.0]), 0.0, 2.0, 6.0, 1.0, 0.9, 0.25)
+    assert canvas.depth[30, 30] == 0.0
+    assert min(canvas.depth[30, 22:28].max(), canvas.depth[30, 33:39].max()) > 0.2

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from scipy.linalg.blas import sgemm
 
-from fluoromap.segmenter.learned_chain.layers import CELL_PX, CONVOLUTIONS, HEADS, Convolution
+from fluoromap.segmenter.learned_chain.layers import AROUND, CELL_PX, CONVOLUTIONS, HEADS, Convolution
 from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
 from fluoromap.segmenter.learned_chain.winograd import convolve, transformed_taps
 from fluoromap.segmenter.log_image import Image
@@ -166,7 +166,7 @@ class ElectrodeNetwork:
             "at_quarter_again", self._answer("at_quarter", self._answer("at_half", picture[..., None]))
         )
         eighth = self._answer("at_eighth", quarter)
-        for name in ("around_1", "around_2", "around_3"):
+        for name in AROUND:
             eighth += self._answer(name, eighth)
         wide = self._answer("back", eighth)
         rows, columns, channels = quarter.shape

@@ -25,15 +25,20 @@ CELL_PX = 2
 STRIDE_PX = 8
 """Rows and columns of a picture are multiples of this."""
 
+AROUND = "around_1", "around_2", "around_3", "around_4", "around_5"
+"""Layers whose answers are added to what they are asked about."""
+
 CONVOLUTIONS = {
     "at_half": Convolution(1, 16, width=5, stride=2),
     "at_quarter": Convolution(16, 32, stride=2),
     "at_quarter_again": Convolution(32, 32),
-    "at_eighth": Convolution(32, 48, stride=2),
-    "around_1": Convolution(48, 48),
-    "around_2": Convolution(48, 48, dilation=2),
-    "around_3": Convolution(48, 48, dilation=3),
-    "back": Convolution(48, 32, width=1, rectified=False),
+    "at_eighth": Convolution(32, 64, stride=2),
+    "around_1": Convolution(64, 64),
+    "around_2": Convolution(64, 64, dilation=2),
+    "around_3": Convolution(64, 64, dilation=4),
+    "around_4": Convolution(64, 64, dilation=2),
+    "around_5": Convolution(64, 64),
+    "back": Convolution(64, 32, width=1, rectified=False),
     "merged": Convolution(32, 32),
     "heads": Convolution(32, 4 * len(HEADS), width=1, rectified=False),
 }

@@ -22,7 +22,7 @@ from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import Proposals
 
-_FIELD_PX = 9 * STRIDE_PX
+_FIELD_PX = 13 * STRIDE_PX
 """How far from a cell the farthest pixel lies that its answer depends on, at most."""
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import affine_transform
 
 from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
-from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS, HEADS
+from fluoromap.segmenter.learned_chain.layers import AROUND, CONVOLUTIONS, HEADS
 from fluoromap.segmenter.learned_chain.network_response import (
     NETWORK_PX_PER_MM,
     NetworkResponse,
@@ -71,7 +71,7 @@ def test_the_whole_network_is_its_layers_in_a_row(weights):
 
     quarter = apply("at_quarter_again", apply("at_quarter", apply("at_half", picture[..., None])))
     eighth = apply("at_eighth", quarter)
-    for name in ("around_1", "around_2", "around_3"):
+    for name in AROUND:
         eighth = eighth + apply(name, eighth)
     heads = apply("heads", apply("merged", quarter + apply("back", eighth).repeat(2, 0).repeat(2, 1)))
     answers = ElectrodeNetwork.of_weights(weights)(picture)
