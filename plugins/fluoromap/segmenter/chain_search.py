@@ -114,8 +114,8 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     """Return how many candidates each two chains have in common, (n, n).
 
     ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may
-    give two candidates. So it is where two or more electrodes of one chain lie between those of the other: one of several chains
-    that take turns along a catheter with more electrodes. Rows of ``chosen`` are filled up with -1.
+    give two candidates. So it is where two or more electrodes of one chain lie between those of the other, or one does and two
+    have the same places: several chains take turns along a catheter with more electrodes. Rows of ``chosen`` are filled up with -1.
     """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)
@@ -126,8 +126,9 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     near = (member @ (square < near_px * near_px).astype(np.float32) > 0).astype(np.float32)
     close = member @ near.T >= most
     if chosen.shape[1] >= _MANY_ELECTRODES:
-        between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
-        close |= between.astype(np.float32) @ member.T >= _INTERLEAVED
+        lies_between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
+        between = lies_between.astype(np.float32) @ member.T
+        close |= (between >= _INTERLEAVED) | ((between >= 1.0) & (between + near @ member.T >= most))
     common: IntArray = (member @ member.T).astype(np.int64)
     common[close | close.T] += most
     return common

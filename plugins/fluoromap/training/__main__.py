@@ -22,7 +22,7 @@ from fluoromap.training.scenes import make_scene
 from fluoromap.training.shards import SCENES_A_SHARD, shards
 from fluoromap.training.validation import validate
 
-SHARDS = 50
+SHARDS = 150
 VALIDATION_SCENES = 160
 _VALIDATION_PX = 320
 _VALIDATION_KEY = 9_999_999

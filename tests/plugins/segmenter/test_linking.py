@@ -174,3 +174,20 @@ def test_chains_do_not_take_turns_along_one_line():
     )
     (only,) = best_chains(possible, points, catheter_families(catalogue), PX)
     assert only.candidates == (0, 1, 3, 4, 6, 7)
+
+
+def test_two_rims_of_a_ring_do_not_let_chains_take_turns():
+    catalogue = Catalogue(
+        (catheter_type("octapolar-2-5-2", "octa"), catheter_type("quadripolar-5-5-5", "quad")), "octa", "quad"
+    )
+    along = np.array([np.cos(0.1), np.sin(0.1)])
+    points = np.array([20.0, 60.0]) + np.outer(np.arange(11) * 3.0 * PX, along)
+    rims = points[[6, 8]] + 0.8 * PX * along
+    aside = points[10] + 4.0 * PX * along[::-1]
+    points = np.concatenate([points, rims, aside[None]])
+    # The short chain shares no candidate with the long one, but two of its places, and one lies in a gap.
+    possible = PossibleChains(
+        (np.array([[0, 1, 3, 4, 6, 8, 9, 10]]), np.array([[11, 7, 12, 13]])), (np.array([6.0]), np.array([5.0]))
+    )
+    (only,) = best_chains(possible, points, catheter_families(catalogue), PX)
+    assert only.candidates == (0, 1, 3, 4, 6, 8, 9, 10)
