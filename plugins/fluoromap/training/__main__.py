@@ -18,7 +18,7 @@ from fluoromap.segmenter.learned_chain.weights import SHIPPED
 from fluoromap.training.anatomy import read_backgrounds
 from fluoromap.training.export import check_folded, halved, write_reference, write_weights
 from fluoromap.training.fitting import BATCH, STEPS_A_SHARD, Progress, fit
-from fluoromap.training.scenes import make_scene
+from fluoromap.training.scenes import CLINICAL_CROWD, make_scene
 from fluoromap.training.shards import SCENES_A_SHARD, shards
 from fluoromap.training.validation import validate
 
@@ -45,7 +45,9 @@ def main(arguments: Sequence[str]) -> None:
     weights = halved(trained)
     network = ElectrodeNetwork.of_weights({name: value.astype(np.float32) for name, value in weights.items()})
     fresh = [
-        make_scene(np.random.default_rng([given.seed, _VALIDATION_KEY, k]), _VALIDATION_PX, catalogue, backgrounds)
+        make_scene(
+            np.random.default_rng([given.seed, _VALIDATION_KEY, k]), _VALIDATION_PX, catalogue, backgrounds, CLINICAL_CROWD
+        )
         for k in range(VALIDATION_SCENES)
     ]
     validated = validate(network, fresh)

@@ -17,13 +17,17 @@ from fluoromap.training.drawing import Canvas, Image
 from fluoromap.training.randomness import between, chance, random_curve, scaled, smooth_field
 
 _DARKEST = 0.04
+_NOBODY = 0.15
 
 
 def anatomy(random: Generator, size: int, px_per_mm: float, frontal: bool) -> Image:
     """Draw a body in attenuation, (size, size) log units, at a random contrast.
 
-    A ``frontal`` view always has bones, mostly ribs and the spine.
+    A ``frontal`` view always has bones, mostly ribs and the spine. Some other scenes show a phantom on the table, without a
+    body.
     """
+    if not frontal and chance(random, _NOBODY):
+        return (scaled(random, 0.002, 0.05) * smooth_field(random, size, between(random, 3.5, 60.0))).astype(np.float32)
     body = between(random, 0.0, 0.45) * smooth_field(random, size, between(random, 35.0, 110.0))
     body += between(random, 0.0, 0.12) * smooth_field(random, size, between(random, 9.0, 28.0))
     body += scaled(random, 0.002, 0.05) * smooth_field(random, size, between(random, 3.5, 9.0))

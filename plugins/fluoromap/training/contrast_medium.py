@@ -95,6 +95,36 @@ def draw_drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> No
         )
 
 
+def draw_tubing(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
+    """Draw joined tubes, as of a vessel phantom: each is filled along a part only.
+
+    Elsewhere drops hang in it, which lie in a row like electrodes; where it is full it has bubbles.
+    """
+    joint = random.uniform(0.0, canvas.size, 2)
+    radius, dark = between(random, 0.8, 3.0) * px_per_mm, scaled(random, 0.15, 1.5)
+    for _ in range(int(random.integers(1, 4))):
+        curve = random_curve(random, between(random, 25.0, 110.0), 0.5, between(random, 0.1, 1.2), tilt=0.0)
+        line = (curve.points_mm - curve.points_mm[0]) * px_per_mm + joint
+        if chance(random, 0.6):
+            canvas.stroke(line, 1.2 * radius, scaled(random, 0.02, 0.2), between(random, 0.7, 0.93))
+        ends = np.sort(random.integers(0, len(line), 2)) if chance(random, 0.8) else np.zeros(2, np.int64)
+        filled = np.full(len(line), dark * (0.0 if chance(random, 0.3) else scaled(random, 0.03, 0.4)))
+        filled[ends[0] : ends[1]] = dark
+        canvas.stroke(line, radius, filled)
+        k, apart = 0, scaled(random, 2.5, 15.0)
+        while (k := k + max(int(apart * scaled(random, 0.4, 2.0) / curve.step_mm), 1)) < len(line):
+            in_it = ends[0] <= k < ends[1]
+            canvas.disc(
+                line[k] + random.normal(size=2) * 0.2 * radius,
+                scaled(random, 0.4, 2.5) * px_per_mm,
+                radius * between(random, 0.3, 1.0),
+                float(curve.heading[k]),
+                dark * (-between(random, 0.0, 0.8) if in_it else scaled(random, 0.15, 1.0)),
+                between(random, 0.6, 1.8),
+                between(random, 2.0, 4.0),
+            )
+
+
 def _fillings(random: Generator, count: int) -> Array:
     """Draw shares from 0 to 1: plugs that end abruptly."""
     empty = between(random, 0.05, 0.4)

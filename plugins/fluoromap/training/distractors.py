@@ -43,6 +43,7 @@ _COMPACT: _Kinds = (
     (contrast_medium.draw_vessels, 0.33),
     (contrast_medium.draw_drained_tube, 0.22),
     (contrast_medium.draw_residue, 0.17),
+    (contrast_medium.draw_tubing, 0.15),
     (probes.draw_echo_probe, 0.1),
     (implants.draw_clip, 0.45),
     (implants.draw_blob, 0.65),

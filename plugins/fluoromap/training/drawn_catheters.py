@@ -25,8 +25,8 @@ _OTHER_BRAID = 0.3
 _IN_PLANE, _LEAST_SEEN = 0.97, 0.2
 """Shortening from which on a ring shows none of its openings, and the least that is drawn."""
 _SIDE_BY_SIDE = 0.2
-_LONG_TIP_MM, _MERGED_TIPS = 3.0, 0.4
-"""A long tip's thermocouple and leads often make one dark bar of the tip and the next ring."""
+_LONG_TIP_MM, _SHORT_GAP_MM, _MERGED_TIPS = 3.0, 3.0, 0.5
+"""A long tip's thermocouple and leads often make one dark bar of the tip and a ring that is near."""
 _FRENCH_RADII_MM = 0.67, 0.83, 1.0, 1.0, 1.0, 1.17, 1.17, 1.33
 
 
@@ -37,6 +37,12 @@ class Design:
     centres_mm: Array
     lengths_mm: Array
     loop: bool = False
+
+    @property
+    def merges_tip(self) -> bool:
+        """Whether the tip is long and the next ring near, so that the two often show as one bar."""
+        gap = float(self.centres_mm[1] - self.centres_mm[0] - 0.5 * self.lengths_mm[:2].sum())
+        return float(self.lengths_mm[0]) >= _LONG_TIP_MM and gap <= _SHORT_GAP_MM
 
 
 def design_of(catheter: Catheter) -> Design:
@@ -202,8 +208,10 @@ def _draw_electrodes(
     labels = np.zeros((len(places), LABEL_COLUMNS))
     if chance(random, 0.25):
         _fill_gaps(random, canvas, places, wide, metal, px_per_mm)
-    elif design.lengths_mm[0] >= _LONG_TIP_MM and chance(random, _MERGED_TIPS):
-        _fill_gap(canvas, places[0], places[1], wide, between(random, 0.6, 1.0) * metal)
+    elif design.merges_tip and chance(random, _MERGED_TIPS):
+        near, far = 0.5 * design.lengths_mm[:2] * shortenings[:2] * px_per_mm
+        toward = (places[1] - places[0]) / max(float(np.linalg.norm(places[1] - places[0])), 1e-6)
+        _fill_gap(canvas, places[0] + near * toward, places[1] - far * toward, 0.5, wide, between(random, 0.5, 1.0) * metal)
     for number, (place, heading, shortening) in enumerate(zip(places, headings, shortenings, strict=True)):
         length = float(design.lengths_mm[number])
         tilted = math.sqrt(max(0.0, 1.0 - shortening * shortening))
@@ -241,13 +249,14 @@ def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, me
     for number in range(1 if only_tip else len(places) - 1):
         length = float(np.linalg.norm(places[number + 1] - places[number]))
         if length < 5.0 * px_per_mm and chance(random, 0.8):
-            _fill_gap(canvas, places[number], places[number + 1], wide, share * metal)
+            _fill_gap(canvas, places[number], places[number + 1], 0.25, wide, share * metal)
 
 
-def _fill_gap(canvas: Canvas, place: Array, following: Array, wide: float, strength: float) -> None:
+def _fill_gap(canvas: Canvas, place: Array, following: Array, half: float, wide: float, strength: float) -> None:
+    """Draw a band in the middle between two places; ``half`` its length over their distance."""
     step = following - place
-    heading, quarter = math.atan2(step[1], step[0]), 0.25 * float(np.linalg.norm(step))
-    canvas.band(0.5 * (place + following), heading, quarter, 0.95 * wide, strength, 0.0, False, 0.7)
+    heading, length = math.atan2(step[1], step[0]), half * float(np.linalg.norm(step))
+    canvas.band(0.5 * (place + following), heading, length, 0.95 * wide, strength, 0.0, False, 0.7)
 
 
 def _draw_sheath(random: Generator, canvas: Canvas, line: Array, radius: float, px_per_mm: float) -> None:

@@ -25,6 +25,9 @@ SCALES_PX_PER_MM = 2.3, 4.6
 CLEAR = 6.5
 """Contrast over noise, summed over an electrode, from which on the network has to find it."""
 
+CLINICAL_CROWD = 0.3
+"""Catheters where they are as dense as in a laboratory: 10 cm x 10 cm of a frame have one or two."""
+
 _WITHOUT_CATHETER = 0.28
 _CATHETERS = 1, 1, 2, 2, 3
 _LEADS = 0.15
@@ -48,7 +51,11 @@ class Scene:
 
 
 def make_scene(
-    random: Generator, size: int, catalogue: Sequence[Catheter] = (), backgrounds: Sequence[Image] = ()
+    random: Generator,
+    size: int,
+    catalogue: Sequence[Catheter] = (),
+    backgrounds: Sequence[Image] = (),
+    crowd: float = 1.0,
 ) -> Scene:
     """Draw one scene.
 
@@ -62,6 +69,8 @@ def make_scene(
         A lab's own catheters, used for half of those drawn.
     backgrounds : sequence of (rows, columns) attenuations
         A lab's own electrode-free frames, used for 6 scenes of 10.
+    crowd : float
+        Catheters over those that scenes to learn from have.
     """
     px_per_mm = scaled(random, *SCALES_PX_PER_MM)
     exposure = random_exposure(random)
@@ -71,7 +80,7 @@ def make_scene(
         draw_distractors(random, canvas, px_per_mm, size / _CALIBRATED_PX)
     drawn = np.zeros((0, LABEL_COLUMNS))
     if not chance(random, _WITHOUT_CATHETER):
-        count = whole(random, float(random.choice(_CATHETERS)) * size * size / _CALIBRATED_PX**2)
+        count = whole(random, crowd * float(random.choice(_CATHETERS)) * size * size / _CALIBRATED_PX**2)
         designs = [random_design(random, catalogue) for _ in range(max(count, 1))]
         drawn = draw_catheters(random, canvas, px_per_mm, designs, exposure.metal)
     for _ in range(whole(random, _LEADS * size / _CALIBRATED_PX)):
