@@ -15,6 +15,7 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import UNSEEN, Acceptance, shows_enough
 from fluoromap.segmenter.bars import follows_bars, products_beside
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
 from fluoromap.segmenter.field_mask import FieldMask
@@ -31,7 +32,6 @@ from fluoromap.segmenter.linking import (
     possible_chains,
 )
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.moved_means import moved_means
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds

@@ -9,6 +9,7 @@ import numpy as np
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.linking import (
     CandidateChain,
     CatheterFamily,
@@ -18,7 +19,6 @@ from fluoromap.segmenter.linking import (
     spacing_fit,
 )
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import answers_for_each
 from fluoromap.segmenter.refinement import ElectrodeFit, predict_on_curve, refine
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends

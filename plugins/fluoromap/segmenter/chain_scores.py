@@ -12,11 +12,12 @@ import numpy as np
 from numba import njit
 
 from fluoromap.contracts import Array, IntArray
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.log_image import Image
 
 _SPACING_SD = 0.06
 _TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
-_MANY_SPACINGS, _DRIFT_SD_PER_MM, _LEAST_SLOPE = 5, 0.03, 0.15
+_DRIFT_SD_PER_MM, _LEAST_SLOPE = 0.03, 0.15
 _BEND_SD = 0.36
 _S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
 _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
@@ -105,7 +106,7 @@ def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, px_per_mm
     those of its two ends and of the bend.
     """
     out = np.empty(len(places))
-    if len(spacing_px) >= _MANY_SPACINGS:
+    if len(spacing_px) + 1 >= MANY_ELECTRODES:
         _fit_many_spacings(places, spacing_px, variance_px2, px_per_mm, out)
     else:
         _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)

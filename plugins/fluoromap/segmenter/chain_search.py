@@ -19,13 +19,16 @@ SHORTEST, LONGEST = 0.35, 1.12
 A foreshortened catheter has a smaller ratio, a catheter nearer to the source a larger one.
 """
 
+MANY_ELECTRODES = 6
+"""From here on a catheter is long. Of a shorter one, more than one electrode is rarely missing."""
+
 _END_SLACK = 0.55, 1.1
 _SPREAD = 0.6
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
-_MANY_SPACINGS, _MOST_CURVED_PER_MM, _MOST_BENT = 5, 0.25, 1.6
+_MOST_CURVED_PER_MM, _MOST_BENT = 0.25, 1.6
 """A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""
-_MANY_ELECTRODES, _INTERLEAVED, _IN_LINE = 6, 2, 0.55
-"""Chains can take turns only where the catalogue has a catheter of many electrodes."""
+_INTERLEAVED, _IN_LINE = 2, 0.55
+"""Chains can take turns only where the catalogue has a long catheter."""
 _PARTIAL = 1500
 _GROWN = 60000
 _MOST_TRIES = 300000
@@ -35,6 +38,17 @@ def find_paths(points: Array, weights: Array, spacing_px: Array, px_per_mm: floa
     """Return all paths with spacings and bends that a catheter can show.
 
     Of each length the search continues with the 1500 paths of the largest weight.
+
+    Parameters
+    ----------
+    points : (n, 2)
+        Candidates, pixels.
+    weights : (n,)
+        Their :func:`~fluoromap.segmenter.linking.evidence`.
+    spacing_px : (electrodes - 1,)
+        Spacings from the tip on, at the isocentre, not foreshortened.
+    px_per_mm : float
+        At the isocentre. How far a catheter may bend depends on lengths in millimetres.
 
     Returns
     -------
@@ -61,7 +75,7 @@ def find_paths(points: Array, weights: Array, spacing_px: Array, px_per_mm: floa
 def _least_cosines(spacing_mm: Array) -> Array:
     """Return the cosine of the largest bend at the first electrode of each gap, (gaps,)."""
     least = np.full(len(spacing_mm), _LEAST_COSINE)
-    if len(spacing_mm) >= _MANY_SPACINGS:
+    if len(spacing_mm) + 1 >= MANY_ELECTRODES:
         bends = _MOST_CURVED_PER_MM * 0.5 * (spacing_mm[:-1] + spacing_mm[1:])
         least[1:] = np.minimum(least[1:], np.cos(np.minimum(bends, _MOST_BENT)))
     return least
@@ -114,8 +128,9 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     """Return how many candidates each two chains have in common, (n, n).
 
     ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may
-    give two candidates. So it is where two or more electrodes of one chain lie between those of the other, or one does and two
-    have the same places: several chains take turns along a catheter with more electrodes. Rows of ``chosen`` are filled up with -1.
+    give two candidates. Where some chain is long, so it is where two or more electrodes of one chain lie between those of the
+    other, or one does and two have the same places: several chains take turns along a catheter with more electrodes. Rows of
+    ``chosen`` are filled up with -1.
     """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)
@@ -125,7 +140,7 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     square = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
     near = (member @ (square < near_px * near_px).astype(np.float32) > 0).astype(np.float32)
     close = member @ near.T >= most
-    if chosen.shape[1] >= _MANY_ELECTRODES:
+    if chosen.shape[1] >= MANY_ELECTRODES:
         lies_between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
         between = lies_between.astype(np.float32) @ member.T
         close |= (between >= _INTERLEAVED) | ((between >= 1.0) & (between + near @ member.T >= most))
@@ -135,7 +150,11 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
 
 
 def _lies_between(chosen: IntArray, points: Array, places: Array, near_px: float) -> BoolArray:
-    """Return which places lie along which chain, (n, places)."""
+    """Return which places lie along which chain, (n, places).
+
+    A place lies along a chain where it is less than ``near_px`` beside one of its gaps. Rows of ``chosen`` are filled up
+    with -1.
+    """
     starts, ends = points[chosen[:, :-1]], points[chosen[:, 1:]]
     is_gap = chosen[:, 1:] >= 0
     along = ends - starts

@@ -12,8 +12,8 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import log_odds
 
 _EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2

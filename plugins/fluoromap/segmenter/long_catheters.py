@@ -14,9 +14,6 @@ from numba import njit
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.chain_search import LONGEST, SHORTEST
 
-MANY_ELECTRODES = 6
-"""From here on a catheter is traced. Of a shorter one, more than one electrode is rarely missing."""
-
 _MOST_SEEDS = 45
 _MOST_MISSING = 0.34
 _MISSING_IN_A_ROW = 2

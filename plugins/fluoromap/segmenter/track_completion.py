@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.tracks import (
     KEPT_VELOCITY,
     ChainSearch,

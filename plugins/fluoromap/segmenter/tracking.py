@@ -203,7 +203,9 @@ def _accepted(
         wrong = [
             track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
         ]
-        wrong += surplus([track for track in tracks if track not in wrong and len(track.chains) >= judged])
+        # Shorter tracks are dropped in any case.
+        lasting = [track for track in tracks if track.manual or len(track.chains) >= _ACCEPTED_AT_LEAST * len(found)]
+        wrong += surplus([track for track in lasting if track not in wrong])
         tracks = [track for track in tracks if track not in wrong]
         found = [_without(entry, wrong) for entry in found]
         if not wrong or attempt == _MOST_RETRIES or not any(entry.chains for entry in found):

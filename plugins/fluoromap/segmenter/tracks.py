@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 
 KEPT_VELOCITY = 0.6
 """Share of a track's last velocity that is expected to last."""

@@ -80,6 +80,17 @@ def separate_moments(cameras: Cameras, points_mm: Array) -> MomentEstimates:
     return MomentEstimates(points_mm, own, np.zeros((p, n, 3)), np.zeros((p, n, 4)))
 
 
+def compile_kernels() -> None:
+    """Compile the least squares, so that the first study does not wait."""
+    from fluoromap.triangulator.moment_kernel import covariances, step
+
+    own, shared, row = np.zeros((1, 1, 3, 4)), np.zeros((1, 1, 3)), np.zeros((1, 1, 4))
+    pixels, unit = np.zeros((2, 1, 1, 2)), np.broadcast_to(np.eye(2), (2, 1, 1, 2, 2)).copy()
+    matrices = np.stack([np.eye(3, 4), np.eye(3, 4)[[2, 0, 1]]])
+    step(matrices, np.ones((1, 1, 3)), pixels, unit, np.zeros((1, 1, 2, 2)), 1.0, own, shared, row)
+    covariances(own, shared, row, unit, np.zeros((1, 1, 4, 1)))
+
+
 def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, breathing: ErrorSource) -> MomentEstimates:
     """Estimate points by generalised least squares of all electrodes of a moment together.
 
@@ -96,7 +107,7 @@ def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, brea
     matrices = np.stack([camera.matrix for camera in cameras])
     stacked, weights = np.stack(pixels.pixels), _inverse(np.stack(pixels.covariances))
     common = np.ascontiguousarray(breathing.effect_px).reshape(p, n, 2, 2)
-    points = np.array(start_mm)
+    points = np.array(start_mm, order="C")
     own, shared, row = np.empty((p, n, 3, 4)), np.empty((p, n, 3)), np.empty((p, n, 4))
     for _ in range(STEPS):
         if (

@@ -15,13 +15,13 @@ import numpy as np
 from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN, middle_score
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.long_catheters import MANY_ELECTRODES
 from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE

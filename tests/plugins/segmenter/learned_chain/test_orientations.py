@@ -1,4 +1,4 @@
-"""The network asked about a picture in all its orientations."""
+"""The network asked about a picture in several orientations."""
 
 import numpy as np
 
