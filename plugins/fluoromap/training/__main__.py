@@ -46,7 +46,11 @@ def main(arguments: Sequence[str]) -> None:
     network = ElectrodeNetwork.of_weights({name: value.astype(np.float32) for name, value in weights.items()})
     fresh = [
         make_scene(
-            np.random.default_rng([given.seed, _VALIDATION_KEY, k]), _VALIDATION_PX, catalogue, backgrounds, CLINICAL_CROWD
+            np.random.default_rng([given.seed, _VALIDATION_KEY, k]),
+            _VALIDATION_PX,
+            catalogue,
+            backgrounds,
+            CLINICAL_CROWD,
         )
         for k in range(VALIDATION_SCENES)
     ]

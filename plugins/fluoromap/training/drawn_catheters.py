@@ -211,7 +211,9 @@ def _draw_electrodes(
     elif design.merges_tip and chance(random, _MERGED_TIPS):
         near, far = 0.5 * design.lengths_mm[:2] * shortenings[:2] * px_per_mm
         toward = (places[1] - places[0]) / max(float(np.linalg.norm(places[1] - places[0])), 1e-6)
-        _fill_gap(canvas, places[0] + near * toward, places[1] - far * toward, 0.5, wide, between(random, 0.5, 1.0) * metal)
+        _fill_gap(
+            canvas, places[0] + near * toward, places[1] - far * toward, 0.5, wide, between(random, 0.5, 1.0) * metal
+        )
     for number, (place, heading, shortening) in enumerate(zip(places, headings, shortenings, strict=True)):
         length = float(design.lengths_mm[number])
         tilted = math.sqrt(max(0.0, 1.0 - shortening * shortening))
