@@ -140,8 +140,9 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     near = (member @ (square < near_px * near_px).astype(np.float32) > 0).astype(np.float32)
     close = member @ near.T >= most
     if chosen.shape[1] >= MANY_ELECTRODES:
-        between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
-        close |= between.astype(np.float32) @ member.T >= _INTERLEAVED
+        lies_between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
+        between = lies_between.astype(np.float32) @ member.T
+        close |= (between >= _INTERLEAVED) | ((between > 0) & (between + between.T + near @ member.T >= most))
     common: IntArray = (member @ member.T).astype(np.int64)
     common[close | close.T] += most
     return common
