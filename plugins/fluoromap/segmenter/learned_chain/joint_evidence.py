@@ -98,7 +98,8 @@ class JointEvidence:
         """Return the proposals, of several parts of one electrode only one.
 
         The rims of a wide ring are blobs too. The cells there point to the ring's middle, those of two electrodes to both. The
-        part nearest to the middle has the electrode's place, or the middle has it where all parts are away from it.
+        part nearest to the middle has the electrode's place, or the middle has it where all parts are away from it. The parts'
+        scatter adds to the covariance.
         """
         count = len(proposed)
         aims = self.network.aims_at(proposed.points_uv) if count else np.zeros((0, 2))
@@ -122,7 +123,9 @@ class JointEvidence:
             nearest = own[int(np.argmin(off))]
             points[first], covariance[first] = proposed.points_uv[nearest], proposed.covariance_px2[nearest]
             if off.min() > _MIDDLE_MM * self.px_per_mm:
-                points[first], covariance[first] = middle, (_HALF_SD_MM * self.px_per_mm) ** 2 * np.eye(2)
+                points[first] = middle
+            scatter = proposed.points_uv[own] - points[first]
+            covariance[first] += scatter.T @ scatter / len(own)
         return Proposals(points[~is_part], proposed.probability[~is_part], covariance[~is_part])
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:

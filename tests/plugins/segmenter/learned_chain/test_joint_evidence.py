@@ -85,6 +85,10 @@ def test_parts_of_one_electrode_are_proposed_once(blobs_uv, electrodes_uv, expec
     proposed = JointEvidence(says, says, 3.2, 0.0).proposals(EVERYWHERE, 4)
     assert sorted(proposed.points_uv.tolist()) == pytest.approx(np.array(expected_uv, dtype=float))
     assert len(proposed.probability) == len(expected_uv)
+    # The scatter of the parts is across the ring.
+    merged = len(blobs_uv) > len(expected_uv)
+    assert np.allclose(proposed.covariance_px2[:, 0, 0], 1.0, atol=0.2)
+    assert ((proposed.covariance_px2[:, 1, 1] > 3.0) == merged).all()
 
 
 def test_an_image_may_show_nothing():
