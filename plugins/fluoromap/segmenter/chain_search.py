@@ -143,7 +143,7 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     if chosen.shape[1] >= MANY_ELECTRODES:
         lies_between = _lies_between(chosen, points, points[used], _IN_LINE * near_px) & (near == 0)
         between = lies_between.astype(np.float32) @ member.T
-        close |= (between >= _INTERLEAVED) | ((between >= 1.0) & (between + near @ member.T >= most))
+        close |= (between >= _INTERLEAVED) | ((between > 0) & (between + between.T + near @ member.T >= most))
     common: IntArray = (member @ member.T).astype(np.int64)
     common[close | close.T] += most
     return common

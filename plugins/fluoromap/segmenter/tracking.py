@@ -199,6 +199,7 @@ def _accepted(
     """
     judged = _judged_frames(found)
     confirmed: list[Track] = []
+    rare: list[Track] = []
     for attempt in range(_MOST_RETRIES + 1):
         wrong = [
             track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
@@ -212,12 +213,17 @@ def _accepted(
             break
         sure = [track for track in tracks if len(track.chains) >= judged]
         confirmed += [track for track in sure if track.confirmed]
+        rare += [track for track in sure if track not in lasting]
         start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in sure))
         seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
         tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     for track in confirmed:
         # Followed in another order, it may have ended at other places, and the judge may have rejected those.
         if not any(meet(track, other) for other in tracks):
+            tracks.append(track)
+    for track in rare:
+        # Followed again, parts of it may have taken its frames.
+        if all(len(other.chain.electrodes) < len(track.chain.electrodes) for other in tracks if meet(track, other)):
             tracks.append(track)
     return tracks
 

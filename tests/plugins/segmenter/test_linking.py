@@ -191,3 +191,21 @@ def test_two_rims_of_a_ring_do_not_let_chains_take_turns():
     )
     (only,) = best_chains(possible, points, catheter_families(catalogue), PX)
     assert only.candidates == (0, 1, 3, 4, 6, 8, 9, 10)
+
+
+def test_chains_that_meet_in_one_electrode_do_not_take_turns_there():
+    catalogue = Catalogue(
+        (catheter_type("octapolar-2-5-2", "octa"), catheter_type("quadripolar-2-5-2", "quad")), "octa", "quad"
+    )
+    points = np.array([20.0, 60.0]) + np.outer(np.arange(15) * 3.0 * PX, [np.cos(0.1), np.sin(0.1)])
+    # Of equal spacings every third electrode is left out; the two chains share one and lie in one gap of each other.
+    possible = PossibleChains(
+        (np.array([[0, 1, 3, 4, 6, 7, 9, 10]]), np.array([[14, 13, 11, 10]])), (np.array([6.0]), np.array([5.0]))
+    )
+    beside = best_chains(possible, points, catheter_families(catalogue), PX)
+    assert len(beside) == 2
+    possible = PossibleChains(
+        (np.array([[0, 1, 3, 4, 6, 7, 9, 10]]), np.array([[12, 11, 9, 8]])), (np.array([6.0]), np.array([5.0]))
+    )
+    (only,) = best_chains(possible, points, catheter_families(catalogue), PX)
+    assert only.candidates == (0, 1, 3, 4, 6, 7, 9, 10)

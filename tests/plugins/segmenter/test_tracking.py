@@ -239,6 +239,22 @@ def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
     assert [len(one.electrodes) for one in entries[-1].chains] == [4]
 
 
+def test_parts_do_not_take_the_frames_of_a_long_catheter_where_the_run_is_followed_again():
+    long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
+    whole, part, other = chain(long, "cs"), chain(long[3:7], "rv"), chain(POINTS + 250, "map")
+    false = chain(POINTS[:, ::-1] + 400, "map")
+    found = run([[whole, false] if frame < 5 else [part, other, false] for frame in range(16)])
+
+    def search(frame, known, shift, reach_px, taken, confirmed=False):
+        return known if confirmed or len(known.electrodes) == 4 else None
+
+    def accepts(chains):
+        return chains[min(chains)].pixels_uv[0, 0] < 390
+
+    entries = track_chains(found, times(16), 3, search, FrameChains(0, (whole, false)), accepts)
+    assert [sorted(len(one.electrodes) for one in entry.chains) for entry in entries] == [[4, 10]] * 16
+
+
 def test_a_short_catheter_that_few_frames_show_may_be_anatomy():
     found = run([[chain(POINTS + 100)] if frame < 5 else [] for frame in range(16)])
     assert not any(

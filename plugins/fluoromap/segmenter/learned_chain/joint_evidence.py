@@ -22,6 +22,8 @@ _LEAST_PROBABILITY = 0.05
 _ENOUGH_CONTRAST = 8.0
 _APART_MM = 0.6
 _HALF_APART_MM, _HALF_SD_MM = 0.3, 0.25
+_WIDEST_RING_MM, _AIMS_APART, _MIDDLE_MM = 2.0, 0.5, 0.4
+"""Parts of one electrode: how far apart they are at most, and the cells' aims over that; how far off its middle a part may be."""
 _FAINT, _CLEAR = 5.0, 9.5
 FAINT_LOG_ODDS = 4.5
 """Of an electrode that is too faint for the network to be sure, where other frames confirm it."""
@@ -90,7 +92,41 @@ class JointEvidence:
             probability = np.concatenate([probability, proposed.probability[away]])
             covariance_px2 = np.concatenate([covariance_px2, proposed.covariance_px2[away]])
         order = np.argsort(-probability, kind="stable")
-        return Proposals(points_uv[order], probability[order], covariance_px2[order])
+        return self._without_parts(Proposals(points_uv[order], probability[order], covariance_px2[order]))
+
+    def _without_parts(self, proposed: Proposals) -> Proposals:
+        """Return the proposals, of several parts of one electrode only one.
+
+        The rims of a wide ring are blobs too. The cells there point to the ring's middle, those of two electrodes to both. The
+        part nearest to the middle has the electrode's place, or the middle has it where all parts are away from it. The parts'
+        scatter adds to the covariance.
+        """
+        count = len(proposed)
+        aims = self.network.aims_at(proposed.points_uv) if count else np.zeros((0, 2))
+        is_part = np.zeros(count, np.bool_)
+        parts: dict[int, list[int]] = {}
+        if count:
+            pairs = cKDTree(proposed.points_uv).query_pairs(_WIDEST_RING_MM * self.px_per_mm, output_type="ndarray")
+            away, aims_away = (
+                np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+                for places in (proposed.points_uv, aims)
+            )
+            pairs = np.sort(pairs[aims_away < _AIMS_APART * away], axis=1)
+            for first, second in pairs[np.lexsort(pairs.T[::-1])].tolist():
+                if not is_part[first] and not is_part[second]:
+                    is_part[second] = True
+                    parts.setdefault(first, [first]).append(second)
+        points, covariance = proposed.points_uv.copy(), proposed.covariance_px2.copy()
+        for first, own in parts.items():
+            middle = aims[own].mean(axis=0)
+            off = np.linalg.norm(proposed.points_uv[own] - middle, axis=1)
+            nearest = own[int(np.argmin(off))]
+            points[first], covariance[first] = proposed.points_uv[nearest], proposed.covariance_px2[nearest]
+            if off.min() > _MIDDLE_MM * self.px_per_mm:
+                points[first] = middle
+            scatter = proposed.points_uv[own] - points[first]
+            covariance[first] += scatter.T @ scatter / len(own)
+        return Proposals(points[~is_part], proposed.probability[~is_part], covariance[~is_part])
 
     def halves_of_pairs(self, allowed: BoolArray) -> Proposals:
         """Return both electrodes of pairs that were proposed as one.

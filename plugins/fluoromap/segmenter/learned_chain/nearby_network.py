@@ -72,6 +72,10 @@ class NearbyNetwork:
         """Return the logits of tip electrodes at points, (n,)."""
         return self.whole().tip_logits_at(points_uv, reach_cells)
 
+    def aims_at(self, points_uv: Array) -> Array:
+        """Return the places to which the cells at points point, (n, 2) pixels."""
+        return self.whole().aims_at(points_uv)
+
     def probability_at(self, points_uv: Array, reach_cells: int = 1) -> Array:
         """Return the highest probability of the cells within reach of each point, (n,)."""
         scale = network_scale(self.px_per_mm)

@@ -52,6 +52,8 @@ class NetworkEvidence(Protocol):
 
     def probability_at(self, points_uv: Array, reach_cells: int = 1) -> Array: ...
 
+    def aims_at(self, points_uv: Array) -> Array: ...
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NetworkResponse:
@@ -157,6 +159,16 @@ class NetworkResponse:
         """Return the highest probability of the cells within reach of each point, (n,)."""
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
         return highest_near(self.probability, middle, reach_cells)
+
+    def aims_at(self, points_uv: Array) -> Array:
+        """Return the places to which the cells at points point, (n, 2) pixels: each to the electrode nearest to it."""
+        v, u = self._cells_near(points_uv, 0)
+        u, v = u[:, 0, 0], v[:, 0, 0]
+        offsets = np.clip(
+            self.answers[v, u][:, [_OFFSET_U, _OFFSET_V]].astype(np.float64), -_MOST_OFFSET_CELLS, _MOST_OFFSET_CELLS
+        )
+        aims: Array = (np.stack([u, v], axis=1) + offsets) * self.cell_px + self.first_px
+        return aims
 
     def _cells_near(self, points_uv: Array, reach_cells: int) -> tuple[IntArray, IntArray]:
         """Return rows and columns of the cells near points.

@@ -46,10 +46,11 @@ def test_the_network_is_asked_once_about_the_same_places(image, monkeypatch):
     assert len(asked) == 2
 
 
-def test_proposals_and_tips_need_the_whole_image(image):
+def test_proposals_aims_and_tips_need_the_whole_image(image):
     trained = read_weights(SHIPPED)
     whole, near = NetworkResponse.of_image(image, trained, 3.2), NearbyNetwork(image, trained, 3.2)
     everywhere = np.ones(image.shape, np.bool_)
     assert np.array_equal(near.proposals(everywhere, 4).points_uv, whole.proposals(everywhere, 4).points_uv)
     assert np.array_equal(near.halves_of_pairs(), whole.halves_of_pairs())
     assert np.array_equal(near.tip_logits_at(CHAIN), whole.tip_logits_at(CHAIN))
+    assert np.array_equal(near.aims_at(CHAIN), whole.aims_at(CHAIN))

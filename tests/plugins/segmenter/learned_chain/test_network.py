@@ -184,6 +184,14 @@ def test_cells_that_point_to_two_places_see_a_pair():
     assert one[1] == pytest.approx(16.0, abs=0.5) == other[1]
 
 
+def test_cells_point_to_places():
+    offset = np.zeros((16, 16))
+    offset[8, 6], offset[8, 7] = 1.0, 9.0
+    response = answered(np.zeros((16, 16)), offset)
+    places = np.array([[12.4, 16.3], [14.0, 16.0], [20.0, 16.0], [-9.0, 99.0]])
+    assert response.aims_at(places).tolist() == [[14.0, 16.0], [17.0, 16.0], [20.0, 16.0], [0.0, 30.0]]
+
+
 def test_the_most_probable_cell_near_a_place_says_whether_it_is_a_tip():
     probability = np.zeros((16, 16))
     probability[8, 7:9] = 0.9, 0.3
