@@ -128,9 +128,9 @@ def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> 
     """Return how many candidates each two chains have in common, (n, n).
 
     ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may
-    give two candidates. Where some chain is long, so it is where two or more electrodes of one chain lie between those of the
-    other, or one does and two have the same places: several chains take turns along a catheter with more electrodes. Rows of
-    ``chosen`` are filled up with -1.
+    give two candidates. Where some chain is long, so it is where chains take turns along a catheter with more electrodes: two or
+    more electrodes of one chain lie between those of the other, or those between and those at the same places are ``most``
+    together. Rows of ``chosen`` are filled up with -1.
     """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)
