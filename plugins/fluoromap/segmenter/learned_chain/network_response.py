@@ -161,7 +161,10 @@ class NetworkResponse:
         return highest_near(self.probability, middle, reach_cells)
 
     def aims_at(self, points_uv: Array) -> Array:
-        """Return the places to which the cells at points point, (n, 2) pixels: each to the electrode nearest to it."""
+        """Return the places to which the cells at points point, (n, 2) pixels.
+
+        Each cell points to the electrode nearest to it.
+        """
         v, u = self._cells_near(points_uv, 0)
         u, v = u[:, 0, 0], v[:, 0, 0]
         offsets = np.clip(
