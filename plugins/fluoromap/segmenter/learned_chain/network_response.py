@@ -160,6 +160,18 @@ class NetworkResponse:
         middle = np.rint((points_uv - self.first_px) / self.cell_px).astype(np.int64)
         return highest_near(self.probability, middle, reach_cells)
 
+    def shares_at(self, chain_uv: Array) -> Array:
+        """Return the highest probability of the cells within reach of each electrode of a chain, (n,).
+
+        Each cell speaks for one electrode only, the nearest: two electrodes cannot be proved by one dark place.
+        """
+        v, u = self._cells_near(chain_uv, 1)
+        cells = np.stack(np.broadcast_arrays(u, v), axis=-1)
+        away = np.linalg.norm(cells[:, :, :, None] - (chain_uv - self.first_px) / self.cell_px, axis=-1)
+        own = away.argmin(axis=-1) == np.arange(len(chain_uv))[:, None, None]
+        shares: Array = np.where(own, self.probability[v, u], 0.0).max(axis=(1, 2)).astype(np.float64)
+        return shares
+
     def aims_at(self, points_uv: Array) -> Array:
         """Return the places to which the cells at points point, (n, 2) pixels.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fluoromap.contracts import Array, Chain, IntArray
-from fluoromap.segmenter.acceptance import UNSEEN, middle_score
+from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.gaussian_blur import gaussian
@@ -35,8 +35,6 @@ _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
 _LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
 """Log-odds of the middle electrode, on average over the pictures; of the worst electrode."""
-_LEAST_WHERE_CLEAR = -1.07
-"""Of the middle electrode in each picture, where half of the single frames show the catheter."""
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
@@ -44,7 +42,6 @@ _LEAST_LONG = 0.0
 """Of the middle electrode of six or more, on average. Clutter often hides some of them: the worst electrodes do not count."""
 _MOST_OUTSIDE = 0.5
 """Share of the frames in which an electrode may lie outside the field, where nothing shows, and still count."""
-_CLEAR_SHARE, _CLEAR_SCORE, _LEAST_CLEAR_SCORE = 0.5, 0.5, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +107,7 @@ class TrackEvidence:
             return bool(
                 middle.mean() >= _LEAST_LONG or np.median(odds_of(sections_in(_all_along(len(frames))))) >= _LEAST_LONG
             )
-        if sum(_is_clear(chain) for chain in chains.values()) >= _CLEAR_SHARE * self.frames:
-            shown = bool((middle >= _LEAST_WHERE_CLEAR).all())
-        else:
-            shown = bool(middle.mean() >= _LEAST_MEDIAN)
-        return shown and _are_electrodes(odds.mean(axis=0))
+        return bool(middle.mean() >= _LEAST_MEDIAN and _are_electrodes(odds.mean(axis=0)))
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.
@@ -136,7 +129,7 @@ class TrackEvidence:
         shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
-        return SectionOdds(log_odds(seen.probability_at(middle - first)), beside, across)
+        return SectionOdds(log_odds(seen.shares_at(middle - first)), beside, across)
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
@@ -165,12 +158,6 @@ def _are_electrodes(odds: Array) -> bool:
     """
     worst = np.quantile(odds, _LOW_QUANTILE, method="lower")
     return bool(worst >= _LEAST_LOW or np.clip(odds, *_COUNTED).mean() >= _LEAST_MEAN)
-
-
-def _is_clear(chain: Chain) -> bool:
-    """Return whether network and contrast show a chain in its frame."""
-    scores = chain.scores[chain.scores > UNSEEN]
-    return bool(len(scores) and middle_score(scores) >= _CLEAR_SCORE and scores.min() >= _LEAST_CLEAR_SCORE)
 
 
 def _first_and_last(frames: int) -> list[IntArray]:
