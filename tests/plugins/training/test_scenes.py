@@ -6,13 +6,14 @@ from PIL import Image
 
 from fluoromap.catheters import catheter_type
 from fluoromap.training.anatomy import read_backgrounds
+from fluoromap.training.contrast_medium import draw_tubing
 from fluoromap.training.courses import entering
 from fluoromap.training.distractors import draw_distractors
 from fluoromap.training.drawing import Canvas
 from fluoromap.training.drawn_catheters import LABEL_COLUMNS, design_of, draw_catheters, random_design
 from fluoromap.training.printing import printed
 from fluoromap.training.randomness import between, random_curve
-from fluoromap.training.scenes import CLEAR, make_scene
+from fluoromap.training.scenes import CLEAR, CLINICAL_CROWD, make_scene
 from fluoromap.training.targets import Prepared, training_pair
 
 
@@ -87,6 +88,38 @@ def test_a_larger_scene_has_its_electrodes_as_densely():
             inside += np.count_nonzero(((scene.electrodes_uv > 0) & (scene.electrodes_uv < size)).all(axis=1))
         density[size] = inside / (seeds * size * size)
     assert 0.67 < density[256] / density[128] < 1.5
+
+
+def test_a_laboratory_s_scene_has_fewer_catheters():
+    counts = [
+        sum(len(make_scene(np.random.default_rng([6, seed]), 128, crowd=crowd).electrodes_uv) for seed in range(60))
+        for crowd in (1.0, CLINICAL_CROWD)
+    ]
+    assert 0.2 < counts[1] / counts[0] < 0.7
+
+
+def test_tubes_are_full_along_a_part_only():
+    filled = 0
+    for seed in range(20):
+        canvas = Canvas.empty(160)
+        draw_tubing(np.random.default_rng(seed), canvas, 3.2)
+        assert np.isfinite(canvas.depth).all()
+        filled += canvas.depth.max() > 0.1
+    assert filled > 15
+
+
+def test_a_long_tip_near_its_ring_may_make_one_bar():
+    near, far = design_of(catheter_type("ablation-4", "a")), design_of(catheter_type("quadripolar-5-5-5", "q"))
+    assert near.merges_tip
+    assert not far.merges_tip
+    darkest = []
+    for seed in range(40):
+        canvas = Canvas.empty(160)
+        tip, ring = draw_catheters(np.random.default_rng(seed), canvas, 3.2, [near], (1.5, 1.6))[:2, :2]
+        u, v = np.rint(0.45 * tip + 0.55 * ring).astype(int)
+        if 0 <= u < 160 and 0 <= v < 160 and np.linalg.norm(tip - ring) > 8.0:
+            darkest.append(canvas.depth[v, u] > 0.6)
+    assert 0.25 < np.mean(darkest) < 0.95
 
 
 def test_a_printed_picture_keeps_its_size_and_its_places():

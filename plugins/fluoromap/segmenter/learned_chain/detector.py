@@ -39,7 +39,8 @@ _ALONE = replace(
     IN_A_RUN,
     least_clearness=0.3,
     sure_clearness=0.5,
-    scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7),
+    scores=ScoreLimits(0.5, seen=0.2, least_seen=0.85),
+    scores_beside=ScoreLimits(0.4, seen=0.15, least_seen=0.7),
     faded_price=math.inf,
 )
 """Scores are probabilities. In a single frame no other frame confirms a chain, but another catheter does."""

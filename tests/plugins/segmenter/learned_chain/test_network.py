@@ -184,6 +184,16 @@ def test_cells_that_point_to_two_places_see_a_pair():
     assert one[1] == pytest.approx(16.0, abs=0.5) == other[1]
 
 
+def test_one_cell_speaks_for_one_electrode_of_a_chain():
+    probability = np.zeros((16, 16))
+    probability[8, 7:9] = 0.9, 0.2
+    response = answered(probability, np.zeros((16, 16)))
+    near = np.array([[14.2, 16.0], [16.4, 16.0], [28.0, 16.0]])
+    assert response.probability_at(near) == pytest.approx([0.9, 0.9, 0.0])
+    assert response.shares_at(near) == pytest.approx([0.9, 0.2, 0.0])
+    assert response.shares_at(near[1:]) == pytest.approx([0.9, 0.0])
+
+
 def test_cells_point_to_places():
     offset = np.zeros((16, 16))
     offset[8, 6], offset[8, 7] = 1.0, 9.0

@@ -104,10 +104,7 @@ def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_
 
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
-    doubted = np.full(electrodes, 0.3)
-    known = chains(np.repeat(row[None], FRAMES, axis=0))
-    track = {frame: replace(chain, scores=doubted) for frame, chain in known.items()}
-    assert judge(track, lambda frame: None) == accepted
+    assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
 
 
 def test_electrodes_outside_the_field_do_not_count(monkeypatch):
