@@ -52,14 +52,14 @@ def test_from_upload_over_a_correction_to_the_mesh(
     page.locator(".view[data-view=a][data-frames]").wait_for()
     shown = page.request.get(f"{study}/sites/{site}").json()
     frames = page.request.get(f"{study}/instances/{shown['view_a']}/electrodes").json()
-    # In the frame that the map uses, so that the correction moves the site.
+    # In the frame that the map uses, along the line of sight of view b, which then cannot contradict it.
     job = page.request.get(f"/v1/jobs?study={study.split('/')[-1]}").json()["items"][0]["id"]
     overlays = page.request.get(f"/v1/jobs/{job}/overlays").json()["overlays"]
     used = next(each["frame"] for each in overlays if (each["site"], each["view"]) == (site, "a"))
     frame = next(each for each in frames if each["frame"] == used)
     tip = next(e for e in frame["electrodes"] if e["catheter"] == "mapping" and e["electrode"] == 1)
     page.get_by_label("Frame of view a").fill(str(frame["frame"]))
-    drag_pixel(page, "a", (tip["u_px"], tip["v_px"]), (tip["u_px"] + 10, tip["v_px"] + 8))
+    drag_pixel(page, "a", (tip["u_px"], tip["v_px"]), (tip["u_px"] + 10, tip["v_px"]))
     page.locator(".view[data-view=a] .status", has_text="stored").wait_for()
     address = f"{study}/instances/{shown['view_a']}/frames/{frame['frame']}/electrodes"
     stored = page.request.get(address).json()
@@ -77,6 +77,8 @@ def test_from_upload_over_a_correction_to_the_mesh(
     _compute(page)
     page.get_by_role("button", name="Compare", exact=True).click()
     page.get_by_text("The maps differ by").wait_for()
+    row = page.locator("table.comparison tbody tr", has_text=site)
+    assert float(row.locator("td").nth(1).inner_text()) > 1.0
     assert page.locator("#panel-map").get_by_text("total activation time").inner_text() != first_map
 
     with page.expect_download() as download:
