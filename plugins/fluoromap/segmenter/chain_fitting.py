@@ -30,6 +30,8 @@ _LONG_TIP_MM = 3.0
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
+_LEAST_GAP = 0.15
+"""Of the spacing at the isocentre. Nearer than that, two electrodes are fitted to one dark place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,7 @@ def fit_chains(
         electrode_fit = refine(
             x, candidates_uv[order], family.catheter, shaft_image.px_per_mm, noise, hidden | outside, without_blob
         )
+        electrode_fit = _apart(electrode_fit, candidates_uv[order], family.catheter, shaft_image.px_per_mm)
         electrode_fit = _with_places(electrode_fit, candidates_uv[order], outside)
         no_variance = np.zeros(order.shape)
         fit = electrode_fit.log_likelihood + spacing_fit(
@@ -138,11 +141,30 @@ def fit_chains(
     return tuple(chains)
 
 
-def _with_places(fit: ElectrodeFit, places_uv: Array, outside: BoolArray) -> ElectrodeFit:
-    """Return the fit with electrodes outside the field at these places (n, electrodes, 2)."""
-    if not outside.any():
+def _apart(fit: ElectrodeFit, candidates_uv: Array, catheter: Catheter, px_per_mm: float) -> ElectrodeFit:
+    """Return the fit without electrodes that it moved into the place of a neighbour.
+
+    Of the two, the one that moved farther stays where it was proposed, (chains, electrodes, 2). The way between both places adds to
+    its covariance.
+    """
+    gaps = np.linalg.norm(np.diff(fit.points_uv, axis=1), axis=2)
+    meets = gaps < _LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)
+    if not meets.any():
         return fit
-    return replace(fit, points_uv=np.where(outside[..., None], places_uv, fit.points_uv))
+    moved = np.linalg.norm(fit.points_uv - candidates_uv, axis=2)
+    second = moved[:, 1:] > moved[:, :-1]
+    back = np.zeros(moved.shape, np.bool_)
+    back[:, 1:] |= meets & second
+    back[:, :-1] |= meets & ~second
+    covariance = fit.covariance_px2 + np.where(back, moved**2, 0.0)[..., None, None] * np.eye(2)
+    return replace(_with_places(fit, candidates_uv, back), covariance_px2=covariance)
+
+
+def _with_places(fit: ElectrodeFit, places_uv: Array, there: BoolArray) -> ElectrodeFit:
+    """Return the fit with some electrodes at these places (n, electrodes, 2)."""
+    if not there.any():
+        return fit
+    return replace(fit, points_uv=np.where(there[..., None], places_uv, fit.points_uv))
 
 
 def _tip_shows(catheter: Catheter) -> bool:

@@ -25,8 +25,8 @@ SCALES_PX_PER_MM = 2.3, 4.6
 CLEAR = 6.5
 """Contrast over noise, summed over an electrode, from which on the network has to find it."""
 
-CLINICAL_CROWD = 0.4
-"""Catheters where they are as dense as in a laboratory: 10 cm x 10 cm of a frame have one or two."""
+CLINICAL_CROWD = 0.7
+"""Catheters where they are as dense as in a laboratory: 10 cm x 10 cm of a frame have three or four."""
 
 _WITHOUT_CATHETER = 0.28
 _CATHETERS = 1, 1, 2, 2, 3

@@ -46,7 +46,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "15"
+    version: ClassVar[str] = "16"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -80,6 +80,6 @@ class LearnedChain:
         def detector_of(field: FieldMask) -> Detector:
             return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms, answers)
 
-        judge = None if alone else TrackEvidence(trained, run.px_per_mm, len(run.frames))
+        judge = None if alone else TrackEvidence(trained, run.px_per_mm, run.frame_times_ms)
         found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)
         return visible_part(found, _DIM_BELOW)

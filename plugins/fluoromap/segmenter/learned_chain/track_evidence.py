@@ -33,8 +33,15 @@ _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
-_LEAST_MEDIAN, _LEAST_LOW = 0.2, -2.0
-"""Log-odds of the middle electrode, on average over the pictures; of the worst electrode."""
+_LEAST_MEDIAN, _LEAST_FOLLOWED, _LEAST_STILL = 0.5, -0.4, 1.2
+"""Log-odds of the middle electrode, on average over the pictures: of any track, of one that was found in nearly all frames and
+moves as the heart does, of one that lies still. Clutter rarely looks like the same catheter in every frame, and it rarely moves."""
+_FOLLOWED = 0.8
+"""Share of the run's frames."""
+_STILL_MM, _BEAT_MS = 1.2, 400.0
+"""A catheter in a beating heart moves farther, in so long a time."""
+_LEAST_LOW = -2.0
+"""Log-odds of the worst electrode."""
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
@@ -61,12 +68,12 @@ class SectionOdds:
 class TrackEvidence:
     """Judge of the tracks of one run.
 
-    frames : number of the run's frames.
+    frame_times_ms : (frames,) of the run.
     """
 
     trained: Trained
     px_per_mm: float
-    frames: int
+    frame_times_ms: Array
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
     def __call__(
@@ -103,11 +110,19 @@ class TrackEvidence:
             return False
         odds = np.array([odds_of(sections) for sections in pictures])
         middle = np.median(odds, axis=1)
+        least = self._least(paths)
         if len(usual) >= MANY_ELECTRODES:
-            return bool(
-                middle.mean() >= _LEAST_LONG or np.median(odds_of(sections_in(_all_along(len(frames))))) >= _LEAST_LONG
-            )
-        return bool(middle.mean() >= _LEAST_MEDIAN and _are_electrodes(odds.mean(axis=0)))
+            least = min(least, _LEAST_LONG)
+            return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
+        return bool(middle.mean() >= least and _are_electrodes(odds.mean(axis=0)))
+
+    def _least(self, path_uv: Array) -> float:
+        """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
+        motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
+        followed = len(path_uv) >= _FOLLOWED * len(self.frame_times_ms)
+        if motion_px < _STILL_MM * self.px_per_mm and not (followed and np.ptp(self.frame_times_ms) < _BEAT_MS):
+            return _LEAST_STILL
+        return _LEAST_FOLLOWED if followed else _LEAST_MEDIAN
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.

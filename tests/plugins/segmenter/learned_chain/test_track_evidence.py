@@ -18,6 +18,7 @@ from fluoromap.segmenter.log_image import LogTransform
 FRAMES = 8
 PX_PER_MM = 512 / 178 * 2
 FACTS = PixelFacts(False, 12, False)
+TIMES_MS = np.arange(4 * FRAMES) * 1000.0 / 60.0
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def evidence(odds):
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
     trained = read_weights(Path(SHIPPED))
-    judge = TrackEvidence(trained, PX_PER_MM, FRAMES)
+    judge = TrackEvidence(trained, PX_PER_MM, TIMES_MS[:FRAMES])
     alone = [NetworkResponse.of_image(image, trained, PX_PER_MM) for image in images]
     for path_uv in noisy.truth.pixels_uv.values():
         assert judge(chains(path_uv), lambda frame: images[frame])
@@ -61,7 +62,7 @@ def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images)
 
 
 def test_a_track_beside_the_catheters_is_rejected(noisy, images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     path_uv = noisy.truth.pixels_uv["reference"]
     for shift in ([0.0, 60.0], [70.0, 0.0], [-55.0, -40.0]):
         beside = path_uv + np.array(shift)
@@ -69,14 +70,14 @@ def test_a_track_beside_the_catheters_is_rejected(noisy, images):
 
 
 def test_a_long_catheter_is_judged_in_sections(images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     row = np.stack([np.linspace(100.0, 400.0, 20), np.full(20, 200.0)], axis=1)
     path_uv = np.repeat(row[None], FRAMES, axis=0)
     assert not judge(chains(path_uv), lambda frame: images[frame])
 
 
 def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     track = chains(noisy.truth.pixels_uv["reference"])
     track[2] = next(iter(chains(noisy.truth.pixels_uv["reference"][2:3, :3]).values()))
     assert judge(track, lambda frame: images[frame])
@@ -97,7 +98,7 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
 def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_doubted(
     monkeypatch, electrodes, odds, hidden, accepted
 ):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
 
     def along(self, frames, path_uv, log_image):
         return evidence(np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -4.0))
@@ -108,7 +109,7 @@ def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_
 
 
 def test_electrodes_outside_the_field_do_not_count(monkeypatch):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     row = np.stack([-10.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     known = chains(np.repeat(row[None], FRAMES, axis=0))
 
@@ -127,7 +128,7 @@ def test_electrodes_outside_the_field_do_not_count(monkeypatch):
 def test_a_long_catheter_at_rest_over_anatomy_is_judged_by_frames_all_along_its_track(
     monkeypatch, electrodes, accepted
 ):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, 2 * FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
 
     def along(self, frames, path_uv, log_image):
         return evidence(np.full(path_uv.shape[1], 0.5 if np.ptp(frames) > FRAMES else -1.5))
@@ -139,7 +140,7 @@ def test_a_long_catheter_at_rest_over_anatomy_is_judged_by_frames_all_along_its_
 
 @pytest.mark.parametrize("lines", ["beside", "across"])
 def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
-    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, FRAMES)
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     known = chains(np.repeat(row[None], FRAMES, axis=0))
     nothing = evidence(np.full(4, 3.0))
