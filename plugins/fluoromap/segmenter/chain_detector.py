@@ -354,7 +354,7 @@ class ChainDetector:
         Others are part of a catheter with more electrodes than the catalogue has, or no catheter: their electrodes are places on
         parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
         dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
-        a short one and 0.77 at most. Electrodes of a long chain in another chain's line belong to the long one.
+        a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]

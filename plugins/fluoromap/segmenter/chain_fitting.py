@@ -144,8 +144,8 @@ def fit_chains(
 def _apart(fit: ElectrodeFit, candidates_uv: Array, catheter: Catheter, px_per_mm: float) -> ElectrodeFit:
     """Return the fit without electrodes that it moved into the place of a neighbour.
 
-    Of the two, the one that moved farther stays where it was proposed, (chains, electrodes, 2). The way between both places adds to
-    its covariance.
+    Of the two electrodes, the second to leave its candidate (chains, electrodes, 2) farther behind returns to it. The way between
+    both places adds to its covariance.
     """
     gaps = np.linalg.norm(np.diff(fit.points_uv, axis=1), axis=2)
     meets = gaps < _LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)

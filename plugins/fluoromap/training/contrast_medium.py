@@ -96,7 +96,7 @@ def draw_drained_tube(random: Generator, canvas: Canvas, px_per_mm: float) -> No
 
 
 def draw_tubing(random: Generator, canvas: Canvas, px_per_mm: float) -> None:
-    """Draw joined tubes, as of a vessel phantom: each is filled along a part only.
+    """Draw joined tubes of a vessel phantom: each is partly filled.
 
     Elsewhere drops hang in it, which lie in a row like electrodes; where it is full it has bubbles.
     """

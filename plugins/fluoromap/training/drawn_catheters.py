@@ -255,7 +255,10 @@ def _fill_gaps(random: Generator, canvas: Canvas, places: Array, wide: float, me
 
 
 def _fill_gap(canvas: Canvas, place: Array, following: Array, half: float, wide: float, strength: float) -> None:
-    """Draw a band in the middle between two places; ``half`` its length over their distance."""
+    """Draw a band in the middle between two places.
+
+    ``half`` : half its length over their distance.
+    """
     step = following - place
     heading, length = math.atan2(step[1], step[0]), half * float(np.linalg.norm(step))
     canvas.band(0.5 * (place + following), heading, length, 0.95 * wide, strength, 0.0, False, 0.7)

@@ -150,3 +150,33 @@ def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
     assert not judge(known, lambda frame: None)
     monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: nothing)
     assert judge(known, lambda frame: None)
+
+
+@pytest.mark.parametrize(
+    ("odds", "found", "moves", "accepted"),
+    [
+        (-0.2, 24, True, True),
+        (-0.6, 24, True, False),
+        (0.3, 12, True, False),
+        (0.7, 12, True, True),
+        (1.0, 24, False, False),
+        (1.3, 24, False, True),
+    ],
+)
+def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(monkeypatch, odds, found, moves, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
+    monkeypatch.setattr(
+        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, odds))
+    )
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(found))[:, None, None] * np.array([0.0, float(moves)])
+    assert judge(chains(row + beat), lambda frame: None) == accepted
+
+
+def test_a_moment_is_too_short_to_see_a_catheter_move(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
+    monkeypatch.setattr(
+        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, -0.2))
+    )
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    assert judge(chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None)

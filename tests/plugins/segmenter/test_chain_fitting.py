@@ -1,0 +1,46 @@
+"""Chains fitted to the image: two electrodes are never fitted to one dark place."""
+
+import numpy as np
+import pytest
+
+from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.segmenter.chain_fitting import fit_chains
+from fluoromap.segmenter.linking import CandidateChain, ShaftImage, catheter_families
+
+PX_PER_MM = 3.5
+CATHETER = catheter_type("quadripolar-2-5-2", "reference")
+CATALOGUE = Catalogue((CATHETER, catheter_type("decapolar-2-5-2", "mapping")), "reference", "mapping")
+ALONG_PX = 60.0 + np.concatenate([[0.0], np.cumsum(CATHETER.spacing_mm)]) * PX_PER_MM
+
+
+def fitted(shown, candidates_u):
+    """Fit a quadripolar catheter of which the image shows some electrodes."""
+    v, u = np.mgrid[:120, :180].astype(np.float64)
+    image = np.random.default_rng(5).normal(0.0, 0.02, v.shape)
+    half = 0.5 * CATHETER.ring_mm * PX_PER_MM
+    for electrode in shown:
+        band = np.clip(0.5 + (half - np.abs(u - ALONG_PX[electrode])) / 2.0, 0.0, 1.0)
+        image -= 0.5 * band * (np.abs(v - 60.0) < 3.5)
+    x = image.astype(np.float32)
+    candidates = np.stack([candidates_u, np.full(4, 60.0)], axis=1)
+    families = tuple(one for one in catheter_families(CATALOGUE) if one.catheter.electrodes == 4)
+    linked = [CandidateChain((0, 1, 2, 3), 0, 5.0)]
+    (one,) = fit_chains(x, candidates, linked, ShaftImage(x, 1, 0.1, PX_PER_MM), families, 0.02)
+    return one.chain
+
+
+def test_the_electrodes_of_a_clear_catheter_are_fitted():
+    chain = fitted(range(4), ALONG_PX + np.array([1.0, -1.0, 1.0, -1.0]))
+    places = np.sort(chain.pixels_uv[:, 0])
+    assert places == pytest.approx(ALONG_PX, abs=0.5)
+
+
+def test_an_electrode_that_would_take_its_neighbour_s_place_stays_where_it_was_proposed():
+    near = ALONG_PX.copy()
+    near[1] = ALONG_PX[0] + 4.0
+    chain = fitted([0, 2, 3], near)
+    order = np.argsort(chain.pixels_uv[:, 0])
+    gaps = np.diff(chain.pixels_uv[order, 0])
+    assert gaps.min() >= 0.15 * min(CATHETER.spacing_mm) * PX_PER_MM
+    spread = np.sqrt(np.trace(chain.covariance_px2[order], axis1=1, axis2=2))
+    assert spread[1] > spread[[0, 2, 3]].max()
