@@ -37,8 +37,6 @@ IN_A_RUN = Acceptance(
 )
 _ALONE = replace(
     IN_A_RUN,
-    least_clearness=0.3,
-    sure_clearness=0.5,
     scores=ScoreLimits(0.5, seen=0.2, least_seen=0.85),
     scores_beside=ScoreLimits(0.4, seen=0.15, least_seen=0.7),
     faded_price=math.inf,

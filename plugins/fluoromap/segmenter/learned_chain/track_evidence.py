@@ -33,9 +33,6 @@ _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
-_LEAST_MEDIAN, _LEAST_FOLLOWED, _LEAST_STILL = 0.5, -0.4, 1.2
-"""Log-odds of the middle electrode, on average over the pictures: of any track, of one that was found in nearly all frames and
-moves as the heart does, of one that lies still. Clutter rarely looks like the same catheter in every frame, and it rarely moves."""
 _FOLLOWED = 0.8
 """Share of the run's frames."""
 _STILL_MM, _BEAT_MS = 1.2, 400.0
@@ -45,10 +42,27 @@ _LEAST_LOW = -2.0
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
-_LEAST_LONG = 0.0
-"""Of the middle electrode of six or more, on average. Clutter often hides some of them: the worst electrodes do not count."""
 _MOST_OUTSIDE = 0.5
 """Share of the frames in which an electrode may lie outside the field, where nothing shows, and still count."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Least:
+    """Least log-odds of the middle electrode of a track, on average over the pictures.
+
+    Clutter rarely looks like the same catheter in every frame, and it rarely moves as the heart does.
+
+    track : of any track. followed : of one that was found in nearly all frames. still : of one that does not move.
+    """
+
+    track: float
+    followed: float
+    still: float
+
+
+_LEAST = _Least(0.5, followed=-0.4, still=1.2)
+_LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0)
+"""Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,19 +124,18 @@ class TrackEvidence:
             return False
         odds = np.array([odds_of(sections) for sections in pictures])
         middle = np.median(odds, axis=1)
-        least = self._least(paths)
         if len(usual) >= MANY_ELECTRODES:
-            least = min(least, _LEAST_LONG)
+            least = self._least(paths, _LEAST_LONG)
             return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
-        return bool(middle.mean() >= least and _are_electrodes(odds.mean(axis=0)))
+        return bool(middle.mean() >= self._least(paths, _LEAST) and _are_electrodes(odds.mean(axis=0)))
 
-    def _least(self, path_uv: Array) -> float:
+    def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
         motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
         followed = len(path_uv) >= _FOLLOWED * len(self.frame_times_ms)
         if motion_px < _STILL_MM * self.px_per_mm and not (followed and np.ptp(self.frame_times_ms) < _BEAT_MS):
-            return _LEAST_STILL
-        return _LEAST_FOLLOWED if followed else _LEAST_MEDIAN
+            return least.still
+        return least.followed if followed else least.track
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.

@@ -92,7 +92,8 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
         (4, 2.5, 2, False),
         (6, 0.5, 1, True),
         (10, 0.1, 2, True),
-        (10, -0.5, 0, False),
+        (10, -1.1, 2, True),
+        (10, -1.5, 0, False),
     ],
 )
 def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_doubted(
@@ -153,22 +154,29 @@ def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
 
 
 @pytest.mark.parametrize(
-    ("odds", "found", "moves", "accepted"),
+    ("electrodes", "odds", "found", "moves", "accepted"),
     [
-        (-0.2, 24, True, True),
-        (-0.6, 24, True, False),
-        (0.3, 12, True, False),
-        (0.7, 12, True, True),
-        (1.0, 24, False, False),
-        (1.3, 24, False, True),
+        (4, -0.2, 24, True, True),
+        (4, -0.6, 24, True, False),
+        (4, 0.3, 12, True, False),
+        (4, 0.7, 12, True, True),
+        (4, 1.0, 24, False, False),
+        (4, 1.3, 24, False, True),
+        (10, -0.2, 12, True, False),
+        (10, 0.1, 24, False, True),
+        (10, -0.2, 24, False, False),
     ],
 )
-def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(monkeypatch, odds, found, moves, accepted):
+def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(
+    monkeypatch, electrodes, odds, found, moves, accepted
+):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
     monkeypatch.setattr(
-        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, odds))
+        TrackEvidence,
+        "evidence_along",
+        lambda self, frames, path_uv, log_image: evidence(np.full(path_uv.shape[1], odds)),
     )
-    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(found))[:, None, None] * np.array([0.0, float(moves)])
     assert judge(chains(row + beat), lambda frame: None) == accepted
 
