@@ -39,6 +39,7 @@ _STILL_MM, _BEAT_MS = 1.2, 400.0
 """A catheter in a beating heart moves farther, in so long a time."""
 _LEAST_LOW = -2.0
 """Log-odds of the worst electrode."""
+_DENIED = -4.0
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
@@ -125,7 +126,9 @@ class TrackEvidence:
         odds = np.array([odds_of(sections) for sections in pictures])
         middle = np.median(odds, axis=1)
         if len(usual) >= MANY_ELECTRODES:
-            least = self._least(paths, _LEAST_LONG)
+            # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
+            displaced = odds.mean(axis=0).min() < _DENIED
+            least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
             return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
         return bool(middle.mean() >= self._least(paths, _LEAST) and _are_electrodes(odds.mean(axis=0)))
 

@@ -188,3 +188,17 @@ def test_a_moment_is_too_short_to_see_a_catheter_move(monkeypatch):
     )
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None)
+
+
+@pytest.mark.parametrize(("worst", "accepted"), [(-3.0, True), (-5.5, False)])
+def test_a_chain_that_is_displaced_along_its_catheter_has_places_that_are_clearly_none(monkeypatch, worst, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    odds = {7: worst, 8: 3.0, 9: 3.0}
+
+    def along(self, frames, path_uv, log_image):
+        place = np.rint((path_uv[0, :, 0] - 100.0) / 20.0).astype(int)
+        return evidence(np.array([odds.get(index, -0.5) for index in place.tolist()]))
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
+    assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
