@@ -91,7 +91,7 @@ def test_electrodes_of_real_frames_marked_from_the_tip(
             for row in [each for each in labels if each["catheter"] == name][:4]:
                 click_pixel(page, view, float(row["u_px"]), float(row["v_px"]))
             page.get_by_role("button", name="Move electrodes", pressed=True).wait_for()
-        page.locator(f".view[data-view={view}] .status", has_text="stored").wait_for()
+        expect(page.locator(f".view[data-view={view}] .status")).to_have_text("stored")
     site = page.request.get(f"{study}/sites/S01").json()
     for view in ("view_a", "view_b"):
         stored = page.request.get(f"{study}/instances/{site[view]}/frames/1/electrodes").json()

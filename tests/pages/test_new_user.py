@@ -60,7 +60,7 @@ def test_from_upload_over_a_correction_to_the_mesh(
     tip = next(e for e in frame["electrodes"] if e["catheter"] == "mapping" and e["electrode"] == 1)
     page.get_by_label("Frame of view a").fill(str(frame["frame"]))
     drag_pixel(page, "a", (tip["u_px"], tip["v_px"]), (tip["u_px"] + 10, tip["v_px"]))
-    page.locator(".view[data-view=a] .status", has_text="stored").wait_for()
+    expect(page.locator(".view[data-view=a] .status")).to_have_text("stored")
     address = f"{study}/instances/{shown['view_a']}/frames/{frame['frame']}/electrodes"
     stored = page.request.get(address).json()
     assert {each["catheter"] for each in stored} == {"mapping"}
@@ -70,9 +70,9 @@ def test_from_upload_over_a_correction_to_the_mesh(
 
     page.locator(".view[data-view=a] canvas").focus()
     page.keyboard.press("Control+z")
-    page.locator(".view[data-view=a] .status", has_text="stored").wait_for()
+    expect(page.locator(".view[data-view=a] .status")).to_have_text("stored")
     page.keyboard.press("Control+y")
-    page.locator(".view[data-view=a] .status", has_text="stored").wait_for()
+    expect(page.locator(".view[data-view=a] .status")).to_have_text("stored")
 
     _compute(page)
     page.get_by_role("button", name="Compare", exact=True).click()

@@ -6,6 +6,7 @@ import itertools
 from typing import Any
 
 import pytest
+from playwright.sync_api import expect
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def press(page: Any, view: Any, *keys: str) -> None:
     view.locator(".status").evaluate("status => (status.textContent = '')")
     for key in keys:
         page.keyboard.press(key)
-    view.locator(".status", has_text="stored").wait_for()
+    expect(view.locator(".status")).to_have_text("stored")
 
 
 def test_the_focus_and_the_choice_are_visible(page: Any, view: Any) -> None:
@@ -64,7 +65,7 @@ def test_an_electrode_is_moved_deleted_added_undone_and_redone(page: Any, view: 
     # The way of one press of Shift is stored once.
     view.locator(".status").evaluate("status => (status.textContent = '')")
     page.keyboard.up("Shift")
-    view.locator(".status", has_text="stored").wait_for()
+    expect(view.locator(".status")).to_have_text("stored")
     moved = electrodes(page, own_study)["mapping", 1]
     assert moved["source"] == "manual"
     assert (moved["u_px"] - tip["u_px"], moved["v_px"] - tip["v_px"]) == pytest.approx((1, 4), abs=0.01)

@@ -97,6 +97,8 @@ export function jobPanel(state, showMap) {
   };
   const run = async (showsMap = false) => {
     const pipeline = Object.fromEntries(Object.entries(chosen).map(([kind, entry]) => [kind, { name: entry.plugin.value, params: entry.form.value() }]));
+    // The job counts each electrode that a person has set.
+    await state.stored;
     const job = await send("POST", `${state.path}/jobs`, { pipeline, view: view.value });
     await watch(job, showsMap);
   };

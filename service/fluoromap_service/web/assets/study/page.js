@@ -26,6 +26,8 @@ export class StudyState extends EventTarget {
     this.jobs = [];
     /** @type {import("../shared/types.js").Job|null} The running job that has its map already. */
     this.mapped = null;
+    /** @type {Promise<void>} Fulfilled when the service has answered each change of electrodes. */
+    this.stored = Promise.resolve();
     /** @type {string|null} The site that a person looks at. */
     this.chosen = null;
     /** @type {{job: string, points: Promise<import("../shared/types.js").Point[]>}|null} */

@@ -1,21 +1,27 @@
-/** The electrodes of one run: detected, or set by hand; each change is stored at once and can be undone. */
+/**
+ * The electrodes of one run: detected, or set by hand; each change is stored at once and can be undone. `changed` fires after each
+ * change, `stored` when the service has stored the last one, `refused` when it has not.
+ */
 import { get, send } from "../shared/api.js";
 
 /** @typedef {import("../shared/types.js").Electrode} Electrode */
+/** @typedef {import("../study/page.js").StudyState} StudyState */
 
 export class Marks extends EventTarget {
-  /** @param {string} studyPath @param {import("../shared/types.js").Run} run */
-  constructor(studyPath, run) {
+  /** @param {StudyState} state @param {import("../shared/types.js").Run} run */
+  constructor(state, run) {
     super();
+    this.state = state;
     this.run = run;
-    this.path = `${studyPath}/instances/${run.sop_instance_uid}`;
+    this.path = `${state.path}/instances/${run.sop_instance_uid}`;
     /** @type {Map<number, Electrode[]>} Frame (from 1) -> electrodes. */
     this.frames = new Map();
     /** @type {{frame: number, before: Electrode[], after: Electrode[]}[]} */
     this.done = [];
     /** @type {{frame: number, before: Electrode[], after: Electrode[]}[]} */
     this.undone = [];
-    this.stored = Promise.resolve();
+    /** Changes that the service has not answered yet. */
+    this.waiting = 0;
   }
 
   async load() {
@@ -72,19 +78,24 @@ export class Marks extends EventTarget {
     this.dispatchEvent(new Event("changed"));
     const manual = electrodes.filter((each) => each.source === "manual");
     const address = `${this.path}/frames/${frame}/electrodes`;
+    this.waiting += 1;
     // One request after the other: the last change has to be the last that the service stores.
-    this.stored = this.stored.catch(() => undefined).then(async () => {
+    const stored = this.state.stored.then(async () => {
       try {
         if (manual.length) await send("PUT", address, manual);
         else this.frames.set(frame, await send("DELETE", address));
       } catch (error) {
+        this.waiting -= 1;
+        this.dispatchEvent(new Event("refused"));
         // The view must not show a change that the service refused.
         await this.load();
         throw error;
       }
+      this.waiting -= 1;
       this.dispatchEvent(new Event("changed"));
-      this.dispatchEvent(new Event("stored"));
+      if (!this.waiting) this.dispatchEvent(new Event("stored"));
     });
-    return this.stored;
+    this.state.stored = stored.catch(() => undefined);
+    return stored;
   }
 }

@@ -35,7 +35,7 @@ export class View extends FrameView {
     this.carried = null;
     /** @type {{u: number, v: number}|null} Place for the next electrode, frame pixels: for people without a pointer. */
     this.cross = null;
-    this.marks = new Marks(state.path, run);
+    this.marks = new Marks(state, run);
     this.playButton = button("Play", () => this.switchPlay(), { "aria-label": `Play view ${letter}` });
     this.status = element("span", { class: "status", "aria-live": "polite" });
     this.element.dataset.view = letter;
@@ -51,6 +51,7 @@ export class View extends FrameView {
     pen.addEventListener("changed", this.followPen);
     this.canvas.addEventListener("focus", this.followPen);
     this.marks.addEventListener("stored", () => (this.status.textContent = "stored"));
+    this.marks.addEventListener("refused", () => (this.status.textContent = "not stored"));
     super.show(1);
     attempt(() => this.marks.load());
   }
@@ -217,17 +218,18 @@ export class View extends FrameView {
     return this.#store(() => this.marks.change(frame, catheter, electrodes));
   }
 
-  /** Take the electrodes of the pen's catheter in this frame as right: the next computation tracks the run from here. @returns {Promise<boolean>} Whether there are any. */
+  /** Take the electrodes of the pen's catheter in this frame as right: the next computation tracks the run from here. @returns {Promise<boolean>} Whether there are any, and the service has them. */
   async confirm() {
-    const { catheter } = this.pen;
-    const shown = this.marks.of(this.frame).filter((each) => each.catheter === catheter);
-    if (!shown.length) {
-      announce(`Frame ${this.frame} of view ${this.letter} shows no electrode of the catheter "${catheter}". Mark it from its tip on first.`, "problem");
+    const { frame, pen: { catheter } } = this;
+    const shown = () => this.marks.of(frame).filter((each) => each.catheter === catheter);
+    if (!shown().length) {
+      announce(`Frame ${frame} of view ${this.letter} shows no electrode of the catheter "${catheter}". Mark it from its tip on first.`, "problem");
       return false;
     }
-    if (shown.some((each) => each.source !== "manual")) await this.#change(this.frame, catheter, shown);
-    await this.marks.stored;
-    return true;
+    if (shown().some((each) => each.source !== "manual")) await this.#change(frame, catheter, shown());
+    await this.state.stored;
+    // A refused change is taken back.
+    return shown().every((each) => each.source === "manual");
   }
 
   /** @param {Electrode} electrode */
