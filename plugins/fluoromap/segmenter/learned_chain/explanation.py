@@ -12,12 +12,14 @@ from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.log_image import Image, LogTransform
 
-SCALES_PX_PER_MM = 2.7, 3.1, 3.6, 4.1, 4.7, 5.4, 6.2
-"""Scales of fluoroscopy at the isocentre, each 15 % above the one before."""
+SCALES_PX_PER_MM = 2.3, 2.7, 3.1, 3.6, 4.1, 4.7, 5.4, 6.2, 7.1, 8.2, 9.4, 10.8
+"""Scales of fluoroscopy at the isocentre, each 15 % above the one before: of 512 to 1024 pixels, and of printed figures."""
 
 _FRAMES = 3
 _LEAST_ELECTRODES = 3.0
 _NEARLY_ALL = 0.75
+_MORE = 1.5
+"""How many times as many electrodes an inverted picture has to show: bright letters and gaps look like some."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +44,23 @@ def find_scale(
 ) -> Explanation | None:
     """Return the scale and the polarity at which the catalogue explains a run best.
 
-    ``run.px_per_mm`` and ``run.pixels.monochrome1`` are not used. A larger scale explains the same pictures by stronger
-    foreshortening, so the smallest scale that explains nearly as much as the best is returned. It is right to about 20 %: enough
-    to find electrodes and to show them, not to locate them. ``trained`` : the shipped network by default.
+    ``run.px_per_mm`` is not used. The polarity is the header's, unless the other one explains clearly more. A larger scale
+    explains the same pictures by stronger foreshortening, so the smallest scale that explains nearly as much as the best is
+    returned. It is right to about 20 %: enough to find electrodes and to show them, not to locate them. ``trained`` : the
+    shipped network by default.
 
     Returns
     -------
     Explanation or None
         None where no scale explains three frames.
     """
-    tried = [
-        one
-        for inverted in (False, True)
-        for one in _explanations(run, replace(run.pixels, monochrome1=inverted), catalogue, scales_px_per_mm, trained)
-    ]
-    return _smallest_of_the_best(tried)
+    header, other = (
+        _smallest_of_the_best(_explanations(run, pixels, catalogue, scales_px_per_mm, trained))
+        for pixels in (run.pixels, _inverted(run.pixels))
+    )
+    if header is None or other is None:
+        return header or other
+    return other if _explains_more(other, header) else header
 
 
 def is_inverted(run: Run, catalogue: Catalogue, trained: Trained | None = None) -> bool:
@@ -64,26 +68,30 @@ def is_inverted(run: Run, catalogue: Catalogue, trained: Trained | None = None) 
 
     ``trained`` : the shipped network by default.
     """
-    inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
-    of_inverted = _smallest_of_the_best(_explanations(run, inverted, catalogue, (run.px_per_mm,), trained))
+    inverted = _explanations(run, _inverted(run.pixels), catalogue, (run.px_per_mm,), trained)
+    of_inverted = _smallest_of_the_best(inverted)
     if of_inverted is None:
         return False
     (as_it_says,) = _explanations(run, run.pixels, catalogue, (run.px_per_mm,), trained)
-    return of_inverted.electrodes > as_it_says.electrodes
+    return _explains_more(of_inverted, as_it_says)
+
+
+def _inverted(pixels: PixelFacts) -> PixelFacts:
+    return replace(pixels, monochrome1=not pixels.monochrome1)
+
+
+def _explains_more(inverted: Explanation, as_it_says: Explanation) -> bool:
+    return inverted.electrodes > _MORE * as_it_says.electrodes
 
 
 def _smallest_of_the_best(tried: Sequence[Explanation]) -> Explanation | None:
-    """Return the smallest scale of the polarity that explains most."""
+    """Return the smallest of the scales that explain nearly as much as the best."""
     possible = [one for one in tried if one.sure and one.electrodes >= _LEAST_ELECTRODES]
     if not possible:
         return None
     best = max(possible, key=lambda one: one.electrodes)
     return min(
-        (
-            one
-            for one in possible
-            if one.monochrome1 == best.monochrome1 and one.electrodes >= _NEARLY_ALL * best.electrodes
-        ),
+        (one for one in possible if one.electrodes >= _NEARLY_ALL * best.electrodes),
         key=lambda one: one.px_per_mm,
     )
 

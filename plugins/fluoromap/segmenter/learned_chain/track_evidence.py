@@ -39,7 +39,8 @@ _STILL_MM, _BEAT_MS = 1.2, 400.0
 """A catheter in a beating heart moves farther, in so long a time."""
 _LEAST_LOW = -2.0
 """Log-odds of the worst electrode."""
-_DENIED = -4.0
+_DENIED, _DENIED_LONG = -3.0, -4.0
+"""Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
@@ -64,6 +65,8 @@ class _Least:
 _LEAST = _Least(0.5, followed=-0.4, still=1.2)
 _LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0)
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
+_LEAST_PAIR = _Least(1.2, followed=0.8, still=1.6)
+"""Of two electrodes, which is little: any two dark spots are a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,7 @@ class TrackEvidence:
         frames = [frame for frame, chain in sorted(chains.items()) if chain.electrodes == usual]
         paths = np.array([chains[frame].pixels_uv for frame in frames])
         inside = np.array([chains[frame].scores > UNSEEN for frame in frames]).mean(axis=0) >= 1.0 - _MOST_OUTSIDE
-        if np.count_nonzero(inside) < LEAST_VISIBLE:
+        if np.count_nonzero(inside) < min(LEAST_VISIBLE, len(usual)):
             return False
 
         def sections_in(picture: IntArray) -> list[SectionOdds]:
@@ -127,10 +130,11 @@ class TrackEvidence:
         middle = np.median(odds, axis=1)
         if len(usual) >= MANY_ELECTRODES:
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
-            displaced = odds.mean(axis=0).min() < _DENIED
+            displaced = odds.mean(axis=0).min() < _DENIED_LONG
             least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
             return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
-        return bool(middle.mean() >= self._least(paths, _LEAST) and _are_electrodes(odds.mean(axis=0)))
+        least = self._least(paths, _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR)
+        return bool(middle.mean() >= least and _are_electrodes(odds.mean(axis=0)))
 
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
@@ -185,8 +189,10 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
 def _are_electrodes(odds: Array) -> bool:
     """Return whether log-odds (n,) are those of electrodes.
 
-    Either all are high enough, or the others are so high that they excuse the worst.
+    Either all are high enough, or the others are so high that they excuse the worst. A place that is clearly none has no excuse.
     """
+    if odds.min() < _DENIED:
+        return False
     worst = np.quantile(odds, _LOW_QUANTILE, method="lower")
     return bool(worst >= _LEAST_LOW or np.clip(odds, *_COUNTED).mean() >= _LEAST_MEAN)
 
