@@ -30,7 +30,8 @@ from fluoromap.segmenter.tracks import (
     reverse,
 )
 
-_BEND_PX = 8.0
+_BEND_PX, _BEND_PX_PER_MS, _MOST_BEND_PX = 8.0, 0.15, 14.0
+"""How far an electrode may move against its chain between two frames: at least, in time, and at most."""
 _STIFF_PX = 3.5
 _BENDING_PX_PER_MS = 0.05
 _STALE_MS = 50.0
@@ -424,8 +425,13 @@ def _tip_odds(chain: Chain) -> float:
 
 def _is_bent(track: Track, chain: Chain, time_ms: float) -> bool:
     """Return whether the shape changed faster than a heart bends a catheter."""
-    allowed = _STIFF_PX + _BENDING_PX_PER_MS * abs(time_ms - track.time_ms)
-    return chain_distance(track.chain, chain)[1] > min(allowed, _BEND_PX)
+    elapsed = abs(time_ms - track.time_ms)
+    return chain_distance(track.chain, chain)[1] > min(_STIFF_PX + _BENDING_PX_PER_MS * elapsed, _most_bent_px(elapsed))
+
+
+def _most_bent_px(elapsed_ms: float) -> float:
+    """Return how far a chain may bend in a time and still be the track's."""
+    return min(max(_BEND_PX, _BEND_PX_PER_MS * elapsed_ms), _MOST_BEND_PX)
 
 
 def _extend(track: Track, chain: Chain, frame: int, time_ms: float) -> None:
@@ -457,20 +463,21 @@ def _assign(tracks: Sequence[Track], chains: Sequence[Chain], time_ms: float) ->
     others: dict[int, Chain] = {}
     for column, track in enumerate(tracks):
         shift, gate = _expected(track, time_ms)
+        most_bent = _most_bent_px(abs(time_ms - track.time_ms))
         for row, chain in enumerate(chains):
             overlap = kind_overlap(track.chain, chain)
             if overlap <= 0:
                 continue
             unlike = _OTHER_KIND * (1.0 - min(overlap, 1.0))
             away, bent = chain_distance(track.chain, chain, shift)
-            if away <= gate and bent <= _BEND_PX:
+            if away <= gate and bent <= most_bent:
                 cost[row, column] = away + 2.0 * bent + unlike
             elif not chain.manual and (away <= gate or chain.electrodes != track.chain.electrodes):
                 # Turned, the same electrodes have the same mean shift.
                 if row not in others:
                     others[row] = reverse(chain)
                 away, bent = chain_distance(track.chain, others[row], shift)
-                if away <= gate and bent <= _BEND_PX:
+                if away <= gate and bent <= most_bent:
                     cost[row, column] = away + 2.0 * bent + unlike + _REVERSED_PX
                     turned[row, column] = True
     numbers, other_way = [-1] * len(chains), [False] * len(chains)
