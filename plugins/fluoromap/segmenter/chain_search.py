@@ -23,7 +23,8 @@ MANY_ELECTRODES = 6
 """From here on a catheter is long. Of a shorter one, more than one electrode is rarely missing."""
 
 _END_SLACK = 0.55, 1.1
-_SPREAD = 0.6
+_SPREAD, _SPREAD_A_GAP, _MOST_SPREAD = 0.6, 0.06, 0.9
+"""How far the ratios of two gaps may differ: of neighbours, more for each gap between them, at most. Long catheters turn in depth."""
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
 _MOST_CURVED_PER_MM, _MOST_BENT = 0.25, 1.6
 """A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""
@@ -111,7 +112,8 @@ def _grow(points, spacing_px, step, least_cosine, kept, ratios, longer, more):  
                 tu, tv = bu / before - du / spacing, bv / before - dv / spacing
                 fits = tu * tu + tv * tv <= _MOST_TURNED * _MOST_TURNED
             for k in range(step):
-                if kept[row, k] == i or abs(ratios[row, k] - length / spacing) > _SPREAD:
+                spread = min(_SPREAD + _SPREAD_A_GAP * (step - 1 - k), _MOST_SPREAD)
+                if kept[row, k] == i or abs(ratios[row, k] - length / spacing) > spread:
                     fits = False
             if fits:
                 longer[count, 0] = kept[row, 0]
