@@ -19,6 +19,8 @@ _MOST_MISSING = 0.34
 _MISSING_IN_A_ROW = 2
 _GATE, _GATE_PX = 0.33, 1.5
 _MISSING_PRICE = 1.5
+_KEPT_BEND = 0.5
+"""Share of the last bend, for its length, that is expected to go on."""
 _MOST_ROWS = 4000
 
 
@@ -88,10 +90,14 @@ def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, 
                     at = a + 1 if way == 0 else a
                     direction_u, direction_v = step * du / length, step * dv / length
                     ratio = seen
+                    before, bend = length, 0.0
                     gap = 0
                     while 0 <= at + step < m and missing <= most_missing:
                         space = spacing[at] if step > 0 else spacing[at - 1]
                         reach = space * ratio
+                        turn = 0.5 * bend * (before + reach)
+                        cosine, sine = math.cos(turn), math.sin(turn)
+                        direction_u, direction_v = cosine * direction_u - sine * direction_v, sine * direction_u + cosine * direction_v
                         eu, ev = place[at, 0] + direction_u * reach, place[at, 1] + direction_v * reach
                         gate = _GATE * reach + _GATE_PX
                         found = -1
@@ -110,6 +116,7 @@ def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, 
                                 value = worth
                                 found = c
                         at += step
+                        before = reach
                         if found < 0:
                             place[at, 0], place[at, 1] = eu, ev
                             if (
@@ -133,7 +140,11 @@ def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, 
                         mu, mv = place[at, 0] - place[at - step, 0], place[at, 1] - place[at - step, 1]
                         moved = max(math.sqrt(mu * mu + mv * mv), 1e-9)
                         ratio = min(max(0.5 * ratio + 0.5 * moved / space, SHORTEST), LONGEST)
-                        direction_u, direction_v = mu / moved, mv / moved
+                        mu, mv = mu / moved, mv / moved
+                        ahead_u, ahead_v = cosine * direction_u + sine * direction_v, cosine * direction_v - sine * direction_u
+                        bent = math.atan2(ahead_u * mv - ahead_v * mu, ahead_u * mu + ahead_v * mv)
+                        bend = _KEPT_BEND * bent / max(0.5 * (before + moved), 1e-9)
+                        direction_u, direction_v, before = mu, mv, moved
                 if missing > most_missing or 2 * (missing + beyond) > m or count == rows.shape[0]:
                     continue
                 for k in range(m):
