@@ -19,7 +19,7 @@ _MOST_MISSING = 0.34
 _MISSING_IN_A_ROW = 2
 _GATE, _GATE_PX = 0.33, 1.5
 _MISSING_PRICE = 1.5
-_KEPT_BEND = 0.5
+_KEPT_BEND = 0.8
 """Share of the last bend, for its length, that is expected to go on."""
 _MOST_ROWS = 4000
 
