@@ -44,6 +44,8 @@ _DENIED, _DENIED_LONG = -3.0, -4.0
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
+_MOST_PROBE_TURN = 2.4
+"""Radians. What lies beside a loop, as another wall beside a probe's, is the loop's own other side."""
 _MOST_OUTSIDE = 0.5
 """Share of the frames in which an electrode may lie outside the field, where nothing shows, and still count."""
 
@@ -124,7 +126,7 @@ class TrackEvidence:
             return odds
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
-        if _is_probe(pictures):
+        if _turn(paths[len(paths) // 2]) < _MOST_PROBE_TURN and _is_probe(pictures):
             return False
         odds = np.array([odds_of(sections) for sections in pictures])
         middle = np.median(odds, axis=1)
@@ -186,6 +188,12 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
     beside = np.sum([np.concatenate([section.beside for section in sections], axis=2) for sections in pictures], axis=0)
     across = np.sum([np.concatenate([section.across for section in sections], axis=2) for sections in pictures], axis=0)
     return follows_bars(beside) or has_other_wall(across)
+
+
+def _turn(path_uv: Array) -> float:
+    """Return how far a path (electrodes, 2) turns from its first gap to its last, radians."""
+    ways = np.diff(path_uv, axis=0) @ np.array([1.0, 1.0j])
+    return float(abs(np.angle(ways[1:] * ways[:-1].conj()).sum()))
 
 
 def _are_electrodes(odds: Array) -> bool:
