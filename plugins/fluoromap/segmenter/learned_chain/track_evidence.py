@@ -33,10 +33,10 @@ _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
-_FOLLOWED = 0.8
-"""Share of the run's frames."""
+_FOLLOWED, _FOLLOWED_FRAMES = 0.8, 8
+"""Share of the run's frames, and how many at least: fewer say little."""
 _STILL_MM, _BEAT_MS = 1.2, 400.0
-"""A catheter in a beating heart moves farther, in so long a time. Shorter runs say little."""
+"""A catheter in a beating heart moves farther, in so long a time."""
 _LEAST_LOW = -2.0
 """Log-odds of the worst electrode."""
 _DENIED, _DENIED_LONG = -3.0, -4.0
@@ -56,7 +56,7 @@ class _Least:
 
     Clutter rarely looks like the same catheter in every frame, and it rarely moves as the heart does.
 
-    track : of any track. followed : of one that was found in nearly all frames of a beat. still : of one that does not move.
+    track : of any track. followed : of one that was found in nearly all frames. still : of one that does not move.
     """
 
     track: float
@@ -142,11 +142,9 @@ class TrackEvidence:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
         motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
         followed = len(path_uv) >= _FOLLOWED * len(self.frame_times_ms)
-        if followed and np.ptp(self.frame_times_ms) < _BEAT_MS:
-            return least.track
-        if motion_px < _STILL_MM * self.px_per_mm:
+        if motion_px < _STILL_MM * self.px_per_mm and not (followed and np.ptp(self.frame_times_ms) < _BEAT_MS):
             return least.still
-        return least.followed if followed else least.track
+        return least.followed if followed and len(path_uv) >= _FOLLOWED_FRAMES else least.track
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.
