@@ -97,7 +97,10 @@ def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, 
                         reach = space * ratio
                         turn = 0.5 * bend * (before + reach)
                         cosine, sine = math.cos(turn), math.sin(turn)
-                        direction_u, direction_v = cosine * direction_u - sine * direction_v, sine * direction_u + cosine * direction_v
+                        direction_u, direction_v = (
+                            cosine * direction_u - sine * direction_v,
+                            sine * direction_u + cosine * direction_v,
+                        )
                         eu, ev = place[at, 0] + direction_u * reach, place[at, 1] + direction_v * reach
                         gate = _GATE * reach + _GATE_PX
                         found = -1
@@ -141,7 +144,10 @@ def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, 
                         moved = max(math.sqrt(mu * mu + mv * mv), 1e-9)
                         ratio = min(max(0.5 * ratio + 0.5 * moved / space, SHORTEST), LONGEST)
                         mu, mv = mu / moved, mv / moved
-                        ahead_u, ahead_v = cosine * direction_u + sine * direction_v, cosine * direction_v - sine * direction_u
+                        ahead_u, ahead_v = (
+                            cosine * direction_u + sine * direction_v,
+                            cosine * direction_v - sine * direction_u,
+                        )
                         bent = math.atan2(ahead_u * mv - ahead_v * mu, ahead_u * mu + ahead_v * mv)
                         bend = _KEPT_BEND * bent / max(0.5 * (before + moved), 1e-9)
                         direction_u, direction_v, before = mu, mv, moved

@@ -152,7 +152,7 @@ def test_misplaced_electrodes_of_a_long_catheter_do_not_interrupt_its_track():
     entries = track_chains(run([[chain(points, "cs")] for points in places]), np.arange(6) * 60.0, 1)
     assert [[one.track for one in entry.chains] for entry in entries] == [[0]] * 6
     for points in places[2:5]:
-        points[:4] += 12.0
+        points[:4] += 24.0
     entries = track_chains(run([[chain(points, "cs")] for points in places]), np.arange(6) * 60.0, 1)
     assert len({one.track for entry in entries for one in entry.chains}) > 1
 

@@ -34,7 +34,7 @@ _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
 _FOLLOWED, _FOLLOWED_FRAMES = 0.8, 8
-"""Share of the run's frames, and how many at least: fewer say little."""
+"""Share of the run's frames, and how many the run has at least: fewer say little."""
 _STILL_MM, _BEAT_MS = 1.2, 400.0
 """A catheter in a beating heart moves farther, in so long a time."""
 _LEAST_LOW = -2.0
@@ -141,10 +141,11 @@ class TrackEvidence:
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
         motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
-        followed = len(path_uv) >= _FOLLOWED * len(self.frame_times_ms)
+        frames = len(self.frame_times_ms)
+        followed = len(path_uv) >= _FOLLOWED * frames
         if motion_px < _STILL_MM * self.px_per_mm and not (followed and np.ptp(self.frame_times_ms) < _BEAT_MS):
             return least.still
-        return least.followed if followed and len(path_uv) >= _FOLLOWED_FRAMES else least.track
+        return least.followed if followed and frames >= _FOLLOWED_FRAMES else least.track
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.

@@ -102,11 +102,46 @@ def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
 
     def along(self, frames, path_uv, log_image):
-        return evidence(np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -4.0))
+        return evidence(np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -2.5))
 
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
+
+
+def test_a_place_that_is_clearly_no_electrode_has_no_excuse_in_a_short_catheter(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    track = chains(np.repeat(row[None], FRAMES, axis=0))
+    for worst, accepted in ((-2.9, True), (-3.1, False)):
+        odds = np.array([3.0, 3.0, 3.0, worst])
+        monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_, odds=odds: evidence(odds))
+        assert judge(track, lambda frame: None) == accepted
+
+
+def test_a_lead_with_two_electrodes_can_be_accepted(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    row = np.array([[100.0, 200.0], [150.0, 200.0]])
+    track = chains(np.repeat(row[None], FRAMES, axis=0))
+    for odds, accepted in ((0.9, True), (0.7, False)):
+        monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_, odds=odds: evidence(np.full(2, odds)))
+        assert judge(track, lambda frame: None) == accepted
+
+
+def test_what_lies_beside_a_loop_is_its_other_side(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    angles = np.linspace(0.0, 5.5, 10)
+    loop = 200.0 + 40.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
+
+    def along(self, frames, path_uv, log_image):
+        count = path_uv.shape[1]
+        wall = np.broadcast_to(np.array([0.6, 1.0, 1.0]), (2, 9, count, 3))
+        return replace(evidence(np.full(count, 3.0)), across=wall)
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    assert judge(chains(np.repeat(loop[None], FRAMES, axis=0)), lambda frame: None)
+    assert not judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None)
 
 
 def test_electrodes_outside_the_field_do_not_count(monkeypatch):
