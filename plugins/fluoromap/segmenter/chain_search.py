@@ -24,7 +24,7 @@ MANY_ELECTRODES = 6
 
 _END_SLACK = 0.55, 1.1
 _SPREAD, _SPREAD_A_GAP, _MOST_SPREAD = 0.6, 0.06, 0.9
-"""How far the ratios of two gaps may differ: of neighbours, more for each gap between them, at most. Long catheters turn in depth."""
+"""How far the ratios of two gaps may differ: of neighbours, more for each gap between, at most. Long catheters turn in depth."""
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
 _MOST_CURVED_PER_MM, _MOST_BENT = 0.25, 1.6
 """A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""

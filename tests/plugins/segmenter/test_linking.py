@@ -13,6 +13,7 @@ from fluoromap.segmenter.linking import (
     kind_probabilities,
     link_candidates,
 )
+from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.proposals import probability_of_contrast
 
 PX = 5.75
@@ -147,6 +148,30 @@ def test_only_a_long_catheter_may_bend_sharply_between_a_pair_and_a_gap(name, is
     spacing_px = np.array(catheter.spacing_mm) * PX
     paths = find_paths(points, np.ones(len(points)), spacing_px, PX)
     assert any((path == np.arange(len(points))).all() for path in paths) == is_found
+
+
+@pytest.mark.parametrize(("name", "is_found"), [("duodecapolar-2-2-2", True), ("quadripolar-2-5-2", False)])
+def test_a_long_catheter_may_turn_out_of_the_image_plane(name, is_found):
+    catheter = catheter_type(name, "deep")
+    spacing_px = np.array(catheter.spacing_mm) * PX
+    ratios = np.linspace(0.32, 1.05, len(spacing_px))
+    u = 30.0 + np.cumsum(np.concatenate([[0.0], ratios * spacing_px]))
+    points = np.stack([u, np.full(len(u), 100.0)], axis=1)
+    paths = find_paths(points, np.ones(len(points)), spacing_px, PX)
+    assert any((path == np.arange(len(points))).all() for path in paths) == is_found
+
+
+def test_the_trace_of_a_long_catheter_follows_its_bend_over_a_missing_electrode():
+    catheter = catheter_type("decapolar-2-5-2", "hook")
+    arc = catheter.arc_lengths_mm * PX
+    radius = 14.0 * PX
+    angles = arc / radius
+    points = 250.0 + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    seen = np.delete(points, 5, axis=0)
+    rows, places = trace_rows(seen, np.ones(9), np.diff(arc), 10, np.ones((512, 512), np.bool_))
+    expected = [0, 1, 2, 3, 4, -1, 5, 6, 7, 8]
+    (row,) = np.flatnonzero((rows == expected).all(axis=1))
+    assert np.linalg.norm(places[row, 5] - points[5]) < 1.5 * PX
 
 
 def test_a_whole_catheter_is_worth_more_than_a_displaced_chain_with_a_part_of_another():

@@ -144,6 +144,13 @@ def test_a_mark_keeps_its_name_in_a_track():
     assert [one.probability("rv") for one in entries[1].chains] == [1.0]
 
 
+@pytest.mark.parametrize(("frame_ms", "tracks"), [(16.7, 2), (80.0, 1)])
+def test_a_catheter_may_bend_farther_between_frames_that_lie_farther_apart(frame_ms, tracks):
+    bent = POINTS + np.array([[0.0, 14.0], [0, 0], [0, 0], [0, 0]])
+    entries = track_chains(run([[chain(POINTS + 100)]] * 3 + [[chain(bent + 100)]] * 3), np.arange(6) * frame_ms, 2)
+    assert len({one.track for entry in entries for one in entry.chains}) == tracks
+
+
 def test_misplaced_electrodes_of_a_long_catheter_do_not_interrupt_its_track():
     row = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
     places = [row + frame for frame in range(6)]

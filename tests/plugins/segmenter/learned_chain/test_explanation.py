@@ -9,6 +9,7 @@ from frame_sources import Frames
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.learned_chain import explanation
 from fluoromap.segmenter.learned_chain.explanation import find_scale, is_inverted
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
@@ -51,6 +52,27 @@ def test_bright_electrodes_are_recognised(frames):
     run = replace(run_of(inverted), px_per_mm=PX_PER_MM)
     assert is_inverted(run, DEFAULT_CATALOGUE)
     assert not is_inverted(replace(run_of(frames), px_per_mm=PX_PER_MM), DEFAULT_CATALOGUE)
+
+
+@pytest.mark.parametrize(("of_inverted", "is_inverted_chosen"), [(8.0, False), (10.0, True)])
+def test_the_header_is_right_unless_the_inverted_picture_explains_clearly_more(
+    monkeypatch, frames, of_inverted, is_inverted_chosen
+):
+    def explained(run, pixels, *_):
+        return [explanation.Explanation(3.1, pixels.monochrome1, of_inverted if pixels.monochrome1 else 6.0, True)]
+
+    monkeypatch.setattr(explanation, "_explanations", explained)
+    found = find_scale(run_of(frames), DEFAULT_CATALOGUE)
+    assert found is not None
+    assert found.monochrome1 == is_inverted_chosen
+    assert is_inverted(run_of(frames), DEFAULT_CATALOGUE) == is_inverted_chosen
+
+
+def test_a_large_picture_has_a_large_scale(frames):
+    doubled = [frame.repeat(2, axis=0).repeat(2, axis=1) for frame in frames]
+    found = find_scale(run_of(doubled), DEFAULT_CATALOGUE)
+    assert found is not None
+    assert 0.78 * PX_PER_MM <= 0.5 * found.px_per_mm <= 1.2 * PX_PER_MM
 
 
 def test_an_inverted_run_is_segmented_all_the_same(frames, caplog):

@@ -90,6 +90,18 @@ def test_a_frame_without_its_catheter_is_searched_in_the_mean_and_the_chain_foun
     assert detector.searched == [1.0, 2.0, 2.0]
 
 
+def test_of_frame_and_mean_the_one_that_helped_last_is_searched_first():
+    frames, detector, _ = search(2.0, shares=False)
+    frames.find_chains(X + 1, 0, [X + 2, X + 3])
+    detector.searched.clear()
+    # In fast motion the mean shows nothing: the first such frame is searched twice, those after it once.
+    detector.level = 1.0
+    frames.find_chains(X + 1, 1, [X + 2, X + 3])
+    assert detector.searched == [2.0, 1.0]
+    frames.find_chains(X + 1, 2, [X + 2, X + 3])
+    assert detector.searched == [2.0, 1.0, 1.0]
+
+
 def test_a_catheter_that_only_the_neighbours_show_is_not_found_in_the_frame():
     frames, detector, _ = search(2.0, shares=False)
     detector.likeness = lambda x: 12.0 if np.isclose(x.mean(), 2.0) else 2.0
