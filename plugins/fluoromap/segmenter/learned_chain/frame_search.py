@@ -52,7 +52,7 @@ class FrameSearch:
     """Detector for the frames of one run in their order.
 
     - A frame that lacks catheters is searched again in the mean of the frame and its neighbours, which has less noise. Chains of
-      the mean are found again in the frame itself. Of the two searches, the one that helped last comes first.
+      the mean are found again in the frame itself. The search that helped last comes first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
     - While all catheters move less than ``near_px``, five more frames use the answer. Not so in runs whose noise hides catheters.

@@ -190,7 +190,7 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
 
 
 def _turn(path_uv: Array) -> float:
-    """Return how far a path (electrodes, 2) turns from its first gap to its last, radians."""
+    """Return how far a path (electrodes, 2) turns along itself, radians."""
     ways = np.diff(path_uv, axis=0) @ np.array([1.0, 1.0j])
     return float(abs(np.angle(ways[1:] * ways[:-1].conj()).sum()))
 
