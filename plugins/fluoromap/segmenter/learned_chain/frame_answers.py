@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.learned_chain.carried_network import CarriedNetwork, Motion
 from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence, NetworkResponse
 from fluoromap.segmenter.log_image import Image
 
@@ -55,19 +56,21 @@ class LatestNetwork:
     """The network's answer that the next image is judged with.
 
     of_image : asks the network about an image. of_places : the same for questions about few places of it. reach_cells : how far
-    from a place its answer may lie; above 1 the latest answer is used again.
+    from a place its answer may lie; above 1 the latest answer is used again. motion : of catheters since the latest answer.
     """
 
     of_image: Callable[[Image], NetworkResponse]
     of_places: Callable[[Image], NetworkEvidence]
     reach_cells: int = OWN_CELLS
+    motion: Motion | None = None
     _latest: tuple[Image, NetworkEvidence] | None = field(default=None, init=False)
 
     def __call__(self, x: Image) -> NetworkEvidence:
         """Return the latest answer where it is borrowed, else the one for this image."""
         if self._latest is None or (self.reach_cells == OWN_CELLS and self._latest[0] is not x):
             self._latest = x, self.of_image(x)
-        return self._latest[1]
+        latest = self._latest[1]
+        return latest if self.motion is None else CarriedNetwork(latest, self.motion)
 
     def latest_for(self, x: Image) -> NetworkResponse | None:
         """Return the latest answer where it is the one for this whole image."""

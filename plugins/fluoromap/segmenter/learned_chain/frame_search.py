@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
+from fluoromap.segmenter.learned_chain.carried_network import Motion
 from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
@@ -18,16 +20,15 @@ from fluoromap.segmenter.log_image import Image
 SHARED_MS = 21.0
 """Time between frames up to which the network's answer for one frame says where electrodes are in the next."""
 
-_NEAR_MS, _NEAR_MM, _NEAR_MM_IN_FAST_RUNS = 40.0, 1.75, 1.0
-"""Time between frames, and motion since the network's answer, up to which the answer serves frames of a catheter near its place.
+_CARRIED_MS, _NEAR_MM = 40.0, 1.0
+"""Time between frames up to which catheters move on as before, and how far they may be from where they would be then."""
 
-Fast runs share answers already, and their frames have more noise.
-"""
-
-_MEAN_CELLS, _NEXT_FRAME_CELLS = 2, 3
+_MEAN_CELLS, _NEXT_FRAME_CELLS, _CARRIED_CELLS = 2, 3, 2
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
-_NEAR_CELLS, _MOST_NEAR = 3, 5
-"""How far the answer may lie from a catheter near its place, and how many frames may share it."""
+_MOST_CARRIED = 8
+"""How many frames may use an answer that is carried along with the catheters."""
+_CARRIED_MM = 4.0
+"""How far from an electrode the image moves with it."""
 _REACH_PX = 6.0
 _LOOSE_PX = 3.0
 _LEAST_SHARE = 0.5
@@ -35,13 +36,11 @@ _LEAST_SHARE = 0.5
 
 
 def near_distance_mm(frame_ms: float) -> float:
-    """Return the motion up to which frames share an answer.
+    """Return how far catheters may be from where they would be if they moved on as before.
 
-    ``frame_ms`` : longest time between frames.
+    ``frame_ms`` : longest time between frames. In slow runs it is 0: nothing is known about where they are.
     """
-    if frame_ms > _NEAR_MS:
-        return 0.0
-    return _NEAR_MM_IN_FAST_RUNS if frame_ms <= SHARED_MS else _NEAR_MM
+    return _NEAR_MM if frame_ms <= _CARRIED_MS else 0.0
 
 
 _NO_FRAME = FrameChains(-2, (), Reason.MANUAL_NEEDED)
@@ -55,9 +54,9 @@ class FrameSearch:
       the mean are found again in the frame itself. The search that helped last comes first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
-    - While all catheters move less than ``near_px``, five more frames use the answer. Not so in runs whose noise hides catheters.
-    - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or catheters that moved, is
-      searched again with an answer of its own.
+    - Where all catheters were found in the frames before, eight more frames use the answer, carried along with the catheters.
+    - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or a catheter more than
+      ``near_px`` from where it would be if it moved on, is searched again with an answer of its own.
     """
 
     detector: ChainDetector
@@ -71,7 +70,7 @@ class FrameSearch:
     _own: NetworkResponse | None = field(default=None, init=False)
     _answered: FrameChains = field(default=_NO_FRAME, init=False)
     _latest: FrameChains = field(default=_NO_FRAME, init=False)
-    _step_px: float = field(default=np.inf, init=False)
+    _before: FrameChains = field(default=_NO_FRAME, init=False)
     _noisy: bool = field(default=False, init=False)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
@@ -83,8 +82,7 @@ class FrameSearch:
             self.answers.network.store(frame, self._own)
             self._store_blobs(x, frame)
         self._next, self._own = frame + 1, None
-        self._step_px = _motion_px(self._latest, entry) if self._latest.frame == frame - 1 else np.inf
-        self._latest = entry
+        self._before, self._latest = self._latest, entry
         return entry
 
     def _find_chains(self, x: Image, frame: int, beside: Sequence[Image]) -> FrameChains:
@@ -93,9 +91,11 @@ class FrameSearch:
             _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= len(self._answered.chains):
                 return entry
-        elif self._is_near(frame):
-            _, entry = self._search(x, first, frame, _NEAR_CELLS)
-            if entry.manual_needed is None and _motion_px(self._answered, entry) <= self.near_px:
+        elif (expected := self._expected(frame)) is not None:
+            self.network.motion = _motion(self._answered, expected, _CARRIED_MM * self.detector.px_per_mm)
+            _, entry = self._search(x, first, frame, _CARRIED_CELLS)
+            self.network.motion = None
+            if entry.manual_needed is None and _motion_px(expected, entry) <= self.near_px:
                 return entry
         searched, entry = self._search(x, first, frame, OWN_CELLS)
         if beside and self._lacks_catheters(entry):
@@ -112,15 +112,27 @@ class FrameSearch:
             self._answered = entry
         return entry
 
-    def _is_near(self, frame: int) -> bool:
-        """Return whether all catheters were clear, and hardly moved since the latest answer."""
-        return (
-            not self._noisy
-            and frame - self._answered.frame <= _MOST_NEAR
-            and self._latest.frame == frame - 1
-            and not self._lacks_catheters(self._answered)
-            and _motion_px(self._answered, self._latest) + self._step_px < self.near_px
-        )
+    def _expected(self, frame: int) -> FrameChains | None:
+        """Return where the catheters of the latest answer are in a frame if they move on.
+
+        None where the answer is too old, or where one of them was not found in both frames before.
+        """
+        if (
+            self.near_px == 0.0
+            or frame - self._answered.frame > _MOST_CARRIED
+            or (self._before.frame, self._latest.frame) != (frame - 2, frame - 1)
+            or self._lacks_catheters(self._answered)
+        ):
+            return None
+        chains = []
+        for chain in self._answered.chains:
+            latest = _nearest(chain, self._latest)
+            before = None if latest is None else _nearest(latest, self._before)
+            if latest is None or before is None:
+                return None
+            step = (latest.pixels_uv - before.pixels_uv).mean(axis=0)
+            chains.append(replace(chain, pixels_uv=latest.pixels_uv + step))
+        return FrameChains(frame, tuple(chains))
 
     def _lacks_catheters(self, entry: FrameChains) -> bool:
         return len(entry.chains) < self.catheters or entry.manual_needed is not None
@@ -204,16 +216,29 @@ def _mean(x: Image, beside: Sequence[Image]) -> Image:
     return total
 
 
+def _motion(before: FrameChains, after: FrameChains, near_px: float) -> Motion:
+    """Return the motion of the same chains from one frame to another."""
+    places = np.concatenate([chain.pixels_uv for chain in after.chains])
+    return Motion(cKDTree(places), places - np.concatenate([chain.pixels_uv for chain in before.chains]), near_px)
+
+
+def _nearest(chain: Chain, entry: FrameChains) -> Chain | None:
+    """Return the chain of a frame with the same electrodes that is nearest to a chain of another frame."""
+    alike = [other for other in entry.chains if other.electrodes == chain.electrodes]
+    return min(alike, key=lambda other: float(_farthest(chain, other)), default=None)
+
+
+def _farthest(chain: Chain, other: Chain) -> float:
+    away = chain.pixels_uv - other.pixels_uv
+    return math.sqrt((away * away).sum(axis=1).max())
+
+
 def _motion_px(before: FrameChains, after: FrameChains) -> float:
     """Return the largest motion of an electrode from one frame to another.
 
     It is infinite where a catheter has no chain of as many electrodes in the other frame.
     """
-    farthest = 0.0
-    for chain in before.chains:
-        alike = [other.pixels_uv for other in after.chains if other.electrodes == chain.electrodes]
-        if not alike:
-            return np.inf
-        away = np.array(alike) - chain.pixels_uv
-        farthest = max(farthest, math.sqrt((away * away).sum(axis=2).max(axis=1).min()))
-    return farthest if len(after.chains) >= len(before.chains) else np.inf
+    nearest = [(chain, _nearest(chain, after)) for chain in before.chains]
+    if len(after.chains) < len(before.chains) or any(other is None for _, other in nearest):
+        return np.inf
+    return max((_farthest(chain, other) for chain, other in nearest if other is not None), default=0.0)
