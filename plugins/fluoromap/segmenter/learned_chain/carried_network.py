@@ -27,7 +27,8 @@ class Motion:
     def shifts_at(self, points_uv: Array) -> Array:
         """Return how far the image moved at points, (n, 2) pixels."""
         away, nearest = self.electrodes.query(points_uv)
-        shifts: Array = np.where(away[:, None] <= self.near_px, self.shifts_uv[nearest], 0.0)
+        is_near = np.asarray(away)[:, None] <= self.near_px
+        shifts: Array = np.where(is_near, self.shifts_uv[np.asarray(nearest)], 0.0)
         return shifts
 
 
@@ -40,6 +41,11 @@ class CarriedNetwork:
 
     earlier: NetworkEvidence
     motion: Motion
+
+    @property
+    def nbytes(self) -> int:
+        """Memory besides that of the earlier answers, bytes."""
+        return 2 * self.motion.shifts_uv.nbytes
 
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
         """Return the electrodes of the earlier frame."""

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
-from fluoromap.segmenter.learned_chain.carried_network import Motion
+from fluoromap.segmenter.learned_chain.carried_network import CarriedNetwork, Motion
 from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
@@ -27,8 +27,8 @@ _MEAN_CELLS, _NEXT_FRAME_CELLS, _CARRIED_CELLS = 2, 3, 2
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
 _MOST_CARRIED = 8
 """How many frames may use an answer that is carried along with the catheters."""
-_CARRIED_MM = 4.0
-"""How far from an electrode the image moves with it."""
+_CARRIED_WITHIN = 4.0
+"""How far from an electrode the image moves with it, over ``near_px``."""
 _REACH_PX = 6.0
 _LOOSE_PX = 3.0
 _LEAST_SHARE = 0.5
@@ -67,7 +67,7 @@ class FrameSearch:
     near_px: float = 0.0
     answers: StoredAnswers = field(default_factory=StoredAnswers)
     _next: int = field(default=0, init=False)
-    _own: NetworkResponse | None = field(default=None, init=False)
+    _own: NetworkResponse | CarriedNetwork | None = field(default=None, init=False)
     _answered: FrameChains = field(default=_NO_FRAME, init=False)
     _latest: FrameChains = field(default=_NO_FRAME, init=False)
     _before: FrameChains = field(default=_NO_FRAME, init=False)
@@ -91,12 +91,8 @@ class FrameSearch:
             _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= len(self._answered.chains):
                 return entry
-        elif (expected := self._expected(frame)) is not None:
-            self.network.motion = _motion(self._answered, expected, _CARRIED_MM * self.detector.px_per_mm)
-            _, entry = self._search(x, first, frame, _CARRIED_CELLS)
-            self.network.motion = None
-            if entry.manual_needed is None and _motion_px(expected, entry) <= self.near_px:
-                return entry
+        elif (carried := self._search_carried(x, first, frame)) is not None:
+            return carried
         searched, entry = self._search(x, first, frame, OWN_CELLS)
         if beside and self._lacks_catheters(entry):
             again, other = self._search(x, second, frame, OWN_CELLS)
@@ -111,6 +107,29 @@ class FrameSearch:
         if entry.manual_needed is None:
             self._answered = entry
         return entry
+
+    def _search_carried(self, x: Image, beside: Sequence[Image], frame: int) -> FrameChains | None:
+        """Search with the latest answer, carried along with the catheters.
+
+        None where that is not possible, or where catheters are not where they would be if they moved on.
+        """
+        expected = self._expected(frame)
+        if expected is None:
+            return None
+        self.network.motion = self._motion_to(expected)
+        _, entry = self._search(x, beside, frame, _CARRIED_CELLS)
+        self.network.motion = None
+        if entry.manual_needed is not None or _motion_px(expected, entry) > self.near_px:
+            return None
+        self._own = self.network.carried(self._motion_to(_in_order(expected, entry)))
+        return entry
+
+    def _motion_to(self, entry: FrameChains) -> Motion:
+        """Return the motion from the latest answer's chains to those of a frame, in the same order."""
+        places, before = (
+            np.concatenate([chain.pixels_uv for chain in chains]) for chains in (entry.chains, self._answered.chains)
+        )
+        return Motion(cKDTree(places), places - before, _CARRIED_WITHIN * self.near_px)
 
     def _expected(self, frame: int) -> FrameChains | None:
         """Return where the catheters of the latest answer are in a frame if they move on.
@@ -216,10 +235,9 @@ def _mean(x: Image, beside: Sequence[Image]) -> Image:
     return total
 
 
-def _motion(before: FrameChains, after: FrameChains, near_px: float) -> Motion:
-    """Return the motion of the same chains from one frame to another."""
-    places = np.concatenate([chain.pixels_uv for chain in after.chains])
-    return Motion(cKDTree(places), places - np.concatenate([chain.pixels_uv for chain in before.chains]), near_px)
+def _in_order(before: FrameChains, after: FrameChains) -> FrameChains:
+    """Return the chains of a frame in the order of another frame's chains, which are near them."""
+    return replace(after, chains=tuple(_nearest(chain, after) or chain for chain in before.chains))
 
 
 def _nearest(chain: Chain, entry: FrameChains) -> Chain | None:

@@ -1,6 +1,5 @@
 """Frames searched one after the other: means of neighbours in noise, and shared answers of the network in fast runs."""
 
-import itertools
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -133,17 +132,36 @@ def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
     assert len(asked) == 3
 
 
-def test_catheters_at_rest_share_an_answer_until_they_move():
-    frames, detector, asked = search(1.0, shares=False, near_px=4.0)
-    places = [0.0, 0.5, 0.5, 0.7, 0.7, 0.7, 0.7, 0.7, 9.0, 9.0, 18.0, 18.0, 18.0]
+def asked_in(frames, detector, asked, places):
+    """Search frames of a catheter at these places; return those for which the network was asked."""
     detector.chain_at = lambda frame: places[frame]
+    of = []
     for frame in range(len(places)):
-        detector.frame = frame
+        detector.frame, before = frame, len(asked)
         assert frames.find_chains(X + 1, frame).chains
-        asked.append(frame)
-    own = [frame for before, frame in itertools.pairwise(asked) if isinstance(before, float)]
-    # Own answers: until the speed is known, after five more frames, while they move.
-    assert own == [0, 1, 7, 8, 9, 10, 11]
+        of += [frame] * (len(asked) - before)
+    return of
+
+
+def test_an_answer_is_carried_along_with_a_catheter_until_it_moves_otherwise():
+    frames, detector, asked = search(1.0, shares=False, near_px=4.0)
+    places = [0.0, 0.5, 1.0, 3.0, 6.0, 9.0, 12.0, 15.0, 18.0, 21.0, 24.0, 27.0, 20.0, 20.0]
+    # Own answers: until the speed is known, after eight more frames, and while the speed changes.
+    assert asked_in(frames, detector, asked, places) == [0, 1, 10, 12, 13]
+
+
+def test_the_answer_is_asked_about_places_where_the_catheter_was_then():
+    frames, detector, asked = search(1.0, shares=False, near_px=4.0)
+    assert asked_in(frames, detector, asked, [0.0, 3.0, 6.5]) == [0, 1]
+    carried = frames.answers.network.of_frame(2)
+    far = POINTS[:1] - [0, 100]
+    assert np.allclose(carried.motion.shifts_at(POINTS + 7.0), 3.5)
+    assert np.allclose(carried.motion.shifts_at(far), 0.0)
+
+
+def test_in_slow_runs_no_answer_is_carried():
+    frames, detector, asked = search(1.0, shares=False)
+    assert asked_in(frames, detector, asked, [0.0] * 4) == [0, 1, 2, 3]
 
 
 def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
@@ -153,13 +171,11 @@ def test_a_frame_that_lacks_a_catheter_has_no_share_in_another_frame_s_answer():
     assert asked == [1.0, 1.0, 5.0, 1.0]
 
 
-def test_in_runs_whose_noise_hides_catheters_each_frame_has_an_answer_of_its_own():
-    frames, detector, asked = search(2.0, shares=False, near_px=4.0)
-    frames.find_chains(X + 1, 0, [X + 2, X + 3])
-    detector.level = 1.0
-    for frame in range(1, 5):
-        assert frames.find_chains(X + 1, frame).chains
-    assert asked[2:] == [1.0] * 4
+def test_answers_for_means_are_carried_too():
+    frames, _, asked = search(2.0, shares=False, near_px=4.0)
+    for frame in range(5):
+        assert frames.find_chains(X + 1, frame, [X + 2, X + 3]).chains
+    assert asked == [1.0, 2.0, 2.0]
 
 
 def test_tracking_uses_the_answers_for_frames_that_were_searched_with_their_own():
