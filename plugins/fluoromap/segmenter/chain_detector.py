@@ -457,16 +457,16 @@ class ChainDetector:
         points = guess + np.einsum("nij,nj->ni", gain, found - guess)
         covariance = gain @ covariance
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-        # The shape comes before the scores: it needs no pass of a network.
+        # Shape and clearness come before the scores: they need no pass of a network.
         is_seen = self._is_seen(points)
-        if not shows_enough(is_seen) or (same_shape and not is_same_shape(points, chain.pixels_uv)):
+        if not shows_enough(is_seen) or place.clearness[0] < self.acceptance.again_clearness:
+            return None
+        if same_shape and not is_same_shape(points, chain.pixels_uv):
             return None
         scores, variance = seen.scores_at(points), seen.variance_at(points)
         weights = self._evidence(seen.probability_at(points))
         for values in (scores, weights, variance) if hidden.any() else ():
             values[hidden] = np.median(values[~hidden])
-        if place.clearness[0] < self.acceptance.again_clearness:
-            return None
         score = chain_score(points, weights, variance, self._shafts(seen), family)
         # Half an electrode at the edge cannot be located.
         scores[~_are_in(self.field.with_edge, points)] = UNSEEN

@@ -124,6 +124,41 @@ def _padded_parts(x: Image, border: int, rows: int, wide: int) -> Image:
     return parts.reshape(4, -1, channels)
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A rectangle of a picture, from (top, left) to before (bottom, right)."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @classmethod
+    def whole(cls, picture: Image) -> Part:
+        """Return the part that is the whole of a picture (rows, columns, ...)."""
+        return cls(0, 0, *picture.shape[:2])
+
+    def at_half(self) -> Part:
+        """Return the part in the picture of half the size that this part needs."""
+        return Part(self.top // 2, self.left // 2, -(-self.bottom // 2), -(-self.right // 2))
+
+    def at_double(self) -> Part:
+        """Return the same part in the picture of double the size."""
+        return Part(2 * self.top, 2 * self.left, 2 * self.bottom, 2 * self.right)
+
+    def with_border(self, width: int, whole: Part) -> Part:
+        """Return the part with a border of this width as far as the whole has one."""
+        return Part(
+            max(self.top - width, whole.top), max(self.left - width, whole.left),
+            min(self.bottom + width, whole.bottom), min(self.right + width, whole.right),
+        )  # fmt: skip
+
+    def of(self, picture: Image, shown: Part) -> Image:
+        """Return this part of a picture that shows another part, in one stretch of memory."""
+        rows = slice(self.top - shown.top, self.bottom - shown.top)
+        return np.ascontiguousarray(picture[rows, self.left - shown.left : self.right - shown.left])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ElectrodeNetwork:
     """All layers with their weights. See :class:`~fluoromap.training.network.ElectrodeNetwork`, which it repeats."""
@@ -150,30 +185,47 @@ class ElectrodeNetwork:
             layers[name] = Layer.of_weights(shape, taps, bias)
         return cls(layers)
 
-    def __call__(self, picture: Image) -> Image:
-        """Answers of all cells of a normalised picture.
+    def __call__(self, picture: Image, cells: Part | None = None) -> Image:
+        """Answers of cells of a normalised picture.
+
+        Each layer leaves out what the cells do not depend on.
 
         Parameters
         ----------
         picture : (rows, columns) float32
             Both multiples of 8.
+        cells : Part, optional
+            The cells of 2 x 2 px to answer for; all by default.
 
         Returns
         -------
-        (rows / 2, columns / 2, 5) float32, see :data:`~fluoromap.segmenter.learned_chain.layers.HEADS`.
+        (rows of cells, columns of cells, 5) float32, see :data:`~fluoromap.segmenter.learned_chain.layers.HEADS`.
         """
-        quarter = self._answer(
-            "at_quarter_again", self._answer("at_quarter", self._answer("at_half", picture[..., None]))
-        )
+        half = self._answer("at_half", picture[..., None])
+        quarter = self._answer("at_quarter_again", self._answer("at_quarter", half))
         eighth = self._answer("at_eighth", quarter)
-        for name in AROUND:
+        asked = Part.whole(half) if cells is None else cells
+        needed = self._needed(asked, Part.whole(quarter), Part.whole(eighth))
+        shown = needed[0]
+        eighth = shown.of(eighth, Part.whole(eighth))
+        for name, after in zip(AROUND, needed[1:], strict=True):
             eighth += self._answer(name, eighth)
+            eighth, shown = after.of(eighth, shown), after
         wide = self._answer("back", eighth)
+        quarter = shown.at_double().of(quarter, Part.whole(quarter))
         rows, columns, channels = quarter.shape
         quarter.reshape(rows // 2, 2, columns // 2, 2, channels)[:] += wide[:, None, :, None]
         heads = self._answer("heads", self._answer("merged", quarter))
-        cells = heads.reshape(rows, columns, len(HEADS), CELL_PX, CELL_PX).transpose(0, 3, 1, 4, 2)
-        return np.ascontiguousarray(cells).reshape(2 * rows, 2 * columns, len(HEADS))
+        of_cells = heads.reshape(rows, columns, len(HEADS), CELL_PX, CELL_PX).transpose(0, 3, 1, 4, 2)
+        return asked.of(of_cells.reshape(2 * rows, 2 * columns, len(HEADS)), shown.at_double().at_double())
+
+    def _needed(self, cells: Part, quarter: Part, eighth: Part) -> list[Part]:
+        """Return what cells need at an eighth of the size: before the first layer around, and after each of them."""
+        merged = cells.at_half().with_border(self.layers["merged"].shape.border, quarter)
+        needed = [merged.at_half()]
+        for name in reversed(AROUND):
+            needed.append(needed[-1].with_border(self.layers[name].shape.border, eighth))
+        return needed[::-1]
 
     def _answer(self, name: str, x: Image) -> Image:
         """Return a layer's answer; the next picture's answer replaces it."""

@@ -16,6 +16,11 @@ class Convolution:
     dilation: int = 1
     rectified: bool = True
 
+    @property
+    def border(self) -> int:
+        """How many pixels round a pixel its answer depends on."""
+        return self.width // 2 * self.dilation
+
 
 HEADS = "heat", "offset_u", "offset_v", "log_variance", "tip"
 """Answers of each cell of 2 x 2 px: logit of an electrode's centre, its offset from the cell's middle in cells, logarithm of the

@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.learned_chain.forward import Part
 from fluoromap.segmenter.learned_chain.layers import CELL_PX, STRIDE_PX
 from fluoromap.segmenter.learned_chain.network_response import (
     NetworkResponse,
-    answer,
     cell_grid,
     electrode_probability,
     highest_near,
     network_scale,
+    padded,
 )
 from fluoromap.segmenter.learned_chain.normalisation import normalise
 from fluoromap.segmenter.learned_chain.resampling import resampled
@@ -95,7 +96,7 @@ class NearbyNetwork:
         # Layers with steps start at the same pixels as in the whole picture.
         first_u, first_v = (max(cell * CELL_PX - _FIELD_PX, 0) // STRIDE_PX * STRIDE_PX for cell in (left, top))
         last_u, last_v = (cell * CELL_PX + _FIELD_PX for cell in (right, bottom))
-        answers = answer(self.trained, picture[first_v:last_v, first_u:last_u])
+        part = picture[first_v:last_v, first_u:last_u]
         u, v = left - first_u // CELL_PX, top - first_v // CELL_PX
-        asked = answers[v : v + bottom - top, u : u + right - left]
-        return electrode_probability(self.trained, asked)
+        cells = Part(v, u, v + bottom - top, u + right - left)
+        return electrode_probability(self.trained, self.trained.network(padded(part), cells))

@@ -278,9 +278,14 @@ def answer(trained: Trained, picture: Image, orientations: int = 1) -> Image:
     ``orientations`` : see :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
     """
     rows, columns = picture.shape
-    padded = repeat_edge(picture, rows + -rows % STRIDE_PX, columns + -columns % STRIDE_PX)
-    answers = mean_answer(trained.network, padded, orientations)
+    answers = mean_answer(trained.network, padded(picture), orientations)
     return answers[: -(-rows // CELL_PX), : -(-columns // CELL_PX)]
+
+
+def padded(picture: Image) -> Image:
+    """Return a picture with its last row and column repeated, until the network's layers with steps divide its size."""
+    rows, columns = picture.shape
+    return repeat_edge(picture, rows + -rows % STRIDE_PX, columns + -columns % STRIDE_PX)
 
 
 def _apart(cells: Array) -> BoolArray:

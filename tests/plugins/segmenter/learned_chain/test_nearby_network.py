@@ -34,8 +34,8 @@ def test_probabilities_near_places_equal_those_of_the_whole_image(image, px_per_
 
 def test_the_network_is_asked_once_about_the_same_places(image, monkeypatch):
     asked = []
-    answer = nearby_network.answer
-    monkeypatch.setattr(nearby_network, "answer", lambda trained, x: asked.append(x.shape) or answer(trained, x))
+    padded = nearby_network.padded
+    monkeypatch.setattr(nearby_network, "padded", lambda part: asked.append(part.shape) or padded(part))
     near = NearbyNetwork(image, read_weights(SHIPPED), 3.2)
     first = near.probability_at(CHAIN + 200.0)
     assert np.array_equal(near.probability_at(CHAIN + 200.0), first)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import affine_transform
 
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
+from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork, Part
 from fluoromap.segmenter.learned_chain.layers import AROUND, CONVOLUTIONS, HEADS
 from fluoromap.segmenter.learned_chain.network_response import (
     NETWORK_PX_PER_MM,
@@ -98,6 +98,18 @@ def test_pictures_of_any_size_get_answers_for_all_their_cells():
     for shape in ((16, 16), (17, 33), (101, 64)):
         answers = answer(trained, np.zeros(shape, np.float32))
         assert answers.shape == (-(-shape[0] // 2), -(-shape[1] // 2), len(HEADS))
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [Part(30, 40, 31, 41), Part(0, 0, 7, 9), Part(61, 50, 104, 128), Part(3, 17, 90, 111), Part(0, 0, 104, 128)],
+)
+def test_a_part_of_the_cells_gets_the_answers_that_it_has_in_the_whole_picture(cells):
+    network = read_weights(SHIPPED).network
+    picture = np.random.default_rng(3).normal(0.0, 1.0, (208, 256)).astype(np.float32)
+    whole = network(picture)
+    part = network(picture, cells)
+    np.testing.assert_allclose(part, whole[cells.top : cells.bottom, cells.left : cells.right], atol=2e-4)
 
 
 def test_grey_levels_and_their_range_do_not_matter():
