@@ -42,11 +42,6 @@ class CarriedNetwork:
     earlier: NetworkEvidence
     motion: Motion
 
-    @property
-    def nbytes(self) -> int:
-        """Memory besides that of the earlier answers, bytes."""
-        return 2 * self.motion.shifts_uv.nbytes
-
     def proposals(self, allowed: BoolArray, expected: int) -> Proposals:
         """Return the electrodes of the earlier frame."""
         return self.earlier.proposals(allowed, expected)

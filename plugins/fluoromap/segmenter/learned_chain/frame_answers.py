@@ -47,9 +47,7 @@ class StoredByFrame(Generic[T]):
 class StoredAnswers:
     """The answers for single frames of one run. Tracking searches some of these frames again."""
 
-    network: StoredByFrame[NetworkResponse | CarriedNetwork] = field(
-        default_factory=lambda: StoredByFrame[NetworkResponse | CarriedNetwork]()
-    )
+    network: StoredByFrame[NetworkResponse] = field(default_factory=lambda: StoredByFrame[NetworkResponse]())
     blobs: StoredByFrame[BlobResponse] = field(default_factory=lambda: StoredByFrame[BlobResponse]())
 
 
@@ -73,10 +71,6 @@ class LatestNetwork:
             self._latest = x, self.of_image(x)
         latest = self._latest[1]
         return latest if self.motion is None else CarriedNetwork(latest, self.motion)
-
-    def carried(self, motion: Motion) -> CarriedNetwork | None:
-        """Return the latest answer carried along with catheters that moved."""
-        return None if self._latest is None else CarriedNetwork(self._latest[1], motion)
 
     def latest_for(self, x: Image) -> NetworkResponse | None:
         """Return the latest answer where it is the one for this whole image."""

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
-from fluoromap.segmenter.learned_chain.carried_network import CarriedNetwork, Motion
+from fluoromap.segmenter.learned_chain.carried_network import Motion
 from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
@@ -67,7 +67,7 @@ class FrameSearch:
     near_px: float = 0.0
     answers: StoredAnswers = field(default_factory=StoredAnswers)
     _next: int = field(default=0, init=False)
-    _own: NetworkResponse | CarriedNetwork | None = field(default=None, init=False)
+    _own: NetworkResponse | None = field(default=None, init=False)
     _answered: FrameChains = field(default=_NO_FRAME, init=False)
     _latest: FrameChains = field(default=_NO_FRAME, init=False)
     _before: FrameChains = field(default=_NO_FRAME, init=False)
@@ -119,10 +119,7 @@ class FrameSearch:
         self.network.motion = self._motion_to(expected)
         _, entry = self._search(x, beside, frame, _CARRIED_CELLS)
         self.network.motion = None
-        if entry.manual_needed is not None or _motion_px(expected, entry) > self.near_px:
-            return None
-        self._own = self.network.carried(self._motion_to(_in_order(expected, entry)))
-        return entry
+        return entry if entry.manual_needed is None and _motion_px(expected, entry) <= self.near_px else None
 
     def _motion_to(self, entry: FrameChains) -> Motion:
         """Return the motion from the latest answer's chains to those of a frame, in the same order."""
@@ -233,11 +230,6 @@ def _mean(x: Image, beside: Sequence[Image]) -> Image:
         total += other
     total /= np.float32(1 + len(beside))
     return total
-
-
-def _in_order(before: FrameChains, after: FrameChains) -> FrameChains:
-    """Return the chains of a frame in the order of another frame's chains, which are near them."""
-    return replace(after, chains=tuple(_nearest(chain, after) or chain for chain in before.chains))
 
 
 def _nearest(chain: Chain, entry: FrameChains) -> Chain | None:
