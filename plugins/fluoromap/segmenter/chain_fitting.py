@@ -25,8 +25,9 @@ from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 
 _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0
-_TIP_WEIGHT, _MOST_TIP = 1.0, 4.0
-_LONG_TIP_MM = 3.0
+_TIP_WEIGHT, _SHORT_TIP_WEIGHT, _MOST_TIP = 1.0, 0.5, 4.0
+_LONG_TIP_MM, _MOST_BANDS = 3.0, 0.5
+"""Tips that are longer than rings for certain, and how much the bands of shorter ones say: makers' tips differ."""
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
@@ -102,17 +103,22 @@ def fit_chains(
         electrode_fit = _apart(electrode_fit, candidates_uv[order], family.catheter, shaft_image.px_per_mm)
         electrode_fit = _with_places(electrode_fit, candidates_uv[order], outside)
         no_variance = np.zeros(order.shape)
-        fit = electrode_fit.log_likelihood + spacing_fit(
-            electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm
-        )
+        bands = electrode_fit.log_likelihood
+        fit = bands + spacing_fit(electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm)
         fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
-        ends = _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter.tip_mm, shaft_image)
-        directed = fit + ends
-        if tip_logits_at is not None and _tip_shows(family.catheter):
+        directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(
+            electrode_fit.points_uv, family.catheter.tip_mm, shaft_image
+        )
+        if tip_logits_at is not None:
             first, last = answers_for_each(tip_logits_at, [electrode_fit.points_uv[:, end] for end in (0, -1)])
-            directed += _TIP_WEIGHT * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
+            weight = _TIP_WEIGHT if _tip_shows(family.catheter) else _SHORT_TIP_WEIGHT
+            directed += weight * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
         for index, row in enumerate(rows):
-            forth_over_back = float(directed[index] - directed[index + len(rows)])
+            back = index + len(rows)
+            forth_over_back = float(directed[index] - directed[back])
+            if family.catheter.tip_mm < _LONG_TIP_MM:
+                of_bands = float(bands[index] - bands[back])
+                forth_over_back += float(np.clip(of_bands, -_MOST_BANDS, _MOST_BANDS)) - of_bands
             best = index if forth_over_back >= 0 else index + len(rows)
             likelihood[row, column] = fit[best]
             electrode_fits[row, column] = electrode_fit, best, _TIP_SHARE * abs(forth_over_back)
@@ -168,7 +174,7 @@ def _with_places(fit: ElectrodeFit, places_uv: Array, there: BoolArray) -> Elect
 
 
 def _tip_shows(catheter: Catheter) -> bool:
-    """Return whether the network can see which end is the tip.
+    """Return whether the network can see well which end is the tip.
 
     The tip of a quadripolar catheter is as long as its rings.
     """
