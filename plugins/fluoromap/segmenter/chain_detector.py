@@ -53,6 +53,7 @@ _WEAKER = 0.25
 _LEAST_MOVING_ODDS = 0.2
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
+_NO_ELECTRODE = -1.0
 _LEAST_PLACES = 4
 _SAME_PLACE_MM = 1.0
 
@@ -161,18 +162,37 @@ class ChainDetector:
         """Search an image again with pairs split into two electrodes.
 
         Such pairs were proposed as one electrode. The result is the image as it was searched before, where the split explains no
-        more electrodes.
+        more electrodes, and as many no better although a long chain had places that are clearly none.
         """
         # Split pairs must not make a part of an unlisted catheter a listed one.
-        if searched.found.explained >= self._electrodes or searched.found.unlisted:
+        sure = [chain for chain in searched.found.chains if not _is_doubtful(chain, searched.seen)]
+        doubtful = len(sure) < len(searched.found.chains)
+        if (searched.found.explained >= self._electrodes and not doubtful) or searched.found.unlisted:
             return searched
         halves = searched.seen.halves_of_pairs(self.field.candidates)
         if not len(halves):
             return searched
         proposed = searched.proposed.with_more(halves)
         found = self._chains_of(searched.x, searched.seen, proposed, len(halves))
-        split = replace(searched, found=self._with_known_places(found, searched.found.chains))
-        return split if split.found.explained > searched.found.explained else searched
+        split = replace(searched, found=self._with_known_places(found, sure))
+        explains_more = split.found.explained > searched.found.explained
+        if not explains_more and doubtful and split.found.explained == searched.found.explained:
+            explains_more = self._evidence_for(split) > self._evidence_for(searched)
+        return split if explains_more else searched
+
+    def has_doubtful_places(self, searched: SearchedImage) -> bool:
+        """Return whether a long chain has places that are clearly no electrodes.
+
+        It may lie a pair of electrodes too far along its catheter, where a foreshortened pair was proposed as one electrode.
+        """
+        return any(_is_doubtful(chain, searched.seen) for chain in searched.found.chains)
+
+    def _evidence_for(self, searched: SearchedImage) -> float:
+        """Return how much speaks for the electrodes of all chains."""
+        return sum(
+            float(self._evidence(searched.seen.probability_at(chain.pixels_uv)).sum())
+            for chain in searched.found.chains
+        )
 
     def _with_known_places(self, found: _FittedSet, known: Sequence[Chain]) -> _FittedSet:
         """Return the chains, but known ones at their places.
@@ -536,6 +556,12 @@ class ChainDetector:
     def _shafts(self, seen: ImageEvidence) -> ShaftImage:
         clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
         return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)
+
+
+def _is_doubtful(chain: Chain, seen: ImageEvidence) -> bool:
+    """Return whether a long chain has a place that is clearly no electrode."""
+    places = chain.pixels_uv[chain.scores > UNSEEN]
+    return len(chain.electrodes) >= MANY_ELECTRODES and bool((seen.kind_odds_at(places) < _NO_ELECTRODE).any())
 
 
 def _are_in(field: BoolArray, points_uv: Array) -> BoolArray:

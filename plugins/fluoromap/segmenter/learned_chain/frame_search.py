@@ -99,11 +99,11 @@ class FrameSearch:
             if len(other.chains) > len(entry.chains):
                 # In fast motion the mean shows less than the frame itself.
                 searched, entry, self._noisy = again, other, not self._noisy
-        if self._lacks_catheters(entry):
+        if self._lacks_catheters(entry) or self.detector.has_doubtful_places(searched):
             split = self.detector.split_pairs(searched)
             if split is not searched:
                 other = self._in_frame(x, split, 1 + len(beside), frame, OWN_CELLS)
-                entry = other if len(other.chains) > len(entry.chains) else entry
+                entry = other if len(other.chains) >= len(entry.chains) else entry
         if entry.manual_needed is None:
             self._answered = entry
         return entry
