@@ -54,6 +54,7 @@ _LEAST_MOVING_ODDS = 0.2
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
+_EXCHANGED = 2
 _LEAST_PLACES = 4
 _SAME_PLACE_MM = 1.0
 
@@ -244,7 +245,7 @@ class ChainDetector:
         possible = _with_enough_places(possible, len(points) - halves, halves)
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
-            return _Linking(points, len(points), possible, linked)
+            return _Linking(points, len(points), possible, self._with_clearer_electrodes(linked, possible, weights))
 
         def dark(places: Array) -> Array:
             probability = seen.unseen_probability_at(places)
@@ -275,7 +276,31 @@ class ChainDetector:
         possible = self._without_shorter_catheters(possible, completed.points_uv, seen, families)
         possible = _with_enough_places(possible, len(points) - halves, halves)
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm, len(points))
-        return _Linking(completed.points_uv, len(points), possible, linked)
+        clearer = self._with_clearer_electrodes(linked, possible, completed.weights)
+        return _Linking(completed.points_uv, len(points), possible, clearer)
+
+    def _with_clearer_electrodes(
+        self, linked: tuple[CandidateChain, ...], possible: PossibleChains, weights: Array
+    ) -> tuple[CandidateChain, ...]:
+        """Return the chains, long ones with other electrodes where these are clearer.
+
+        The errors of one proposer go together, so its log-odds count in part only for a whole chain. Of two chains that have all
+        electrodes but two in common, these two decide, and what the proposer says of them counts in full.
+        """
+        more = 1.0 / self.acceptance.trust.share - 1.0
+        chosen = list(linked)
+        for index, chain in enumerate(linked):
+            if len(chain.candidates) < MANY_ELECTRODES or more == 0.0:
+                continue
+            rows, scores = possible.rows[chain.family], possible.scores[chain.family]
+            others = [one for other in chosen if other is not chain for one in other.candidates]
+            taken = list(set(others) - set(chain.candidates))
+            alike = np.isin(rows, chain.candidates).sum(axis=1) >= len(chain.candidates) - _EXCHANGED
+            rows, scores = (of_all[alike & ~np.isin(rows, taken).any(axis=1)] for of_all in (rows, scores))
+            if len(rows):
+                best = int(np.argmax(scores + more * weights[rows].sum(axis=1)))
+                chosen[index] = CandidateChain(tuple(rows[best].tolist()), chain.family, float(scores[best]))
+        return tuple(chosen)
 
     def _without_shorter_catheters(
         self, possible: PossibleChains, points_uv: Array, seen: ImageEvidence, families: tuple[CatheterFamily, ...]
