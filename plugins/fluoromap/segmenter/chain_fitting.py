@@ -26,7 +26,7 @@ from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0
 _TIP_WEIGHT, _SHORT_TIP_WEIGHT, _MOST_TIP = 1.0, 0.5, 4.0
-_LONG_TIP_MM, _MOST_BANDS = 3.0, 0.5
+_LONG_TIP_MM, _MOST_BANDS = 3.0, 1.0
 """Tips that are longer than rings for certain, and how much the bands of shorter ones say: makers' tips differ."""
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
