@@ -44,7 +44,7 @@ class Detector:
         self.network, self.level = network, level
         self.likeness = lambda x: 10.0
         self.searched, self.split, self.found_again = [], [], []
-        self.of_pairs = ()
+        self.of_pairs, self.doubtful = (), False
         self.frame, self.chain_at = 0, lambda frame: 0.0
 
     def forget_image(self):
@@ -56,6 +56,9 @@ class Detector:
         return Searched(
             x, self.image_evidence(x), (chain(self.chain_at(self.frame)),) if np.isclose(x.mean(), self.level) else ()
         )
+
+    def has_doubtful_places(self, searched):
+        return self.doubtful
 
     def split_pairs(self, searched):
         self.split.append(float(searched.x.mean()))
@@ -123,6 +126,13 @@ def test_pairs_are_split_only_where_the_mean_does_not_show_the_catheter_either()
     assert detector.split == []
     assert np.allclose(frames.find_chains(X + 5, 1).chains[0].pixels_uv, POINTS + 30)
     assert detector.split == [5.0]
+
+
+def test_pairs_are_split_where_a_chain_has_places_that_are_no_electrodes():
+    frames, detector, _ = search(1.0, shares=False)
+    detector.of_pairs, detector.doubtful = (chain(30.0),), True
+    assert np.allclose(frames.find_chains(X + 1, 0).chains[0].pixels_uv, POINTS + 30)
+    assert detector.split == [1.0]
 
 
 def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
