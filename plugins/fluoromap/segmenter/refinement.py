@@ -21,6 +21,10 @@ _LAST_REACH_PX = 2.0
 _SOFT_PX = 2.0
 _APART_PX = 6.0
 _GAIN, _TIP_GAIN = (4.6, 5.3), (6.15, 6.35)
+_TIP_REACH = 0.8
+"""How far a long tip's middle is searched, over half its length: the first guess may lie near one of its ends."""
+_TIP_SHAPE = 0.1
+"""Standard deviation of a long tip's middle, over half its visible length: makers round tips differently."""
 _FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.034, 0.048), (0.09, 0.056), (0.155, 0.056)
 _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
@@ -112,7 +116,7 @@ def refine(
     half = np.full(len(arc_mm), 0.5 * catheter.ring_mm * px_per_mm)
     half[0] = 0.5 * catheter.tip_mm * px_per_mm
     shifts = np.full(misfits.shape, int(_REACH_PX / _STEP_PX))
-    shifts[:, 0] = int(_TIP_REACH_PX / _STEP_PX)
+    shifts[:, 0] = int(max(_TIP_REACH_PX, _TIP_REACH * half[0]) / _STEP_PX)
     shifts[hidden | without_blob] = int(_LAST_REACH_PX / _STEP_PX)
     for _ in range(2):
         _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
@@ -124,6 +128,8 @@ def refine(
     sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
     if len(arc_mm) >= 3:
         _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
+    if catheter.tip_mm >= _LONG_TIP_MM:
+        sd[:, 0, 0] = np.hypot(sd[:, 0, 0], _TIP_SHAPE * bands[:, 0])
     fit = ElectrodeFit(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
     covariance = fit.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):
