@@ -190,6 +190,35 @@ def test_a_split_keeps_the_chains_that_were_found_without_it():
     assert moved in split.found.chains
 
 
+def test_a_long_chain_with_places_that_are_no_electrodes_gives_way_to_one_with_a_split_pair():
+    catheter = row_of("cs", (120, 120), 0.4, shortened=0.5)
+    on = (catheter[-1] - catheter[0]) / np.linalg.norm(catheter[-1] - catheter[0])
+    shaft = catheter[-1] + np.outer(np.array([6.0, 9.0]) * PX * 0.5, on)
+    merged = 0.5 * (catheter[:1] + catheter[1:2])
+    points = np.concatenate([merged, catheter[2:], shaft])
+    probability, scores = [0.95] * 9 + [0.25, 0.25], [0.95] * 11
+    image = drawn([catheter])
+    (displaced,) = chains_found(image, points, probability, scores)
+    assert not lies_on(displaced, catheter)
+    found = chains_found(image, points, probability, scores, halves=catheter[:2])
+    assert any(lies_on(chain, catheter) for chain in found)
+
+
+def test_of_chains_that_differ_in_one_electrode_the_clearer_one_wins():
+    one = Catalogue((catheter_type("decapolar-5-5-5", "cs"),), None, "cs")
+    along = np.concatenate([[0.0], np.cumsum(np.asarray(one["cs"].spacing_mm))]) * PX * 0.85
+    # The last gap is shorter, and beyond the other end something lies just where one more electrode would.
+    along[-1] -= 0.2 * (along[-1] - along[-2])
+    places = np.append(along, -(along[1] - along[0]))
+    points = np.stack([70.0 + places, np.full(11, 180.0)], axis=1)
+    image = drawn_without_shaft(points[:10])
+    evidence = Evidence(image, points, [0.98] * 10 + [0.3], [0.95] * 11)
+    detector = detector_of(evidence, one)
+    (found,) = detector.search(image).entry(0).chains
+    ends = np.sort(found.pixels_uv[:, 0])[[0, -1]]
+    np.testing.assert_allclose(ends, points[[0, 9], 0], atol=4.0)
+
+
 def test_three_blobs_are_no_quadripolar_catheter_with_a_split_pair():
     catheter = row_of("ablation", (60, 60), 0.4, shortened=0.5)
     points = np.concatenate([catheter[:2], 0.5 * (catheter[2:3] + catheter[3:])])

@@ -44,3 +44,22 @@ def test_an_electrode_that_would_take_its_neighbour_s_place_stays_where_it_was_p
     assert gaps.min() >= 0.15 * min(CATHETER.spacing_mm) * PX_PER_MM
     spread = np.sqrt(np.trace(chain.covariance_px2[order], axis1=1, axis2=2))
     assert spread[1] > spread[[0, 2, 3]].max()
+
+
+def test_the_shaft_says_more_of_the_tip_than_the_length_of_short_bands():
+    catheter = catheter_type("quadripolar-5-5-5", "reference")
+    along = 60.0 + np.concatenate([[0.0], np.cumsum(catheter.spacing_mm)]) * PX_PER_MM
+    v, u = np.mgrid[:120, :220].astype(np.float64)
+    image = np.random.default_rng(5).normal(0.0, 0.02, v.shape)
+    image -= 0.15 * ((u > along[0]) & (np.abs(v - 60.0) < 2.5))
+    # The last ring is as long as the catalogue says of the tip.
+    for at, length_mm in zip(along, (1.0, 1.0, 1.0, 2.0), strict=True):
+        band = np.clip(0.5 + (0.5 * length_mm * PX_PER_MM - np.abs(u - at)) / 2.0, 0.0, 1.0)
+        image -= 0.5 * band * (np.abs(v - 60.0) < 3.5)
+    x = image.astype(np.float32)
+    candidates = np.stack([along, np.full(4, 60.0)], axis=1)
+    families = catheter_families(Catalogue((catheter,), None, "reference"))
+    (one,) = fit_chains(
+        x, candidates, [CandidateChain((0, 1, 2, 3), 0, 5.0)], ShaftImage(x, 1, 0.1, PX_PER_MM), families, 0.02
+    )
+    assert one.chain.pixels_uv[:, 0] == pytest.approx(along, abs=1.5)

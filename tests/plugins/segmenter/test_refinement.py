@@ -1,6 +1,7 @@
 """Sub-pixel positions: a catheter whose foreshortening changes along it is not pulled straight."""
 
 import numpy as np
+import pytest
 
 from fluoromap.catheters import catheter_type
 from fluoromap.segmenter.refinement import refine
@@ -26,3 +27,25 @@ def test_a_long_catheter_s_ends_stay_where_its_foreshortening_changes():
     error = fit.points_uv[0] - points
     assert np.abs(error[[0, 1, -2, -1], 0]).max() < 1.0
     assert np.sqrt((error[:, 0] ** 2).mean()) < 0.6
+
+
+@pytest.mark.parametrize("first_guess_mm", [-2.5, 0.0, 1.5])
+def test_the_middle_of_a_long_tip_is_found_from_its_ends(first_guess_mm):
+    catheter = catheter_type("ablation-8", "ablation")
+    px_per_mm = 5.0
+    along = np.concatenate([[0.0], np.cumsum(np.asarray(catheter.spacing_mm))]) * px_per_mm
+    points = np.stack([50.0 + along, np.full(4, 40.0)], axis=1)
+    v, u = np.mgrid[:80, :220].astype(np.float64)
+    image = np.random.default_rng(3).normal(0.0, 0.02, v.shape)
+    for k, (at, _) in enumerate(points):
+        half = 0.5 * (catheter.tip_mm if k == 0 else catheter.ring_mm) * px_per_mm
+        band = np.clip(0.5 + (half - np.abs(u - at)) / 2.0, 0.0, 1.0)
+        image -= 0.5 * band * (np.abs(v - 40.0) < 5.5)
+    guess = points.copy()
+    guess[0, 0] += first_guess_mm * px_per_mm
+    nothing = np.zeros((1, 4), np.bool_)
+    fit = refine(image.astype(np.float32), guess[None], catheter, px_per_mm, 0.02, nothing, nothing)
+    error = fit.points_uv[0, 0, 0] - points[0, 0]
+    # The template's end is round, that of the picture is not: the covariance knows of it.
+    assert abs(error) < 2.5 * np.sqrt(fit.covariance_px2[0, 0, 0, 0])
+    assert abs(error) < 1.0 * px_per_mm
