@@ -20,7 +20,7 @@ from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance
+from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance, reverse
 
 T = TypeVar("T")
 
@@ -259,6 +259,7 @@ def segment_run(
     context.progress(0.95)
     chains = mean.chains
     if search_again:
+        chains = _turned_as_tracks(mean_x, chains, detector, averaged, entries)
         chains = _add_missing_catheters(mean_x, chains, detector, averaged, entries, catheters)
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
@@ -391,6 +392,32 @@ def _moving_search(
         return recall(FoundMoving, (frame,), find).chains
 
     return search
+
+
+def _turned_as_tracks(
+    x: Image,
+    chains: tuple[Chain, ...],
+    detector: Detector,
+    averaged: tuple[int, ...],
+    entries: Sequence[FrameChains],
+) -> tuple[Chain, ...]:
+    """Return the mean image's chains in the direction of their tracks.
+
+    All frames of a track decide about its direction. A turned chain is fitted again, because a tip is longer than a ring.
+    """
+    tracked = [other for frame in averaged for other in entries[frame].chains]
+    as_tracks = []
+    for chain in chains:
+        other_way = reverse(chain)
+        as_it_is, turned = (
+            min((sum(chain_distance(one, other)) for other in tracked), default=np.inf) for one in (chain, other_way)
+        )
+        if turned <= _SAME_TRACK_PX < as_it_is:
+            beside = [other for other in chains if other is not chain]
+            again = detector.find_again(x, other_way, np.zeros(2), _SAME_TRACK_PX / 2, beside)
+            chain = other_way if again is None else replace(again, tip_odds=other_way.tip_odds)
+        as_tracks.append(chain)
+    return tuple(as_tracks)
 
 
 def _add_missing_catheters(

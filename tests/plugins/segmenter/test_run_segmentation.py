@@ -1,0 +1,68 @@
+"""Chains of a run's frames and of its diastolic mean become one answer."""
+
+import numpy as np
+
+from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
+from fluoromap.segmenter.run_segmentation import segment_run
+from fluoromap.segmenter.tracks import reverse
+
+CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "reference"),), None, "reference")
+PLACES = np.array([[40.0, 40], [50, 44], [68, 50], [78, 55]])
+
+
+class Frames:
+    shape = (128, 128)
+
+    def __init__(self, count):
+        random = np.random.default_rng(2)
+        self.frames = random.poisson(600, (count, *self.shape)).astype(np.uint16)
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __getitem__(self, index):
+        return self.frames[index]
+
+    def __iter__(self):
+        return iter(self.frames)
+
+
+def chain(tip_odds):
+    return Chain(
+        (1, 2, 3, 4), PLACES, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), (("reference", 1.0),), tip_odds=tip_odds
+    )
+
+
+class Detector:
+    """Finds the same catheter in each frame, and in the mean, which follows them, with its tip at the other end."""
+
+    def __init__(self, count):
+        self.count, self.searched, self.fitted = count, 0, []
+
+    def find_chains(self, x, frame, beside=()):
+        self.searched += 1
+        return FrameChains(frame, (chain(1.0) if self.searched <= self.count else reverse(chain(-0.2)),))
+
+    def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False, confirmed=False):
+        if frame is None:
+            self.fitted.append(known)
+        return known
+
+    def find_moving(self, images, times_ms, middle, frame):
+        return ()
+
+    def shows_extra_catheter(self, x, chains):
+        return False
+
+
+def test_the_mean_of_a_run_has_its_tip_where_the_frames_have_it():
+    frames = Frames(12)
+    run = Run(frames, np.arange(12) * 33.0, 4.0, PixelFacts(False, 12, False))
+    detector = Detector(12)
+    found = segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
+    (diastolic,) = found.diastole.chains
+    assert np.array_equal(diastolic.pixels_uv, PLACES)
+    assert {each.track for entry in found.frames for each in entry.chains} == {diastolic.track}
+    # It was fitted again in that direction: a tip is longer than a ring.
+    assert any(np.array_equal(known.pixels_uv, PLACES) for known in detector.fitted)
