@@ -139,22 +139,25 @@ class Part:
         return cls(0, 0, *picture.shape[:2])
 
     def at_half(self) -> Part:
-        """Return the part in the picture of half the size that this part needs."""
+        """Return the part that this part needs at half the size."""
         return Part(self.top // 2, self.left // 2, -(-self.bottom // 2), -(-self.right // 2))
 
     def at_double(self) -> Part:
-        """Return the same part in the picture of double the size."""
+        """Return the same part at double the size."""
         return Part(2 * self.top, 2 * self.left, 2 * self.bottom, 2 * self.right)
 
     def with_border(self, width: int, whole: Part) -> Part:
-        """Return the part with a border of this width as far as the whole has one."""
+        """Return the part with a border, as far as the whole has one."""
         return Part(
             max(self.top - width, whole.top), max(self.left - width, whole.left),
             min(self.bottom + width, whole.bottom), min(self.right + width, whole.right),
         )  # fmt: skip
 
     def of(self, picture: Image, shown: Part) -> Image:
-        """Return this part of a picture that shows another part, in one stretch of memory."""
+        """Return this part of a picture that shows another part.
+
+        It lies in one stretch of memory.
+        """
         rows = slice(self.top - shown.top, self.bottom - shown.top)
         return np.ascontiguousarray(picture[rows, self.left - shown.left : self.right - shown.left])
 
@@ -220,7 +223,10 @@ class ElectrodeNetwork:
         return asked.of(of_cells.reshape(2 * rows, 2 * columns, len(HEADS)), shown.at_double().at_double())
 
     def _needed(self, cells: Part, quarter: Part, eighth: Part) -> list[Part]:
-        """Return what cells need at an eighth of the size: before the first layer around, and after each of them."""
+        """Return the parts that cells need at an eighth of the size.
+
+        They are needed before the first layer around, and after each of them.
+        """
         merged = cells.at_half().with_border(self.layers["merged"].shape.border, quarter)
         needed = [merged.at_half()]
         for name in reversed(AROUND):

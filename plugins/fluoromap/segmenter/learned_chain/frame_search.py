@@ -25,7 +25,7 @@ _CARRIED_MS, _NEAR_MM = 40.0, 1.0
 
 _MEAN_CELLS, _NEXT_FRAME_CELLS, _CARRIED_CELLS = 2, 3, 2
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
-_MOST_CARRIED = 8
+_MOST_CARRIED = 12
 """How many frames may use an answer that is carried along with the catheters."""
 _CARRIED_WITHIN = 4.0
 """How far from an electrode the image moves with it, over ``near_px``."""
@@ -36,9 +36,10 @@ _LEAST_SHARE = 0.5
 
 
 def near_distance_mm(frame_ms: float) -> float:
-    """Return how far catheters may be from where they would be if they moved on as before.
+    """Return how far catheters may be from where they are expected.
 
-    ``frame_ms`` : longest time between frames. In slow runs it is 0: nothing is known about where they are.
+    They are expected where they would be if they moved on as before. ``frame_ms`` : longest time between frames. In slow runs
+    the distance is 0: nothing is known about where they are.
     """
     return _NEAR_MM if frame_ms <= _CARRIED_MS else 0.0
 
@@ -54,7 +55,7 @@ class FrameSearch:
       the mean are found again in the frame itself. The search that helped last comes first.
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
-    - Where all catheters were found in the frames before, eight more frames use the answer, carried along with the catheters.
+    - Where all catheters were found in the frames before, twelve more frames use the answer, carried along with the catheters.
     - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or a catheter more than
       ``near_px`` from where it would be if it moved on, is searched again with an answer of its own.
     """
@@ -122,14 +123,17 @@ class FrameSearch:
         return entry if entry.manual_needed is None and _motion_px(expected, entry) <= self.near_px else None
 
     def _motion_to(self, entry: FrameChains) -> Motion:
-        """Return the motion from the latest answer's chains to those of a frame, in the same order."""
+        """Return the motion since the latest answer.
+
+        The chains of ``entry`` have the same order as those of the answered frame.
+        """
         places, before = (
             np.concatenate([chain.pixels_uv for chain in chains]) for chains in (entry.chains, self._answered.chains)
         )
         return Motion(cKDTree(places), places - before, _CARRIED_WITHIN * self.near_px)
 
     def _expected(self, frame: int) -> FrameChains | None:
-        """Return where the catheters of the latest answer are in a frame if they move on.
+        """Return where catheters are in a frame if they move on.
 
         None where the answer is too old, or where one of them was not found in both frames before.
         """
@@ -233,7 +237,7 @@ def _mean(x: Image, beside: Sequence[Image]) -> Image:
 
 
 def _nearest(chain: Chain, entry: FrameChains) -> Chain | None:
-    """Return the chain of a frame with the same electrodes that is nearest to a chain of another frame."""
+    """Return the nearest chain of another frame with as many electrodes."""
     alike = [other for other in entry.chains if other.electrodes == chain.electrodes]
     return min(alike, key=lambda other: float(_farthest(chain, other)), default=None)
 

@@ -283,7 +283,10 @@ def answer(trained: Trained, picture: Image, orientations: int = 1) -> Image:
 
 
 def padded(picture: Image) -> Image:
-    """Return a picture with its last row and column repeated, until the network's layers with steps divide its size."""
+    """Return a picture whose size the layers with steps divide.
+
+    Its last row and column are repeated.
+    """
     rows, columns = picture.shape
     return repeat_edge(picture, rows + -rows % STRIDE_PX, columns + -columns % STRIDE_PX)
 

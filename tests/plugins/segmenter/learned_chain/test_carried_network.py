@@ -12,7 +12,7 @@ THEN, NOW = np.array([[20.0, 20.0], [60.0, 20.0]]), np.array([[32.0, 26.0], [60.
 
 
 def answered():
-    """Answers for electrodes at the places of then, and for one of another thing that stands still."""
+    """Answer for electrodes at the places of then, and one at rest."""
     probability, answers = np.zeros((64, 64), np.float32), np.zeros((64, 64, 5), np.float32)
     for number, (u, v) in enumerate([*THEN, (100.0, 100.0)]):
         cell = int(v / 2), int(u / 2)

@@ -143,7 +143,10 @@ def test_in_fast_runs_one_answer_of_the_network_serves_two_frames():
 
 
 def asked_in(frames, detector, asked, places):
-    """Search frames of a catheter at these places; return those for which the network was asked."""
+    """Return the frames for which the network was asked.
+
+    The catheter is at one of these places in each frame.
+    """
     detector.chain_at = lambda frame: places[frame]
     of = []
     for frame in range(len(places)):
@@ -155,9 +158,9 @@ def asked_in(frames, detector, asked, places):
 
 def test_an_answer_is_carried_along_with_a_catheter_until_it_moves_otherwise():
     frames, detector, asked = search(1.0, shares=False, near_px=4.0)
-    places = [0.0, 0.5, 1.0, 3.0, 6.0, 9.0, 12.0, 15.0, 18.0, 21.0, 24.0, 27.0, 20.0, 20.0]
-    # Own answers: until the speed is known, after eight more frames, and while the speed changes.
-    assert asked_in(frames, detector, asked, places) == [0, 1, 10, 12, 13]
+    places = [0.0, 0.5, 1.0, 3.0, *range(6, 40, 3), 32.0, 32.0]
+    # Own answers: until the speed is known, after twelve more frames, and while the speed changes.
+    assert asked_in(frames, detector, asked, places) == [0, 1, 14, 16, 17]
 
 
 def test_a_carried_answer_is_asked_about_places_where_the_catheter_was_then():
