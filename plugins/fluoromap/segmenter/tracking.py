@@ -97,6 +97,7 @@ def track_chains(
     """
     if not found:
         return ()
+    seed = _as_frames_say(seed, found, frame_times_ms, catheters, marks_first)
     tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     outvoted = [track for track in tracks if _is_outvoted(track, found)]
     if outvoted:
@@ -143,6 +144,23 @@ def track_chains(
         reason = Reason.MANUAL_NEEDED if not chains else Reason.TRACK_INTERRUPTED if missing else None
         entries.append(FrameChains(frame, tuple(chains), reason))
     return tuple(entries)
+
+
+def _as_frames_say(
+    seed: FrameChains | None, found: Sequence[FrameChains], frame_times_ms: Array, catheters: int, marks_first: bool
+) -> FrameChains | None:
+    """Return the seed with each chain in the direction that the frames say.
+
+    A chain in the wrong direction would be fitted again in each frame, with the tip's length at the wrong end.
+    """
+    if seed is None or not seed.chains:
+        return seed
+    tracks = _follow(found, frame_times_ms, catheters, None, seed, marks_first)
+    begun = [track for track in tracks if track.from_seed]
+    if len(begun) < len(seed.chains):
+        return seed
+    chains = (reverse(chain) if track.direction < 0 else chain for chain, track in zip(seed.chains, begun, strict=True))
+    return replace(seed, chains=tuple(chains))
 
 
 def _follow(

@@ -67,6 +67,21 @@ def test_sure_frames_decide_where_the_tip_of_a_track_is():
         np.testing.assert_allclose(entry.chains[0].pixels_uv, POINTS)
 
 
+def test_a_seed_with_its_tip_at_the_other_end_is_turned_before_frames_are_searched_with_it():
+    searched = []
+
+    def search(frame, known, shift, reach_px, taken, same_shape=False, confirmed=False):
+        searched.append(known.pixels_uv)
+
+    found = run([[chain(POINTS, tip_odds=1.0)] if frame != 5 else [] for frame in range(9)])
+    seed = FrameChains(4, (chain(POINTS[::-1], tip_odds=0.2),))
+    for entry in track_chains(found, times(9), 1, search, seed, lambda chains: True):
+        assert all(np.array_equal(each.pixels_uv, POINTS) for each in entry.chains)
+    # The frame without a chain, and none in which a chain had to be turned and fitted again.
+    assert searched
+    assert all(np.array_equal(points, POINTS) for points in searched)
+
+
 def test_another_kind_is_another_track():
     entries = track_chains(run([[chain(POINTS)], [chain(POINTS + 1, "mapping")]]), times(2), 3)
     assert entries[0].chains[0].track != entries[1].chains[0].track
