@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LEAST_ON_LOOP = 8
+_USUAL_LONG_TIP_MM = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,13 @@ class Catheter:
         """
         equal = max(self.spacing_mm) - min(self.spacing_mm) < 1e-6 and abs(self.tip_mm - self.ring_mm) < 1e-6
         return self.electrodes >= _LEAST_ON_LOOP and equal
+
+    def tip_centre_sd_mm(self, usual_sd_mm: float) -> float:
+        """Return how far the tip's middle may be from its image's centre.
+
+        A standard deviation, mm along the shaft. ``usual_sd_mm`` is that of tips of 4 mm and less. Makers round longer tips in proportion.
+        """
+        return usual_sd_mm * max(1.0, self.tip_mm / _USUAL_LONG_TIP_MM)
 
     def looks_like(self, other: Catheter) -> bool:
         """Return whether the two look alike in fluoroscopy (all lengths within 1 mm).

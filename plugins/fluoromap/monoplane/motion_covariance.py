@@ -51,7 +51,7 @@ class MotionParams(BaseModel, extra="forbid"):
         0.2,
         ge=0,
         le=5,
-        description="Distance along the shaft from the tip electrode's middle to its centre in the image, mm.",
+        description="Distance along the shaft from the middle of a tip of 4 mm or less to its centre in the image, mm.",
     )
     mapping_motion_sd_mm: float = Field(
         2.9, ge=0, le=30, description="Motion of the mapping catheter over the cycle where no cycle is known, mm."

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, StudyShares, Track
 from fluoromap.monoplane.catheter_lengths import catheter_lengths
 from fluoromap.monoplane.expected_motion import expected_motion
@@ -177,7 +178,7 @@ class MotionPrior:
     ) -> Track:
         electrodes = run.electrodes
         n, m = electrodes.visible.shape
-        joint = joint + _tip_centres_mm2(electrodes, positions, self._params.tip_centre_sd_mm)
+        joint = joint + _tip_centres_mm2(electrodes, positions, run.view.catalogue, self._params.tip_centre_sd_mm)
         blocks = np.einsum("nmimj->nmij", joint.reshape(n, m, 3, m, 3))
         across = np.eye(3) - run.rays[..., :, None] * run.rays[..., None, :]
         # The prior contains the depth's gantry error. This view's own gantry displaces the electrodes across its rays.
@@ -285,7 +286,7 @@ def _from_reference(electrodes: ViewElectrodes, reference: str | None) -> tuple[
     return np.eye(len(is_reference)) - mean[:, None, :], count > 0
 
 
-def _tip_centres_mm2(electrodes: ViewElectrodes, positions: Array, sd_mm: float) -> Array:
+def _tip_centres_mm2(electrodes: ViewElectrodes, positions: Array, catalogue: Catalogue, usual_sd_mm: float) -> Array:
     """Return the joint covariance (n, 3 m, 3 m) from the tips' radiographic centres.
 
     The centre of a tip in the image is not the middle of its metal. All views show the same centre, so that no pixel reveals
@@ -297,6 +298,7 @@ def _tip_centres_mm2(electrodes: ViewElectrodes, positions: Array, sd_mm: float)
         if electrode == 1 and (catheter, 2) in electrodes.labels:
             along = positions[:, tip] - positions[:, electrodes.labels.index((catheter, 2))]
             along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+            sd_mm = catalogue[catheter].tip_centre_sd_mm(usual_sd_mm)
             covariance[:, tip, :, tip] = sd_mm**2 * along[:, :, None] * along[:, None, :]
     return covariance.reshape(n, 3 * m, 3 * m)
 

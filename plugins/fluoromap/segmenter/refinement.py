@@ -23,8 +23,6 @@ _APART_PX = 6.0
 _GAIN, _TIP_GAIN = (4.6, 5.3), (6.15, 6.35)
 _TIP_REACH = 0.8
 """How far a long tip's middle is searched, over half its length: the first guess may lie near one of its ends."""
-_TIP_SHAPE = 0.1
-"""Standard deviation of a long tip's middle, over half its visible length: makers round tips differently."""
 _FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.034, 0.048), (0.09, 0.056), (0.155, 0.056)
 _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
@@ -116,20 +114,22 @@ def refine(
     half = np.full(len(arc_mm), 0.5 * catheter.ring_mm * px_per_mm)
     half[0] = 0.5 * catheter.tip_mm * px_per_mm
     shifts = np.full(misfits.shape, int(_REACH_PX / _STEP_PX))
-    shifts[:, 0] = int(max(_TIP_REACH_PX, _TIP_REACH * half[0]) / _STEP_PX)
+    tip_reach = max(_TIP_REACH_PX, _TIP_REACH * half[0])
+    shifts[:, 0] = int(tip_reach / _STEP_PX)
     shifts[hidden | without_blob] = int(_LAST_REACH_PX / _STEP_PX)
-    for _ in range(2):
+    # A wrong first guess of a very long tip also gives a wrong length of its band.
+    for attempt in range(3 if tip_reach > _TIP_REACH_PX else 2):
         _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
         longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
         scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
         _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, misfits)
         shifts[:] = int(_LAST_REACH_PX / _STEP_PX)
+        if attempt == 0 and tip_reach > _TIP_REACH_PX:
+            shifts[:, 0] = int(_TIP_REACH_PX / _STEP_PX)
     _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
     sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
     if len(arc_mm) >= 3:
         _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
-    if catheter.tip_mm >= _LONG_TIP_MM:
-        sd[:, 0, 0] = np.hypot(sd[:, 0, 0], _TIP_SHAPE * bands[:, 0])
     fit = ElectrodeFit(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
     covariance = fit.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):

@@ -167,7 +167,7 @@ def common_sources(
     """
     return (
         *study_sources(cameras, points_world_mm, labels, catalogue, params, gantry_covariance),
-        *site_sources(cameras, points_world_mm, labels, params, motion),
+        *site_sources(cameras, points_world_mm, labels, catalogue, params, motion),
     )
 
 
@@ -208,6 +208,7 @@ def site_sources(
     cameras: Cameras,
     points_world_mm: Array,
     labels: Sequence[tuple[str, int]],
+    catalogue: Catalogue,
     params: UncertaintyParams,
     motion: Motion | None,
 ) -> tuple[ErrorSource, ...]:
@@ -222,7 +223,8 @@ def site_sources(
         if tip is not None:
             # Both views show the same centre, so that no epipolar distance reveals it.
             effect = effect_px(jacobian, tip, tip)
-            sources.append(ErrorSource(effect, np.array([[params.tip_centre_sd_mm**2]]), ("pixels",)))
+            sd_mm = catalogue[name].tip_centre_sd_mm(params.tip_centre_sd_mm)
+            sources.append(ErrorSource(effect, np.array([[sd_mm**2]]), ("pixels",)))
     if motion is not None:
         displaced, velocity = motion.displaced_mm[..., None], motion.velocity_mm[..., None]
         sources.append(_both_views(jacobian, displaced, displaced, params.beat_amplitude_sd, "phase_mismatch"))

@@ -187,7 +187,7 @@ class SiteLocator:
             cameras, start, pixels.labels, self.catalogue, any_study.params, any_study.gantry.covariance
         )
         of_site = [
-            *site_sources(cameras, start, pixels.labels, any_study.params, motion),
+            *site_sources(cameras, start, pixels.labels, self.catalogue, any_study.params, motion),
             bend_source(jacobians(cameras, start), any_study.params),
         ]
         if jump is not None:

@@ -41,7 +41,7 @@ class UncertaintyParams(BaseModel, extra="forbid"):
         0.2,
         ge=0,
         le=5,
-        description="Distance along the shaft from the tip electrode's middle to its centre in the image, mm.",
+        description="Distance along the shaft from the middle of a tip of 4 mm or less to its centre in the image, mm.",
     )
     beat_amplitude_sd: float = Field(
         0.04, ge=0, le=1, description="Variation of the motion's amplitude from beat to beat, as a share of it."

@@ -46,6 +46,5 @@ def test_the_middle_of_a_long_tip_is_found_from_its_ends(first_guess_mm):
     nothing = np.zeros((1, 4), np.bool_)
     fit = refine(image.astype(np.float32), guess[None], catheter, px_per_mm, 0.02, nothing, nothing)
     error = fit.points_uv[0, 0, 0] - points[0, 0]
-    # The template's end is round, that of the picture is not: the covariance knows of it.
-    assert abs(error) < 2.5 * np.sqrt(fit.covariance_px2[0, 0, 0, 0])
-    assert abs(error) < 1.0 * px_per_mm
+    # The template's end is round, that of the picture is not: triangulation adds this distance to the covariance.
+    assert abs(error) < catheter.tip_centre_sd_mm(0.2) * px_per_mm

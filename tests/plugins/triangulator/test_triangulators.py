@@ -1,5 +1,7 @@
 """Whole sites: positions, honest covariances, positions relative to the reference catheter, reasons."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -268,6 +270,28 @@ def test_the_budget_adds_up_to_the_covariances(plugin: type) -> None:
     stated = np.mean([np.trace(point.covariance_mm2) for point in answer.sites[0].points])
     assert np.square(shares).sum() == pytest.approx(stated, rel=1e-6)
     assert budget.pixels_mm == pytest.approx(0.137, rel=0.1)
+
+
+def along_the_shaft_mm2(tip_mm: float, tip_centre_sd_mm: float) -> float:
+    """Return the variance of the mapping tip along its shaft, from the reference catheter."""
+    mapping = replace(DEFAULT_CATALOGUE["mapping"], tip_mm=tip_mm)
+    catalogue = replace(
+        DEFAULT_CATALOGUE,
+        catheters=tuple(mapping if one.name == "mapping" else one for one in DEFAULT_CATALOGUE.catheters),
+    )
+    points = heart(np.random.default_rng(4))
+    a, b = (observation(one, points) for one in LATERAL_AND_FRONTAL)
+    params = UncertaintyParams(tip_centre_sd_mm=tip_centre_sd_mm)
+    (located,) = MaximumLikelihood(params).triangulate((site(a, b, LATERAL_AND_FRONTAL),), catalogue, Silent()).sites
+    shaft = points["mapping"][1] - points["mapping"][0]
+    shaft /= np.linalg.norm(shaft)
+    return float(shaft @ located.point("mapping", 1).relative_covariance_mm2 @ shaft)
+
+
+@pytest.mark.parametrize(("tip_mm", "sd_mm"), [(2.0, 0.2), (4.0, 0.2), (8.0, 0.4)])
+def test_the_unknown_shape_of_a_long_tip_widens_its_covariance_along_the_shaft(tip_mm: float, sd_mm: float) -> None:
+    wider = along_the_shaft_mm2(tip_mm, 0.2) - along_the_shaft_mm2(tip_mm, 0.0)
+    assert wider == pytest.approx(sd_mm**2, rel=0.15)
 
 
 @BOTH
