@@ -83,7 +83,8 @@ class Catheter:
     def tip_centre_sd_mm(self, usual_sd_mm: float) -> float:
         """Return how far the tip's middle may be from its image's centre.
 
-        A standard deviation, mm along the shaft. ``usual_sd_mm`` is that of tips of 4 mm and less. Makers round longer tips in proportion.
+        A standard deviation, mm along the shaft. ``usual_sd_mm`` is that of tips of 4 mm and less. Makers round longer tips in
+        proportion.
         """
         return usual_sd_mm * max(1.0, self.tip_mm / _USUAL_LONG_TIP_MM)
 
