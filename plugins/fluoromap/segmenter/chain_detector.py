@@ -406,7 +406,7 @@ class ChainDetector:
         odds_of_free, odds, *odds_of_chains = answers_for_each(seen.kind_odds_at, places)
         listed = np.zeros(len(chains), np.bool_)
         for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
-            family = self._family(chain)
+            family = self.family_of(chain)
             is_seen = chain.scores > UNSEEN
             if family is None or follows_bars(products_beside(chain.pixels_uv[is_seen], self._shafts(seen))):
                 continue
@@ -473,7 +473,7 @@ class ChainDetector:
 
         None means that the image does not support the chain.
         """
-        family = self._family(chain)
+        family = self.family_of(chain)
         if family is None:
             return None
         seen = self.image_evidence(x)
@@ -569,7 +569,7 @@ class ChainDetector:
         """Return how clearly electrodes show at points, NaN outside the field, (n,)."""
         return np.where(self._is_seen(points_uv), seen.scores_at(points_uv), np.nan)
 
-    def _family(self, chain: Chain) -> CatheterFamily | None:
+    def family_of(self, chain: Chain) -> CatheterFamily | None:
         """Return the most probable family whose catheters have exactly this chain's electrodes."""
         whole = [
             family

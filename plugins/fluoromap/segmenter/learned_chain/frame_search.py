@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
+from fluoromap.segmenter.chain_following import follow_chains
 from fluoromap.segmenter.learned_chain.carried_network import Motion
 from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
@@ -27,6 +28,8 @@ _MEAN_CELLS, _NEXT_FRAME_CELLS, _CARRIED_CELLS = 2, 3, 2
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
 _MOST_CARRIED = 12
 """How many frames may use an answer that is carried along with the catheters."""
+_MOST_FOLLOWED = 2
+"""How many frames in a row may be fitted without a search."""
 _CARRIED_WITHIN = 4.0
 """How far from an electrode the image moves with it, over ``near_px``."""
 _REACH_PX = 6.0
@@ -56,6 +59,7 @@ class FrameSearch:
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
     - Where all catheters were found in the frames before, twelve more frames use the answer, carried along with the catheters.
+    - Of these frames, two of three are not searched: clear catheters that move on as before are only fitted.
     - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or a catheter more than
       ``near_px`` from where it would be if it moved on, is searched again with an answer of its own.
     """
@@ -73,12 +77,19 @@ class FrameSearch:
     _latest: FrameChains = field(default=_NO_FRAME, init=False)
     _before: FrameChains = field(default=_NO_FRAME, init=False)
     _noisy: bool = field(default=False, init=False)
+    _noise: float | None = field(default=None, init=False)
+    _may_follow: int = field(default=0, init=False)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image; see :class:`~fluoromap.segmenter.run_segmentation.Detector`."""
         # The mean of a run's frames follows its last frame, with the number of another one.
         is_next = frame == self._next
-        entry = self._find_chains(x, frame, beside)
+        expected = self._expected(frame)
+        entry = None if expected is None else self._follow(x, expected)
+        if entry is None:
+            entry = self._find_chains(x, frame, beside, expected)
+            moved_on = expected is not None and _motion_px(expected, entry) <= self.near_px
+            self._may_follow = _MOST_FOLLOWED if moved_on else 0
         if is_next:
             self.answers.network.store(frame, self._own)
             self._store_blobs(x, frame)
@@ -86,13 +97,13 @@ class FrameSearch:
         self._before, self._latest = self._latest, entry
         return entry
 
-    def _find_chains(self, x: Image, frame: int, beside: Sequence[Image]) -> FrameChains:
+    def _find_chains(self, x: Image, frame: int, beside: Sequence[Image], expected: FrameChains | None) -> FrameChains:
         first, second = (beside, ()) if self._noisy else ((), beside)
         if self.shares and frame == self._answered.frame + 1:
             _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= len(self._answered.chains):
                 return entry
-        elif (carried := self._search_carried(x, first, frame)) is not None:
+        elif expected is not None and (carried := self._search_carried(x, first, expected)) is not None:
             return carried
         searched, entry = self._search(x, first, frame, OWN_CELLS)
         if beside and self._lacks_catheters(entry):
@@ -109,16 +120,30 @@ class FrameSearch:
             self._answered = entry
         return entry
 
-    def _search_carried(self, x: Image, beside: Sequence[Image], frame: int) -> FrameChains | None:
+    def _follow(self, x: Image, expected: FrameChains) -> FrameChains | None:
+        """Fit the chains where they would be if they moved on, without a search.
+
+        None where a search is due, or where the fit does not show all of them.
+        """
+        families = [self.detector.family_of(chain) for chain in expected.chains]
+        catheters = [family.catheter for family in families if family is not None]
+        if self._noise is None or self._may_follow == 0 or len(catheters) < len(families):
+            return None
+        chains = follow_chains(
+            x, expected.chains, catheters, self.detector.field.inside, self.detector.px_per_mm, self._noise, self.near_px
+        )  # fmt: skip
+        if chains is None:
+            return None
+        self._may_follow -= 1
+        return replace(expected, chains=chains)
+
+    def _search_carried(self, x: Image, beside: Sequence[Image], expected: FrameChains) -> FrameChains | None:
         """Search with the latest answer, carried along with the catheters.
 
-        None where that is not possible, or where catheters are not where they would be if they moved on.
+        None where catheters are not where they would be if they moved on.
         """
-        expected = self._expected(frame)
-        if expected is None:
-            return None
         self.network.motion = self._motion_to(expected)
-        _, entry = self._search(x, beside, frame, _CARRIED_CELLS)
+        _, entry = self._search(x, beside, expected.frame, _CARRIED_CELLS)
         self.network.motion = None
         return entry if entry.manual_needed is None and _motion_px(expected, entry) <= self.near_px else None
 
@@ -151,7 +176,7 @@ class FrameSearch:
             if latest is None or before is None:
                 return None
             step = (latest.pixels_uv - before.pixels_uv).mean(axis=0)
-            chains.append(replace(chain, pixels_uv=latest.pixels_uv + step))
+            chains.append(replace(latest, pixels_uv=latest.pixels_uv + step))
         return FrameChains(frame, tuple(chains))
 
     def _lacks_catheters(self, entry: FrameChains) -> bool:
@@ -170,6 +195,8 @@ class FrameSearch:
         searched = self.detector.search(mean)
         self.network.reach_cells = OWN_CELLS
         self._own = self.network.latest_for(x) or self._own
+        # The mean of several frames has less noise than a frame.
+        self._noise = None if beside else searched.seen.position_noise
         return searched, self._in_frame(x, searched, 1 + len(beside), frame, reach_cells)
 
     def _in_frame(self, x: Image, searched: SearchedImage, averaged: int, frame: int, reach_cells: int) -> FrameChains:
