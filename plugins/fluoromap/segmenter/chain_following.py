@@ -17,7 +17,7 @@ _CLEAR = 0.8
 """Clearness from which on the fit itself shows a catheter: the template explains about half of each profile."""
 _ALONE_MM = 1.5
 """Distance from which on electrodes of two catheters are never one dark place."""
-_LEAST_GAP = 0.5
+_LEAST_GAP = 0.35
 """Of the spacing at the isocentre. Nearer electrodes may be taken for each other."""
 
 

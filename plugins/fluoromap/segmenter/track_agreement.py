@@ -13,6 +13,7 @@ from fluoromap.contracts import Array, Chain
 
 _LONG_TRACK, _COMPARED = 5, 60
 _SAME_PX, _DISPLACED_PX = 1.5, 4.0
+_JUMP_PX = 2.5
 _SHARED_AT_LEAST = 0.5
 _SUPPORTED_AT_LEAST = 0.8
 _REACH_PX = 3.0
@@ -41,7 +42,8 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
 
     Clutter or two electrodes in one blob displace some electrodes of a frame, while the others are where the rest of the run
     shows them. Where more frames agree on other places of those electrodes, the frame is searched again with the shape of
-    the nearest such frame. The chain remains where that search does not find the shape.
+    the nearest such frame. The chain remains where that search does not find the shape. A catheter that came to its other shape
+    without a jump from one frame to the next is not searched: it has bent.
 
     Parameters
     ----------
@@ -52,11 +54,13 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
     """
     if len(chains) < _LONG_TRACK:
         return dict(chains)
-    frames = np.array(list(chains))
-    places = _places(list(chains.values()))
+    frames = np.array(sorted(chains))
+    places = _places([chains[frame] for frame in frames.tolist()])
     others = np.arange(len(frames))[:: max(1, len(frames) // _COMPARED)]
     same, displaced = _compare(places, places[others])
     support = same.sum(axis=1)
+    smooth = _smooth_parts(places)
+    displaced &= smooth[:, None] != smooth[others]
     agreed = dict(chains)
     for row in np.flatnonzero((displaced & (support[others] > support[:, None])).any(axis=1)):
         frame = int(frames[row])
@@ -72,6 +76,18 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
         if is_same_shape(found.pixels_uv, shape.pixels_uv):
             agreed[frame] = replace(found, kinds=chains[frame].kinds, tip_odds=chains[frame].tip_odds)
     return agreed
+
+
+def _smooth_parts(places: Array) -> NDArray[np.int64]:
+    """Return numbers (chains,) that are the same for successive chains without a jump between them.
+
+    ``places`` : (chains, electrodes, 2) in the order of time, NaN where a chain lacks an electrode.
+    """
+    steps = np.diff(places, axis=0)
+    jumps = np.asarray(~np.isfinite(steps[..., 0]).any(axis=1))
+    rest = steps[~jumps] - np.nanmedian(steps[~jumps], axis=1, keepdims=True)
+    jumps[~jumps] = np.nanmax(np.linalg.norm(rest, axis=2), axis=1) >= _JUMP_PX
+    return np.concatenate([[0], np.cumsum(jumps)])
 
 
 def is_same_shape(points_uv: Array, others_uv: Array) -> bool:

@@ -57,6 +57,23 @@ def test_a_catheter_that_bends_is_not_searched_again():
     assert not asked
 
 
+def test_a_catheter_whose_tip_bends_far_without_a_jump_is_not_searched_again():
+    def bent(frame):
+        return ROW + np.clip(np.arange(10) - 6, 0, None)[:, None] * [0.0, 0.55 * max(frame - 14, 0)]
+
+    chains = {frame: chain(bent(frame)) for frame in range(2 * FRAMES)}
+    # Most frames show another shape than the last ones, six pixels away.
+    assert np.abs(bent(2 * FRAMES - 1) - ROW).max() > 6.0
+    search, asked = search_of(bent)
+    assert with_common_shape(chains, search) == chains
+    assert not asked
+    # The same shapes as displaced places of single frames: they come and go.
+    jumping = {frame: chain(bent(23 if frame % 4 == 1 else 0)) for frame in range(2 * FRAMES)}
+    search, asked = search_of(lambda frame: bent(0))
+    with_common_shape(jumping, search)
+    assert asked == [frame for frame in range(2 * FRAMES) if frame % 4 == 1]
+
+
 def test_chains_remain_where_the_search_finds_nothing_or_another_shape():
     chains = {frame: chain(displaced(ROW) if frame == 4 else ROW) for frame in range(FRAMES)}
     for answer in (None, chain(displaced(ROW)), chain(ROW[:9])):

@@ -8,6 +8,7 @@ import numpy as np
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.learned_chain import frame_search
 from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredByFrame
 from fluoromap.segmenter.learned_chain.frame_search import FrameSearch
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
@@ -46,6 +47,8 @@ class Detector:
         self.searched, self.split, self.found_again = [], [], []
         self.of_pairs, self.doubtful = (), False
         self.frame, self.chain_at = 0, lambda frame: 0.0
+        self.family = None
+        self.field, self.px_per_mm = SimpleNamespace(inside=np.ones(X.shape, np.bool_)), 5.0
 
     def forget_image(self):
         pass
@@ -65,7 +68,11 @@ class Detector:
         return replace(searched, chains=self.of_pairs) if self.of_pairs else searched
 
     def image_evidence(self, x):
-        return SimpleNamespace(likeness=Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0))
+        likeness = Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0)
+        return SimpleNamespace(likeness=likeness, position_noise=0.02)
+
+    def family_of(self, chain):
+        return self.family
 
     def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False, confirmed=False):
         self.found_again.append((float(x.mean()), known))
@@ -175,6 +182,55 @@ def test_a_carried_answer_is_asked_about_places_where_the_catheter_was_then():
     assert frames.network.motion is None
     # Tracking, which may begin with detections that were stored, does not use carried answers.
     assert frames.answers.network.of_frame(2) is None
+
+
+def searched_of(frames, detector, places, level=1.0):
+    """Return the frames that were searched, and all entries, where the catheter is at these places."""
+    detector.chain_at = lambda frame: places[frame]
+    of, entries = [], []
+    for frame in range(len(places)):
+        detector.frame, before = frame, len(detector.searched)
+        entries.append(frames.find_chains(X + level, frame))
+        of += [frame] * (len(detector.searched) > before)
+    return of, entries
+
+
+def follow_by(monkeypatch, answer):
+    monkeypatch.setattr(frame_search, "follow_chains", lambda x, expected, *_: answer(expected))
+
+
+def test_a_catheter_that_moves_on_is_only_fitted_in_two_of_three_frames(monkeypatch):
+    frames, detector, _ = search(1.0, shares=False, near_px=4.0)
+    detector.family = SimpleNamespace(catheter="reference")
+    follow_by(monkeypatch, tuple)
+    searched, entries = searched_of(frames, detector, [2.0 * frame for frame in range(10)])
+    # Its motion is known from the third frame on, and the search must agree with it first.
+    assert searched == [0, 1, 2, 5, 8]
+    for frame, entry in enumerate(entries):
+        assert entry.frame == frame
+        assert np.allclose(entry.chains[0].pixels_uv, POINTS + 2.0 * frame)
+
+
+def test_a_frame_that_the_fit_does_not_show_is_searched(monkeypatch):
+    frames, detector, _ = search(1.0, shares=False, near_px=4.0)
+    detector.family = SimpleNamespace(catheter="reference")
+    follow_by(monkeypatch, lambda expected: None)
+    assert searched_of(frames, detector, [0.0] * 6)[0] == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_catheter_that_moves_otherwise_is_not_followed_at_once(monkeypatch):
+    frames, detector, _ = search(1.0, shares=False, near_px=4.0)
+    detector.family = SimpleNamespace(catheter="reference")
+    follow_by(monkeypatch, tuple)
+    assert searched_of(frames, detector, [0.0, 0, 20, 40, 60, 60, 60])[0] == [0, 1, 2, 3, 6]
+
+
+def test_catheters_that_only_the_mean_shows_are_not_followed(monkeypatch):
+    frames, detector, _ = search(2.0, shares=False, near_px=4.0)
+    detector.family = SimpleNamespace(catheter="reference")
+    follow_by(monkeypatch, lambda expected: 1 / 0)
+    for frame in range(6):
+        assert frames.find_chains(X + 1, frame, [X + 2, X + 3]).chains
 
 
 def test_in_slow_runs_no_answer_is_carried():
