@@ -136,7 +136,11 @@ class TrackEvidence:
             least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
             return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
         least = self._least(paths, _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR)
-        return bool(middle.mean() >= least and _are_electrodes(odds.mean(axis=0)))
+        if middle.mean() >= least and _are_electrodes(odds.mean(axis=0)):
+            return True
+        # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
+        odds_all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
+        return bool(np.median(odds_all_along) >= least and _are_electrodes(odds_all_along))
 
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""

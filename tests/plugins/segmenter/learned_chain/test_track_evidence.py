@@ -160,14 +160,15 @@ def test_electrodes_outside_the_field_do_not_count(monkeypatch):
     assert not judge(known, lambda frame: None)
 
 
-@pytest.mark.parametrize(("electrodes", "accepted"), [(10, True), (4, False)])
-def test_a_long_catheter_at_rest_over_anatomy_is_judged_by_frames_all_along_its_track(
-    monkeypatch, electrodes, accepted
+@pytest.mark.parametrize(("all_along", "accepted"), [(0.5, True), (-1.5, False)])
+@pytest.mark.parametrize("electrodes", [4, 10])
+def test_a_catheter_at_rest_over_anatomy_or_in_noise_is_judged_by_frames_all_along_its_track(
+    monkeypatch, electrodes, all_along, accepted
 ):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
 
     def along(self, frames, path_uv, log_image):
-        return evidence(np.full(path_uv.shape[1], 0.5 if np.ptp(frames) > FRAMES else -1.5))
+        return evidence(np.full(path_uv.shape[1], all_along if np.ptp(frames) > FRAMES else -1.5))
 
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
