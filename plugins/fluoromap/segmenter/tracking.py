@@ -48,6 +48,8 @@ _REVERSED_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
+_ASKED_FOR_DIRECTION = 20
+"""How many frames before and after the seed say which direction its chains have."""
 
 
 def track_chains(
@@ -149,13 +151,17 @@ def track_chains(
 def _as_frames_say(
     seed: FrameChains | None, found: Sequence[FrameChains], frame_times_ms: Array, catheters: int, marks_first: bool
 ) -> FrameChains | None:
-    """Return the seed with each chain in the direction that the frames say.
+    """Return the seed with each chain in the direction that the frames near it say.
 
     A chain in the wrong direction would be fitted again in each frame, with the tip's length at the wrong end.
     """
     if seed is None or not seed.chains:
         return seed
-    tracks = _follow(found, frame_times_ms, catheters, None, seed, marks_first)
+    near = [
+        entry if abs(entry.frame - seed.frame) <= _ASKED_FOR_DIRECTION else FrameChains(entry.frame, ())
+        for entry in found
+    ]
+    tracks = _follow(near, frame_times_ms, catheters, None, seed, marks_first)
     begun = [track for track in tracks if track.from_seed]
     if len(begun) < len(seed.chains):
         return seed

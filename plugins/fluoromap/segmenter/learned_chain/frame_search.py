@@ -28,7 +28,7 @@ _MEAN_CELLS, _NEXT_FRAME_CELLS, _CARRIED_CELLS = 2, 3, 2
 """How far from a place the network's answer for it may lie. A catheter moves 2 mm in a frame of a fast run: 3 cells."""
 _MOST_CARRIED = 12
 """How many frames may use an answer that is carried along with the catheters."""
-_MOST_FOLLOWED = 2
+_MOST_FOLLOWED = 3
 """How many frames in a row may be fitted without a search."""
 _CARRIED_WITHIN = 4.0
 """How far from an electrode the image moves with it, over ``near_px``."""
@@ -59,9 +59,10 @@ class FrameSearch:
     - Where catheters lack still, pairs of electrodes that the network found as one are split.
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
     - Where all catheters were found in the frames before, twelve more frames use the answer, carried along with the catheters.
-    - Of these frames, two of three are not searched: clear catheters that move on as before are only fitted.
+    - Of these frames, three of four are not searched: clear catheters that move on as before are only fitted.
     - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or a catheter more than
-      ``near_px`` from where it would be if it moved on, is searched again with an answer of its own.
+      ``near_px`` from where it would be if it moved on, is searched again with an answer of its own. So are the frames after it,
+      until catheters move on again.
     """
 
     detector: ChainDetector
@@ -79,6 +80,7 @@ class FrameSearch:
     _noisy: bool = field(default=False, init=False)
     _noise: float | None = field(default=None, init=False)
     _may_follow: int = field(default=0, init=False)
+    _erratic: bool = field(default=False, init=False)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
         """Return the chains of one log image; see :class:`~fluoromap.segmenter.run_segmentation.Detector`."""
@@ -88,8 +90,9 @@ class FrameSearch:
         entry = None if expected is None else self._follow(x, expected)
         if entry is None:
             entry = self._find_chains(x, frame, beside, expected)
-            moved_on = expected is not None and _motion_px(expected, entry) <= self.near_px
-            self._may_follow = _MOST_FOLLOWED if moved_on else 0
+            if expected is not None:
+                self._erratic = _motion_px(expected, entry) > self.near_px
+            self._may_follow = _MOST_FOLLOWED if expected is not None and not self._erratic else 0
         if is_next:
             self.answers.network.store(frame, self._own)
             self._store_blobs(x, frame)
@@ -103,8 +106,10 @@ class FrameSearch:
             _, entry = self._search(x, first, frame, _NEXT_FRAME_CELLS)
             if entry.manual_needed is None and len(entry.chains) >= len(self._answered.chains):
                 return entry
-        elif expected is not None and (carried := self._search_carried(x, first, expected)) is not None:
-            return carried
+        elif expected is not None and not self._erratic:
+            carried = self._search_carried(x, first, expected)
+            if carried is not None:
+                return carried
         searched, entry = self._search(x, first, frame, OWN_CELLS)
         if beside and self._lacks_catheters(entry):
             again, other = self._search(x, second, frame, OWN_CELLS)

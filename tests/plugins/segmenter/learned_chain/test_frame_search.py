@@ -199,13 +199,13 @@ def follow_by(monkeypatch, answer):
     monkeypatch.setattr(frame_search, "follow_chains", lambda x, expected, *_: answer(expected))
 
 
-def test_a_catheter_that_moves_on_is_only_fitted_in_two_of_three_frames(monkeypatch):
+def test_a_catheter_that_moves_on_is_only_fitted_in_three_of_four_frames(monkeypatch):
     frames, detector, _ = search(1.0, shares=False, near_px=4.0)
     detector.family = SimpleNamespace(catheter="reference")
     follow_by(monkeypatch, tuple)
     searched, entries = searched_of(frames, detector, [2.0 * frame for frame in range(10)])
     # Its motion is known from the third frame on, and the search must agree with it first.
-    assert searched == [0, 1, 2, 5, 8]
+    assert searched == [0, 1, 2, 6]
     for frame, entry in enumerate(entries):
         assert entry.frame == frame
         assert np.allclose(entry.chains[0].pixels_uv, POINTS + 2.0 * frame)
@@ -222,7 +222,15 @@ def test_a_catheter_that_moves_otherwise_is_not_followed_at_once(monkeypatch):
     frames, detector, _ = search(1.0, shares=False, near_px=4.0)
     detector.family = SimpleNamespace(catheter="reference")
     follow_by(monkeypatch, tuple)
-    assert searched_of(frames, detector, [0.0, 0, 20, 40, 60, 60, 60])[0] == [0, 1, 2, 3, 6]
+    # In the third frame it is not where it would be; from the fourth on it moves as before.
+    assert searched_of(frames, detector, [0.0, 0, 20, 40, 60, 80, 100])[0] == [0, 1, 2, 3]
+
+
+def test_after_a_catheter_moved_otherwise_the_next_frame_has_an_answer_of_its_own_at_once():
+    frames, detector, asked = search(1.0, shares=False, near_px=4.0)
+    assert asked_in(frames, detector, asked, [0.0, 0, 0, 20, 40, 60]) == [0, 1, 3, 4]
+    # The fourth frame was searched with the carried answer first.
+    assert len(detector.searched) == 7
 
 
 def test_catheters_that_only_the_mean_shows_are_not_followed(monkeypatch):
