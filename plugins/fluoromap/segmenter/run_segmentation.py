@@ -540,7 +540,7 @@ def _assign_tracks(
 ) -> tuple[Chain, ...]:
     """Give each diastolic chain the track number of the averaged frames.
 
-    The number is that of the chains at the same place.
+    The number is that of the chains at the same place, where most of the averaged frames that show the track show it there.
     """
     taken: set[int] = {chain.track for chain in chains if chain.track >= 0}
     fresh = 1 + max((chain.track for entry in entries for chain in entry.chains), default=-1)
@@ -556,9 +556,9 @@ def _assign_tracks(
                 ]
                 if near and min(near)[0] <= _SAME_TRACK_PX:
                     votes[min(near)[1]] = votes.get(min(near)[1], 0) + 1
-            if votes:
-                number = max(votes, key=lambda track: votes[track])
-            else:
+            number = max(votes, key=lambda track: votes[track], default=-1)
+            shown = sum(any(other.track == number for other in entries[frame].chains) for frame in averaged)
+            if number < 0 or 2 * votes[number] < shown:
                 number, fresh = fresh, fresh + 1
             taken.add(number)
             chain = replace(chain, track=number)

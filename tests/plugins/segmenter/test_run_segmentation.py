@@ -1,5 +1,7 @@
 """Chains of a run's frames and of its diastolic mean become one answer."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from fluoromap.catheters import Catalogue, catheter_type
@@ -66,3 +68,31 @@ def test_the_mean_of_a_run_has_its_tip_where_the_frames_have_it():
     assert {each.track for entry in found.frames for each in entry.chains} == {diastolic.track}
     # It was fitted again in that direction: a tip is longer than a ring.
     assert any(np.array_equal(known.pixels_uv, PLACES) for known in detector.fitted)
+
+
+class DisplacedMean(Detector):
+    """Finds the catheter displaced in the mean, and in these frames."""
+
+    def __init__(self, count, displaced):
+        super().__init__(count)
+        self.displaced = displaced
+
+    def find_chains(self, x, frame, beside=()):
+        self.searched += 1
+        there = self.searched > self.count or frame in self.displaced
+        return FrameChains(frame, (replace(chain(1.0), pixels_uv=PLACES + np.array([0.0, 14.0 * there])),))
+
+
+def test_a_chain_of_the_mean_belongs_to_a_track_where_most_of_its_frames_show_it():
+    run = Run(Frames(12), np.arange(12) * 33.0, 4.0, PixelFacts(False, 12, False))
+
+    def segmented(displaced):
+        detector = DisplacedMean(12, displaced)
+        return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
+
+    averaged = segmented(()).diastole_frames
+    assert len(averaged) >= 3
+    assert len(segmented(averaged).diastole.chains) == 1
+    found = segmented(averaged[:1])
+    assert found.diastole.chains == ()
+    assert {each.track for entry in found.frames for each in entry.chains} == {0}

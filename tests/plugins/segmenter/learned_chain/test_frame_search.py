@@ -185,7 +185,7 @@ def test_a_carried_answer_is_asked_about_places_where_the_catheter_was_then():
 
 
 def searched_of(frames, detector, places, level=1.0):
-    """Return the frames that were searched, and all entries, where the catheter is at these places."""
+    """Return the searched frames and all entries of a catheter at these places."""
     detector.chain_at = lambda frame: places[frame]
     of, entries = [], []
     for frame in range(len(places)):
@@ -226,7 +226,7 @@ def test_a_catheter_that_moves_otherwise_is_not_followed_at_once(monkeypatch):
     assert searched_of(frames, detector, [0.0, 0, 20, 40, 60, 80, 100])[0] == [0, 1, 2, 3]
 
 
-def test_after_a_catheter_moved_otherwise_the_next_frame_has_an_answer_of_its_own_at_once():
+def test_after_a_sudden_motion_the_next_frame_asks_the_network_at_once():
     frames, detector, asked = search(1.0, shares=False, near_px=4.0)
     assert asked_in(frames, detector, asked, [0.0, 0, 0, 20, 40, 60]) == [0, 1, 3, 4]
     # The fourth frame was searched with the carried answer first.
