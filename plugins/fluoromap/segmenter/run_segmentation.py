@@ -258,16 +258,19 @@ def segment_run(
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
+    needs_track = shows_catheter is not None and count > 1
     if search_again:
         chains = _turned_as_tracks(mean_x, chains, detector, averaged, entries)
+        if needs_track:
+            # Else it would take the place of a catheter that the frames show.
+            chains = _on_tracks(_assign_tracks(chains, averaged, entries), entries)
         chains = _add_missing_catheters(mean_x, chains, detector, averaged, entries, catheters)
     chains, averaged = _apply_marks(chains, averaged, entries, automatic, motion, run.px_per_mm)
     chains = _assign_tracks(chains, averaged, entries)
     if search_again:
         chains = _with_shapes_of_tracks(mean_x, chains, detector, averaged, entries)
-    if shows_catheter is not None and count > 1:
-        tracks = {chain.track for entry in entries for chain in entry.chains}
-        chains = tuple(chain for chain in chains if chain.manual or chain.track in tracks)
+    if needs_track:
+        chains = _on_tracks(chains, entries)
     reason = None if chains else Reason.MANUAL_NEEDED
     if chains:
         extra = recall(
@@ -533,6 +536,12 @@ def _apply_marks(
         return chains, averaged
     quietest = min(lacking, key=lambda frame: float(motion[frame]))
     return _merge_marks(entries[quietest].chains, automatic[quietest], px_per_mm), (quietest,)
+
+
+def _on_tracks(chains: Sequence[Chain], entries: Sequence[FrameChains]) -> tuple[Chain, ...]:
+    """Return the chains that were set by hand or belong to a track."""
+    tracks = {chain.track for entry in entries for chain in entry.chains}
+    return tuple(chain for chain in chains if chain.manual or chain.track in tracks)
 
 
 def _assign_tracks(
