@@ -45,6 +45,7 @@ _SEEN_AT_LEAST = 0.2
 _RECOVERED_AT_LEAST = 0.5
 _LONG_RUN = 5
 _REVERSED_PX = 4.0
+_TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
@@ -384,8 +385,11 @@ def _advance(
         tracks[number].detections += 1
         tracks[number].direction += -_tip_odds(chain) if other_way else _tip_odds(chain)
         if other_way:
+            beside = [other for other in entry.chains if other is not chain]
             chain = reverse(chain)
-        if search is not None and not by_hand and (other_way or _is_bent(tracks[number], chain, time_ms)):
+            if search is not None and not by_hand:
+                chain = _fitted_again(chain, entry.frame, beside, search)
+        if search is not None and not by_hand and _is_bent(tracks[number], chain, time_ms):
             bent.append((number, chain))
         else:
             _extend(tracks[number], chain, entry.frame, time_ms)
@@ -410,6 +414,17 @@ def _advance(
             track = Track(chain, time_ms, np.zeros(2), manual=chain.manual, chains={entry.frame: chain})
             track.direction = _tip_odds(chain)
             tracks.append(track)
+
+
+def _fitted_again(chain: Chain, frame: int, beside: Sequence[Chain], search: ChainSearch) -> Chain:
+    """Return a reversed chain fitted again at its place: a tip is longer than a ring.
+
+    The fit depends on the frame alone, so that a correction elsewhere in the run finds it stored.
+    """
+    again = search(frame, chain, np.zeros(2), _TURNED_REACH_PX, beside)
+    if again is None or overlaps(again, beside):
+        return chain
+    return replace(again, kinds=chain.kinds, tip_odds=chain.tip_odds)
 
 
 def _search(
