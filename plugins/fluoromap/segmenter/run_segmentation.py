@@ -20,7 +20,7 @@ from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance, reverse
+from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance, overlaps, reverse
 
 T = TypeVar("T")
 
@@ -132,6 +132,13 @@ class RunDetections:
 
 
 @dataclass(frozen=True, eq=False)
+class RunTracks:
+    """The tracked chains of a run without any marks, one entry a frame."""
+
+    frames: tuple[FrameChains, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class FoundAgain:
     """The answer of :meth:`Detector.find_again`."""
 
@@ -182,7 +189,7 @@ def segment_run(
     """Segment a run: tracked chains of all frames, and diastolic chains.
 
     Chains at diastole come from the mean of the quiet frames round diastole. Marks replace the automatic chains of their
-    frames, and the tracks start from the first marked frame. At diastole a mark counts as follows:
+    frames, and the tracks of the run are followed again from the first marked frame. At diastole a mark counts as follows:
 
     - A mark in one of the averaged frames replaces the automatic chain of the same catheter or place.
     - A mark elsewhere, of a catheter that is missing at diastole, moves diastole to the quietest marked frame. The
@@ -231,12 +238,6 @@ def segment_run(
         for index, entry in enumerate(detections.frames)
         if index in marks
     }
-    found = [
-        FrameChains(entry.frame, tuple(replace(chain, manual=True) for chain in marks[entry.frame]))
-        if entry.frame in marks
-        else entry
-        for entry in detections.frames
-    ]
     context.progress(0.9)
     context.check()
     mean = detections.mean
@@ -247,14 +248,21 @@ def segment_run(
     search = _chain_search(detector, log_image, context, recall) if search_again else None
     seed = mean if len(averaged) > 1 else None
     accepts = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
-    entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
-    if search_moving:
+
+    def tracked(found: Sequence[FrameChains]) -> tuple[FrameChains, ...]:
+        entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
+        if not search_moving:
+            return entries
         hidden = _moving_search(detector, log_image, run.frame_times_ms, context, recall)
 
         def follow(found: Sequence[FrameChains], start: FrameChains) -> tuple[FrameChains, ...]:
             return track_chains(found, run.frame_times_ms, catheters, search, start, accepts, marks_first=False)
 
-        entries = add_hidden_catheters(found, entries, catalogue, run.px_per_mm, hidden, follow)
+        return add_hidden_catheters(found, entries, catalogue, run.px_per_mm, hidden, follow)
+
+    entries = recall(RunTracks, (), lambda: RunTracks(tracked(detections.frames))).frames
+    if marks:
+        entries = tracked(_with_marks(entries, detections.frames, marks))
     entries = _mark_out_of_field(entries, field)
     context.progress(0.95)
     chains = mean.chains
@@ -289,6 +297,25 @@ def segment_run(
         frame_times_ms=run.frame_times_ms,
         r_wave_frames=run.r_wave_frames,
     )
+
+
+def _with_marks(tracked: Sequence[FrameChains], detections: Sequence[FrameChains], marks: Marks) -> list[FrameChains]:
+    """Return the chains from which the tracks of a marked run are followed.
+
+    The tracks of the run without marks have found their catheters in most frames, so that few are searched again. Detections that
+    are on none of these tracks may belong to the marked catheter.
+    """
+    found = []
+    for entry, detected in zip(tracked, detections, strict=True):
+        if entry.frame in marks:
+            by_hand = tuple(replace(chain, manual=True) for chain in marks[entry.frame])
+            found.append(FrameChains(entry.frame, by_hand))
+            continue
+        chains = tuple(replace(chain, track=-1) for chain in entry.chains)
+        others = tuple(chain for chain in detected.chains if not overlaps(chain, chains))
+        reason = detected.manual_needed if others or not chains else None
+        found.append(FrameChains(entry.frame, (*chains, *others), reason))
+    return found
 
 
 def _detect(

@@ -417,9 +417,9 @@ def _advance(
 
 
 def _fitted_again(chain: Chain, frame: int, beside: Sequence[Chain], search: ChainSearch) -> Chain:
-    """Return a reversed chain fitted again at its place: a tip is longer than a ring.
+    """Fit a reversed chain again at its place.
 
-    The fit depends on the frame alone, so that a correction elsewhere in the run finds it stored.
+    A tip is longer than a ring. The fit depends on the frame alone, so that a correction elsewhere in the run finds it stored.
     """
     again = search(frame, chain, np.zeros(2), _TURNED_REACH_PX, beside)
     if again is None or overlaps(again, beside):

@@ -99,3 +99,63 @@ def test_a_chain_of_the_mean_belongs_to_a_track_where_most_of_its_frames_show_it
     (usual,) = found.diastole.chains
     assert np.array_equal(usual.pixels_uv, PLACES)
     assert {each.track for entry in found.frames for each in entry.chains} == {usual.track}
+
+
+class HiddenInSomeFrames(Detector):
+    """Finds the catheter in most frames; the others need a second search."""
+
+    def find_chains(self, x, frame, beside=()):
+        return FrameChains(frame, () if frame in (2, 9) else (chain(1.0),))
+
+    def find_again(self, x, known, shift, reach_px, taken, frame=None, same_shape=False, confirmed=False):
+        if frame is not None:
+            self.fitted.append(frame)
+        return known
+
+
+class Remembering(Silent):
+    """Remembers the partial results that depend on the run alone."""
+
+    def __init__(self):
+        self.results = {}
+
+    def recall(self, kind, inputs, compute):
+        if len(inputs) > 1:
+            return compute()
+        if kind not in self.results:
+            self.results[kind] = compute()
+        return self.results[kind]
+
+
+def test_a_correction_searches_no_frame_again_in_which_the_run_without_it_shows_the_catheter():
+    run = Run(Frames(12), np.arange(12) * 33.0, 4.0, PixelFacts(False, 12, False), content="run")
+    context = Remembering()
+
+    def segmented(marks):
+        detector = HiddenInSomeFrames(12)
+        found = segment_run(run, CATALOGUE, marks, context, lambda field: detector, True, True, lambda *_: True)
+        return found, detector.fitted
+
+    found, searched = segmented({})
+    assert sorted(set(searched)) == [2, 9]
+    assert all(len(entry.chains) == 1 for entry in found.frames)
+    corrected = replace(chain(None), pixels_uv=PLACES + 1.0, kinds=(("reference", 1.0),))
+    again, searched = segmented({5: (corrected,)})
+    assert searched == []
+    assert all(len(entry.chains) == 1 for entry in again.frames)
+    assert len({each.track for entry in again.frames for each in entry.chains}) == 1
+    (by_hand,) = again.frames[5].chains
+    assert by_hand.manual
+    assert np.array_equal(by_hand.pixels_uv, PLACES + 1.0)
+
+
+def test_a_mark_brings_back_detections_of_a_catheter_that_the_run_did_not_accept():
+    run = Run(Frames(12), np.arange(12) * 33.0, 4.0, PixelFacts(False, 12, False))
+
+    def segmented(marks):
+        detector = Detector(12)
+        return segment_run(run, CATALOGUE, marks, Silent(), lambda field: detector, True, True, lambda *_: False)
+
+    assert not any(entry.chains for entry in segmented({}).frames)
+    found = segmented({5: (chain(None),)})
+    assert all(len(entry.chains) == 1 for entry in found.frames)
