@@ -18,7 +18,7 @@ from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_cov
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
-from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.field_mask import FieldMask, are_in
 from fluoromap.segmenter.linking import (
     CandidateChain,
     CatheterFamily,
@@ -514,7 +514,7 @@ class ChainDetector:
             values[hidden] = np.median(values[~hidden])
         score = chain_score(points, weights, variance, self._shafts(seen), family)
         # Half an electrode at the edge cannot be located.
-        scores[~_are_in(self.field.with_edge, points)] = UNSEEN
+        scores[~are_in(self.field.with_edge, points)] = UNSEEN
         in_view = confirmed and np.mean(seen.likeness.at(points[is_seen])) >= _CONFIRMED_CONTRAST
         if score < family.floor - _AGAIN_SLACK and not in_view:
             return None
@@ -563,7 +563,7 @@ class ChainDetector:
 
     def _is_seen(self, points_uv: Array) -> BoolArray:
         """Return which points lie in the field, (n,)."""
-        return _are_in(self.field.inside, points_uv)
+        return are_in(self.field.inside, points_uv)
 
     def _scores_in_field(self, seen: ImageEvidence, points_uv: Array) -> Array:
         """Return how clearly electrodes show at points, NaN outside the field, (n,)."""
@@ -587,14 +587,6 @@ def _is_doubtful(chain: Chain, seen: ImageEvidence) -> bool:
     """Return whether a long chain has a place that is clearly no electrode."""
     places = chain.pixels_uv[chain.scores > UNSEEN]
     return len(chain.electrodes) >= MANY_ELECTRODES and bool((seen.kind_odds_at(places) < _NO_ELECTRODE).any())
-
-
-def _are_in(field: BoolArray, points_uv: Array) -> BoolArray:
-    """Return which points lie in a part of the image, (n,)."""
-    pixels = np.rint(points_uv).astype(np.int64)
-    nearest = np.minimum(np.maximum(pixels, 0), np.array(field.shape[::-1]) - 1)
-    inside: BoolArray = field[nearest[:, 1], nearest[:, 0]] & (pixels == nearest).all(axis=1)
-    return inside
 
 
 def _bending_px(reach_px: float) -> float:

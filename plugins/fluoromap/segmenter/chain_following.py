@@ -10,6 +10,7 @@ import numpy as np
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
 from fluoromap.segmenter.chain_fitting import widen_covariance
+from fluoromap.segmenter.field_mask import are_in
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.refinement import refine
 
@@ -64,9 +65,9 @@ def follow_chains(
         if (away > reach_px).any() or (fit.clearness < _CLEAR).any():
             return None
         gaps = np.linalg.norm(np.diff(fit.points_uv, axis=1), axis=2)
-        if (gaps < _LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)).any() or not _all_inside(
-            fit.points_uv, inside
-        ):
+        if (gaps < _LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)).any():
+            return None
+        if not are_in(inside, fit.points_uv.reshape(-1, 2)).all():
             return None
         for row, index in enumerate(own):
             found[index] = replace(
@@ -89,11 +90,3 @@ def _lie_alone(places: Sequence[Array], distance_px: float) -> bool:
             if (apart * apart).sum(axis=2).min() < distance_px * distance_px:
                 return False
     return True
-
-
-def _all_inside(points_uv: Array, inside: BoolArray) -> bool:
-    """Return whether all points (..., 2) lie in the field."""
-    pixels = np.rint(points_uv.reshape(-1, 2)).astype(np.int64)
-    if (pixels < 0).any() or (pixels >= inside.shape[::-1]).any():
-        return False
-    return bool(inside[pixels[:, 1], pixels[:, 0]].all())

@@ -57,6 +57,14 @@ class FieldMask:
         return x
 
 
+def are_in(field: BoolArray, points_uv: Array) -> BoolArray:
+    """Return which points lie in a part of the image, (n,)."""
+    pixels = np.rint(points_uv).astype(np.int64)
+    nearest = np.minimum(np.maximum(pixels, 0), np.array(field.shape[::-1]) - 1)
+    inside: BoolArray = field[nearest[:, 1], nearest[:, 0]] & (pixels == nearest).all(axis=1)
+    return inside
+
+
 def find_field(frames: FrameSource, facts: PixelFacts) -> FieldMask:
     """Return the field mask of a run.
 
