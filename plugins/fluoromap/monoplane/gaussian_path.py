@@ -7,11 +7,13 @@ that the cost is linear in their number.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg.lapack import dtrtri
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.geometry import Camera
@@ -111,75 +113,80 @@ def _linearise(evidence: Evidence, positions_mm: Array) -> _Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class _WhiteEvidence:
-    """The evidence with unit noise; each frame's own deviation is integrated out.
+class WhiteEvidence:
+    """The evidence with unit noise, linearised at some positions; each frame's own deviation is integrated out.
 
-    gap : (n, r) difference from the prior mean's prediction. by_position : (n, r, 3 m), by_w : (n, r, q + k) its slopes.
-    The last k coefficients are the lasting errors of the lengths.
+    gap : (n, r) difference from the prior mean's prediction. by_position : (n, r, 3 m), by_w : (n, r, q + k) its slopes, before
+    any gain. The last k coefficients are the lasting errors of the lengths.
+    information : (q + k, q + k), vector : (q + k,) the information on the coefficients.
     """
 
     gap: Array
     by_position: Array
     by_w: Array
-
-    def information(self) -> tuple[Array, Array]:
-        """Return the information on ``w``: matrix (q, q) and vector (q,)."""
-        flat = self.by_w.reshape(-1, self.by_w.shape[2])
-        return flat.T @ flat, flat.T @ self.gap.reshape(-1)
+    information: Array
+    vector: Array
 
 
-def _with_lengths(columns: Array, lengths: Lengths) -> Array:
-    """Return columns (n, 3 m, q + k): the lengths' lasting errors displace no electrode by themselves."""
-    none = np.zeros((*columns.shape[:2], len(lengths.first)))
-    return np.concatenate([columns, none], axis=2)
-
-
-def _whiten(evidence: Evidence, prior: PathPrior, columns: Array, positions_mm: Array) -> _WhiteEvidence:
-    """Linearise the evidence at ``positions_mm`` and whiten it; ``columns`` (n, 3 m, q + k)."""
-    linear = _linearise(evidence, positions_mm)
-    from_mean = (positions_mm - prior.mean_mm).reshape(len(columns), -1, 1)
+def whiten(prior: PathPrior, evidence: Evidence, at_mm: Array) -> WhiteEvidence:
+    """Linearise the evidence at ``at_mm`` (n, m, 3) and whiten it."""
+    linear = _linearise(evidence, at_mm)
+    from_mean = (at_mm - prior.mean_mm).reshape(len(at_mm), -1, 1)
     gap = linear.residual[..., None] + linear.slope @ from_mean
     spread = linear.noise + linear.slope @ prior.white_mm2 @ np.swapaxes(linear.slope, 1, 2)
-    whiten = np.linalg.inv(np.linalg.cholesky(spread))
-    by_position = whiten @ linear.slope
-    by_w = by_position @ columns
-    lasting = evidence.lengths.lasting_sd_mm
-    if len(lasting):
-        by_w[:, :, -len(lasting) :] += whiten[:, :, -len(lasting) :] * lasting
-    return _WhiteEvidence((whiten @ gap)[..., 0], by_position, by_w)
+    k, q, positions = len(evidence.lengths.first), len(prior.parts), linear.slope.shape[2]
+    lasting = np.zeros((*gap.shape[:2], k))
+    lasting[:, gap.shape[1] - k :] = np.diag(evidence.lengths.lasting_sd_mm)
+    white = np.linalg.solve(np.linalg.cholesky(spread), np.concatenate([gap, linear.slope, lasting], axis=2))
+    gap, by_position = white[:, :, 0], white[:, :, 1 : 1 + positions]
+    by_columns = by_position @ prior.columns_mm.reshape(len(at_mm), positions, q)
+    # The lengths' lasting errors displace no electrode by themselves.
+    by_w = np.concatenate([by_columns, white[:, :, 1 + positions :]], axis=2)
+    flat = by_w.reshape(-1, q + k)
+    return WhiteEvidence(gap, by_position, by_w, flat.T @ flat, flat.T @ gap.reshape(-1))
 
 
-def estimate_gains(prior: PathPrior, evidence: Evidence, at_mm: Array, choices: Sequence[Sequence[float]]) -> Array:
+def estimate_gains(prior: PathPrior, white: WhiteEvidence, choices: Sequence[Sequence[float]]) -> Array:
     """Estimate the gains (1 + parts,) of greatest marginal likelihood.
 
     Coordinate ascent chooses among ``choices`` for each part from 1 on. A log-normal prior around 1 with standard deviation
     1.5 keeps a gain near 1 where the view shows nothing about it. The first entry, of the fixed part, is 1.
     """
-    columns = _with_lengths(prior.columns_mm.reshape(len(at_mm), -1, len(prior.parts)), evidence.lengths)
-    parts = np.concatenate([prior.parts, np.zeros(len(evidence.lengths.first), dtype=np.int64)])
-    information, vector = _whiten(evidence, prior, columns, at_mm).information()
-    gains = np.ones(1 + len(choices))
+    parts = prior.parts[prior.parts > 0]
+    free = np.zeros(len(white.vector), dtype=np.bool_)
+    free[: len(prior.parts)] = prior.parts > 0
+    information, vector = _without_fixed(free, white.information, white.vector)
 
-    def likelihood(trial: Array) -> float:
+    @functools.cache
+    def likelihood(*trial: float) -> float:
         scale = np.sqrt(trial)[parts]
-        whole = scale[:, None] * information * scale + np.eye(len(scale))
-        factor = cho_factor(whole, lower=True, overwrite_a=True, check_finite=False)
-        explained = (scale * vector) @ cho_solve(factor, scale * vector, check_finite=False)
+        whole = information * np.outer(scale, scale)
+        whole.flat[:: len(scale) + 1] += 1.0
+        factor = np.linalg.cholesky(whole)
+        explained = solve_triangular(factor, scale * vector, lower=True, check_finite=False)
         penalty = (np.log(trial) ** 2).sum() / _GAIN_PRIOR_SD**2
-        return float(0.5 * explained - np.log(np.diag(factor[0])).sum() - 0.5 * penalty)
+        return float(0.5 * explained @ explained - np.log(np.diag(factor)).sum() - 0.5 * penalty)
 
-    best = likelihood(gains)
+    gains = [1.0] * (1 + len(choices))
     for _ in range(2):
         before = gains
         for part, values in enumerate(choices, start=1):
             for value in values:
-                trial = gains.copy()
-                trial[part] = value
-                if value != gains[part] and (found := likelihood(trial)) > best:
-                    best, gains = found, trial
+                trial = [*gains[:part], value, *gains[part + 1 :]]
+                if likelihood(*trial) > likelihood(*gains):
+                    gains = trial
         if gains is before:
             break
-    return gains
+    return np.array(gains)
+
+
+def _without_fixed(free: BoolArray, information: Array, vector: Array) -> tuple[Array, Array]:
+    """Return the information on the ``free`` coefficients (q,) alone; the others are integrated out, with unit prior."""
+    fixed = information[np.ix_(~free, ~free)] + np.eye(int((~free).sum()))
+    factor = np.linalg.cholesky(fixed)
+    beside = solve_triangular(factor, information[np.ix_(~free, free)], lower=True, check_finite=False)
+    explained = solve_triangular(factor, vector[~free], lower=True, check_finite=False)
+    return information[np.ix_(free, free)] - beside.T @ beside, vector[free] - beside.T @ explained
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,31 +197,37 @@ class Paths:
     covariance_mm2: Array
 
 
-def most_probable(prior: PathPrior, evidence: Evidence, gains: Array, start_mm: Array, steps: int) -> Paths:
-    """Find the most probable paths by Gauss-Newton from ``start_mm``.
+def most_probable(
+    prior: PathPrior, evidence: Evidence, gains: Array, start_mm: Array, at_start: WhiteEvidence, steps: int
+) -> Paths:
+    """Find the most probable paths by Gauss-Newton from ``start_mm``, where ``at_start`` is linearised.
 
     The covariance is that of the last linearisation.
     """
     n, m = start_mm.shape[:2]
-    columns = (prior.columns_mm * np.sqrt(gains)[prior.parts]).reshape(n, 3 * m, -1)
-    columns = _with_lengths(columns, evidence.lengths)
-    positions = start_mm
-    for _ in range(steps):
-        white = _whiten(evidence, prior, columns, positions)
-        information, vector = white.information()
-        factor = np.linalg.cholesky(information + np.eye(len(vector)))
-        w = cho_solve((factor, True), vector, check_finite=False)
+    q = len(prior.parts)
+    scale = np.ones(len(at_start.vector))
+    scale[:q] = np.sqrt(gains)[prior.parts]
+    columns = prior.columns_mm.reshape(n, 3 * m, q)
+    positions, white = start_mm, at_start
+    for step in range(steps):
+        if step:
+            white = whiten(prior, evidence, positions)
+        factor = np.linalg.cholesky(white.information * np.outer(scale, scale) + np.eye(len(scale)))
+        w = scale * cho_solve((factor, True), scale * white.vector, check_finite=False)
         share = prior.white_mm2 @ np.swapaxes(white.by_position, 1, 2)
-        moved = columns @ w + (share @ (white.gap - white.by_w @ w)[..., None])[..., 0]
+        moved = columns @ w[:q] + (share @ (white.gap - white.by_w @ w)[..., None])[..., 0]
         found = prior.mean_mm + moved.reshape(n, m, 3)
         settled = np.abs(found - positions).max() < _SETTLED_MM
         positions = found
         if settled:
             break
-    left = (columns - share @ white.by_w).reshape(n * 3 * m, -1)
-    half = solve_triangular(factor, left.T, lower=True, check_finite=False).T.reshape(n, 3 * m, -1)
+    left = -share @ white.by_w
+    left[..., :q] += columns
+    # The inverse takes half the time of solving for so many columns.
+    half = (left.reshape(n * 3 * m, -1) @ (scale[:, None] * dtrtri(factor, lower=1)[0].T)).reshape(n, 3 * m, -1)
     covariance = half @ np.swapaxes(half, 1, 2) + prior.white_mm2 - share @ np.swapaxes(share, 1, 2)
-    unseen = (prior.unseen_mm * np.sqrt(gains)[prior.parts]).reshape(n, 3 * m, -1)
+    unseen = (prior.unseen_mm * scale[:q]).reshape(n, 3 * m, q)
     covariance = covariance + unseen @ np.swapaxes(unseen, 1, 2)
     return Paths(positions, (covariance + np.swapaxes(covariance, 1, 2)) / 2)
 

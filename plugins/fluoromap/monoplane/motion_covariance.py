@@ -107,9 +107,9 @@ class MotionCovariance:
         columns, unseen, parts, causes = [], [], [], []
         rays = self.rays[frames]
         for part, cause, seen_along, block in self._parts(frames):
-            along = _along(rays, block)
-            columns.append(block if seen_along else block - along)
-            unseen.append(np.zeros_like(along) if seen_along else along)
+            along = np.zeros_like(block) if seen_along else _along(rays, block)
+            columns.append(block - along)
+            unseen.append(along)
             parts += [part] * block.shape[-1]
             causes += [cause] * block.shape[-1]
         mean = self._expected.mean_mm[frames]

@@ -14,7 +14,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Context, MonoplaneView, Refusal, StudyShares, Track
 from fluoromap.monoplane.catheter_lengths import catheter_lengths
 from fluoromap.monoplane.expected_motion import expected_motion
-from fluoromap.monoplane.gaussian_path import Evidence, PathPrior, estimate_gains, most_probable, surprise
+from fluoromap.monoplane.gaussian_path import Evidence, PathPrior, estimate_gains, most_probable, surprise, whiten
 from fluoromap.monoplane.motion_covariance import BEND, FIXED, OFFSET, OTHER, TILT, MotionCovariance, MotionParams
 from fluoromap.monoplane.view_electrodes import (
     ViewElectrodes,
@@ -86,43 +86,49 @@ class MotionPrior:
         baseline = np.where(electrodes.visible[..., None], baseline, expected.mean_mm)
         windows = tuple(_windows(electrodes.phases))
         run = _Run(view, electrodes, baseline, covariance.rays, expected.mean_mm, expected.common_mm2)
-        trusted = self._trusted_pixels(run, [(frames, covariance.window(frames)) for frames in windows])
         n, m = electrodes.visible.shape
         positions, joint = baseline.copy(), np.zeros((n, 3 * m, 3 * m))
         depth = np.zeros((OTHER, n, m, m))
-        gated = electrodes.visible & ~trusted
+        trusted, gated = np.zeros((2, n, m), dtype=np.bool_)
         for number, frames in enumerate(windows):
             context.check()
             prior = covariance.window(frames)
-            positions[frames], joint[frames], depth[:, frames], closed = self._window(run, frames, prior, trusted)
-            gated[frames] |= closed & electrodes.visible[frames]
+            trusted[frames] = self._near(run, frames, prior)
+            positions[frames], joint[frames], depth[:, frames], closed = self._window(run, frames, prior, trusted[frames])
+            gated[frames] = (closed | ~trusted[frames]) & electrodes.visible[frames]
             context.progress((number + 1) / len(windows))
+        self._refuse_mirrored(run, trusted, windows, covariance)
         reasons = list(expected.reasons)
         if expected.cycle_spread > _IRREGULAR:
             reasons.append(Reason.IRREGULAR_RHYTHM)
         return self._track(run, positions, joint, depth, gated, reasons)
 
-    def _trusted_pixels(self, run: _Run, windows: list[tuple[slice, PathPrior]]) -> BoolArray:
-        """Return the pixels (n, m) that are near enough to the prior's expectation to be used.
+    def _near(self, run: _Run, frames: slice, prior: PathPrior) -> BoolArray:
+        """Return the pixels (n, m) that are near enough to the prior's expectation to be used."""
+        electrodes = run.electrodes
+        found = _by_catheter(electrodes, run.surprise(frames, prior), frames)
+        near: BoolArray = electrodes.visible[frames] & (found <= self._params.surprise_sd)
+        return near
+
+    def _refuse_mirrored(
+        self, run: _Run, trusted: BoolArray, windows: tuple[slice, ...], covariance: MotionCovariance
+    ) -> None:
+        """Raise where most pixels are too far away, but would not be in the mirrored image.
 
         Raises
         ------
         Refusal
-            VIEW_MIRRORED where most pixels are too far away, but would not be in the mirrored image.
+            VIEW_MIRRORED.
         """
-        electrodes = run.electrodes
-        limit = self._params.surprise_sd
-        found = np.concatenate([_by_catheter(electrodes, run.surprise(f, prior), f) for f, prior in windows])
-        trusted: BoolArray = electrodes.visible & (found <= limit)
-        if trusted.sum() < _MIRRORED_SHARE * electrodes.visible.sum():
-            mirrored = run.mirrored()
-            others = np.concatenate([_by_catheter(electrodes, mirrored.surprise(f, prior), f) for f, prior in windows])
-            if (electrodes.visible & (others <= limit)).sum() > 2 * trusted.sum():
-                raise Refusal(
-                    Reason.VIEW_MIRRORED,
-                    "This view agrees with the biplane positions only as a mirror image; check its image orientation.",
-                )
-        return trusted
+        if trusted.sum() >= _MIRRORED_SHARE * run.electrodes.visible.sum():
+            return
+        mirrored = run.mirrored()
+        near = sum(self._near(mirrored, frames, covariance.window(frames)).sum() for frames in windows)
+        if near > 2 * trusted.sum():
+            raise Refusal(
+                Reason.VIEW_MIRRORED,
+                "This view agrees with the biplane positions only as a mirror image; check its image orientation.",
+            )
 
     def _window(
         self, run: _Run, frames: slice, prior: PathPrior, trusted: BoolArray
@@ -135,19 +141,20 @@ class MotionPrior:
             Positions (n, m, 3), joint covariance (n, 3 m, 3 m), joint covariance of the depths from each cause that the study
             scales (4, n, m, m), and gated catheters (n, m).
         """
-        evidence = run.evidence(frames, trusted[frames])
+        evidence = run.evidence(frames, trusted)
         start, rays = run.baseline_mm[frames], run.rays[frames]
         free = bool((prior.parts != FIXED).any())
-        gains = estimate_gains(prior, evidence, start, _GAINS) if free else np.ones(4)
+        at_start = whiten(prior, evidence, start)
+        gains = estimate_gains(prior, at_start, _GAINS) if free else np.ones(4)
         for attempt in range(1 + _LOOSENINGS):
-            paths = most_probable(prior, evidence, gains, start, _STEPS)
+            paths = most_probable(prior, evidence, gains, start, at_start, _STEPS)
             apart = paths.positions_mm - start
             usual = prior.variance_mm2(gains, (FIXED, OFFSET), rays)
             closed = self._gated_catheters(run.electrodes, evidence.used, np.einsum("nmi,nmi->nm", apart, rays), usual)
             if not free or not closed.any() or attempt == _LOOSENINGS:
                 break
             gains[[TILT, BEND]] *= _LOOSER
-        outside = closed | (run.electrodes.visible[frames] & ~trusted[frames])
+        outside = closed | (run.electrodes.visible[frames] & ~trusted)
         along = prior.variance_mm2(gains, (FIXED, OFFSET, TILT, BEND), rays)
         # Path and baseline compete here, so that their distance is part of the uncertainty.
         alone = (
