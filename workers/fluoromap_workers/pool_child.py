@@ -116,6 +116,8 @@ def warm_up() -> None:
     So the first run does not wait. A plugin may offer a class method ``warm_up()``. A failure there is logged; later the
     stage reports it to the user.
     """
+    # Compiling makes millions of objects and keeps most: the collector would walk through them a thousand times.
+    gc.disable()
     for row in plugins():
         if row.error is not None:
             log.warning("plugin_broken", kind=row.kind, plugin=row.name)
@@ -128,3 +130,5 @@ def warm_up() -> None:
             log.warning("plugin_missing", kind=kind, plugin=name)
         except Exception:
             log.warning("plugin_not_warm", kind=kind, plugin=name, exc_info=True)
+    gc.enable()
+    gc.collect()

@@ -94,7 +94,9 @@ class MotionPrior:
             context.check()
             prior = covariance.window(frames)
             trusted[frames] = self._near(run, frames, prior)
-            positions[frames], joint[frames], depth[:, frames], closed = self._window(run, frames, prior, trusted[frames])
+            positions[frames], joint[frames], depth[:, frames], closed = self._window(
+                run, frames, prior, trusted[frames]
+            )
             gated[frames] = (closed | ~trusted[frames]) & electrodes.visible[frames]
             context.progress((number + 1) / len(windows))
         self._refuse_mirrored(run, trusted, windows, covariance)

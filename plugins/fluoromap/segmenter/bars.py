@@ -49,17 +49,18 @@ def products_beside(chain_uv: Array, shaft_image: ShaftImage, beside_mm: Array =
     products: Array = np.zeros((2, len(beside_mm), len(chain_uv), 3))
     _add_products(
         shaft_image.smooth, 1.0 / shaft_image.reduction, px_per_mm, corners_uv, corners_mm, offsets_mm,
-        np.empty((len(offsets_mm), samples)), products.reshape(-1, len(chain_uv), 3),
+        np.empty((len(offsets_mm), samples)), np.zeros(samples), products.reshape(-1, len(chain_uv), 3),
     )  # fmt: skip
     return products
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_products(smooth, scale, px_per_mm, corners_uv, corners_mm, offsets_mm, depths, products):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _add_products(smooth, scale, px_per_mm, corners_uv, corners_mm, offsets_mm, depths, own, products):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the products of :func:`products_beside`, (lines, electrodes, 3).
 
     The chain is the line through the corners; all corners but the first and the last are electrodes. offsets_mm : how far beside
-    the chain the lines are; the first is the chain's own. depths : (lines + 1, samples) the picture along the lines, overwritten.
+    the chain the lines are; the first is the chain's own. depths : (lines + 1, samples) the picture along the lines, own :
+    (samples,) the first line's less anatomy; both are overwritten.
     """
     last_u, last_v = smooth.shape[1] - 1.0, smooth.shape[0] - 1.0
     lines, samples = depths.shape
@@ -89,7 +90,6 @@ def _add_products(smooth, scale, px_per_mm, corners_uv, corners_mm, offsets_mm, 
             lower = smooth[below, left] + (x - left) * (smooth[below, right] - smooth[below, left])
             depths[line, i] = upper + (y - top) * (lower - upper)
     window = 2 * _MARGIN + 1
-    own = np.zeros(samples)
     for line in range(lines):
         electrode, anatomy = 0, 0.0
         for i in range(window - 1):

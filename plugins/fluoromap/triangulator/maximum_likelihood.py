@@ -9,7 +9,6 @@ from pydantic import BaseModel
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, MatchedSite, Triangulation
 from fluoromap.triangulator.estimate import JointLeastSquares
-from fluoromap.triangulator.moments import compile_kernels
 from fluoromap.triangulator.study_triangulation import calibrate_and_locate
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 
@@ -30,11 +29,6 @@ class MaximumLikelihood:
 
     def __init__(self, params: UncertaintyParams) -> None:
         self._params = params
-
-    @classmethod
-    def warm_up(cls) -> None:
-        """Compile the kernels."""
-        compile_kernels()
 
     def triangulate(self, sites: tuple[MatchedSite, ...], catalogue: Catalogue, context: Context) -> Triangulation:
         return calibrate_and_locate(sites, catalogue, context, self._params, JointLeastSquares())

@@ -40,12 +40,18 @@ class MomentEstimates:
         sources : sequence of ErrorSource
             Errors that electrodes share.
         """
-        from fluoromap.triangulator.moment_kernel import covariances
-
         p, n, _ = self.points_mm.shape
         effects = np.concatenate([_of_unit_errors(source) for source in sources], axis=-1).reshape(p, n, 4, -1)
-        found: Array = covariances(self.own, self.shared, self.row, np.stack(noise_px2), effects)
-        return found
+        together = np.einsum("pnc,pnck->pk", self.row, effects)
+        moved = self.own @ effects + self.shared[..., None] * together[:, None, None]
+        noise = _both_views(noise_px2)
+        noisy = self.own @ noise
+        mixed = (noisy @ self.row[..., None]) * self.shared[..., None, :]
+        variance = np.einsum("pna,pnab,pnb->p", self.row, noise, self.row, optimize=True)
+        common = variance[:, None, None, None] * self.shared[..., :, None] * self.shared[..., None, :]
+        parts = (noisy @ np.swapaxes(self.own, -1, -2), moved @ np.swapaxes(moved, -1, -2), mixed, common)
+        found: Array = sum(parts) + np.swapaxes(mixed, -1, -2)
+        return (found + np.swapaxes(found, -1, -2)) / 2
 
 
 def _of_unit_errors(source: ErrorSource) -> Array:
@@ -80,19 +86,11 @@ def separate_moments(cameras: Cameras, points_mm: Array) -> MomentEstimates:
     return MomentEstimates(points_mm, own, np.zeros((p, n, 3)), np.zeros((p, n, 4)))
 
 
-def compile_kernels() -> None:
-    """Compile the least squares, so that the first study does not wait."""
-    from fluoromap.triangulator.moment_kernel import covariances, step
-
-    own, shared, row = np.zeros((1, 1, 3, 4)), np.zeros((1, 1, 3)), np.zeros((1, 1, 4))
-    pixels, unit = np.zeros((2, 1, 1, 2)), np.broadcast_to(np.eye(2), (2, 1, 1, 2, 2)).copy()
-    matrices = np.stack([np.eye(3, 4), np.eye(3, 4)[[2, 0, 1]]])
-    step(matrices, np.ones((1, 1, 3)), pixels, unit, np.zeros((1, 1, 2, 2)), 1.0, own, shared, row)
-    covariances(own, shared, row, unit, np.zeros((1, 1, 4, 1)))
-
-
 def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, breathing: ErrorSource) -> MomentEstimates:
     """Estimate points by generalised least squares of all electrodes of a moment together.
+
+    Pixel noise is independent from electrode to electrode, and one displacement of the whole heart between the runs is common to
+    all. So the normal equations are blocks of 3 x 3 and a matrix of rank one, and no large matrix is inverted.
 
     Parameters
     ----------
@@ -101,18 +99,38 @@ def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, brea
     breathing : ErrorSource
         The displacement of the whole heart between the runs, one parameter.
     """
-    from fluoromap.triangulator.moment_kernel import step
-
     p, n, _ = start_mm.shape
     matrices = np.stack([camera.matrix for camera in cameras])
-    stacked, weights = np.stack(pixels.pixels), _inverse(np.stack(pixels.covariances))
-    common = np.ascontiguousarray(breathing.effect_px).reshape(p, n, 2, 2)
-    points = np.array(start_mm, order="C")
-    own, shared, row = np.empty((p, n, 3, 4)), np.empty((p, n, 3)), np.empty((p, n, 4))
+    seen = np.concatenate(pixels.pixels, axis=-1)
+    weights = _both_views([_inverse(covariance) for covariance in pixels.covariances])
+    common = breathing.effect_px.reshape(p, n, 4, 1)
+    pushed = weights @ common
+    variance = float(breathing.covariance[0, 0])
+    left = variance / (1.0 + variance * (pushed * common).sum(axis=(1, 2, 3)))
+    points = start_mm
     for _ in range(STEPS):
-        if (
-            step(matrices, points, stacked, weights, common, float(breathing.covariance[0, 0]), own, shared, row)
-            < SETTLED_MM
-        ):
+        projected = np.stack([points @ matrix[:, :3].T + matrix[:, 3] for matrix in matrices], axis=2)
+        at, depth = projected[..., :2] / projected[..., 2:], projected[..., 2:, None]
+        residual = seen - at.reshape(p, n, 4)
+        jacobian = ((matrices[:, :2, :3] - at[..., None] * matrices[:, 2:, :3]) / depth).reshape(p, n, 4, 3)
+        weighted = np.swapaxes(jacobian, -1, -2) @ np.concatenate([weights, pushed], axis=-1)
+        solved = np.linalg.solve(weighted[..., :4] @ jacobian, weighted)
+        own, along, pulled = solved[..., :4], solved[..., 4], weighted[..., 4]
+        steps = (own @ residual[..., None])[..., 0]
+        gain = left / (1.0 - left * (along * pulled).sum(axis=(1, 2)))
+        shared = along * gain[:, None, None]
+        rest = (steps * pulled).sum(axis=(1, 2)) - (pushed[..., 0] * residual).sum(axis=(1, 2))
+        moved = steps + shared * rest[:, None, None]
+        points = points + moved
+        if np.abs(moved).max() < SETTLED_MM:
             break
+    # What an electrode's own place explains of the common displacement.
+    row = (np.swapaxes(own, -1, -2) @ pulled[..., None] - pushed)[..., 0]
     return MomentEstimates(points, own, shared, row)
+
+
+def _both_views(blocks: Sequence[Array]) -> Array:
+    """Return matrices (p, N, 4, 4) of the pixels of view a and b, from those (p, N, 2, 2) of each view."""
+    both = np.zeros((*blocks[0].shape[:2], 4, 4))
+    both[..., :2, :2], both[..., 2:, 2:] = blocks
+    return both
