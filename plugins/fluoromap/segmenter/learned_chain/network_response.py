@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
@@ -215,21 +214,10 @@ def electrode_probability(trained: Trained, answers: Image) -> Image:
 
 def highest_near(probability: Image, cells: IntArray, reach: int) -> Array:
     """Return the highest probability of the cells within reach of each of the cells (n, 2), (n,)."""
-    highest = np.zeros(len(cells))
-    _write_highest(probability, cells, reach, highest)
+    near, (rows, columns) = np.arange(-reach, reach + 1), probability.shape
+    u, v = np.clip(cells[:, 0, None] + near, 0, columns - 1), np.clip(cells[:, 1, None] + near, 0, rows - 1)
+    highest: Array = probability[v[:, :, None], u[:, None, :]].max(axis=(1, 2))
     return highest
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _write_highest(probability, middle, reach, highest):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the highest probability of the cells near each of the cells (u, v)."""
-    last_v, last_u = probability.shape[0] - 1, probability.shape[1] - 1
-    for point in range(highest.size):
-        for dv in range(-reach, reach + 1):
-            v = min(max(middle[point, 1] + dv, 0), last_v)
-            for du in range(-reach, reach + 1):
-                u = min(max(middle[point, 0] + du, 0), last_u)
-                highest[point] = max(highest[point], probability[v, u])
 
 
 def _peaks(probability: Image, answers: Image, cell_px: float, first_px: float, variance_gain: float) -> Proposals:
