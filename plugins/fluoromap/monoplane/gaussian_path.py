@@ -181,7 +181,10 @@ def estimate_gains(prior: PathPrior, white: WhiteEvidence, choices: Sequence[Seq
 
 
 def _without_fixed(free: BoolArray, information: Array, vector: Array) -> tuple[Array, Array]:
-    """Return the information on the ``free`` coefficients (q,) alone; the others are integrated out, with unit prior."""
+    """Return the information on the ``free`` coefficients alone.
+
+    free : (q,). The others are integrated out, with their unit prior.
+    """
     fixed = information[np.ix_(~free, ~free)] + np.eye(int((~free).sum()))
     factor = np.linalg.cholesky(fixed)
     beside = solve_triangular(factor, information[np.ix_(~free, free)], lower=True, check_finite=False)

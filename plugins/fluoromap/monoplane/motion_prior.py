@@ -115,7 +115,9 @@ class MotionPrior:
     def _refuse_mirrored(
         self, run: _Run, trusted: BoolArray, windows: tuple[slice, ...], covariance: MotionCovariance
     ) -> None:
-        """Raise where most pixels are too far away, but would not be in the mirrored image.
+        """Refuse a view that only its mirror image explains.
+
+        Most pixels are too far from the expectation, and would not be in the mirrored image.
 
         Raises
         ------

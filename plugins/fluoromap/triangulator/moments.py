@@ -130,7 +130,7 @@ def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, brea
 
 
 def _both_views(blocks: Sequence[Array]) -> Array:
-    """Return matrices (p, N, 4, 4) of the pixels of view a and b, from those (p, N, 2, 2) of each view."""
+    """Return matrices (p, N, 4, 4) from those (p, N, 2, 2) of each view."""
     both = np.zeros((*blocks[0].shape[:2], 4, 4))
     both[..., :2, :2], both[..., 2:, 2:] = blocks
     return both
