@@ -59,8 +59,8 @@ def _add_products(smooth, scale, px_per_mm, corners_uv, corners_mm, offsets_mm, 
     """Add the products of :func:`products_beside`, (lines, electrodes, 3).
 
     The chain is the line through the corners; all corners but the first and the last are electrodes. offsets_mm : how far beside
-    the chain the lines are; the first is the chain's own. depths : (lines + 1, samples) the picture along the lines, own :
-    (samples,) the first line's less anatomy; both are overwritten.
+    the chain the lines are; the first is the chain's own. depths : (lines + 1, samples) the picture along the lines; own :
+    (samples,) that of the first line less anatomy. Both are overwritten.
     """
     last_u, last_v = smooth.shape[1] - 1.0, smooth.shape[0] - 1.0
     lines, samples = depths.shape

@@ -100,8 +100,6 @@ def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, brea
         The displacement of the whole heart between the runs, one parameter.
     """
     p, n, _ = start_mm.shape
-    matrices = np.stack([camera.matrix for camera in cameras])
-    seen = np.concatenate(pixels.pixels, axis=-1)
     weights = _both_views([_inverse(covariance) for covariance in pixels.covariances])
     common = breathing.effect_px.reshape(p, n, 4, 1)
     pushed = weights @ common
@@ -109,10 +107,8 @@ def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, brea
     left = variance / (1.0 + variance * (pushed * common).sum(axis=(1, 2, 3)))
     points = start_mm
     for _ in range(STEPS):
-        projected = np.stack([points @ matrix[:, :3].T + matrix[:, 3] for matrix in matrices], axis=2)
-        at, depth = projected[..., :2] / projected[..., 2:], projected[..., 2:, None]
-        residual = seen - at.reshape(p, n, 4)
-        jacobian = ((matrices[:, :2, :3] - at[..., None] * matrices[:, 2:, :3]) / depth).reshape(p, n, 4, 3)
+        residual = pixels.residuals_px(cameras, points).reshape(p, n, 4)
+        jacobian = jacobians(cameras, points).reshape(p, n, 4, 3)
         weighted = np.swapaxes(jacobian, -1, -2) @ np.concatenate([weights, pushed], axis=-1)
         solved = np.linalg.solve(weighted[..., :4] @ jacobian, weighted)
         own, along, pulled = solved[..., :4], solved[..., 4], weighted[..., 4]
@@ -122,7 +118,7 @@ def joint_moments(cameras: Cameras, pixels: TwoViewPixels, start_mm: Array, brea
         rest = (steps * pulled).sum(axis=(1, 2)) - (pushed[..., 0] * residual).sum(axis=(1, 2))
         moved = steps + shared * rest[:, None, None]
         points = points + moved
-        if np.abs(moved).max() < SETTLED_MM:
+        if np.abs(moved).max(initial=0.0) < SETTLED_MM:
             break
     # What an electrode's own place explains of the common displacement.
     row = (np.swapaxes(own, -1, -2) @ pulled[..., None] - pushed)[..., 0]

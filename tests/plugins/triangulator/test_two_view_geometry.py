@@ -38,6 +38,11 @@ def test_exact_projections_come_back_to_a_billionth_of_a_millimetre(
     assert np.abs(signed_epipolar_px(a, b, pixels_a, pixels_b)).max() < 1e-7
 
 
+def test_no_electrodes_give_no_points() -> None:
+    none = np.zeros((0, 2))
+    assert triangulate_maximum_likelihood(camera(90), camera(0), none, none, unit(0), unit(0)).shape == (0, 3)
+
+
 def test_fundamental_matrix_sends_the_other_source_to_nothing() -> None:
     a, b = camera(90, 10), camera(0, -15)
     fundamental = fundamental_matrix(a, b)
