@@ -17,7 +17,7 @@ from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
-from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames
+from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
 from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance, overlaps, reverse
@@ -344,7 +344,8 @@ def _detect(
     if count > 1:
         motion[0] = motion[1]
     context.check()
-    averaged = diastolic_frames(motion, run.frame_times_ms, run.r_wave_frames)
+    quiet = diastolic_frames(motion, run.frame_times_ms, run.r_wave_frames)
+    averaged = still_frames(quiet, found, run.frame_times_ms, run.px_per_mm)
     middle = averaged[len(averaged) // 2]
     mean = detector.find_chains(mean_image(averaged), middle)
     return RunDetections(

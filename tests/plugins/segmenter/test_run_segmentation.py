@@ -101,6 +101,34 @@ def test_a_chain_of_the_mean_belongs_to_a_track_where_most_of_its_frames_show_it
     assert {each.track for entry in found.frames for each in entry.chains} == {usual.track}
 
 
+class Moving(Detector):
+    """Finds the catheter farther down in each frame, and nothing in the mean of several."""
+
+    def __init__(self, count, step):
+        super().__init__(count)
+        self.step = step
+
+    def find_chains(self, x, frame, beside=()):
+        self.searched += 1
+        if self.searched > self.count:
+            return FrameChains(frame, ())
+        return FrameChains(frame, (replace(chain(1.0), pixels_uv=PLACES + np.array([0.0, self.step * frame])),))
+
+
+def test_frames_in_which_a_catheter_lies_elsewhere_are_not_averaged():
+    run = Run(Frames(3), np.arange(3) * 66.7, 4.0, PixelFacts(False, 12, False))
+
+    def averaged(step):
+        detector = Moving(3, step)
+        return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
+
+    # The frames show noise alone, so that all of them are quiet.
+    assert len(averaged(0.5).diastole_frames) >= 2
+    (alone,) = averaged(7.0).diastole_frames
+    (diastolic,) = averaged(7.0).diastole.chains
+    assert np.array_equal(diastolic.pixels_uv, PLACES + np.array([0.0, 7.0 * alone]))
+
+
 class HiddenInSomeFrames(Detector):
     """Finds the catheter in most frames; the others need a second search."""
 

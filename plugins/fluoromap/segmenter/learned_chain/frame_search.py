@@ -200,8 +200,9 @@ class FrameSearch:
         searched = self.detector.search(mean)
         self.network.reach_cells = OWN_CELLS
         self._own = self.network.latest_for(x) or self._own
-        # The mean of several frames has less noise than a frame.
-        self._noise = None if beside else searched.seen.position_noise
+        if not beside:
+            # The mean of several frames has less noise than a frame.
+            self._noise = searched.seen.position_noise
         return searched, self._in_frame(x, searched, 1 + len(beside), frame, reach_cells)
 
     def _in_frame(self, x: Image, searched: SearchedImage, averaged: int, frame: int, reach_cells: int) -> FrameChains:

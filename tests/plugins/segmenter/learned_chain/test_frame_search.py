@@ -69,7 +69,7 @@ class Detector:
 
     def image_evidence(self, x):
         likeness = Likeness(np.full(X.shape, self.likeness(x), np.float32), 4.0, 0.0)
-        return SimpleNamespace(likeness=likeness, position_noise=0.02)
+        return SimpleNamespace(likeness=likeness, position_noise=0.02 * float(x.mean()))
 
     def family_of(self, chain):
         return self.family
@@ -233,12 +233,20 @@ def test_after_a_sudden_motion_the_next_frame_asks_the_network_at_once():
     assert len(detector.searched) == 7
 
 
-def test_catheters_that_only_the_mean_shows_are_not_followed(monkeypatch):
+def test_catheters_that_only_a_mean_showed_are_followed_with_the_noise_of_a_frame(monkeypatch):
     frames, detector, _ = search(2.0, shares=False, near_px=4.0)
     detector.family = SimpleNamespace(catheter="reference")
-    follow_by(monkeypatch, lambda expected: 1 / 0)
-    for frame in range(6):
+    noises = []
+    monkeypatch.setattr(
+        frame_search,
+        "follow_chains",
+        lambda x, expected, catheters, inside, px_per_mm, noise, reach_px: noises.append(noise) or tuple(expected),
+    )
+    for frame in range(7):
         assert frames.find_chains(X + 1, frame, [X + 2, X + 3]).chains
+    # Frames 3, 4 and 5 are fitted; the first frame, searched without its neighbours, showed the noise of a frame.
+    assert noises == [0.02] * 3
+    assert len(detector.searched) == 5
 
 
 def test_in_slow_runs_no_answer_is_carried():
