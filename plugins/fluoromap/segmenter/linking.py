@@ -245,17 +245,20 @@ def best_chains(
     for _ in range(len(families)):
         if len(chosen) in (0, sum(len(family.names) for family in families)):
             break
-        taken = [candidate for chain in chosen for candidate in chain.candidates]
-        away = np.linalg.norm(points[:, None] - points[taken], axis=2).min(axis=1)
-        is_taken = away < _SAME_PLACE_MM * px_per_mm
         compared = []
         for index, (paths, scores) in enumerate(zip(likely.rows, likely.scores, strict=True)):
+            # A shorter chain may itself be a part of the other one.
+            as_long = [chain for chain in chosen if len(chain.candidates) >= paths.shape[1]]
+            taken = [candidate for chain in as_long for candidate in chain.candidates]
+            away = np.linalg.norm(points[:, None] - points[taken], axis=2).min(axis=1, initial=np.inf)
+            is_taken = away < _SAME_PLACE_MM * px_per_mm
             elsewhere = np.flatnonzero(is_taken[paths].sum(axis=1) < _SAME_PLACES)
             of_family = [chain.candidates for chain in chosen if chain.family == index]
             own = [np.flatnonzero((paths == np.array(candidates)).all(axis=1))[:1] for candidates in of_family]
             compared.append(np.concatenate([*own, elsewhere[np.argsort(-scores[elsewhere], kind="stable")[:most]]]))
+        # The chosen chains are compared again, so that another set has a higher value.
         more = _best_set(likely, compared, points, families, px_per_mm, sure)
-        if len(more) <= len(chosen):
+        if set(more) == set(chosen):
             break
         chosen = more
     return chosen

@@ -134,6 +134,25 @@ def test_parts_of_a_long_catheter_do_not_crowd_out_a_short_one_elsewhere():
     assert sorted(chain.candidates for chain in chosen) == [tuple(range(10)), (20, 21, 22, 23)]
 
 
+def test_parts_of_the_longest_catheter_do_not_crowd_out_a_long_one_over_which_a_short_chain_lies():
+    names = "duodecapolar-2-2-2", "decapolar-2-5-2", "ablation-4"
+    families = catheter_families(Catalogue(tuple(catheter_type(name, name) for name in names), names[0], names[-1]))
+    rng = np.random.default_rng(0)
+    longest, _ = straight(families[0].catheter, (20, 60), 0.1, 0.5)
+    long, _ = straight(families[1].catheter, (20, 250), 0.1, 0.5)
+    points = np.concatenate([longest, longest + rng.normal(0, 1.0, longest.shape), long])
+    # Hundreds of chains of ten in the longest catheter score more than the long catheter.
+    parts = np.sort(rng.permuted(np.tile(np.arange(20), (300, 1)), axis=1)[:, :10], axis=1)
+    parts += 20 * rng.integers(0, 2, parts.shape)
+    own = np.arange(40, 50)
+    possible = PossibleChains(
+        (np.arange(20)[None], np.concatenate([parts, own[None]]), own[None, :4]),
+        (np.array([16.0]), np.append(rng.uniform(8.0, 9.0, 300), 5.0), np.array([4.5])),
+    )
+    chosen = best_chains(possible, points, families, PX)
+    assert sorted(chain.candidates for chain in chosen) == [tuple(range(20)), tuple(own.tolist())]
+
+
 def bent(catheter, tip, turn_deg, at):
     """Return the electrodes of a catheter that bends once, at the electrode ``at``."""
     angles = np.where(np.arange(catheter.electrodes - 1) < at, 0.0, np.deg2rad(turn_deg))

@@ -210,18 +210,18 @@ class _Pictures:
 
 def _start_pictures(job_id: str, threads: ThreadPoolExecutor) -> _Pictures | None:
     """Let the pool draw the pictures; None without a map."""
+    overlays: deque[tuple[LocatedView, Future[bytes]]] = deque()
     try:
         with reading() as session:
             job = job_of(session, job_id)
-            finished = map_of(session, job)
-            fusions = [(view, fusion_of(session, job, view.uid, None)) for view in located_views(session, job)]
+            map_picture = threads.submit(map_picture_of, job_id, map_of(session, job))
+            # The pool draws the first pictures while this thread finds the parts of the others.
+            for view in located_views(session, job):
+                fusion = fusion_of(session, job, view.uid, None)
+                look = Look(covariances_mm2=fusion.covariances_mm2)
+                overlays.append((view, threads.submit(jpeg_of, fusion, look)))
     except Problem:
         return None
-    map_picture = threads.submit(map_picture_of, job_id, finished)
-    overlays = deque(
-        (view, threads.submit(jpeg_of, fusion, Look(covariances_mm2=fusion.covariances_mm2)))
-        for view, fusion in fusions
-    )
     return _Pictures(map_picture, overlays)
 
 
