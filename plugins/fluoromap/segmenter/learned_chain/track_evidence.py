@@ -33,12 +33,12 @@ _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
-_FOLLOWED, _FOLLOWED_FRAMES = 0.8, 8
+_FOLLOWED, _FOLLOWED_FRAMES = 0.8, 6
 """Share of the run's frames, and how many the run has at least: fewer say little."""
-_STILL_MM, _BEAT_MS = 1.2, 400.0
-"""A catheter in a beating heart moves farther, in so long a time."""
-_LEAST_LOW = -2.0
-"""Log-odds of the worst electrode."""
+_STILL_MM, _MOMENT_MS = 1.2, 300.0
+"""A catheter in a beating heart moves farther, but not in so short a time."""
+_LEAST_LOW, _LEAST_LOW_STILL = -2.0, -0.7
+"""Log-odds of the worst electrode, and of the worst one of a track that does not move."""
 _DENIED, _DENIED_LONG = -3.0, -4.0
 """Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
 _LOW_QUANTILE = 0.1
@@ -136,20 +136,28 @@ class TrackEvidence:
             least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
             return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
         least = self._least(paths, _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR)
-        if middle.mean() >= least and _are_electrodes(odds.mean(axis=0)):
+        still = self._is_still(paths)
+        if middle.mean() >= least and _are_electrodes(odds.mean(axis=0), still):
             return True
         # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
         odds_all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
-        return bool(np.median(odds_all_along) >= least and _are_electrodes(odds_all_along))
+        return bool(np.median(odds_all_along) >= least and _are_electrodes(odds_all_along, still))
 
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
-        motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
-        frames = len(self.frame_times_ms)
-        followed = len(path_uv) >= _FOLLOWED * frames
-        if motion_px < _STILL_MM * self.px_per_mm and not (followed and np.ptp(self.frame_times_ms) < _BEAT_MS):
+        if self._is_still(path_uv):
             return least.still
-        return least.followed if followed and frames >= _FOLLOWED_FRAMES else least.track
+        return least.followed if self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES else least.track
+
+    def _is_still(self, path_uv: Array) -> bool:
+        """Return whether places (frames, electrodes, 2) hardly move, although the run is long enough."""
+        motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
+        is_moment = self._is_followed(path_uv) and np.ptp(self.frame_times_ms) < _MOMENT_MS
+        return bool(motion_px < _STILL_MM * self.px_per_mm) and not is_moment
+
+    def _is_followed(self, path_uv: Array) -> bool:
+        """Return whether nearly all frames of the run show a track."""
+        return len(path_uv) >= _FOLLOWED * len(self.frame_times_ms)
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.
@@ -199,11 +207,14 @@ def _turn(path_uv: Array) -> float:
     return float(abs(np.angle(ways[1:] * ways[:-1].conj()).sum()))
 
 
-def _are_electrodes(odds: Array) -> bool:
+def _are_electrodes(odds: Array, still: bool) -> bool:
     """Return whether log-odds (n,) are those of electrodes.
 
     Either all are high enough, or the others are so high that they excuse the worst. A place that is clearly none has no excuse.
+    Nothing excuses one in a track that does not move: drops of contrast medium at rest look the same in each frame.
     """
+    if still:
+        return bool(odds.min() >= _LEAST_LOW_STILL)
     if odds.min() < _DENIED:
         return False
     worst = np.quantile(odds, _LOW_QUANTILE, method="lower")

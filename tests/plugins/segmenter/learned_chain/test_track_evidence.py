@@ -238,3 +238,14 @@ def test_a_chain_that_is_displaced_along_its_catheter_has_places_that_are_clearl
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
+
+
+@pytest.mark.parametrize(("step_px", "accepted"), [(0.0, False), (3.0, True)])
+def test_a_short_track_that_does_not_move_needs_every_electrode(monkeypatch, step_px, accepted):
+    frames = 6
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, 66.7 * np.arange(frames))
+    odds = np.array([2.0, 2.0, 2.0, -1.5])
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(odds))
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    places = row + np.array([0.0, step_px]) * np.arange(frames)[:, None, None]
+    assert judge(chains(places), lambda frame: None) == accepted
