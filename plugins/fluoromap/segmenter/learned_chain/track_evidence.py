@@ -147,7 +147,11 @@ class TrackEvidence:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
         if self._is_still(path_uv):
             return least.still
-        return least.followed if self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES else least.track
+        return (
+            least.followed
+            if self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
+            else least.track
+        )
 
     def _is_still(self, path_uv: Array) -> bool:
         """Return whether places (frames, electrodes, 2) hardly move, although the run is long enough."""
