@@ -115,17 +115,17 @@ class Moving(Detector):
         return FrameChains(frame, (replace(chain(1.0), pixels_uv=PLACES + np.array([0.0, self.step * frame])),))
 
 
-def test_frames_in_which_a_catheter_lies_elsewhere_are_not_averaged():
+def test_frames_in_which_a_catheter_lies_elsewhere_are_not_segmented():
     run = Run(Frames(3), np.arange(3) * 66.7, 4.0, PixelFacts(False, 12, False))
 
-    def averaged(step):
+    def segmented(step):
         detector = Moving(3, step)
         return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
 
     # The frames show noise alone, so that all of them are quiet.
-    assert len(averaged(0.5).diastole_frames) >= 2
-    (alone,) = averaged(7.0).diastole_frames
-    (diastolic,) = averaged(7.0).diastole.chains
+    assert len(segmented(0.5).diastole_frames) >= 2
+    (alone,) = segmented(7.0).diastole_frames
+    (diastolic,) = segmented(7.0).diastole.chains
     assert np.array_equal(diastolic.pixels_uv, PLACES + np.array([0.0, 7.0 * alone]))
 
 
