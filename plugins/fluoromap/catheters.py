@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LEAST_ON_LOOP = 8
+_LOOP_TURNS = 0.85
+"""Part of a full circle that the electrodes of a circular catheter fill."""
 _USUAL_LONG_TIP_MM = 4.0
 
 
@@ -80,6 +82,13 @@ class Catheter:
         equal = max(self.spacing_mm) - min(self.spacing_mm) < 1e-6 and abs(self.tip_mm - self.ring_mm) < 1e-6
         return self.electrodes >= _LEAST_ON_LOOP and equal
 
+    @property
+    def curvature_per_mm(self) -> float:
+        """Turn along the shaft, radians a millimetre: that of a circular catheter's loop, 0 for a straight one."""
+        if not self.is_circular:
+            return 0.0
+        return 2 * math.pi * _LOOP_TURNS / (float(self.arc_lengths_mm[-1]) + 0.5 * self.tip_mm + self.ring_mm)
+
     def tip_centre_sd_mm(self, usual_sd_mm: float) -> float:
         """Return how far the tip's middle may be from its image's centre.
 
@@ -89,11 +98,11 @@ class Catheter:
         return usual_sd_mm * max(1.0, self.tip_mm / _USUAL_LONG_TIP_MM)
 
     def looks_like(self, other: Catheter) -> bool:
-        """Return whether the two look alike in fluoroscopy (all lengths within 1 mm).
+        """Return whether the two look alike in fluoroscopy (all lengths within 1 mm, both loops or neither).
 
         Descriptions are wrong by up to 0.5 mm each.
         """
-        if self.electrodes != other.electrodes:
+        if self.electrodes != other.electrodes or self.is_circular != other.is_circular:
             return False
         mine = (*self.spacing_mm, self.tip_mm, self.ring_mm)
         theirs = (*other.spacing_mm, other.tip_mm, other.ring_mm)

@@ -13,7 +13,6 @@ Array = NDArray[np.float64]
 
 _STEP_MM = 0.4
 _BEND_MM = 25.0
-_TURNS = 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +47,15 @@ class Shaft:
     def around(cls, catheter: Catheter, radius_mm: float, centre: Array, normal: Array, entry: Array) -> Shaft:
         """Make a shaft whose electrodes lie on a loop about ``centre``.
 
-        The loop has 0.85 turns across ``normal``; then the shaft bends to ``entry``. Each is (3,), mm.
+        The loop lies across ``normal`` and has the catheter's curvature; then the shaft bends to ``entry``. Each is (3,), mm.
         """
         normal = normal / np.linalg.norm(normal)
         side = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
         side /= np.linalg.norm(side)
         other = np.cross(normal, side)
         round_mm = float(catheter.arc_lengths_mm[-1]) + 0.5 * catheter.tip_mm + catheter.ring_mm
-        loop_radius = round_mm / (2.0 * np.pi * _TURNS)
-        angles = np.linspace(0.0, 2.0 * np.pi * _TURNS, 400)[:, None]
+        loop_radius = 1.0 / catheter.curvature_per_mm
+        angles = np.linspace(0.0, round_mm * catheter.curvature_per_mm, 400)[:, None]
         loop = centre + loop_radius * (np.cos(angles) * side + np.sin(angles) * other)
         leaving = np.cos(angles[-1]) * other - np.sin(angles[-1]) * side
         back = normal if normal @ (entry - centre) > 0 else -normal

@@ -16,7 +16,7 @@ from fluoromap.segmenter.linking import (
     ShaftImage,
     kind_probabilities,
     shaft_evidence,
-    spacing_fit,
+    shape_fit,
 )
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import answers_for_each
@@ -104,7 +104,7 @@ def fit_chains(
         electrode_fit = _with_places(electrode_fit, candidates_uv[order], outside)
         no_variance = np.zeros(order.shape)
         bands = electrode_fit.log_likelihood
-        fit = bands + spacing_fit(electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm)
+        fit = bands + shape_fit(electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm)
         fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
         directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter.tip_mm, shaft_image)
         if tip_logits_at is not None:

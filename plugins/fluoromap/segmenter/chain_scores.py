@@ -18,9 +18,14 @@ from fluoromap.segmenter.log_image import Image
 _SPACING_SD = 0.06
 _TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
 _DRIFT_SD_PER_MM, _LEAST_SLOPE = 0.03, 0.15
+_LOOP_DRIFT = 0.8
+"""How fast the foreshortening of a loop changes, as a part of its curvature."""
 _BEND_SD = 0.36
 _S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
 _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
+_LOOP_SCALE = 1.1
+_LOOP_TURN_SD, _MOST_UNLIKE_LOOP = 0.9, 3.0
+_LEAST_SEEN = 0.1
 _UNLIKE_WEIGHT = 0.6
 _BEHIND_MM = 2.4, 5.9
 _BEFORE_MM = 2.1, 3.5
@@ -28,7 +33,7 @@ _BEFORE_MM = 2.1, 3.5
 
 def score_paths(
     chosen: IntArray, points: Array, weights: Array, variance_px2: Array, sure: int, lost: float, spacing_px: Array, tip_mm: float,
-    px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float, shaft_weight: float, least: float,
+    curvature_per_mm: float, px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float, shaft_weight: float, least: float,
 ) -> Array:  # fmt: skip
     """Return the score of each path, (n,).
 
@@ -38,7 +43,8 @@ def score_paths(
     places, variances = np.empty((*chosen.shape, 2)), np.empty(chosen.shape)
     out = np.empty(len(chosen))
     _score_shapes(chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out)
-    out += spacing_fit(places, spacing_px, variances, px_per_mm)
+    out += spacing_fit(places, spacing_px, variances, curvature_per_mm, px_per_mm)
+    out += loop_fit(places, spacing_px, curvature_per_mm / px_per_mm)
     hopeful = out + 3.0 * shaft_weight >= least
     out[~hopeful] = -np.inf
     rows = np.flatnonzero(hopeful)
@@ -98,23 +104,52 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
         out[row] = score if 2 * unsure <= m else -np.inf
 
 
-def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, px_per_mm: float) -> Array:
+def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array:
+    """Return how much more likely the bends are on a loop of this curvature than on a straight catheter, (n,).
+
+    The image of a circle is an ellipse. A small turn in the image, times the square of the foreshortening there, is the turn on the
+    circle times the ratio of the ellipse's axes. That ratio is free where the foreshortening allows it. The whole turn is that of the circle from every side; where it
+    is not, an unlikeness that is limited counts: seen edge on, the turns have no certain sign. All are 0 without a curvature.
+    """
+    if not curvature_per_px:
+        return np.zeros(len(places))
+    gaps = np.diff(places, axis=1)
+    seen = np.minimum(np.linalg.norm(gaps, axis=2) / spacing_px, 1.0)
+    u, v = gaps[..., 0], gaps[..., 1]
+    turns = np.arctan2(u[:, :-1] * v[:, 1:] - v[:, :-1] * u[:, 1:], (gaps[:, :-1] * gaps[:, 1:]).sum(axis=2))
+    shares = np.maximum(seen[:, :-1] * seen[:, 1:], _LEAST_SEEN)
+    on_circle = curvature_per_px * 0.5 * (spacing_px[:-1] + spacing_px[1:])
+    squares, products = (turns * turns * shares).sum(axis=1), turns @ on_circle
+    # The mean square of the foreshortening of an ellipse; a loop may be larger than described.
+    least = np.sqrt(np.clip(2.0 * (seen * seen).mean(axis=1) / _LOOP_SCALE**2 - 1.0, 0.0, 1.0))
+    axes = products / (on_circle**2 / shares).sum(axis=1)
+    axes = np.where(axes < 0, -1.0, 1.0) * np.clip(np.abs(axes), least, 1.0)
+    left = squares - 2.0 * axes * products + axes * axes * (on_circle**2 / shares).sum(axis=1)
+    is_s = (turns.min(axis=1) < -_S_BEND) & (turns.max(axis=1) > _S_BEND)
+    straight = squares * np.where(is_s, _S_BEND_WEIGHT * _S_BEND_WEIGHT, 1.0)
+    unlike = (np.abs(turns.sum(axis=1)) - on_circle.sum()) / _LOOP_TURN_SD
+    better: Array = 0.5 * (straight - left) / (_BEND_SD * _BEND_SD)
+    return better - np.minimum(0.5 * unlike * unlike, _MOST_UNLIKE_LOOP)
+
+
+def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, curvature_per_mm: float, px_per_mm: float) -> Array:
     """Return the log-likelihood of these spacings at the places, up to a constant, (n,).
 
     One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2`` (n,
     electrodes) is the variance of each place. The variance of each ratio between visible and true spacing contains
-    those of its two ends and of the bend.
+    those of its two ends and of the bend. A loop turns in depth as fast as its curvature allows.
     """
     out = np.empty(len(places))
     if len(spacing_px) + 1 >= MANY_ELECTRODES:
-        _fit_many_spacings(places, spacing_px, variance_px2, px_per_mm, out)
+        drift = max(_DRIFT_SD_PER_MM, _LOOP_DRIFT * curvature_per_mm)
+        _fit_many_spacings(places, spacing_px, variance_px2, drift / px_per_mm, out)
     else:
         _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)
     return out
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _fit_many_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _fit_many_spacings(places, spacing_px, variance_px2, drift_per_px, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write the log-likelihoods for a long catheter, whose foreshortening may rise and fall again.
 
     The ratio of visible to true spacing drifts from gap to gap as far as a bend in depth allows; a Kalman filter follows it.
@@ -129,7 +164,7 @@ def _fit_many_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # typ
             if k == 0:
                 ratio, spread = seen, noise
             else:
-                slope = _DRIFT_SD_PER_MM * 0.5 * (before + spacing) / px_per_mm
+                slope = drift_per_px * 0.5 * (before + spacing)
                 spread += slope * slope * max(1.0 - ratio * ratio, _LEAST_SLOPE)
                 total = spread + noise
                 away = seen - ratio

@@ -175,7 +175,8 @@ def possible_chains(
     A chain's score is the sum of its candidates' weights. Penalties are subtracted for:
 
     - spacings whose foreshortening differs more than a bend in depth explains (0.06 SD),
-    - bends (0.36 rad SD across the rays, more where foreshortened; S-bends count half more),
+    - bends (0.36 rad SD across the rays, more where foreshortened; S-bends count half more), of a circular catheter those that
+      its loop does not explain,
     - strong foreshortening,
     - rings of unlike weight.
 
@@ -212,8 +213,8 @@ def possible_chains(
                 paths = np.concatenate([paths, completed[index]])
             scores = chain_scores.score_paths(
                 paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm,
-                shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction, shaft_image.clear, shaft_image.side_px,
-                _SHAFT_WEIGHT, family.floor - slack,
+                family.catheter.curvature_per_mm, shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction,
+                shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, family.floor - slack,
             )  # fmt: skip
         all_rows.append(paths)
         all_scores.append(scores)
@@ -334,18 +335,22 @@ def chain_score(
     return float(
         chain_scores.score_paths(
             np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,
-            _spacing_px(family.catheter, shaft_image.px_per_mm), family.catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,
-            shaft_image.reduction, shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, -np.inf,
+            _spacing_px(family.catheter, shaft_image.px_per_mm), family.catheter.tip_mm,
+            family.catheter.curvature_per_mm, shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction,
+            shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, -np.inf,
         )[0]
     )  # fmt: skip
 
 
-def spacing_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> Array:
-    """Return the log-likelihood of each chain's spacings for this catheter, (n,).
+def shape_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> Array:
+    """Return the log-likelihood of each chain's spacings for this catheter, (n,); of a loop's bends too.
 
     points_uv : (n, electrodes, 2). One foreshortening is free. The likelihood lacks a constant.
     """
-    return chain_scores.spacing_fit(points_uv, _spacing_px(catheter, px_per_mm), variance_px2, px_per_mm)
+    spacing_px, curvature = _spacing_px(catheter, px_per_mm), catheter.curvature_per_mm
+    fit = chain_scores.spacing_fit(points_uv, spacing_px, variance_px2, curvature, px_per_mm)
+    fit += chain_scores.loop_fit(points_uv, spacing_px, curvature / px_per_mm)
+    return fit
 
 
 def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage) -> Array:
