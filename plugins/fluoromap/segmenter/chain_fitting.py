@@ -106,7 +106,7 @@ def fit_chains(
         bands = electrode_fit.log_likelihood
         fit = bands + shape_fit(electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm)
         fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
-        directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter.tip_mm, shaft_image)
+        directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter, shaft_image)
         if tip_logits_at is not None:
             first, last = answers_for_each(tip_logits_at, [electrode_fit.points_uv[:, end] for end in (0, -1)])
             weight = _TIP_WEIGHT if _tip_shows(family.catheter) else _SHORT_TIP_WEIGHT

@@ -1,6 +1,7 @@
 """Which end of a chain the shaft leaves: nothing dark goes on beyond a tip.
 
-A shaft bends, so a fan of rays is looked at beyond each end, and the darkest ray counts.
+A shaft bends, so a fan of rays is looked at beyond each end, and the darkest ray counts. A loop's shaft may leave it in a wide
+fan; rays that meet the loop itself do not count.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import math
 import numpy as np
 from numba import njit
 
-from fluoromap.contracts import Array
+from fluoromap.catheters import Catheter
+from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.linking import ShaftImage
 
-_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9))
+_FAN_RAD, _LOOP_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9)), np.deg2rad(np.linspace(-80.0, 80.0, 25))
+_BESIDE_LOOP_MM = 1.5
 _REACH_MM = 2.4, 8.0
 _SAMPLES = 12
 _LEAST_SAMPLES = 3
@@ -22,7 +25,7 @@ _HALF_RING_MM = 0.5
 _DARKEST = 1.5
 
 
-def shaft_beyond_ends(chains_uv: Array, tip_mm: float, shaft_image: ShaftImage) -> Array:
+def shaft_beyond_ends(chains_uv: Array, catheter: Catheter, shaft_image: ShaftImage) -> Array:
     """Return how much more a shaft shows behind than before chains.
 
     The result (n,) lies between -2 and 2.
@@ -31,25 +34,40 @@ def shaft_beyond_ends(chains_uv: Array, tip_mm: float, shaft_image: ShaftImage) 
     ----------
     chains_uv : (n, electrodes, 2)
         Pixels from the tip on.
-    tip_mm : float
-        Length of the tip electrode.
+    catheter : Catheter
     shaft_image : ShaftImage
     """
-    behind = _darkest_ray(chains_uv[:, -1], chains_uv[:, -1] - chains_uv[:, -2], 0.0, shaft_image)
-    before = _darkest_ray(chains_uv[:, 0], chains_uv[:, 0] - chains_uv[:, 1], 0.5 * tip_mm - _HALF_RING_MM, shaft_image)
+    from_tip = chains_uv[:, ::-1]
+    behind = _darkest_ray(chains_uv, 0.0, catheter.is_circular, shaft_image)
+    before = _darkest_ray(from_tip, 0.5 * catheter.tip_mm - _HALF_RING_MM, catheter.is_circular, shaft_image)
     more: Array = behind - before
     return more
 
 
-def _darkest_ray(ends_uv: Array, ways: Array, later_mm: float, shaft_image: ShaftImage) -> Array:
-    """Return the depth of the darkest ray from each end, (n,).
+def _darkest_ray(chains_uv: Array, later_mm: float, is_circular: bool, shaft_image: ShaftImage) -> Array:
+    """Return the depth of the darkest ray beyond the last place of each chain, (n,).
 
     It lies between -1 and 1, and is 0 outside the image.
     """
-    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
+    ends_uv, ways = chains_uv[:, -1], chains_uv[:, -1] - chains_uv[:, -2]
+    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + (_LOOP_FAN_RAD if is_circular else _FAN_RAD)
     first, last = _REACH_MM
-    darkest = ray_depths(ends_uv, angles, (later_mm + first, later_mm + last), shaft_image).max(axis=-1)
+    reach_mm = later_mm + first, later_mm + last
+    depths = ray_depths(ends_uv, angles, reach_mm, shaft_image)
+    if is_circular:
+        depths[_meets_chain(chains_uv, angles, reach_mm, shaft_image.px_per_mm)] = -np.inf
+    darkest = depths.max(axis=-1)
     return np.where(np.isfinite(darkest), darkest, 0.0)
+
+
+def _meets_chain(chains_uv: Array, angles_rad: Array, reach_mm: tuple[float, float], px_per_mm: float) -> BoolArray:
+    """Return which rays from the last places meet the rest of their own chain, (n, rays)."""
+    rest = np.concatenate([chains_uv[:, :-2], 0.5 * (chains_uv[:, :-2] + chains_uv[:, 1:-1])], axis=1)
+    ways = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)
+    places = chains_uv[:, None, None, -1] + _steps(reach_mm, px_per_mm)[:, None] * ways[:, :, None]
+    apart = np.linalg.norm(places[..., None, :] - rest[:, None, None], axis=-1)
+    meets: BoolArray = (apart < _BESIDE_LOOP_MM * px_per_mm).any(axis=(2, 3))
+    return meets
 
 
 def ray_depths(starts_uv: Array, angles_rad: Array, reach_mm: tuple[float, float], shaft_image: ShaftImage) -> Array:
