@@ -15,7 +15,8 @@ from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.log_image import Image
 
-_SPACING_SD = 0.06
+_SPACING_SD, _LOOP_SPACING_SD = 0.06, 0.12
+"""Of the ratio between visible and true spacing. Loops are made in several sizes, and some can be tightened."""
 _TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
 _DRIFT_SD_PER_MM, _LEAST_SLOPE = 0.03, 0.15
 _LOOP_DRIFT = 0.8
@@ -142,14 +143,15 @@ def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, curvature
     out = np.empty(len(places))
     if len(spacing_px) + 1 >= MANY_ELECTRODES:
         drift = max(_DRIFT_SD_PER_MM, _LOOP_DRIFT * curvature_per_mm)
-        _fit_many_spacings(places, spacing_px, variance_px2, drift / px_per_mm, out)
+        spacing_sd = _LOOP_SPACING_SD if curvature_per_mm else _SPACING_SD
+        _fit_many_spacings(places, spacing_px, variance_px2, spacing_sd, drift / px_per_mm, out)
     else:
         _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out)
     return out
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _fit_many_spacings(places, spacing_px, variance_px2, drift_per_px, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _fit_many_spacings(places, spacing_px, variance_px2, spacing_sd, drift_per_px, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write the log-likelihoods for a long catheter, whose foreshortening may rise and fall again.
 
     The ratio of visible to true spacing drifts from gap to gap as far as a bend in depth allows; a Kalman filter follows it.
@@ -160,7 +162,7 @@ def _fit_many_spacings(places, spacing_px, variance_px2, drift_per_px, out):  # 
             du, dv = places[row, k + 1, 0] - places[row, k, 0], places[row, k + 1, 1] - places[row, k, 1]
             spacing = spacing_px[k]
             seen = math.sqrt(du * du + dv * dv) / spacing
-            noise = _SPACING_SD * _SPACING_SD + (variance_px2[row, k] + variance_px2[row, k + 1]) / (spacing * spacing)
+            noise = spacing_sd * spacing_sd + (variance_px2[row, k] + variance_px2[row, k + 1]) / (spacing * spacing)
             if k == 0:
                 ratio, spread = seen, noise
             else:
