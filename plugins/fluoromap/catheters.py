@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_LEAST_ON_LOOP = 8
+_LEAST_ON_LOOP, _PAIRS_ON_LOOP = 8, 20
 _LOOP_TURNS = 0.85
 """Part of a full circle that the electrodes of a circular catheter fill."""
 _USUAL_LONG_TIP_MM = 4.0
@@ -75,12 +75,14 @@ class Catheter:
 
     @property
     def is_circular(self) -> bool:
-        """Whether the electrodes lie on a loop: eight or more, all alike and equally far apart.
+        """Whether the electrodes lie on a loop: all are alike, and eight or more equally far apart or 20 in pairs.
 
         A straight catheter has a tip electrode that is longer than its rings.
         """
-        equal = max(self.spacing_mm) - min(self.spacing_mm) < 1e-6 and abs(self.tip_mm - self.ring_mm) < 1e-6
-        return self.electrodes >= _LEAST_ON_LOOP and equal
+        if self.electrodes < _LEAST_ON_LOOP or not _alike((self.tip_mm, self.ring_mm)):
+            return False
+        in_pairs = self.electrodes >= _PAIRS_ON_LOOP and _alike(self.spacing_mm[::2]) and _alike(self.spacing_mm[1::2])
+        return in_pairs or _alike(self.spacing_mm)
 
     @property
     def curvature_per_mm(self) -> float:
@@ -150,6 +152,10 @@ class Catalogue:
         return tuple(catheter.name for catheter in self.catheters)
 
 
+def _alike(lengths_mm: Sequence[float]) -> bool:
+    return max(lengths_mm) - min(lengths_mm) < 1e-6
+
+
 def _alternating(pairs: int, pair_mm: float, apart_mm: float) -> tuple[float, ...]:
     """Return the edge gaps of ``pairs`` pairs of electrodes.
 
@@ -174,6 +180,7 @@ CATHETER_TYPES: dict[str, tuple[tuple[float, ...], float, float]] = {
     "ablation-8": (_alternating(2, 2.0, 5.0), 8.0, 1.3),
     "circular-10": ((5.0,) * 9, 1.0, 1.0),
     "circular-20": ((2.0,) * 19, 1.0, 1.0),
+    "circular-20-2-6-2": (_alternating(10, 2.0, 6.0), 1.0, 1.0),
     "pacing-lead": ((8.0,), 1.5, 2.5),
     "defibrillator-lead": ((10.0,), 1.5, 2.5),
 }

@@ -18,7 +18,8 @@ _BENT = 1
 def are_crossings(points_uv: Array, chain_uv: Array, shaft_image: ShaftImage) -> BoolArray:
     """Return at which points a dark line crosses a chain, (n,).
 
-    The line goes on to both sides at 40 degrees or more to the chain, and bends by at most 10 degrees there.
+    The line goes on to both sides at 40 degrees or more to the chain, and bends by at most 10 degrees there. Points farther from all
+    electrodes than the chain's widest gap are none: a curved chain has another direction there.
 
     Parameters
     ----------
@@ -28,11 +29,12 @@ def are_crossings(points_uv: Array, chain_uv: Array, shaft_image: ShaftImage) ->
         Pixels from the tip on.
     shaft_image : ShaftImage
     """
-    middles = 0.5 * (chain_uv[:-1] + chain_uv[1:])
+    middles, gaps = 0.5 * (chain_uv[:-1] + chain_uv[1:]), np.diff(chain_uv, axis=0)
     nearest = np.linalg.norm(points_uv[:, None] - middles[None], axis=2).argmin(axis=1)
-    way = np.diff(chain_uv, axis=0)[nearest]
+    away = np.linalg.norm(points_uv[:, None] - chain_uv[None], axis=2).min(axis=1)
+    way = gaps[nearest]
     angles = np.arctan2(way[:, 1], way[:, 0])[:, None] + _ANGLES_RAD
     one, other = (ray_depths(points_uv, angles + turn, _REACH_MM, shaft_image) for turn in (0.0, np.pi))
     other = ndimage.maximum_filter1d(other, 2 * _BENT + 1, axis=1, mode="nearest")
     crossed: BoolArray = np.minimum(one, other).max(axis=1) >= _CLEAR
-    return crossed
+    return crossed & (away <= np.linalg.norm(gaps, axis=1).max())

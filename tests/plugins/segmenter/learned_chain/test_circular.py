@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.catheters import CATHETER_TYPES, Catalogue, catheter_type
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.geometry import Gantry, camera_from_gantry
 from fluoromap.phantom import APPEARANCES
@@ -13,6 +13,7 @@ from fluoromap.phantom.torso import torso
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
+LOOP_TYPES = ["circular-10", "circular-20", "circular-20-2-6-2"]
 FRAMES = 12
 SPACING = 292.0 / 512
 GANTRY = Gantry(90.0, 0.0, 1000.0, 500.0, (SPACING, SPACING), 512, 512)
@@ -72,13 +73,12 @@ def chains_on(entry, truth):
 
 
 def test_catheters_with_equal_rings_are_loops():
-    assert catheter_type("circular-10", "x").is_circular
-    assert catheter_type("circular-20", "x").is_circular
-    assert not catheter_type("decapolar-2-2-2", "x").is_circular
-    assert not catheter_type("duodecapolar-2-2-2", "x").is_circular
+    assert all(catheter_type(loop_type, "x").is_circular for loop_type in LOOP_TYPES)
+    straight = [name for name in CATHETER_TYPES if name not in LOOP_TYPES]
+    assert not any(catheter_type(name, "x").is_circular for name in straight)
 
 
-@pytest.mark.parametrize("loop_type", ["circular-10", "circular-20"])
+@pytest.mark.parametrize("loop_type", LOOP_TYPES)
 def test_the_phantom_s_loop_keeps_its_spacings(loop_type):
     catheter = catheter_type(loop_type, "loop")
     shaft = Shaft.around(catheter, 0.75, np.zeros(3), np.array([1.0, 0.5, 0.2]), ENTRY)
@@ -89,7 +89,7 @@ def test_the_phantom_s_loop_keeps_its_spacings(loop_type):
     assert np.linalg.norm(electrodes[0] - electrodes[-1]) < 0.5 * float(catheter.arc_lengths_mm[-1])
 
 
-@pytest.mark.parametrize("loop_type", ["circular-10", "circular-20"])
+@pytest.mark.parametrize("loop_type", LOOP_TYPES)
 def test_a_loop_seen_face_on_is_found(loop_type):
     run, truth = run_of(loop_type, [1.0, 0.7, 0.2])
     found = segmented(run, (loop_type, "ablation-4"))
@@ -102,7 +102,7 @@ def test_a_loop_seen_face_on_is_found(loop_type):
 
 
 @pytest.mark.parametrize("normal", [[1.0, 2.0, 0.5], [1.0, 8.0, 0.0]])
-@pytest.mark.parametrize("loop_type", ["circular-10", "circular-20"])
+@pytest.mark.parametrize("loop_type", LOOP_TYPES)
 def test_a_loop_seen_from_the_side_is_found_or_reported(loop_type, normal):
     run, truth = run_of(loop_type, normal)
     found = segmented(run, (loop_type, "ablation-4"))
@@ -113,14 +113,16 @@ def test_a_loop_seen_from_the_side_is_found_or_reported(loop_type, normal):
 
 
 @pytest.mark.parametrize("normal", [[1.0, 0.7, 0.2], [1.0, 8.0, 0.0]])
-@pytest.mark.parametrize("loop_type", ["circular-10", "circular-20"])
+@pytest.mark.parametrize("loop_type", LOOP_TYPES)
 @pytest.mark.parametrize("listed", ["quadripolar-2-5-2", "decapolar-2-5-2"])
 def test_an_unlisted_loop_is_no_other_catheter(loop_type, normal, listed):
     run, truth = run_of(loop_type, normal)
     found = segmented(run, (listed, "ablation-4"))
     taken = {name for entry in found.frames for name in chains_on(entry, truth)}
-    # Poles of an oblique loop of 20 may lie as those of a decapolar catheter. The run is reported all the same.
+    # Poles of an oblique loop of 20 may lie as those of a decapolar catheter, and pairs of poles as those of every catheter with
+    # such pairs. The run is reported all the same.
     as_decapolar = (loop_type, listed, normal[1]) == ("circular-20", "decapolar-2-5-2", 8.0)
-    assert taken - ({"loop"} if as_decapolar else set()) == {"ablation"}
+    in_pairs = loop_type == "circular-20-2-6-2"
+    assert taken - ({"loop", None} if in_pairs else {"loop"} if as_decapolar else set()) == {"ablation"}
     if (loop_type, normal[1]) != ("circular-10", 0.7):
         assert found.diastole.manual_needed is Reason.EXTRA_CATHETER
