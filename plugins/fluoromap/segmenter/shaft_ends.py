@@ -16,7 +16,7 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.linking import ShaftImage
 
-_FAN_RAD, _LOOP_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9)), np.deg2rad(np.linspace(-80.0, 80.0, 25))
+_FAN_RAD, _LOOP_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9)), np.deg2rad(np.linspace(-45.0, 45.0, 15))
 _BESIDE_LOOP_MM = 1.5
 _REACH_MM = 2.4, 8.0
 _SAMPLES = 12
