@@ -24,7 +24,7 @@ _LOOP_DRIFT = 0.8
 _BEND_SD = 0.36
 _S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
 _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
-_LOOP_SCALE = 1.1
+_LOOP_SCALE, _LOOP_SIZE_SD = 1.1, 0.2
 _LOOP_TURN_SD, _MOST_UNLIKE_LOOP = 0.9, 3.0
 _LEAST_SEEN = 0.1
 _UNLIKE_WEIGHT = 0.6
@@ -109,13 +109,15 @@ def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array
     """Return how much more likely the bends are on a loop of this curvature than on a straight catheter, (n,).
 
     The image of a circle is an ellipse. A small turn in the image, times the square of the foreshortening there, is the turn on the
-    circle times the ratio of the ellipse's axes. That ratio is free where the foreshortening allows it. The whole turn is that of the circle from every side; where it
-    is not, an unlikeness that is limited counts: seen edge on, the turns have no certain sign. All are 0 without a curvature.
+    circle times the ratio of the ellipse's axes. That ratio is free where the foreshortening allows it. The size of the circle
+    differs from the described one by a fifth. The whole turn is that of the circle from every side; where it is not, an
+    unlikeness that is limited counts: seen edge on, the turns have no certain sign. All are 0 without a curvature.
     """
     if not curvature_per_px:
         return np.zeros(len(places))
     gaps = np.diff(places, axis=1)
-    seen = np.minimum(np.linalg.norm(gaps, axis=2) / spacing_px, 1.0)
+    ratios = np.linalg.norm(gaps, axis=2) / spacing_px
+    seen = np.minimum(ratios, 1.0)
     u, v = gaps[..., 0], gaps[..., 1]
     turns = np.arctan2(u[:, :-1] * v[:, 1:] - v[:, :-1] * u[:, 1:], (gaps[:, :-1] * gaps[:, 1:]).sum(axis=2))
     shares = np.maximum(seen[:, :-1] * seen[:, 1:], _LEAST_SEEN)
@@ -129,8 +131,11 @@ def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array
     is_s = (turns.min(axis=1) < -_S_BEND) & (turns.max(axis=1) > _S_BEND)
     straight = squares * np.where(is_s, _S_BEND_WEIGHT * _S_BEND_WEIGHT, 1.0)
     unlike = (np.abs(turns.sum(axis=1)) - on_circle.sum()) / _LOOP_TURN_SD
+    # The mean square of the foreshortening on an ellipse is that of its axes.
+    log_size = 0.5 * np.log(2.0 * (ratios * ratios).mean(axis=1) / (1.0 + axes * axes))
     better: Array = 0.5 * (straight - left) / (_BEND_SD * _BEND_SD)
-    return better - np.minimum(0.5 * unlike * unlike, _MOST_UNLIKE_LOOP)
+    better -= np.minimum(0.5 * unlike * unlike, _MOST_UNLIKE_LOOP)
+    return better - 0.5 * (log_size / _LOOP_SIZE_SD) ** 2
 
 
 def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, curvature_per_mm: float, px_per_mm: float) -> Array:

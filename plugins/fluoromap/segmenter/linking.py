@@ -24,6 +24,8 @@ _WORTH = 6.0
 _FLOOR_FALLS = 0.6
 _BEST, _LEAST_OF_FAMILY = 80, 20
 _SIDE_MM = 1.75
+_LARGEST_LOOP = 1.3
+"""Size of the largest loop of a type, in that of the type."""
 _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
 
 
@@ -208,7 +210,8 @@ def possible_chains(
         if len(points) >= family.catheter.electrodes:
             spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
             searched = sure if completed else len(points)
-            paths = chain_search.find_paths(points[:searched], weights[:searched], spacing_px, shaft_image.px_per_mm)
+            longest_px = searched_spacing_px(family.catheter, shaft_image.px_per_mm)
+            paths = chain_search.find_paths(points[:searched], weights[:searched], longest_px, shaft_image.px_per_mm)
             if completed:
                 paths = np.concatenate([paths, completed[index]])
             scores = chain_scores.score_paths(
@@ -363,6 +366,14 @@ def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage
         points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,
         shaft_image.reduction, shaft_image.clear, shaft_image.side_px,
     )  # fmt: skip
+
+
+def searched_spacing_px(catheter: Catheter, px_per_mm: float) -> Array:
+    """Return the spacings for which chains are searched, (electrodes - 1,) pixels at the isocentre.
+
+    A loop may be larger than its type says: loops are made in several sizes.
+    """
+    return _spacing_px(catheter, px_per_mm) * (_LARGEST_LOOP if catheter.is_circular else 1.0)
 
 
 def _spacing_px(catheter: Catheter, px_per_mm: float) -> Array:

@@ -16,7 +16,7 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.linking import CatheterFamily
+from fluoromap.segmenter.linking import CatheterFamily, searched_spacing_px
 from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.proposals import answers_for_each
 from fluoromap.segmenter.refinement import predict_on_curve
@@ -121,9 +121,9 @@ def _incomplete_chains(
     points: Array, weights: Array, catheter: Catheter, px_per_mm: float, inside: BoolArray
 ) -> list[_IncompleteChains]:
     """Return the chains of candidates (n, 2) that lack electrodes of a catheter."""
-    electrodes, spacing_px = catheter.electrodes, np.asarray(catheter.spacing_mm) * px_per_mm
-    found = []
+    electrodes, found = catheter.electrodes, []
     if electrodes >= MANY_ELECTRODES:
+        spacing_px = searched_spacing_px(catheter, px_per_mm)
         for row, position in zip(*trace_rows(points, weights, spacing_px, _MOST, inside), strict=True):
             missing = np.flatnonzero(row < 0)
             found.append(_IncompleteChains(row[None], missing, position[missing]))
