@@ -91,6 +91,11 @@ class Catheter:
             return 0.0
         return 2 * math.pi * _LOOP_TURNS / (float(self.arc_lengths_mm[-1]) + 0.5 * self.tip_mm + self.ring_mm)
 
+    @property
+    def angles_on_loop_rad(self) -> NDArray[np.float64] | None:
+        """Angles of the electrodes on a circular catheter's loop from electrode 1's, (electrodes,); None for a straight one."""
+        return self.curvature_per_mm * self.arc_lengths_mm if self.is_circular else None
+
     def tip_centre_sd_mm(self, usual_sd_mm: float) -> float:
         """Return how far the tip's middle may be from its image's centre.
 

@@ -30,15 +30,19 @@ _MOST_CURVED_PER_MM, _MOST_BENT = 0.25, 1.6
 """A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""
 _INTERLEAVED, _IN_LINE = 2, 0.55
 """Chains can take turns only where the catalogue has a long catheter."""
+_OFF_ELLIPSE = 0.2
+"""Standard deviation of a place from an ellipse, in spacings."""
 _PARTIAL = 1500
 _GROWN = 60000
 _MOST_TRIES = 300000
 
 
-def find_paths(points: Array, weights: Array, spacing_px: Array, px_per_mm: float) -> IntArray:
+def find_paths(
+    points: Array, weights: Array, spacing_px: Array, px_per_mm: float, angles_rad: Array | None = None
+) -> IntArray:
     """Return all paths with spacings and bends that a catheter can show.
 
-    Of each length the search continues with the 1500 paths of the largest weight.
+    Of each length the search continues with the 1500 paths of the largest weight. On a loop, places off the best ellipse lessen it.
 
     Parameters
     ----------
@@ -50,6 +54,8 @@ def find_paths(points: Array, weights: Array, spacing_px: Array, px_per_mm: floa
         Spacings from the tip on, at the isocentre, not foreshortened.
     px_per_mm : float
         At the isocentre. How far a catheter may bend depends on lengths in millimetres.
+    angles_rad : (electrodes,), optional
+        Places of the electrodes on a loop, from the tip on.
 
     Returns
     -------
@@ -66,11 +72,33 @@ def find_paths(points: Array, weights: Array, spacing_px: Array, px_per_mm: floa
         kept, ratios = longer[:count], more[:count]
         if count > _PARTIAL:
             values = weights[kept[:, : step + 2]].sum(axis=1)
+            if angles_rad is not None:
+                off = _off_ellipse(points[kept[:, : step + 2]], angles_rad[: step + 2]) / spacing_px.mean() ** 2
+                values -= 0.5 * off / (_OFF_ELLIPSE * _OFF_ELLIPSE)
             best = np.argpartition(-values, _PARTIAL)[:_PARTIAL]
             kept, ratios = kept[best], ratios[best]
     mean = ratios.mean(axis=1)
     possible: IntArray = kept[(mean >= SHORTEST) & (mean <= LONGEST)]
     return possible
+
+
+def _off_ellipse(places: Array, angles_rad: Array) -> Array:
+    """Return the sums of the squared distances of places from their best ellipses, (n,) pixels².
+
+    The image of a circle is ``c + a cos + b sin`` of the angles on the circle, with the same angles from every side.
+
+    Parameters
+    ----------
+    places : (n, electrodes, 2)
+        Pixels.
+    angles_rad : (electrodes,)
+        Places on the circle.
+    """
+    basis = np.linalg.qr(np.column_stack([np.ones(len(angles_rad)), np.cos(angles_rad), np.sin(angles_rad)]))[0]
+    centred = places - places.mean(axis=1, keepdims=True)
+    on_ellipse = basis.T @ centred
+    off: Array = (centred * centred).sum(axis=(1, 2)) - (on_ellipse * on_ellipse).sum(axis=(1, 2))
+    return off
 
 
 def _least_cosines(spacing_mm: Array) -> Array:

@@ -211,7 +211,9 @@ def possible_chains(
             spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
             searched = sure if completed else len(points)
             longest_px = searched_spacing_px(family.catheter, shaft_image.px_per_mm)
-            paths = chain_search.find_paths(points[:searched], weights[:searched], longest_px, shaft_image.px_per_mm)
+            paths = chain_search.find_paths(
+                points[:searched], weights[:searched], longest_px, shaft_image.px_per_mm, family.catheter.angles_on_loop_rad
+            )
             if completed:
                 paths = np.concatenate([paths, completed[index]])
             scores = chain_scores.score_paths(
