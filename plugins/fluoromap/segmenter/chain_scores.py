@@ -34,7 +34,8 @@ _BEFORE_MM = 2.1, 3.5
 
 def score_paths(
     chosen: IntArray, points: Array, weights: Array, variance_px2: Array, sure: int, lost: float, spacing_px: Array, tip_mm: float,
-    curvature_per_mm: float, px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float, shaft_weight: float, least: float,
+    curvature_per_mm: float, px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float, shaft_weight: float,
+    least: float,
 ) -> Array:  # fmt: skip
     """Return the score of each path, (n,).
 
@@ -106,7 +107,7 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array:
-    """Return how much more likely the bends are on a loop of this curvature than on a straight catheter, (n,).
+    """Return how much more likely a loop is than a straight catheter, (n,).
 
     The image of a circle is an ellipse. A small turn in the image, times the square of the foreshortening there, is the turn on the
     circle times the ratio of the ellipse's axes. That ratio is free where the foreshortening allows it. The size of the circle
@@ -135,10 +136,13 @@ def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array
     log_size = 0.5 * np.log(2.0 * (ratios * ratios).mean(axis=1) / (1.0 + axes * axes))
     better: Array = 0.5 * (straight - left) / (_BEND_SD * _BEND_SD)
     better -= np.minimum(0.5 * unlike * unlike, _MOST_UNLIKE_LOOP)
-    return better - 0.5 * (log_size / _LOOP_SIZE_SD) ** 2
+    better -= 0.5 * (log_size / _LOOP_SIZE_SD) ** 2
+    return better
 
 
-def spacing_fit(places: Array, spacing_px: Array, variance_px2: Array, curvature_per_mm: float, px_per_mm: float) -> Array:
+def spacing_fit(
+    places: Array, spacing_px: Array, variance_px2: Array, curvature_per_mm: float, px_per_mm: float
+) -> Array:
     """Return the log-likelihood of these spacings at the places, up to a constant, (n,).
 
     One foreshortening is free; it may change along the catheter as far as catheters bend in depth. ``variance_px2`` (n,

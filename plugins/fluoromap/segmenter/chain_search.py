@@ -73,7 +73,7 @@ def find_paths(
         if count > _PARTIAL:
             values = weights[kept[:, : step + 2]].sum(axis=1)
             if angles_rad is not None:
-                off = _off_ellipse(points[kept[:, : step + 2]], angles_rad[: step + 2]) / spacing_px.mean() ** 2
+                off = off_ellipse(points[kept[:, : step + 2]], angles_rad[: step + 2]) / spacing_px.mean() ** 2
                 values -= 0.5 * off / (_OFF_ELLIPSE * _OFF_ELLIPSE)
             best = np.argpartition(-values, _PARTIAL)[:_PARTIAL]
             kept, ratios = kept[best], ratios[best]
@@ -82,7 +82,7 @@ def find_paths(
     return possible
 
 
-def _off_ellipse(places: Array, angles_rad: Array) -> Array:
+def off_ellipse(places: Array, angles_rad: Array) -> Array:
     """Return the sums of the squared distances of places from their best ellipses, (n,) pixels².
 
     The image of a circle is ``c + a cos + b sin`` of the angles on the circle, with the same angles from every side.

@@ -18,8 +18,8 @@ _BENT = 1
 def are_crossings(points_uv: Array, chain_uv: Array, shaft_image: ShaftImage) -> BoolArray:
     """Return at which points a dark line crosses a chain, (n,).
 
-    The line goes on to both sides at 40 degrees or more to the chain, and bends by at most 10 degrees there. Points farther from all
-    electrodes than the chain's widest gap are none: a curved chain has another direction there.
+    The line goes on to both sides at 40 degrees or more to the chain, and bends by at most 10 degrees there. Points farther
+    from all electrodes than the chain's widest gap are none: a curved chain has another direction there.
 
     Parameters
     ----------
@@ -37,4 +37,5 @@ def are_crossings(points_uv: Array, chain_uv: Array, shaft_image: ShaftImage) ->
     one, other = (ray_depths(points_uv, angles + turn, _REACH_MM, shaft_image) for turn in (0.0, np.pi))
     other = ndimage.maximum_filter1d(other, 2 * _BENT + 1, axis=1, mode="nearest")
     crossed: BoolArray = np.minimum(one, other).max(axis=1) >= _CLEAR
-    return crossed & (away <= np.linalg.norm(gaps, axis=1).max())
+    crossed &= away <= np.linalg.norm(gaps, axis=1).max()
+    return crossed

@@ -212,7 +212,11 @@ def possible_chains(
             searched = sure if completed else len(points)
             longest_px = searched_spacing_px(family.catheter, shaft_image.px_per_mm)
             paths = chain_search.find_paths(
-                points[:searched], weights[:searched], longest_px, shaft_image.px_per_mm, family.catheter.angles_on_loop_rad
+                points[:searched],
+                weights[:searched],
+                longest_px,
+                shaft_image.px_per_mm,
+                family.catheter.angles_on_loop_rad,
             )
             if completed:
                 paths = np.concatenate([paths, completed[index]])
@@ -348,9 +352,10 @@ def chain_score(
 
 
 def shape_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> Array:
-    """Return the log-likelihood of each chain's spacings for this catheter, (n,); of a loop's bends too.
+    """Return the log-likelihood of each chain's shape for this catheter, (n,).
 
-    points_uv : (n, electrodes, 2). One foreshortening is free. The likelihood lacks a constant.
+    That is the shape of its spacings, and of a loop's bends. One foreshortening is free. The likelihood lacks a constant.
+    ``points_uv`` are (n, electrodes, 2).
     """
     spacing_px, curvature = _spacing_px(catheter, px_per_mm), catheter.curvature_per_mm
     fit = chain_scores.spacing_fit(points_uv, spacing_px, variance_px2, curvature, px_per_mm)

@@ -50,9 +50,9 @@ def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_p
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    """Return whether points go on in the chain's line, or its curve, beyond an end.
+    """Return whether points go on in the chain's line or curve.
 
-    Three or more points are needed, no farther apart than the chain's electrodes are.
+    Three or more points beyond an end are needed, no farther apart than the chain's electrodes are.
 
     Parameters
     ----------
@@ -103,9 +103,9 @@ def shows_row(points_uv: Array, px_per_mm: float) -> bool:
 
 
 def _count_onwards(at: Array, before: Array, left: Array, reach: float, curve: float = 0.0) -> int:
-    """Count the points that go on in a line past ``at``, which turns by ``curve`` radians a pixel.
+    """Count the points that go on in a line past ``at``.
 
-    The line comes from ``before``. Each point is at most ``reach`` from the last.
+    The line comes from ``before`` and turns by ``curve`` radians a pixel. Each point is at most ``reach`` from the last.
     """
     return int(_count_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach, curve))
 

@@ -51,3 +51,11 @@ def test_a_corner_is_no_crossing():
 
 def test_no_points_have_no_crossings():
     assert are_crossings(np.zeros((0, 2)), CHAIN, drawn()).shape == (0,)
+
+
+def test_a_line_far_beyond_the_chain_does_not_cross_it():
+    far = CHAIN[-1] + np.array([[40.0, 0.0]])
+    assert not are_crossings(far, CHAIN, drawn(line(90.0) + far - PLACE)).any()
+    assert are_crossings(
+        CHAIN[-1:] + 15.0 * np.eye(2)[:1], CHAIN, drawn(line(90.0) + CHAIN[-1] + [15.0, 0.0] - PLACE)
+    ).all()
