@@ -1,7 +1,7 @@
 """Circular catheters from face on to edge on: ``python benchmarks/circular_catheters.py [frames]``.
 
-Lateral runs of the phantom show a loop and an ablation catheter: 512 x 512, 3.5 px/mm, 12 bits. The loop's normal is turned from the
-ray towards four sides. Prints for each type and turn the share of frames with the whole loop within 5 px, that with the right
+Lateral runs of the phantom show a loop and an ablation catheter: 512 x 512, 3.5 px/mm, 12 bits. The loop's normal is turned
+from the ray towards four sides. Prints for each type and turn the share of frames with the whole loop within 5 px, that with the right
 numbers too, false chains in all frames, and the runs that were reported as ``extra_catheter``.
 """
 
@@ -30,11 +30,8 @@ SIDES_DEG = 20, 100, 160, 250
 FRAME_MS = 66.7
 ENTRY_MM = np.array([-18.0, 8.0, 95.0])
 ABLATION = catheter_type("ablation-4", "ablation")
-ABLATION_MM = [
-    np.array(place) for place in ((4.0, -18.0, -24.0), (0.0, -8.0, -4.0), (-4.0, 6.0, 40.0), (-8.0, 10.0, 95.0))
-]
-    np.array(place) for place in ((4.0, -18.0, -24.0), (0.0, -8.0, -4.0), (-4.0, 6.0, 40.0), (-8.0, 10.0, 95.0))
-]
+ABLATION_MM = ((4.0, -18.0, -24.0), (0.0, -8.0, -4.0), (-4.0, 6.0, 40.0), (-8.0, 10.0, 95.0))
+"""Points of the ablation catheter's course."""
 
 
 def main() -> None:
@@ -76,7 +73,7 @@ def _segmented_run(loop_type: str, normal: Array, frames: int) -> tuple[Segmenta
     gantry = Gantry(90.0, 0.0, 1000.0, 500.0, (spacing, spacing), 512, 512)
     camera, appearance = camera_from_gantry(gantry), APPEARANCES["LAT"]
     loop = Shaft.around(catheter_type(loop_type, "loop"), 0.75, np.array([0.0, 10.0, 5.0]), normal, ENTRY_MM)
-    shafts = [loop, Shaft.through(ABLATION, 1.17, True, *ABLATION_MM)]
+    shafts = [loop, Shaft.through(ABLATION, 1.17, True, *map(np.array, ABLATION_MM))]
     moves = np.arange(frames)[:, None] * np.array([0.0, 0.3, 0.2])
     behind = torso(gantry, appearance, np.random.default_rng(1), np.random.default_rng(2), 0.0)
 
