@@ -1,8 +1,8 @@
 """Circular catheters from face on to edge on: ``python benchmarks/circular_catheters.py [frames]``.
 
 Lateral runs of the phantom show a loop and an ablation catheter: 512 x 512, 3.5 px/mm, 12 bits. The loop's normal is turned
-from the ray towards four sides. Prints for each type and turn the share of frames with the whole loop within 5 px, that with the right
-numbers too, false chains in all frames, and the runs that were reported as ``extra_catheter``.
+from the ray towards four sides. Prints for each type and turn the share of frames with the whole loop within 5 px, that with the
+right numbers too, false chains in all frames, and the runs that were reported as ``extra_catheter``.
 """
 
 from __future__ import annotations
