@@ -21,7 +21,8 @@ _TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
 _DRIFT_SD_PER_MM, _LEAST_SLOPE = 0.03, 0.15
 _LOOP_DRIFT = 0.8
 """How fast the foreshortening of a loop changes, as a part of its curvature."""
-_BEND_SD = 0.36
+_BEND_SD, _USUAL_GAP_MM = 0.36, 4.75
+"""Standard deviation of a bend between two gaps, radians; in proportion more where they are longer than usual on average."""
 _S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
 _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
 _LOOP_SCALE, _LOOP_SIZE_SD = 1.1, 0.2
@@ -44,9 +45,10 @@ def score_paths(
     """
     places, variances = np.empty((*chosen.shape, 2)), np.empty(chosen.shape)
     out = np.empty(len(chosen))
-    _score_shapes(chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out)
+    freedom = bend_freedom(spacing_px / px_per_mm)
+    _score_shapes(chosen, points, weights, variance_px2, sure, lost, spacing_px, freedom, places, variances, out)
     out += spacing_fit(places, spacing_px, variances, curvature_per_mm, px_per_mm)
-    out += loop_fit(places, spacing_px, curvature_per_mm / px_per_mm)
+    out += loop_fit(places, spacing_px, curvature_per_mm, px_per_mm)
     hopeful = out + 3.0 * shaft_weight >= least
     out[~hopeful] = -np.inf
     rows = np.flatnonzero(hopeful)
@@ -60,7 +62,7 @@ def score_paths(
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
-    chosen, points, weights, variance_px2, sure, lost, spacing_px, places, variances, out
+    chosen, points, weights, variance_px2, sure, lost, spacing_px, freedom, places, variances, out
 ):  # fmt: skip
     """Write places, variances and score of each path.
 
@@ -96,7 +98,7 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
             before, shortened = shortened, min(length / spacing_px[k], 1.0)
             if k > 0:
                 turn = math.atan2(before_u * dv - before_v * du, before_u * du + before_v * dv)
-                squares += turn * turn * before * shortened
+                squares += turn * turn * before * shortened / (freedom[k - 1] * freedom[k - 1])
                 left, right = min(left, turn), max(right, turn)
             before_u, before_v = du, dv
         if left < -_S_BEND and right > _S_BEND:
@@ -106,7 +108,12 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
         out[row] = score if 2 * unsure <= m else -np.inf
 
 
-def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array:
+def bend_freedom(spacing_mm: Array) -> Array:
+    """Return how much more than usual each bend may be, (gaps - 1,)."""
+    return np.maximum(1.0, 0.5 * (spacing_mm[:-1] + spacing_mm[1:]) / _USUAL_GAP_MM)
+
+
+def loop_fit(places: Array, spacing_px: Array, curvature_per_mm: float, px_per_mm: float) -> Array:
     """Return how much more likely a loop is than a straight catheter, (n,).
 
     The image of a circle is an ellipse. A small turn in the image, times the square of the foreshortening there, is the turn on the
@@ -114,21 +121,23 @@ def loop_fit(places: Array, spacing_px: Array, curvature_per_px: float) -> Array
     differs from the described one by a fifth. The whole turn is that of the circle from every side; where it is not, an
     unlikeness that is limited counts: seen edge on, the turns have no certain sign. All are 0 without a curvature.
     """
-    if not curvature_per_px:
+    if not curvature_per_mm:
         return np.zeros(len(places))
     gaps = np.diff(places, axis=1)
     ratios = np.linalg.norm(gaps, axis=2) / spacing_px
     seen = np.minimum(ratios, 1.0)
     u, v = gaps[..., 0], gaps[..., 1]
     turns = np.arctan2(u[:, :-1] * v[:, 1:] - v[:, :-1] * u[:, 1:], (gaps[:, :-1] * gaps[:, 1:]).sum(axis=2))
+    freedom = bend_freedom(spacing_px / px_per_mm) ** 2
     shares = np.maximum(seen[:, :-1] * seen[:, 1:], _LEAST_SEEN)
-    on_circle = curvature_per_px * 0.5 * (spacing_px[:-1] + spacing_px[1:])
-    squares, products = (turns * turns * shares).sum(axis=1), turns @ on_circle
+    on_circle = curvature_per_mm / px_per_mm * 0.5 * (spacing_px[:-1] + spacing_px[1:])
+    squares, products = (turns * turns * shares / freedom).sum(axis=1), turns @ (on_circle / freedom)
+    circle = (on_circle**2 / shares / freedom).sum(axis=1)
     # The mean square of the foreshortening of an ellipse; a loop may be larger than described.
     least = np.sqrt(np.clip(2.0 * (seen * seen).mean(axis=1) / _LOOP_SCALE**2 - 1.0, 0.0, 1.0))
-    axes = products / (on_circle**2 / shares).sum(axis=1)
+    axes = products / circle
     axes = np.where(axes < 0, -1.0, 1.0) * np.clip(np.abs(axes), least, 1.0)
-    left = squares - 2.0 * axes * products + axes * axes * (on_circle**2 / shares).sum(axis=1)
+    left = squares - 2.0 * axes * products + axes * axes * circle
     is_s = (turns.min(axis=1) < -_S_BEND) & (turns.max(axis=1) > _S_BEND)
     straight = squares * np.where(is_s, _S_BEND_WEIGHT * _S_BEND_WEIGHT, 1.0)
     unlike = (np.abs(turns.sum(axis=1)) - on_circle.sum()) / _LOOP_TURN_SD

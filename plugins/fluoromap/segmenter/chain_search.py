@@ -26,7 +26,7 @@ _END_SLACK = 0.55, 1.1
 _SPREAD, _SPREAD_A_GAP, _MOST_SPREAD = 0.6, 0.06, 0.9
 """How far the ratios of two gaps may differ: of neighbours, more for each gap between, at most. Long catheters turn in depth."""
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
-_MOST_CURVED_PER_MM, _MOST_BENT = 0.25, 1.6
+_MOST_CURVED_PER_MM, _MOST_BENT, _WIDE_GAPS_MM = 0.25, 1.6, 5.0
 """A long catheter is recognised by its many spacings, so that it may bend as far as its material does, radians."""
 _INTERLEAVED, _IN_LINE = 2, 0.55
 """Chains can take turns only where the catalogue has a long catheter."""
@@ -104,9 +104,10 @@ def off_ellipse(places: Array, angles_rad: Array) -> Array:
 def _least_cosines(spacing_mm: Array) -> Array:
     """Return the cosine of the largest bend at the first electrode of each gap, (gaps,)."""
     least = np.full(len(spacing_mm), _LEAST_COSINE)
-    if len(spacing_mm) + 1 >= MANY_ELECTRODES:
-        bends = _MOST_CURVED_PER_MM * 0.5 * (spacing_mm[:-1] + spacing_mm[1:])
-        least[1:] = np.minimum(least[1:], np.cos(np.minimum(bends, _MOST_BENT)))
+    between = 0.5 * (spacing_mm[:-1] + spacing_mm[1:])
+    if len(spacing_mm) + 1 < MANY_ELECTRODES:
+        between[between < _WIDE_GAPS_MM] = 0.0
+    least[1:] = np.minimum(least[1:], np.cos(np.minimum(_MOST_CURVED_PER_MM * between, _MOST_BENT)))
     return least
 
 

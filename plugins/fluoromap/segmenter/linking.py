@@ -359,7 +359,7 @@ def shape_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_
     """
     spacing_px, curvature = _spacing_px(catheter, px_per_mm), catheter.curvature_per_mm
     fit = chain_scores.spacing_fit(points_uv, spacing_px, variance_px2, curvature, px_per_mm)
-    fit += chain_scores.loop_fit(points_uv, spacing_px, curvature / px_per_mm)
+    fit += chain_scores.loop_fit(points_uv, spacing_px, curvature, px_per_mm)
     return fit
 
 

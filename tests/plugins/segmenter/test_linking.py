@@ -160,8 +160,10 @@ def bent(catheter, tip, turn_deg, at):
     return np.concatenate([[tip], tip + np.cumsum(steps, axis=0)])
 
 
-@pytest.mark.parametrize(("name", "is_found"), [("decapolar-2-5-2", True), ("quadripolar-2-5-2", False)])
-def test_only_a_long_catheter_may_bend_sharply_between_a_pair_and_a_gap(name, is_found):
+@pytest.mark.parametrize(
+    ("name", "is_found"), [("decapolar-2-5-2", True), ("quadripolar-2-5-2", False), ("quadripolar-5-5-5", True)]
+)
+def test_only_a_long_catheter_or_one_with_wide_gaps_may_bend_sharply(name, is_found):
     catheter = catheter_type(name, "bent")
     points = bent(catheter, np.array([30.0, 30.0]), 64.0, 2 if name.startswith("quad") else 4)
     spacing_px = np.array(catheter.spacing_mm) * PX
@@ -178,6 +180,15 @@ def test_a_long_catheter_may_turn_out_of_the_image_plane(name, is_found):
     points = np.stack([u, np.full(len(u), 100.0)], axis=1)
     paths = find_paths(points, np.ones(len(points)), spacing_px, PX)
     assert any((path == np.arange(len(points))).all() for path in paths) == is_found
+
+
+def test_a_hooked_catheter_with_wide_gaps_is_linked_and_one_with_narrow_gaps_is_not():
+    for name, expected in (("quadripolar-5-5-5", 1), ("quadripolar-2-5-2", 0)):
+        probe = catheter_type(name, "probe")
+        catalogue = Catalogue((probe, Catheter("reference", 4, (9.0, 9.0, 9.0), 2.0, 1.0)), "reference", "probe")
+        points = bent(probe, np.array([60.0, 60.0]), 80.0, 2)
+        shaft_end = points[-1] + 8.0 * (points[-1] - points[-2]) / probe.spacing_mm[-1]
+        assert len(linked(points, drawn([(points, shaft_end)]), catalogue)) == expected
 
 
 def test_the_trace_of_a_long_catheter_follows_its_bend_over_a_missing_electrode():

@@ -30,7 +30,7 @@ def straight(catheter, ratio=0.95):
 
 def fit_of(catheter, places):
     spacing_px = np.array(catheter.spacing_mm) * PX
-    return float(loop_fit(places[None], spacing_px, catheter.curvature_per_mm / PX)[0])
+    return float(loop_fit(places[None], spacing_px, catheter.curvature_per_mm, PX)[0])
 
 
 @pytest.mark.parametrize("name", LOOPS)
