@@ -21,8 +21,8 @@ _TREND_SD_PER_MM, _MOST_TREND_SD = 0.045, 0.9
 _DRIFT_SD_PER_MM, _LEAST_SLOPE = 0.03, 0.15
 _LOOP_DRIFT = 0.8
 """How fast the foreshortening of a loop changes, as a part of its curvature."""
-_BEND_SD, _USUAL_GAP_MM = 0.36, 4.75
-"""Standard deviation of a bend between two gaps, radians; in proportion more where they are longer than usual on average."""
+_BEND_SD, _USUAL_GAP_MM = 0.36, 4.7
+"""Standard deviation of a bend between two gaps, radians; in proportion more where both are wider than usual."""
 _S_BEND, _S_BEND_WEIGHT = 0.12, 1.5
 _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
 _LOOP_SCALE, _LOOP_SIZE_SD = 1.1, 0.2
@@ -110,7 +110,7 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 def bend_freedom(spacing_mm: Array) -> Array:
     """Return how much more than usual each bend may be, (gaps - 1,)."""
-    return np.maximum(1.0, 0.5 * (spacing_mm[:-1] + spacing_mm[1:]) / _USUAL_GAP_MM)
+    return np.maximum(1.0, np.minimum(spacing_mm[:-1], spacing_mm[1:]) / _USUAL_GAP_MM)
 
 
 def loop_fit(places: Array, spacing_px: Array, curvature_per_mm: float, px_per_mm: float) -> Array:

@@ -106,7 +106,7 @@ def _least_cosines(spacing_mm: Array) -> Array:
     least = np.full(len(spacing_mm), _LEAST_COSINE)
     between = 0.5 * (spacing_mm[:-1] + spacing_mm[1:])
     if len(spacing_mm) + 1 < MANY_ELECTRODES:
-        between[between < _WIDE_GAPS_MM] = 0.0
+        between[np.minimum(spacing_mm[:-1], spacing_mm[1:]) < _WIDE_GAPS_MM] = 0.0
     least[1:] = np.minimum(least[1:], np.cos(np.minimum(_MOST_CURVED_PER_MM * between, _MOST_BENT)))
     return least
 

@@ -50,9 +50,9 @@ def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_p
 
 
 def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    """Return whether points go on in the chain's line or curve.
+    """Return whether points go on in the chain's line beyond an end.
 
-    Three or more points beyond an end are needed, no farther apart than the chain's electrodes are.
+    Three or more points are needed, no farther apart than the chain's electrodes are.
 
     Parameters
     ----------
@@ -70,19 +70,10 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
     step = _LONGEST_STEP * max(catheter.spacing_mm) * seen / sum(catheter.spacing_mm)
     for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
         before = row[-3] if len(row) > 2 else row[-2]
-        if any(_count_onwards(row[-1], before, free, step, curve) >= _ROW_CONTINUES for curve in (0.0, _curve_of(row))):
+        count = _count_onwards(row[-1], before, free, step)
+        if count >= _ROW_CONTINUES:
             return True
     return False
-
-
-def _curve_of(row: Array) -> float:
-    """Return the mean turn along a row of places, radians a pixel."""
-    u, v = np.diff(row, axis=0).T
-    if len(u) < 2:
-        return 0.0
-    turns = np.arctan2(u[:-1] * v[1:] - v[:-1] * u[1:], u[:-1] * u[1:] + v[:-1] * v[1:])
-    lengths = np.hypot(u, v)
-    return float(turns.sum() / max(0.5 * (lengths[:-1] + lengths[1:]).sum(), 1e-9))
 
 
 def shows_row(points_uv: Array, px_per_mm: float) -> bool:
@@ -102,16 +93,16 @@ def shows_row(points_uv: Array, px_per_mm: float) -> bool:
     return False
 
 
-def _count_onwards(at: Array, before: Array, left: Array, reach: float, curve: float = 0.0) -> int:
+def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
     """Count the points that go on in a line past ``at``.
 
-    The line comes from ``before`` and turns by ``curve`` radians a pixel. Each point is at most ``reach`` from the last.
+    The line comes from ``before``. Each point is at most ``reach`` from the last.
     """
-    return int(_count_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach, curve))
+    return int(_count_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach, curve):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     for count in range(left.shape[0]):
         way_u, way_v = at_u - before_u, at_v - before_v
         length = max(math.sqrt(way_u * way_u + way_v * way_v), 1e-9)
@@ -119,9 +110,7 @@ def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach, curve):
         for point in range(left.shape[0]):
             du, dv = left[point, 0] - at_u, left[point, 1] - at_v
             away = max(math.sqrt(du * du + dv * dv), 1e-9)
-            turn = 0.5 * curve * (length + away)
-            cosine, sine = math.cos(turn), math.sin(turn)
-            onwards = (du * (cosine * way_u - sine * way_v) + dv * (sine * way_u + cosine * way_v)) / length
+            onwards = (du * way_u + dv * way_v) / length
             if is_left[point] and away <= reach and onwards >= _LEAST_COSINE * away and away < least:
                 nearest, least = point, away
         if nearest < 0:

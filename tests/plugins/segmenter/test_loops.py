@@ -1,14 +1,12 @@
-"""Loops of circular catheters as images of circles: their shape, the search for them, and rows that go on in a curve."""
+"""Loops of circular catheters as images of circles: their shape, and the search for them."""
 
 import numpy as np
 import pytest
 
-from fluoromap.catheters import Catalogue, Catheter, catheter_type
-from fluoromap.contracts import Chain
+from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.segmenter.chain_scores import loop_fit
 from fluoromap.segmenter.chain_search import find_paths, off_ellipse
 from fluoromap.segmenter.linking import catheter_families, searched_spacing_px
-from fluoromap.segmenter.unlisted import continues
 
 PX = 3.2
 LOOPS = ["circular-10", "circular-20", "circular-20-2-6-2"]
@@ -78,13 +76,3 @@ def test_the_search_finds_a_loop_of_another_size_among_many_candidates(size):
     assert any((path == np.arange(10)).all() for path in paths)
     straight_px = np.array(catheter_type("decapolar-5-5-5", "cs").spacing_mm) * PX
     assert np.array_equal(searched_spacing_px(catheter_type("decapolar-5-5-5", "cs"), PX), straight_px)
-
-
-@pytest.mark.parametrize("name", LOOPS)
-def test_a_part_of_a_loop_goes_on_in_its_curve(name):
-    loop, short = catheter_type(name, "loop"), Catheter("short", 4, (4.0, 4.0, 4.0), 2.0, 1.0)
-    places = image_of(loop)
-    chain = Chain((1, 2, 3, 4), places[:4], np.tile(np.eye(2), (4, 1, 1)), np.ones(4), (("short", 1.0),))
-    wide = Catheter("short", 4, loop.spacing_mm[:3], 1.0, 1.0)
-    assert continues(chain, places, wide, PX)
-    assert not continues(chain, places[:6], short, PX)
