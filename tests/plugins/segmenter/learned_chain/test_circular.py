@@ -19,19 +19,24 @@ SPACING = 292.0 / 512
 GANTRY = Gantry(90.0, 0.0, 1000.0, 500.0, (SPACING, SPACING), 512, 512)
 CAMERA = camera_from_gantry(GANTRY)
 ENTRY = np.array([-18.0, 8.0, 95.0])
+SINUS = [np.array(place) for place in ((26.0, -6.0, 12.0), (12.0, 18.0, 4.0), (-22.0, 20.0, 2.0), (-20.0, 8.0, 95.0))]
 
 
 def run_of(loop_type, normal):
     """Return a lateral run of a circular and an ablation catheter.
 
-    The electrodes of each come with it, (frames, n, 2) pixels.
+    The electrodes of each come with it, (frames, n, 2) pixels. Without a normal the circular one lies stretched in the sinus.
     """
     appearance = APPEARANCES["LAT"]
     ablation = Shaft.through(
         catheter_type("ablation-4", "ablation"), 1.17, True, np.array([4.0, -18.0, -24.0]), np.array([0.0, -8.0, -4.0]),
         np.array([-4.0, 6.0, 40.0]), np.array([-8.0, 10.0, 95.0]),
     )  # fmt: skip
-    loop = Shaft.around(catheter_type(loop_type, "loop"), 0.75, np.array([0.0, 10.0, 5.0]), np.array(normal), ENTRY)
+    catheter = catheter_type(loop_type, "loop")
+    if normal is None:
+        loop = Shaft.through(catheter, 1.0, False, *SINUS)
+    else:
+        loop = Shaft.around(catheter, 0.75, np.array([0.0, 10.0, 5.0]), np.array(normal), ENTRY)
     shafts = [loop, ablation]
     moves = np.arange(FRAMES)[:, None] * np.array([0.0, 0.3, 0.2])
     behind = torso(GANTRY, appearance, np.random.default_rng(1), np.random.default_rng(2), 0.0)
@@ -126,3 +131,11 @@ def test_an_unlisted_loop_is_no_other_catheter(loop_type, normal, listed):
     assert taken - ({"loop", None} if in_pairs else {"loop"} if as_decapolar else set()) == {"ablation"}
     if (loop_type, normal[1]) != ("circular-10", 0.7):
         assert found.diastole.manual_needed is Reason.EXTRA_CATHETER
+
+
+@pytest.mark.parametrize("loop_type", LOOP_TYPES)
+def test_a_straight_catheter_that_is_described_as_a_loop_is_found(loop_type):
+    run, truth = run_of(loop_type, None)
+    found = segmented(run, (loop_type, "ablation-4"))
+    for entry in found.frames:
+        assert sorted(name or "" for name in chains_on(entry, truth)) == ["ablation", "loop"]
