@@ -1,7 +1,7 @@
 """PNG files of pictures (ISO/IEC 15948).
 
 Pillow tries every filter on each line, which takes longer than the compression. A line of a fluoroscopy frame is like the
-line above it, so that one filter suits all lines. ISA-L compresses as well as zlib, in a fifth of its time.
+line above it, so that one filter suits all lines. ISA-L compresses as well as zlib, in less time.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ LEVEL = 1
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
     """Encode a picture, (rows, columns) grey or (rows, columns, 3) RGB, as PNG; the same picture gives the same bytes.
+
+    Another kind of processor may compress it to other bytes.
 
     Raises
     ------

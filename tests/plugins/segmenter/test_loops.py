@@ -12,13 +12,13 @@ PX = 3.2
 LOOPS = ["circular-10", "circular-20", "circular-20-2-6-2"]
 
 
-def image_of(loop, axes=1.0, turn_deg=0.0, size=1.0, px=PX):
+def image_of(loop, axes=1.0, turn_deg=0.0, size=1.0):
     """Return the electrodes of a loop that is seen as an ellipse.
 
     They are pixels; ``axes`` is the ratio of the axes.
     """
     angles = loop.angles_on_loop_rad + np.deg2rad(turn_deg)
-    radius = size * px / loop.curvature_per_mm
+    radius = size * PX / loop.curvature_per_mm
     return 120.0 + radius * np.stack([np.cos(angles), axes * np.sin(angles)], axis=1)
 
 

@@ -115,7 +115,7 @@ class Moving(Detector):
         return FrameChains(frame, (replace(chain(1.0), pixels_uv=PLACES + np.array([0.0, self.step * frame])),))
 
 
-def test_frames_in_which_a_catheter_lies_elsewhere_are_not_segmented():
+def test_frames_in_which_a_catheter_lies_elsewhere_are_not_averaged():
     run = Run(Frames(3), np.arange(3) * 66.7, 4.0, PixelFacts(False, 12, False))
 
     def segmented(step):
