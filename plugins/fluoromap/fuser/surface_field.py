@@ -8,31 +8,20 @@ wave with a wide prior.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh, qr
-from scipy.sparse import coo_array, csc_array, csr_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_array
 from scipy.special import logsumexp
 
 from fluoromap.contracts import Array, IntArray
+from fluoromap.fuser.laplace_beltrami import eigenfunctions
 from fluoromap.fuser.surface import SurfacePoints, face_areas_mm2
 
 LENGTHS_MM = (8.0, 12.0, 18.0, 27.0, 40.0, 60.0)
 # Conduction of 0.5 to 1 m/s over chambers of 3 to 8 cm makes variations of this length; the prior is wide.
 LENGTH_PRIOR = (25.0, 0.6)
-_SHIFT = -1e-4
 _LEAST_WEIGHT = 1e-4
-_TOLERANCE = 1e-6
-"""Relative residual of an eigenvalue, far below the uncertainty of the times."""
-_BLOCK = 4
-"""Vectors in a block of the Krylov space. A block of one costs more time a vector; large blocks need more vectors."""
-_BASIS = 2.9
-"""Size of the Krylov space at the first test, as a multiple of the number of eigenfunctions."""
-_LARGEST_BASIS = 8
-"""The largest size of the Krylov space, as such a multiple."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +52,7 @@ class SurfaceField:
         area = float(face_areas_mm2(vertices_mm, faces).sum())
         # Weyl's law: about area * lambda / 4 pi eigenvalues lie below lambda; 0.13 /mm2 holds waves down to 17 mm.
         modes = int(np.clip(0.13 * area / (4 * np.pi), 30, 250))
-        values, self.modes = _laplace_beltrami(vertices_mm, faces, min(modes, len(vertices_mm) // 3))
+        values, self.modes = eigenfunctions(vertices_mm, faces, min(modes, len(vertices_mm) // 3))
         self.spectra = []
         for length in LENGTHS_MM:
             # Matern of smoothness 3/2 in two dimensions, scaled to a mean variance of 1 over the surface.
@@ -182,77 +171,3 @@ class _Fit:
 def _log_prior(value: float, prior: tuple[float, float]) -> float:
     centre, spread = prior
     return -0.5 * float(np.log(value / centre) / spread) ** 2
-
-
-def _laplace_beltrami(vertices_mm: Array, faces: IntArray, modes: int) -> tuple[Array, Array]:
-    """Return the lowest eigenvalues (m,), 1/mm², and eigenfunctions (n, m) by linear finite elements.
-
-    The eigenfunctions have unit square integral.
-    """
-    n = len(vertices_mm)
-    corners = vertices_mm[faces]
-    edges = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
-    doubled = 2 * face_areas_mm2(vertices_mm, faces)
-    # Needle-shaped faces, as in a hull of nearly coplanar sites, would otherwise make the matrix ill-conditioned.
-    doubled = np.maximum(doubled, 1e-3 * (edges**2).sum(axis=2).max(axis=1))
-    stiffness = np.einsum("fix,fjx->fij", edges, edges) / (2 * doubled)[:, None, None]
-    where = (np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel())
-    matrix = coo_array((stiffness.ravel(), where), shape=(n, n)).tocsc()
-    mass = np.bincount(faces.ravel(), np.repeat(doubled / 6, 3), minlength=n)
-    scale = 1 / np.sqrt(mass)
-    symmetric = csc_array(diags_array(scale) @ matrix @ diags_array(scale))
-    # An ordering for symmetric matrices has half the fill-in of the general ordering.
-    factor = splu(
-        csc_array(symmetric - _SHIFT * diags_array(np.ones(n))),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    values, vectors = _largest_eigenpairs(factor.solve, np.sqrt(mass), modes)
-    return np.maximum(1 / values + _SHIFT, 0.0), vectors * scale[:, None]
-
-
-def _largest_eigenpairs(apply: Callable[[Array], Array], start: Array, count: int) -> tuple[Array, Array]:
-    """Return the largest eigenvalues (m,), falling, and eigenvectors (n, m) of a positive definite matrix.
-
-    The block Lanczos method with orthogonalisation: Golub & Van Loan, Matrix Computations, 4th ed., section 10.3.6. Blocks
-    make one matrix product of many products of vectors, which ARPACK computes one by one.
-
-    Parameters
-    ----------
-    apply : callable
-        Multiplies the matrix and vectors (n, b).
-    start : (n,)
-        First vector; the others of its block are random, and the same each time.
-    count : int
-        Number m of the eigenvalues.
-    """
-    n = len(start)
-    if n < 4 * count + _BLOCK:
-        found, axes = eigh(apply(np.eye(n)))
-        return found[::-1][:count], axes[:, ::-1][:, :count]
-    room = min(n, _LARGEST_BASIS * count)
-    basis, projected = np.empty((n, room), order="F"), np.zeros((room, room))
-    block = np.column_stack([start, np.random.default_rng(0).normal(size=(n, _BLOCK - 1))])
-    basis[:, :_BLOCK] = qr(block, mode="economic")[0]
-    size, enough = 0, int(_BASIS * count)
-    while size + 2 * _BLOCK <= room:
-        old, own = slice(max(size - _BLOCK, 0), size), slice(size, size + _BLOCK)
-        size += _BLOCK
-        new = apply(basis[:, own])
-        new -= basis[:, old] @ projected[own, old].T
-        projected[own, own] = basis[:, own].T @ new
-        new -= basis[:, own] @ projected[own, own]
-        # Rounding brings back directions of earlier blocks. A step enlarges them by at most the ratio of the largest
-        # eigenvalue to the smallest of interest. Every third block keeps them, because they stay far below the tolerance.
-        if size // _BLOCK % 3 or size >= enough:
-            new -= basis[:, :size] @ (basis[:, :size].T @ new)
-        following, coupling = qr(new, mode="economic", check_finite=False)
-        if size >= enough:
-            values, axes = eigh(projected[:size, :size], lower=True, subset_by_index=[size - count, size - 1])
-            if (np.linalg.norm(coupling @ axes[-_BLOCK:], axis=0) < _TOLERANCE * values).all():
-                return values[::-1], (basis[:, :size] @ axes)[:, ::-1]
-            enough = size + count // 8
-        own = slice(size, size + _BLOCK)
-        basis[:, own], projected[own, size - _BLOCK : size] = following, coupling
-    raise np.linalg.LinAlgError("the eigenfunctions of the surface do not converge")

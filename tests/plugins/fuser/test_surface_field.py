@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from fluoromap.fuser.chamber_shape import wall_surface
-from fluoromap.fuser.surface_field import SurfaceField, _largest_eigenpairs
+from fluoromap.fuser.surface_field import SurfaceField
 
 AXES_MM = np.array([20.0, 24.0, 32.0])
-
-
-@pytest.mark.parametrize(("size", "count"), [(400, 30), (60, 20)])
-def test_the_largest_eigenpairs_are_those_of_the_whole_matrix(size: int, count: int) -> None:
-    rng = np.random.default_rng(1)
-    axes = np.linalg.qr(rng.normal(size=(size, size)))[0]
-    values = 1.0 / np.arange(1.0, size + 1)
-    matrix = (axes * values) @ axes.T
-    found, vectors = _largest_eigenpairs(lambda of: matrix @ of, np.ones(size), count)
-    np.testing.assert_allclose(found, values[:count], rtol=1e-12)
-    np.testing.assert_allclose(np.abs((vectors * axes[:, :count]).sum(axis=0)), 1.0, atol=1e-12)
 
 
 def test_the_eigenfunctions_of_a_wall_are_orthonormal_and_the_same_each_time() -> None:
