@@ -8,6 +8,8 @@ of the top-left pixel. World points are millimetres along DICOM patient axes (LP
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -287,6 +289,19 @@ class Chain:
             raise ValueError(f"probabilities of kinds {self.kinds} add up to more than 1")
         if self.tip_odds is not None and not math.isfinite(self.tip_odds):
             raise ValueError(f"tip_odds is {self.tip_odds}; it must be finite, or None")
+
+    @functools.cached_property
+    def extent_px(self) -> tuple[float, float, float, float]:
+        """Left, upper, right and lower edge of the electrodes' places."""
+        (left, upper), (right, lower) = self.pixels_uv.min(axis=0).tolist(), self.pixels_uv.max(axis=0).tolist()
+        return left, upper, right, lower
+
+    def on_track(self, track: int) -> Chain:
+        """Return the same chain with another track number."""
+        # The other fields were checked when this chain was made, and tracking renumbers every chain of a run.
+        chain = copy.copy(self)
+        object.__setattr__(chain, "track", track)
+        return chain
 
     def from_other_end(self, electrodes: int) -> Chain:
         """Return the chain of a catheter with so many electrodes, numbered from the other end."""

@@ -30,6 +30,19 @@ _Pixel = TypeVar("_Pixel", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
+class ExposedField:
+    """What the frames show of the field; all else about it follows.
+
+    inside : the eroded field; text : burnt-in text; both (rows, columns) of half the size.
+    mean_level : mean stored grey level inside, over the sampled frames.
+    """
+
+    inside: BoolArray
+    text: BoolArray
+    mean_level: float
+
+
+@dataclass(frozen=True, eq=False)
 class FieldMask:
     """The field of one run.
 
@@ -66,7 +79,12 @@ def are_in(field: BoolArray, points_uv: Array) -> BoolArray:
 
 
 def find_field(frames: FrameSource, facts: PixelFacts) -> FieldMask:
-    """Return the field mask of a run.
+    """Return the field mask of a run."""
+    return field_mask(exposed_field(frames, facts), frames.shape)
+
+
+def exposed_field(frames: FrameSource, facts: PixelFacts) -> ExposedField:
+    """Return the exposed part of a run's images.
 
     Shutter attributes are used where the header has them. Otherwise the median of at most 9 evenly spaced frames is cut
     at 6 % of its bright level, and at straight and circular collimator edges that are fitted to it. A grey level alone
@@ -87,7 +105,29 @@ def find_field(frames: FrameSource, facts: PixelFacts) -> FieldMask:
     field = _largest_part(field)
     if np.count_nonzero(field) < 0.02 * field.size:
         field = np.ones(median.shape, dtype=np.bool_)
-    return _build_mask(field, text, median, frames.shape)
+    inside = field
+    if not field.all():  # the distance transform needs a background
+        eroded = ndimage.distance_transform_edt(np.pad(field, 1, mode="edge"))[1:-1, 1:-1] > 0.5 * _ERODE_PX
+        inside = eroded if eroded.any() else field
+    return ExposedField(inside, text, float(median[inside].mean()))
+
+
+def field_mask(exposed: ExposedField, shape: tuple[int, int]) -> FieldMask:
+    """Return the field mask of images (rows, columns) from their exposed part."""
+    inside, text = exposed.inside, exposed.text
+    # A candidate also needs a margin to the border of the image: half an electrode cannot be located.
+    to_edge = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
+    candidates, with_edge = (
+        _double_size((to_edge > 0.5 * min(margin, min(shape) // 8)) & ~text, shape) for margin in (MARGIN_PX, EDGE_PX)
+    )
+    whole = _double_size(inside, shape)
+    hidden = ~inside | text
+    outside = np.flatnonzero(_double_size(hidden, shape))
+    nearest = np.zeros(0, dtype=np.int64)
+    if outside.size:
+        v, u = _nearest_place(hidden)
+        nearest = _double_size(2 * (v * shape[1] + u), shape).ravel()[outside]
+    return FieldMask(whole, candidates, with_edge, outside, nearest, exposed.mean_level)
 
 
 def evenly_spaced_frames(count: int, most: int = _SAMPLES) -> list[int]:
@@ -153,26 +193,6 @@ def _largest_part(field: BoolArray) -> BoolArray:
         field = labels == int(np.argmax(sizes))
     filled: BoolArray = ndimage.binary_fill_holes(field)
     return filled
-
-
-def _build_mask(half: BoolArray, text: BoolArray, median: Image, shape: tuple[int, int]) -> FieldMask:
-    inside = half
-    if not half.all():  # the distance transform needs a background
-        eroded = ndimage.distance_transform_edt(np.pad(half, 1, mode="edge"))[1:-1, 1:-1] > 0.5 * _ERODE_PX
-        inside = eroded if eroded.any() else half
-    # A candidate also needs a margin to the border of the image: half an electrode cannot be located.
-    to_edge = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
-    candidates, with_edge = (
-        _double_size((to_edge > 0.5 * min(margin, min(shape) // 8)) & ~text, shape) for margin in (MARGIN_PX, EDGE_PX)
-    )
-    whole = _double_size(inside, shape)
-    hidden = ~inside | text
-    outside = np.flatnonzero(_double_size(hidden, shape))
-    nearest = np.zeros(0, dtype=np.int64)
-    if outside.size:
-        v, u = _nearest_place(hidden)
-        nearest = _double_size(2 * (v * shape[1] + u), shape).ravel()[outside]
-    return FieldMask(whole, candidates, with_edge, outside, nearest, float(median[inside].mean()))
 
 
 def _double_size(half: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:

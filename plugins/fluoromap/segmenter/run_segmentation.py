@@ -13,7 +13,7 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
+from fluoromap.segmenter.field_mask import ExposedField, FieldMask, evenly_spaced_frames, exposed_field, field_mask
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
@@ -213,7 +213,9 @@ def segment_run(
         Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     """
     context.check()
-    field = find_field(run.frames, run.pixels)
+    # Marks change the tracks, but not what the images show.
+    recall = _recall_for(run, catalogue, context)
+    field = field_mask(recall(ExposedField, (), lambda: exposed_field(run.frames, run.pixels)), run.frames.shape)
     transform = LogTransform.of_run(run.pixels, field.mean_level)
     count = len(run.frames)
 
@@ -227,8 +229,6 @@ def segment_run(
             total += run.frames[index].astype(np.float64)
         return field.fill(transform(total / len(averaged)))
 
-    # Marks change the tracks, but not what the images show.
-    recall = _recall_for(run, catalogue, context)
     detections = recall(
         RunDetections, (), lambda: _detect(run, detector_of(field), log_image, mean_image, field, context)
     )
@@ -311,7 +311,7 @@ def _with_marks(tracked: Sequence[FrameChains], detections: Sequence[FrameChains
             by_hand = tuple(replace(chain, manual=True) for chain in marks[entry.frame])
             found.append(FrameChains(entry.frame, by_hand))
             continue
-        chains = tuple(replace(chain, track=-1) for chain in entry.chains)
+        chains = tuple(chain.on_track(-1) for chain in entry.chains)
         others = tuple(chain for chain in detected.chains if not overlaps(chain, chains))
         reason = detected.manual_needed if others or not chains else None
         found.append(FrameChains(entry.frame, (*chains, *others), reason))
@@ -468,7 +468,7 @@ def _add_missing_catheters(
             if known.track not in on_tracks and len(chains) < catheters and not known.manual:
                 on_tracks.add(known.track)
                 carried = detector.find_again(x, known, np.zeros(2), _SAME_TRACK_PX / 2, chains)
-                chains += [] if carried is None else [replace(carried, track=-1)]
+                chains += [] if carried is None else [carried.on_track(-1)]
     return tuple(chains)
 
 
@@ -598,6 +598,6 @@ def _assign_tracks(
             if number < 0 or 2 * votes[number] < shown:
                 number, fresh = fresh, fresh + 1
             taken.add(number)
-            chain = replace(chain, track=number)
+            chain = chain.on_track(number)
         numbered.append(chain)
     return tuple(numbered)

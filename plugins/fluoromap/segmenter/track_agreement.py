@@ -32,7 +32,7 @@ def with_common_kinds(chains: Mapping[int, Chain], track: int) -> dict[int, Chai
         (name, math.fsum(chain.probability(name) for chain in chains.values()) / len(chains)) for name in names
     )
     return {
-        frame: replace(chain, track=track, kinds=chain.kinds if chain.manual else kinds)
+        frame: (chain if chain.manual else replace(chain, kinds=kinds)).on_track(track)
         for frame, chain in chains.items()
     }
 

@@ -131,7 +131,7 @@ def track_chains(
             track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
     for number, track in enumerate(tracks_kept):
         if track.manual:
-            track.chains = {frame: replace(chain, track=number) for frame, chain in track.chains.items()}
+            track.chains = {frame: chain.on_track(number) for frame, chain in track.chains.items()}
         else:
             track.chains = with_common_kinds(track.chains, number)
     usual = [track for track in tracks_kept if len(track.chains) > len(found) / 2]
