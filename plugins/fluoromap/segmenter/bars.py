@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from fluoromap.contracts import Array
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.linking import ShaftImage
 
 _STEP_MM, _BEYOND_MM, _AHEAD_MM = 0.25, 2.0, 2.0
@@ -54,7 +54,7 @@ def products_beside(chain_uv: Array, shaft_image: ShaftImage, beside_mm: Array =
     return products
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:,::1], f8, f8, f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1]", fastmath=False)
 def _add_products(smooth, scale, px_per_mm, corners_uv, corners_mm, offsets_mm, depths, own, products):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the products of :func:`products_beside`, (lines, electrodes, 3).
 

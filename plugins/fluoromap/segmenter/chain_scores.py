@@ -13,6 +13,7 @@ from numba import njit
 
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
 _SPACING_SD, _LOOP_SPACING_SD = 0.06, 0.12
@@ -60,7 +61,7 @@ def score_paths(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("i8[:,::1], f8[:,::1], f8[::1], f8[::1], i8, f8, f8[::1], f8[::1], f8[:,:,::1], f8[:,::1], f8[::1]")
 def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
     chosen, points, weights, variance_px2, sure, lost, spacing_px, freedom, places, variances, out
 ):  # fmt: skip
@@ -196,7 +197,7 @@ def _fit_many_spacings(places, spacing_px, variance_px2, spacing_sd, drift_per_p
         out[row] = -0.5 * rest
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f8[:,:,::1], f8[::1], f8[:,::1], f8, f8[::1]")
 def _fit_spacings(places, spacing_px, variance_px2, px_per_mm, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     n = spacing_px.size
     reach = -0.5 * (spacing_px[0] + spacing_px[n - 1])
@@ -265,7 +266,7 @@ def _shaft_pieces(electrodes: int, widest: int, tip_mm: float) -> tuple[IntArray
     return pieces, np.array([[-0.25, -0.75], _BEHIND_MM, [before, before + _BEFORE_MM[1]]])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f8[:,:,::1], i8[:,::1], f8[:,::1], f8, f4[:,::1], i8, f8, f8, f8[::1]")
 def _look_for_shafts(places, pieces, reach, px_per_mm, smooth, reduction, clear, side, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add, over three pieces, the mean of the darker side less the middle.
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.segmenter.kernels import kernel
 
 SHORTEST, LONGEST = 0.35, 1.12
 """Limits of the ratio between the spacing in the image and the same spacing across the rays at the isocentre.
@@ -111,7 +111,7 @@ def _least_cosines(spacing_mm: Array) -> Array:
     return least
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f8[:,::1], f8[::1], i8, f8, i8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1]")
 def _grow(points, spacing_px, step, least_cosine, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write all paths with one more electrode; return their number.
 
@@ -221,7 +221,7 @@ def best_set(values: Array, shared: IntArray, family: IntArray, capacity: IntArr
     return best[: _branch_and_bound(values, shared, family, capacity.copy(), price, stack, np.zeros(most + 1), best)]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f8[::1], i8[:,::1], i8[::1], i8[::1], f8, i8[::1], f8[::1], i8[::1]")
 def _branch_and_bound(values, shared, family, left, price, stack, gained, best):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write the best set to ``best`` and return its size.
 

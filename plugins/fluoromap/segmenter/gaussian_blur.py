@@ -10,9 +10,9 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 
 from fluoromap.contracts import IntArray
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
 _AT_ONCE = 3
@@ -101,7 +101,7 @@ def _reflected(size: int, reach: int) -> IntArray:
     return np.minimum(index, 2 * size - 1 - index)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[::1], f4[::1], i8[::1], i8[::1], i8[::1], f4[::1], f4[::1], f4[::1]")
 def _blur_rows(x, taps, rows, columns, along, middle, line, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Blur across the rows into a line with mirrored ends, then along that line.
 
@@ -135,7 +135,7 @@ def _blur_rows(x, taps, rows, columns, along, middle, line, out):  # type: ignor
                     )
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[:,::1], f4[:,::1]")
 def _halve(x, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     quarter = np.float32(0.25)
     for v in range(out.shape[0]):
@@ -153,7 +153,7 @@ def _enlarge(small: Image, factor: int, shape: tuple[int, ...]) -> Image:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[:,::1], i8, f4[:,::1]")
 def _interpolate_rows(x, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     last = x.shape[0] - 1
     for v in range(out.shape[0]):

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fluoromap.contracts import BoolArray, PixelFacts
+from fluoromap.segmenter.kernels import kernel
 
 Image = NDArray[np.float32]
 
@@ -18,7 +18,7 @@ _COARSE_OFFSET = 0.02
 _GAUSSIAN_SD = 1.4826
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("u2[:,::1], f4[::1], f4[:,::1]")
 def _look_up(pixels, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     last = table.size - 1
     for v in range(pixels.shape[0]):

@@ -7,11 +7,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.chain_search import LONGEST, SHORTEST
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
 _STEP_PX = 0.5
@@ -162,7 +162,7 @@ def _diameter_mm(catheter: Catheter) -> float:
     return 2.33 if catheter.tip_mm >= _LONG_TIP_MM else 2.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f8[:,:,::1], f8[::1], f8, f8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], i8[:,::1]")
 def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write arc lengths, axes, band lengths and profile lengths of all electrodes.
 
@@ -196,7 +196,7 @@ def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  
             sides[row, k] = int(max(window, bands[row, k] + _LEAST_WINDOW_PX) / _STEP_PX)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[:,::1], f8[:,:,::1], f8[:,::1], f8, i8[:,::1], i8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1]")
 def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, misfits):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move the points to the best nearby positions of bands along these axes.
 

@@ -10,10 +10,10 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.linking import ShaftImage
 
 _FAN_RAD, _LOOP_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9)), np.deg2rad(np.linspace(-45.0, 45.0, 15))
@@ -103,7 +103,7 @@ def _steps(reach_mm: tuple[float, float], px_per_mm: float) -> Array:
     return np.linspace(*reach_mm, _SAMPLES) * px_per_mm
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8, f8, f8, f8[:,::1]", fastmath=False)
 def _measure_rays(smooth, starts_uv, angles_rad, steps, scale, side, clear, depths):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write the depths of the rays that have enough samples in the image."""
     last_u, last_v = smooth.shape[1] - 1, smooth.shape[0] - 1

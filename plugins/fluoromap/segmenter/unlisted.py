@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
+from fluoromap.segmenter.kernels import kernel
 
 SURE = 0.5
 """Proposals of this probability have to be explained."""
@@ -101,7 +101,7 @@ def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
     return int(_count_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f8, f8, f8, f8, f8[:,::1], b1[::1], f8", fastmath=False)
 def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     for count in range(left.shape[0]):
         way_u, way_v = at_u - before_u, at_v - before_v

@@ -1,4 +1,4 @@
-"""A small synthetic run that makes a worker compile the kernels before it takes work."""
+"""What a worker does before its first run: it compiles the kernels and segments a small synthetic run."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue
 from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
+from fluoromap.segmenter.kernels import compile_kernels
 
 _PX_PER_MM = 5.75
 _FRAME_MS = 1000.0 / 15
@@ -51,8 +52,9 @@ class SyntheticFrames:
         return (self[index] for index in range(_FRAMES))
 
 
-def compile_kernels(segmenter: Segmenter) -> None:
-    """Segment the synthetic run, which compiles the kernels or loads them from the cache."""
+def prepare(segmenter: Segmenter) -> None:
+    """Compile the kernels, or load them from the cache, and segment the synthetic run."""
+    compile_kernels()
     run = Run(
         SyntheticFrames(DEFAULT_CATALOGUE),
         np.arange(_FRAMES, dtype=np.float64) * _FRAME_MS,

@@ -11,7 +11,7 @@ from fluoromap.fuser.laplace_beltrami import eigenfunctions, lowest_eigenpairs
 
 
 def _grid_laplacian(rows: int, columns: int) -> tuple[csc_array, np.ndarray]:
-    """Return the matrix of a grid with free edges, and its eigenvalues in closed form."""
+    """Return the matrix of a grid with free edges, and its eigenvalues."""
 
     def path(n: int) -> np.ndarray:
         matrix = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)

@@ -31,6 +31,8 @@ segmenter = build_segmenter(sys.argv[1], {})
 segmenter.warm_up()
 warm = kernels()
 assert any(warm.values())
+# The declared types are those of the calls: no kernel is compiled for other ones too.
+assert all(len(signatures) <= 1 for signatures in warm.values()), warm
 for view in simulated:
     run = Run(view.frames, view.frame_times_ms, 5.75, PixelFacts(False, 12, False))
     segmenter.segment(run, DEFAULT_CATALOGUE, {}, Silent())

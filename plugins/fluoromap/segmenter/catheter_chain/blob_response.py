@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image, pixel_noise, robust_sd
 from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 
@@ -205,7 +205,7 @@ def _noise_at_half_size(x: Image, inside: BoolArray) -> float:
     return pixel_noise(half, inside[: 2 * half.shape[0] : 2, : 2 * half.shape[1] : 2])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4, f4[::1]")
 def _sum_round(up, left, centre, right, down, weight, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     four = np.float32(4)
     for i in range(out.size):

@@ -15,7 +15,7 @@ from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run
 from fluoromap.segmenter.visible_part import visible_part
-from fluoromap.segmenter.warm_up import compile_kernels
+from fluoromap.segmenter.warm_up import prepare
 
 _ACCEPTANCE = Acceptance(
     least_clearness=0.75, again_clearness=0.6, sure_clearness=1.1, extra_clearness=1.3, scores=ScoreLimits(3.5)
@@ -40,7 +40,7 @@ class CatheterChain:
     @classmethod
     def warm_up(cls) -> None:
         """Compile the kernels, or load them from the cache."""
-        compile_kernels(cls())
+        prepare(cls())
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.linalg.blas import sgemm
 
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.learned_chain.layers import AROUND, CELL_PX, CONVOLUTIONS, HEADS, Convolution
 from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
 from fluoromap.segmenter.learned_chain.winograd import convolve, transformed_taps
@@ -241,7 +241,7 @@ class ElectrodeNetwork:
         return out
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[:,::1], f4[::1], f4, f4[:,::1]")
 def _add_bias(flat, bias, least, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write the first values of each row with the bias added.
 

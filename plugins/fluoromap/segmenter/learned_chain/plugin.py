@@ -20,7 +20,7 @@ from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, segment_run
 from fluoromap.segmenter.visible_part import visible_part
-from fluoromap.segmenter.warm_up import compile_kernels
+from fluoromap.segmenter.warm_up import prepare
 
 _DIM_BELOW = 0.02
 """Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""
@@ -55,7 +55,7 @@ class LearnedChain:
     @classmethod
     def warm_up(cls) -> None:
         """Compile the kernels, or load them from the cache."""
-        compile_kernels(cls())
+        prepare(cls())
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""

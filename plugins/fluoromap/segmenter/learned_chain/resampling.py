@@ -6,9 +6,9 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 
 from fluoromap.contracts import Array, IntArray
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
 
@@ -63,7 +63,7 @@ def _shares(size: int, count: int, scale: float) -> tuple[IntArray, Image]:
     return first, shifted[:, : min(taps, size)].astype(np.float32)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[:,::1], i8[::1], f4[:,::1], f4[:,::1]")
 def _along_rows(x, first, weights, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     if weights.shape[1] == 4:
         # A reduction by less than 2, as of most runs: without the inner loop it takes a third of the time.
@@ -87,7 +87,7 @@ def _along_rows(x, first, weights, out):  # type: ignore[no-untyped-def]  # prag
             out[v, u] = total
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[:,::1], i8[::1], f4[:,::1], f4[:,::1]")
 def _across_rows(x, first, weights, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     for v in range(out.shape[0]):
         target = out[v]
@@ -108,7 +108,7 @@ def add_moved(image: Image, turn: Array, shift: Array, total: Image) -> None:
     _add_moved(image, turn, shift, total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f4[:,::1], f8[:,::1], f8[::1], f4[:,::1]", fastmath=False)
 def _add_moved(image, turn, shift, total):  # type: ignore[no-untyped-def]  # pragma: no cover
     last_u, last_v = image.shape[1] - 1.0, image.shape[0] - 1.0
     for row in range(total.shape[0]):

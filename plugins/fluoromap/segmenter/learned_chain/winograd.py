@@ -9,8 +9,8 @@ column of each, so that one column of all tiles of a row is contiguous.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
 from fluoromap.segmenter.log_image import Image
 
@@ -88,7 +88,7 @@ def _split(x: Image, dilation: int, padded: Image) -> None:
                 picture[: part.shape[0], (column + 1) % _TILE, first : first + part.shape[1]] = part
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[::1], i8, i8, i8, f4[::1], f4[::1], i8, i8")
 def _transform_tiles(padded, wide, down, first_row, lines, tiles, apart_tiles, size):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Transform rows of tiles along columns, then along rows.
 
@@ -128,7 +128,7 @@ def _transform_tiles(padded, wide, down, first_row, lines, tiles, apart_tiles, s
                     )
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel("f4[::1], i8, f4[::1], i8, i8, i8, f4[::1], f4[::1], f4[:,:,::1]")
 def _join_tiles(answers, apart_answers, bias, dilation, down, first_row, lines, pixels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Transform the answers of rows of tiles back to pixels.
 
