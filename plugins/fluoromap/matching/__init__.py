@@ -5,5 +5,5 @@ from fluoromap.matching.study_matching import match_study
 
 __all__ = ["VERSION", "SiteRuns", "match_study"]
 
-VERSION = "7"
+VERSION = "8"
 """Version of the results: it changes whenever the same chains give another result; results are stored under it."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array, BoolArray, Chain
+from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.geometry import Camera
+from fluoromap.matching.numberings import Numbering, Way, readings
 from fluoromap.matching.run_catheters import RunCatheter
 from fluoromap.matching.two_view import signed_epipolar_px, triangulate_linear
 
@@ -25,6 +26,10 @@ _TURN_RAD = 1e-3
 _PIXEL_FLOOR_PX = 0.8
 _SPACING_SD_MM = 0.45
 _BEND_SD_DEG = 35.0
+_OTHER_FIRST_COST = 3.0
+"""Cost of numbers that begin at another electrode of a loop than the segmenter found, nats."""
+_HOPELESS = 20.0
+"""Numbers of a loop with which its distances from the epipolar lines cost so much more than with others are not tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +44,11 @@ class PairTable:
     group_cost : (groups, n, m), spacing and votes; infinite where the name is impossible.
     motion_cost : (n, m, shifts) over the cycle, for each shift of view b's phases.
     position_mm : (n, m, 3), mean of the electrodes in the world.
-    turned : (n, m, 2), whether the chain of view a and that of view b are numbered from the other end. The other fields hold for
-    these numbers.
+    turned, rotated : (n, m, 2), the :class:`~fluoromap.matching.numberings.Numbering` of the chain of view a and of that of
+    view b. The other fields hold for these numbers.
     other_end_cost : (n, m), by how much the pair costs more with both chains numbered from the other end; infinite where that is
-    no question. one_end_cost : (n, m), the same with one of the two numbered from its other end.
+    no question. other_way_cost : (n, m), the same with one of the two numbered from its other end, or from another electrode of a
+    loop.
     axis_mm : (n, m, 3), from the highest of the common electrodes to the lowest.
     """
 
@@ -55,9 +61,18 @@ class PairTable:
     motion_cost: Array
     position_mm: Array
     turned: BoolArray
+    rotated: IntArray
     other_end_cost: Array
-    one_end_cost: Array
+    other_way_cost: Array
     axis_mm: Array
+
+    def way(self, pair: tuple[int, int]) -> Way:
+        """Return how the two chains of a pair are numbered."""
+        a, b = (
+            Numbering(bool(turned), int(rotated))
+            for turned, rotated in zip(self.turned[pair], self.rotated[pair], strict=True)
+        )
+        return a, b
 
 
 def student_cost(chi2: Array, terms: int | Array = 1) -> Array:
@@ -115,48 +130,55 @@ def pair_table(
     table = PairTable(
         np.zeros((n, m), dtype=np.bool_), np.zeros((n, m)), np.ones((n, m)), np.zeros((n, m, 3)), np.zeros((n, m)),
         np.full((len(groups), n, m), np.inf), motion_cost, np.zeros((n, m, 3)), np.zeros((n, m, 2), dtype=np.bool_),
-        np.full((n, m), np.inf), np.full((n, m), np.inf), np.zeros((n, m, 3)),
+        np.zeros((n, m, 2), dtype=np.int64), np.full((n, m), np.inf), np.full((n, m), np.inf), np.zeros((n, m, 3)),
     )  # fmt: skip
-    readings = [
+    votes_a, votes_b = (
+        np.array([[one.vote(group) for group in groups] for one in catheters])
+        for catheters in (catheters_a, catheters_b)
+    )
+    on_loop = np.array([catalogue[group[0]].is_circular for group in groups])
+    found = [
         reading
         for i, first in enumerate(catheters_a)
         for j, second in enumerate(catheters_b)
         if not (first.manual_name and second.manual_name and first.manual_name != second.manual_name)
-        for reading in _readings((i, j), first, second)
+        for reading in readings((i, j), first, second, bool((on_loop & _is_voted(votes_a[i], votes_b[j])).any()))
     ]
-    if not readings:
+    if not found:
         return table
-    pixels_a = np.concatenate([catheters_a[one.pair[0]].diastole.pixels_uv[one.rows_a] for one in readings])
-    pixels_b = np.concatenate([catheters_b[one.pair[1]].diastole.pixels_uv[one.rows_b] for one in readings])
+    pixels_a = np.concatenate([catheters_a[one.pair[0]].diastole.pixels_uv[one.rows_a] for one in found])
+    pixels_b = np.concatenate([catheters_b[one.pair[1]].diastole.pixels_uv[one.rows_b] for one in found])
     distances = signed_epipolar_px(*cameras, pixels_a, pixels_b)
     moved = np.stack(
         [signed_epipolar_px(cameras[0], _turned(cameras[1], axis), pixels_a, pixels_b) for axis in range(3)], axis=1
     )
     slopes = (moved - distances[:, None]) / _TURN_RAD
     points = triangulate_linear(*cameras, pixels_a, pixels_b)
-    ends = np.cumsum([len(one.rows_a) for one in readings])
+    ends = np.cumsum([len(one.rows_a) for one in found])
     catheter_variance = (CATHETER_SD_MM * cameras[1].px_per_mm) ** 2
     noise_a, noise_b = ([_variances_px2(one.diastole) for one in catheters] for catheters in (catheters_a, catheters_b))
-    votes_a, votes_b = (
-        np.array([[one.vote(group) for group in groups] for one in catheters])
-        for catheters in (catheters_a, catheters_b)
-    )
-    costs: dict[tuple[int, int], dict[tuple[bool, bool], float]] = {}
-    for one, end in zip(readings, ends, strict=True):
+    costs: dict[tuple[int, int], dict[Way, float]] = {}
+    least_uneven: dict[tuple[int, int], float] = {}
+    for one, end in zip(found, ends, strict=True):
         own = slice(end - len(one.rows_a), end)
         i, j = one.pair
         first, second = catheters_a[i], catheters_b[j]
         noise = _PIXEL_FLOOR_PX**2 + noise_a[i][one.rows_a] + noise_b[j][one.rows_b]
         mean = common_distance(distances[own], noise)
         uneven = float(student_cost((distances[own] - mean) ** 2 / noise).sum())
-        shape = uneven + bend_cost(points[own])
-        for ways in one.ways:
-            at = points[own][::-1] if ways[0] else points[own]
-            electrodes = [first.electrodes + 1 - number for number in reversed(one.numbers)] if ways[0] else one.numbers
-            ends_cost = _ends_cost(first, ways[0]) + _ends_cost(second, ways[1])
-            whole = first.electrodes if ways[0] else None
-            names = _name_costs(at, electrodes, whole, np.stack([votes_a[i], votes_b[j]]), catalogue, groups)
-            by_group = ends_cost + names
+        if one.is_rotated and uneven > least_uneven.get(one.pair, np.inf) + _HOPELESS:
+            continue
+        least_uneven[one.pair] = min(uneven, least_uneven.get(one.pair, np.inf))
+        for way in one.ways:
+            numbers = [way[0].number(number, first.electrodes) for number in one.numbers]
+            at, electrodes = points[own][np.argsort(numbers)], sorted(numbers)
+            shape = uneven + bend_cost(at)
+            names = _name_costs(at, electrodes, np.stack([votes_a[i], votes_b[j]]), catalogue, groups)
+            is_rotated = bool(way[0].rotated or way[1].rotated)
+            if way[0].turned or is_rotated:
+                whole = np.array([catalogue[group[0]].electrodes == first.electrodes for group in groups])
+                names[~(whole & (on_loop | (not is_rotated)))] = np.inf
+            by_group = _ends_cost(first, way[0]) + _ends_cost(second, way[1]) + names
             cost = shape + float(by_group.min(initial=np.inf))
             known = costs.setdefault((i, j), {})
             if cost < min(known.values(), default=np.inf) or not known:
@@ -167,32 +189,24 @@ def pair_table(
                 table.shape_cost[i, j] = shape
                 table.group_cost[:, i, j] = by_group
                 table.possible[i, j] = bool(np.isfinite(by_group).any())
-                table.turned[i, j] = ways
+                table.turned[i, j] = [numbering.turned for numbering in way]
+                table.rotated[i, j] = [numbering.rotated for numbering in way]
                 table.axis_mm[i, j] = at[0] - at[-1]
-            known[ways] = cost
-    for (i, j), known in costs.items():
-        in_a, in_b = (bool(way) for way in table.turned[i, j])
-        if table.possible[i, j] and len(known) > 1:
-            least = known[in_a, in_b]
-            table.other_end_cost[i, j] = known.get((not in_a, not in_b), np.inf) - least
-            one_end = [known.get(ways, np.inf) for ways in ((not in_a, in_b), (in_a, not in_b))]
-            table.one_end_cost[i, j] = min(one_end) - least
+            known[way] = cost
+    for pair, known in costs.items():
+        if table.possible[pair] and len(known) > 1:
+            chosen = table.way(pair)
+            other_end = [way for way in known if all(a.turned != b.turned for a, b in zip(way, chosen, strict=True))]
+            others = [way for way in known if way != chosen and way not in other_end]
+            for cost_of, ways in ((table.other_end_cost, other_end), (table.other_way_cost, others)):
+                cost_of[pair] = min((known[way] for way in ways), default=np.inf) - known[chosen]
     return table
 
 
-@dataclass(frozen=True, slots=True)
-class _Reading:
-    """Two chains, electrode by electrode.
-
-    numbers : of the common electrodes in view a. rows_a, rows_b : these electrodes in each chain. ways : which of the chains may be
-    numbered from the other end so that these electrodes belong together.
-    """
-
-    pair: tuple[int, int]
-    numbers: list[int]
-    rows_a: list[int]
-    rows_b: list[int]
-    ways: tuple[tuple[bool, bool], ...]
+def _is_voted(votes_a: Array, votes_b: Array) -> BoolArray:
+    """Return which names (groups,) two chains with these votes may have."""
+    voted: BoolArray = votes_a + votes_b >= 2 * LEAST_VOTE
+    return voted
 
 
 def _variances_px2(chain: Chain) -> Array:
@@ -201,47 +215,24 @@ def _variances_px2(chain: Chain) -> Array:
     return variances
 
 
-def _readings(pair: tuple[int, int], first: RunCatheter, second: RunCatheter) -> list[_Reading]:
-    """Return the ways in which two chains may show the same electrodes."""
-    alike = first.electrodes == second.electrodes
-    may_turn = [alike and one.tip_odds is not None for one in (first, second)]
-    ways = [(a, b) for a in (False, True) for b in (False, True) if (may_turn[0] or not a) and (may_turn[1] or not b)]
-    found = []
-    for opposite in (False, True):
-        own = tuple(way for way in ways if (way[0] != way[1]) == opposite)
-        in_a, in_b = first.diastole.electrodes, second.diastole.electrodes
-        partners = {number: second.electrodes + 1 - number if opposite else number for number in in_a}
-        numbers = [number for number in in_a if partners[number] in in_b]
-        if own and numbers:
-            rows_a = [in_a.index(number) for number in numbers]
-            rows_b = [in_b.index(partners[number]) for number in numbers]
-            found.append(_Reading(pair, numbers, rows_a, rows_b, own))
-    return found
-
-
-def _ends_cost(catheter: RunCatheter, is_turned: bool) -> float:
-    """Return the cost of numbering a catheter from its other end."""
-    return catheter.tip_odds or 0.0 if is_turned else 0.0
+def _ends_cost(catheter: RunCatheter, numbering: Numbering) -> float:
+    """Return the cost of these numbers against those that the segmenter found."""
+    turned = catheter.tip_odds or 0.0 if numbering.turned else 0.0
+    return turned + (_OTHER_FIRST_COST if numbering.rotated else 0.0)
 
 
 def _name_costs(
     points_world_mm: Array,
     electrodes: Sequence[int],
-    whole: int | None,
     votes: Array,
     catalogue: Catalogue,
     groups: Sequence[tuple[str, ...]],
 ) -> Array:
-    """Return the cost (groups,) of each name's spacings and votes (2, groups).
-
-    Names of catheters that do not have ``whole`` electrodes, where it is given, are impossible.
-    """
+    """Return the cost (groups,) of each name's spacings and votes (2, groups)."""
     costs: Array = -np.log(np.maximum(votes, 0.02)).sum(axis=0)
-    for k, group in enumerate(groups):
-        if votes[0, k] + votes[1, k] >= 2 * LEAST_VOTE and whole in (None, catalogue[group[0]].electrodes):
-            costs[k] += min(spacing_cost(points_world_mm, electrodes, catalogue[name]) for name in group)
-        else:
-            costs[k] = np.inf
+    costs[~_is_voted(*votes)] = np.inf
+    for k in np.flatnonzero(np.isfinite(costs)).tolist():
+        costs[k] += min(spacing_cost(points_world_mm, electrodes, catalogue[name]) for name in groups[k])
     return costs
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -98,11 +98,6 @@ class RunCatheter:
             return None
         odds = [chain.tip_odds for chain in self.chains.values() or (self.diastole,) if chain.tip_odds is not None]
         return sum(odds) / len(odds) if odds else None
-
-    def turned(self) -> RunCatheter:
-        """Return the catheter with its electrodes numbered from the other end."""
-        chains = {frame: chain.from_other_end(self.electrodes) for frame, chain in self.chains.items()}
-        return replace(self, chains=chains, diastole=self.diastole.from_other_end(self.electrodes))
 
     @property
     def facts(self) -> CatheterFacts:

@@ -35,6 +35,7 @@ from fluoromap.matching.ends import common_ends
 from fluoromap.matching.hypotheses import Hypotheses
 from fluoromap.matching.identity import PairedCatheter, look_alike_groups, name_look_alikes
 from fluoromap.matching.joint_choice import SiteChoice, choose_pairings
+from fluoromap.matching.numberings import Way
 from fluoromap.matching.pairs import PairTable
 from fluoromap.matching.phase_matching import pair_by_phase, phase_shift
 from fluoromap.matching.run_catheters import RunCatheter
@@ -43,8 +44,8 @@ from fluoromap.reasons import Reason
 
 LEAST_PROBABILITY = 0.02
 """Another pairing with a lower probability counts as ruled out."""
-_UNSURE_END = 0.1
-"""Probability that a catheter is numbered from the wrong end, above which its identity is uncertain."""
+_UNSURE_NUMBERS = 0.1
+"""Probability that a catheter's numbers are wrong, above which its identity is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +63,13 @@ class _ComparedSite:
 class _NamedSite:
     """A site with named catheters.
 
-    pairs, alternative : name -> chain of view a, of view b. turned : name -> whether each of the two is numbered from the other
-    end. probability : of the alternative. notes : (name, reason of doubt).
+    pairs, alternative : name -> chain of view a, of view b. ways : name -> how each of the two is numbered. probability : of the
+    alternative. notes : (name, reason of doubt).
     """
 
     compared: _ComparedSite
     pairs: dict[str, tuple[int, int]]
-    turned: dict[str, tuple[bool, bool]]
+    ways: dict[str, Way]
     alternative: dict[str, tuple[int, int]] | None
     probability: float
     notes: tuple[tuple[str, Reason], ...]
@@ -78,7 +79,7 @@ class _NamedSite:
         # The order of the names is part of the result.
         pairs = tuple(self.pairs.items())
         alternative = None if self.alternative is None else (tuple(self.alternative.items()), self.probability)
-        return *self.compared.runs.content, catalogue, pairs, tuple(self.turned.items()), alternative
+        return *self.compared.runs.content, catalogue, pairs, tuple(self.ways.items()), alternative
 
 
 class _Views:
@@ -202,18 +203,19 @@ def _with_common_ends(name: str, sites: Sequence[_NamedSite], rests: bool) -> li
     shown = [site for site in sites if name in site.pairs]
     own = [(site.compared.table, site.pairs[name]) for site in shown]
     costs = np.array([table.other_end_cost[pair] for table, pair in own])
-    if not np.isfinite(costs).any():
+    others = np.array([table.other_way_cost[pair] for table, pair in own])
+    if not np.isfinite([costs, others]).any():
         return list(sites)
     axes = np.array([table.axis_mm[pair] for table, pair in own])
     wrong, sure = common_ends(axes, costs) if rests else (np.zeros(len(costs), dtype=np.bool_), costs)
     answers = {}
-    for site, (table, pair), is_wrong, cost in zip(shown, own, wrong, sure, strict=True):
-        ways, notes = site.turned[name], site.notes
+    for site, is_wrong, cost, other in zip(shown, wrong, sure, others, strict=True):
+        way, notes = site.ways[name], site.notes
         if is_wrong:
-            ways = (not ways[0], not ways[1])
-        if expit(-cost) + expit(-table.one_end_cost[pair]) > _UNSURE_END:
+            way = way[0].from_other_end(), way[1].from_other_end()
+        if expit(-cost) + expit(-other) > _UNSURE_NUMBERS:
             notes = tuple(dict.fromkeys((*notes, (name, Reason.IDENTITY_UNCERTAIN))))
-        answers[site.compared.runs.site] = replace(site, turned={**site.turned, name: ways}, notes=notes)
+        answers[site.compared.runs.site] = replace(site, ways={**site.ways, name: way}, notes=notes)
     return [answers.get(site.compared.runs.site, site) for site in sites]
 
 
@@ -260,13 +262,8 @@ def _named_site(
         notes.extend((name, Reason.EXTRA_CATHETER) for name in groups[number] if name in pairs)
     if site.comparison.irregular:
         notes.extend((name, Reason.IRREGULAR_RHYTHM) for name in pairs)
-    turned = {name: _ways(site.table, pair) for name, pair in pairs.items()}
-    return _NamedSite(site, pairs, turned, alternative, choice.probability, tuple(dict.fromkeys(notes)))
-
-
-def _ways(table: PairTable, pair: tuple[int, int]) -> tuple[bool, bool]:
-    """Return which chains of a pair are numbered from the other end."""
-    return bool(table.turned[pair][0]), bool(table.turned[pair][1])
+    ways = {name: site.table.way(pair) for name, pair in pairs.items()}
+    return _NamedSite(site, pairs, ways, alternative, choice.probability, tuple(dict.fromkeys(notes)))
 
 
 def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) -> MatchedRuns:
@@ -278,15 +275,15 @@ def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) ->
     phases_b = b.phases
     if views.folded is not None and phases_b is not None:
         phases_b = (phases_b + phase_shift(cameras, views.folded, list(named.pairs.values()))) % 1.0
-    in_a, in_b = _in_views((a, b), named.pairs, named.turned)
+    in_a, in_b = _in_views((a, b), named.pairs, named.ways)
     track_a, track_b = _track(in_a, a.segmentation, a.phases), _track(in_b, b.segmentation, phases_b)
     alternative = None
     if named.alternative is not None and catalogue.mapping in named.alternative:
-        other_turned = {
-            name: named.turned[name] if named.pairs.get(name) == pair else _ways(named.compared.table, pair)
+        other_ways = {
+            name: named.ways[name] if named.pairs.get(name) == pair else named.compared.table.way(pair)
             for name, pair in named.alternative.items()
         }
-        other_a, other_b = _in_views((a, b), named.alternative, other_turned)
+        other_a, other_b = _in_views((a, b), named.alternative, other_ways)
         alternative = Alternative(_at_diastole(catalogue, other_a, other_b, a.phases, phases_b), named.probability)
     return MatchedRuns(
         camera_a=runs.camera_a,
@@ -302,14 +299,11 @@ def _matched(named: _NamedSite, catalogue: Catalogue, views_of_sites: _Views) ->
 
 
 def _in_views(
-    views: tuple[RunInView, RunInView], pairs: dict[str, tuple[int, int]], turned: dict[str, tuple[bool, bool]]
+    views: tuple[RunInView, RunInView], pairs: dict[str, tuple[int, int]], ways: dict[str, Way]
 ) -> tuple[dict[str, RunCatheter], dict[str, RunCatheter]]:
-    """Return the catheters of each view by their names, numbered from the right end."""
+    """Return the catheters of each view by their names, with the right numbers."""
     a, b = (
-        {
-            name: view.catheters[pair[k]].turned() if turned[name][k] else view.catheters[pair[k]]
-            for name, pair in pairs.items()
-        }
+        {name: ways[name][k].of(view.catheters[pair[k]]) for name, pair in pairs.items()}
         for k, view in enumerate(views)
     )
     return a, b
