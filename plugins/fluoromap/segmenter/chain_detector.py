@@ -50,7 +50,7 @@ _WORST_FIT = 2.0
 _BENDING, _LEAST_REACH_PX, _SMOOTH_PX = 0.12, 6.5, 35.0
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
-_LEAST_MOVING_ODDS = 0.2
+_LEAST_MOVING_ODDS, _LEAST_ROW_ODDS, _FAINT_CONTRAST = 0.2, -0.2, 11.0
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
@@ -527,18 +527,24 @@ class ChainDetector:
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first.
 
-        A velocity that is wrong for a catheter blurs it: among chains at one place the most probable has the right velocity.
+        A velocity that is wrong for a catheter blurs it: among chains at one place the most probable has the right velocity. A long
+        row of faint electrodes comes before a few of them, which may be clearer than all.
         """
-        found: list[tuple[float, Chain]] = []
+        found: list[tuple[bool, float, Chain]] = []
         for x in moved_means(images, times_ms, middle, self.px_per_mm):
             self.forget_image()
             chains = self.find_chains(x, frame).chains
             seen = self.image_evidence(x)
-            found += [(float(np.median(log_odds(seen.probability_at(chain.pixels_uv)))), chain) for chain in chains]
+            for chain in chains:
+                odds = float(np.median(log_odds(seen.probability_at(chain.pixels_uv))))
+                faint = np.median(seen.likeness.at(chain.pixels_uv)) < _FAINT_CONTRAST
+                faint_row = bool(faint) and len(chain.electrodes) >= MANY_ELECTRODES
+                if odds >= (_LEAST_ROW_ODDS if faint_row else _LEAST_MOVING_ODDS):
+                    found.append((faint_row, odds, chain))
         best: list[Chain] = []
-        for odds, chain in sorted(found, key=lambda one: -one[0]):
+        for _, _, chain in sorted(found, key=lambda one: one[:2], reverse=True):
             shared = (_away(chain.pixels_uv, other.pixels_uv) < _HIDING_MM * self.px_per_mm for other in best)
-            if odds >= _LEAST_MOVING_ODDS and all(np.count_nonzero(near) < 2 for near in shared):
+            if all(np.count_nonzero(near) < 2 for near in shared):
                 best.append(chain)
         return tuple(best)
 

@@ -12,7 +12,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.segmenter.tracks import chain_distance
 
-_SEARCHED_AT = 0.25, 0.625
+_SEARCHED_AT = 0.25, 0.625, 0.875
 """Where in the run catheters are searched: at two moments of different motion."""
 _SAME_ELECTRODE_MM, _SAME_CHAIN_PX = 1.2, 4.0
 

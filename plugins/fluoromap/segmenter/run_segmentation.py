@@ -20,7 +20,7 @@ from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, chain_distance, overlaps, reverse
+from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict, chain_distance, overlaps, reverse
 
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ _LEAST_MOVED = 5
 Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
 """(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
 
-RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], bool]
+RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], Verdict]
 """(frame -> chain of one track, frame -> log image, recall) -> whether the run shows a catheter there."""
 
 
@@ -247,16 +247,16 @@ def segment_run(
     catheters = len(catalogue.catheters)
     search = _chain_search(detector, log_image, context, recall) if search_again else None
     seed = mean if len(averaged) > 1 else None
-    accepts = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
+    judge = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
 
     def tracked(found: Sequence[FrameChains]) -> tuple[FrameChains, ...]:
-        entries = track_chains(found, run.frame_times_ms, catheters, search, seed, accepts)
+        entries = track_chains(found, run.frame_times_ms, catheters, search, seed, judge)
         if not search_moving:
             return entries
         hidden = _moving_search(detector, log_image, run.frame_times_ms, context, recall)
 
         def follow(found: Sequence[FrameChains], start: FrameChains) -> tuple[FrameChains, ...]:
-            return track_chains(found, run.frame_times_ms, catheters, search, start, accepts, marks_first=False)
+            return track_chains(found, run.frame_times_ms, catheters, search, start, judge, marks_first=False)
 
         return add_hidden_catheters(found, entries, catalogue, run.px_per_mm, hidden, follow)
 

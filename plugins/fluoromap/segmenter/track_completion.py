@@ -30,7 +30,7 @@ def completed(
     frame_times_ms: Array,
     catheters: int,
     search: ChainSearch,
-    accepts: TrackJudge,
+    judge: TrackJudge,
 ) -> list[Track]:
     """Return the tracks with chains in the frames that lacked them.
 
@@ -47,7 +47,7 @@ def completed(
     catheters : int
         Number of catheters in the catalogue: the largest number of chains of one frame.
     search : ChainSearch
-    accepts : TrackJudge
+    judge : TrackJudge
     """
     tracks = list(kept)
     for track in tracks:
@@ -58,7 +58,7 @@ def completed(
         if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
             others = [other for other in tracks if other not in parts]
             _complete(track, others, frame_times_ms, catheters, search)
-            if len(track.chains) >= least and accepts(track.chains):
+            if len(track.chains) >= least and judge(track.chains).is_catheter:
                 tracks = [*others, track]
     return tracks
 

@@ -49,6 +49,8 @@ _TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
+_LESS_CLEAR = 2.0
+"""How much less clear than the run's other catheters a catheter may be, log-odds."""
 _ASKED_FOR_DIRECTION = 20
 """How many frames before and after the seed say which direction its chains have."""
 
@@ -59,7 +61,7 @@ def track_chains(
     catheters: int,
     search: ChainSearch | None = None,
     seed: FrameChains | None = None,
-    accepts: TrackJudge | None = None,
+    judge: TrackJudge | None = None,
     marks_first: bool = True,
 ) -> tuple[FrameChains, ...]:
     """Give the chains of a run track numbers.
@@ -85,7 +87,7 @@ def track_chains(
     search : ChainSearch, optional
     seed : FrameChains, optional
         Chains in the mean of the frames round ``seed.frame``. They are more certain than the chains of a single frame.
-    accepts : TrackJudge, optional
+    judge : TrackJudge, optional
         Decides about each track of four or more frames, and of half of the frames in short runs. Where it rejects one, the run is
         tracked again without the track's chains, twice at most. An accepted track has chains in half of the frames; one of six or
         more electrodes may get them from a search that needs their contrast only. All tracks are accepted by default.
@@ -109,21 +111,21 @@ def track_chains(
         seed = None if seed is None else replace(seed, chains=kept)
         tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     least = max(2.0, _SEEN_AT_LEAST * len(found)) if len(found) >= _LONG_RUN else 1.0
-    if accepts is not None:
+    if judge is not None:
         least = max(least, _ACCEPTED_AT_LEAST * len(found))
-        tracks = _accepted(tracks, found, frame_times_ms, catheters, search, accepts, marks_first)
+        tracks = _accepted(tracks, found, frame_times_ms, catheters, search, judge, marks_first)
     tracks_kept = [
         track
         for track in tracks
         if track.manual
         or track.detections >= least
         or (track.from_seed and len(track.chains) >= max(least, _RECOVERED_AT_LEAST * len(found)))
-        or (accepts is not None and len(track.chains) >= least)
+        or (judge is not None and len(track.chains) >= least)
     ]
     tracks_kept.sort(key=lambda track: -track.detections)
-    if accepts is not None and search is not None:
+    if judge is not None and search is not None:
         rare = [track for track in tracks if track not in tracks_kept and len(track.chains) >= _judged_frames(found)]
-        tracks_kept = completed(tracks_kept, rare, least, frame_times_ms, catheters, search, accepts)
+        tracks_kept = completed(tracks_kept, rare, least, frame_times_ms, catheters, search, judge)
     for track in tracks_kept:
         if track.direction < 0 and not track.manual:
             track.chains = {frame: reverse(chain) for frame, chain in track.chains.items()}
@@ -216,7 +218,7 @@ def _accepted(
     frame_times_ms: Array,
     catheters: int,
     search: ChainSearch | None,
-    accepts: TrackJudge,
+    judge: TrackJudge,
     marks_first: bool,
 ) -> list[Track]:
     """Return the tracks without wrong ones.
@@ -227,21 +229,28 @@ def _accepted(
     confirmed: list[Track] = []
     rare: list[Track] = []
     for attempt in range(_MOST_RETRIES + 1):
-        wrong = [
-            track for track in tracks if not track.manual and len(track.chains) >= judged and not accepts(track.chains)
-        ]
         # Shorter tracks are dropped in any case.
         lasting = [track for track in tracks if track.manual or len(track.chains) >= _ACCEPTED_AT_LEAST * len(found)]
+        verdicts = {
+            track: judge(track.chains) for track in tracks if not track.manual and len(track.chains) >= judged
+        }
+        sure = [verdicts[track].log_odds for track in lasting if track in verdicts and verdicts[track].is_catheter]
+        least = float(np.median(sure)) - _LESS_CLEAR if sure else math.inf
+        wrong = [
+            track
+            for track, verdict in verdicts.items()
+            if not verdict.is_catheter and not (verdict.may_be_hidden and verdict.log_odds >= least)
+        ]
         wrong += surplus([track for track in lasting if track not in wrong])
         tracks = [track for track in tracks if track not in wrong]
         found = [_without(entry, wrong) for entry in found]
         if not wrong or attempt == _MOST_RETRIES or not any(entry.chains for entry in found):
             break
-        sure = [track for track in tracks if len(track.chains) >= judged]
-        confirmed += [track for track in sure if track.confirmed]
-        rare += [track for track in sure if track not in lasting]
-        start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in sure))
-        seed = FrameChains(start, tuple(track.chains[start] for track in sure if start in track.chains))
+        kept = [track for track in tracks if len(track.chains) >= judged]
+        confirmed += [track for track in kept if track.confirmed]
+        rare += [track for track in kept if track not in lasting]
+        start = max(range(len(found)), key=lambda frame: sum(frame in track.chains for track in kept))
+        seed = FrameChains(start, tuple(track.chains[start] for track in kept if start in track.chains))
         tracks = _follow(found, frame_times_ms, catheters, search, seed, marks_first)
     for track in confirmed:
         # Followed in another order, it may have ended at other places, and the judge may have rejected those.

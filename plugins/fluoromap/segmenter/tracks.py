@@ -39,7 +39,20 @@ class ChainSearch(Protocol):
         """Return the chain in a frame; see :meth:`~fluoromap.segmenter.run_segmentation.Detector.find_again`."""
 
 
-TrackJudge = Callable[[Mapping[int, Chain]], bool]
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a judge says of a track.
+
+    is_catheter : whether the run shows a catheter there. log_odds : of the middle electrode. may_be_hidden : whether it is a
+    catheter if noise hides the run's other catheters nearly as much.
+    """
+
+    is_catheter: bool
+    log_odds: float = 0.0
+    may_be_hidden: bool = False
+
+
+TrackJudge = Callable[[Mapping[int, Chain]], Verdict]
 """frame -> chain of one track -> whether the run shows a catheter there."""
 
 

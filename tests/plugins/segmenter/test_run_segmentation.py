@@ -7,7 +7,7 @@ import numpy as np
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
 from fluoromap.segmenter.run_segmentation import segment_run
-from fluoromap.segmenter.tracks import reverse
+from fluoromap.segmenter.tracks import Verdict, reverse
 
 CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "reference"),), None, "reference")
 PLACES = np.array([[40.0, 40], [50, 44], [68, 50], [78, 55]])
@@ -62,7 +62,7 @@ def test_the_mean_of_a_run_has_its_tip_where_the_frames_have_it():
     frames = Frames(12)
     run = Run(frames, np.arange(12) * 33.0, 4.0, PixelFacts(False, 12, False))
     detector = Detector(12)
-    found = segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
+    found = segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: Verdict(True))
     (diastolic,) = found.diastole.chains
     assert np.array_equal(diastolic.pixels_uv, PLACES)
     assert {each.track for entry in found.frames for each in entry.chains} == {diastolic.track}
@@ -88,7 +88,7 @@ def test_a_chain_of_the_mean_belongs_to_a_track_where_most_of_its_frames_show_it
 
     def segmented(displaced):
         detector = DisplacedMean(12, displaced)
-        return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
+        return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: Verdict(True))
 
     averaged = segmented(()).diastole_frames
     assert len(averaged) >= 3
@@ -120,7 +120,7 @@ def test_frames_in_which_a_catheter_lies_elsewhere_are_not_averaged():
 
     def segmented(step):
         detector = Moving(3, step)
-        return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: True)
+        return segment_run(run, CATALOGUE, {}, Silent(), lambda field: detector, True, True, lambda *_: Verdict(True))
 
     # The frames show noise alone, so that all of them are quiet.
     assert len(segmented(0.5).diastole_frames) >= 2
@@ -161,7 +161,7 @@ def test_a_correction_searches_no_frame_again_in_which_the_run_without_it_shows_
 
     def segmented(marks):
         detector = HiddenInSomeFrames(12)
-        found = segment_run(run, CATALOGUE, marks, context, lambda field: detector, True, True, lambda *_: True)
+        found = segment_run(run, CATALOGUE, marks, context, lambda field: detector, True, True, lambda *_: Verdict(True))
         return found, detector.fitted
 
     found, searched = segmented({})
@@ -182,7 +182,7 @@ def test_a_mark_brings_back_detections_of_a_catheter_that_the_run_did_not_accept
 
     def segmented(marks):
         detector = Detector(12)
-        return segment_run(run, CATALOGUE, marks, Silent(), lambda field: detector, True, True, lambda *_: False)
+        return segment_run(run, CATALOGUE, marks, Silent(), lambda field: detector, True, True, lambda *_: Verdict(False))
 
     assert not any(entry.chains for entry in segmented({}).frames)
     found = segmented({5: (chain(None),)})

@@ -6,6 +6,7 @@ import pytest
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.tracking import track_chains
+from fluoromap.segmenter.tracks import Verdict
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 
@@ -127,7 +128,7 @@ def test_a_rejected_track_leaves_its_place_to_the_catheter_that_it_kept_out():
     found = run([[false] if frame < 8 else [right] for frame in range(20)])
     assert len({one.track for entry in track_chains(found, times(20), 1, search) for one in entry.chains}) <= 2
     entries = track_chains(
-        found, times(20), 1, search, accepts=lambda chains: chains[max(chains)].pixels_uv[0, 0] < 200
+        found, times(20), 1, search, judge=says(lambda chains: chains[max(chains)].pixels_uv[0, 0] < 200)
     )
     assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
 
@@ -135,7 +136,7 @@ def test_a_rejected_track_leaves_its_place_to_the_catheter_that_it_kept_out():
 def test_an_accepted_track_is_there_in_most_frames():
     found = run([[chain(POINTS + 100)] if frame < 8 else [] for frame in range(20)])
     assert track_chains(found, times(20), 1)[0].chains
-    assert not track_chains(found, times(20), 1, accepts=lambda chains: True)[0].chains
+    assert not track_chains(found, times(20), 1, judge=says(lambda chains: True))[0].chains
 
 
 def test_a_part_of_a_longer_catheter_does_not_keep_it_out():
@@ -211,6 +212,11 @@ def test_a_short_catheter_stays_where_one_frame_shows_a_longer_one_at_its_place(
     assert all(len(entry.chains[0].electrodes) == 4 for entry in entries)
 
 
+def says(is_there):
+    """Return the judge that is sure of a catheter where ``is_there`` says so."""
+    return lambda chains: Verdict(is_there(chains))
+
+
 def only_confirmed(frame, known, shift, reach_px, taken, confirmed=False):
     return known if confirmed else None
 
@@ -219,7 +225,7 @@ def only_confirmed(frame, known, shift, reach_px, taken, confirmed=False):
 def test_an_accepted_track_is_searched_by_contrast_in_the_frames_that_lack_it(frame_ms):
     right, at_ms = chain(POINTS + 100), np.arange(12) * frame_ms
     found = run([[right] if frame not in (0, 5, 6) else [] for frame in range(12)])
-    entries = track_chains(found, at_ms, 1, only_confirmed, accepts=lambda chains: True)
+    entries = track_chains(found, at_ms, 1, only_confirmed, judge=says(lambda chains: True))
     assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
     entries = track_chains(found, at_ms, 1, only_confirmed)
     assert [entry.frame for entry in entries if not entry.chains] == [0, 5, 6]
@@ -233,9 +239,9 @@ def test_a_catheter_of_moved_means_is_followed_where_no_frame_shows_it_and_a_fal
     def accepts(chains):
         return chains[min(chains)].pixels_uv[0, 0] < 200
 
-    entries = track_chains(found, times(8), 1, only_confirmed, seed, accepts, marks_first=False)
+    entries = track_chains(found, times(8), 1, only_confirmed, seed, says(accepts), marks_first=False)
     assert all(np.allclose(entry.chains[0].pixels_uv, right.pixels_uv) for entry in entries)
-    assert not any(entry.chains for entry in track_chains(found, times(8), 1, only_confirmed, seed, accepts))
+    assert not any(entry.chains for entry in track_chains(found, times(8), 1, only_confirmed, seed, says(accepts)))
 
 
 def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
@@ -248,7 +254,7 @@ def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
         return len(chains[min(chains)].electrodes) in accepted
 
     def tracked():
-        entries = track_chains(found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), accepts)
+        entries = track_chains(found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), says(accepts))
         return [[len(one.electrodes) for one in entry.chains] for entry in entries]
 
     assert tracked() == [[10]] * 16
@@ -256,7 +262,7 @@ def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
     assert tracked() == [[10]] * 16
     # Not where the judge doubts it in the frames that were added.
     entries = track_chains(
-        found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), lambda chains: len(chains) < 15
+        found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), says(lambda chains: len(chains) < 15)
     )
     assert [len(one.electrodes) for one in entries[-1].chains] == [4]
 
@@ -273,12 +279,28 @@ def test_parts_do_not_take_the_frames_of_a_long_catheter_where_the_run_is_follow
     def accepts(chains):
         return chains[min(chains)].pixels_uv[0, 0] < 390
 
-    entries = track_chains(found, times(16), 3, search, FrameChains(0, (whole, false)), accepts)
+    entries = track_chains(found, times(16), 3, search, FrameChains(0, (whole, false)), says(accepts))
     assert [sorted(len(one.electrodes) for one in entry.chains) for entry in entries] == [[4, 10]] * 16
 
 
 def test_a_short_catheter_that_few_frames_show_may_be_anatomy():
     found = run([[chain(POINTS + 100)] if frame < 5 else [] for frame in range(16)])
     assert not any(
-        entry.chains for entry in track_chains(found, times(16), 1, only_confirmed, None, lambda chains: True)
+        entry.chains for entry in track_chains(found, times(16), 1, only_confirmed, None, says(lambda chains: True))
     )
+
+
+def test_a_faint_catheter_is_accepted_only_beside_a_clear_one():
+    clear, faint = chain(POINTS + 100, "map"), chain(POINTS + 250, "rv")
+
+    def judge(chains):
+        return Verdict(False, -1.0, True) if chains[min(chains)].pixels_uv[0, 0] > 200 else Verdict(True, clear_odds)
+
+    def tracked(found):
+        entries = track_chains(run(found), times(10), 2, only_confirmed, judge=judge)
+        return [len(entry.chains) for entry in entries]
+
+    assert tracked([[clear, faint]] * 10) == [2] * 10
+    assert tracked([[faint]] * 10) == [0] * 10
+    # A catheter that is there for a moment does not vouch for another one.
+    assert tracked([[clear, faint]] * 4 + [[faint]] * 6) == [0] * 10

@@ -24,6 +24,7 @@ from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
+from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 _AVERAGED = 8
@@ -57,17 +58,20 @@ class _Least:
     Clutter rarely looks like the same catheter in every frame, and it rarely moves as the heart does.
 
     track : of any track. followed : of one that was found in nearly all frames. still : of one that does not move.
+    hidden, hidden_still : of one that was found in nearly all frames and that noise may hide, as it may hide the other catheters.
     """
 
     track: float
     followed: float
     still: float
+    hidden: float
+    hidden_still: float
 
 
-_LEAST = _Least(0.5, followed=-0.4, still=1.2)
-_LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0)
+_LEAST = _Least(0.5, followed=-0.4, still=1.2, hidden=-1.3, hidden_still=0.6)
+_LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0, hidden=-1.3, hidden_still=0.0)
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
-_LEAST_PAIR = _Least(1.2, followed=0.8, still=1.6)
+_LEAST_PAIR = _Least(1.2, followed=0.8, still=1.6, hidden=0.8, hidden_still=1.6)
 """Of two electrodes, which is little: any two dark spots are a pair."""
 
 
@@ -101,14 +105,14 @@ class TrackEvidence:
         chains: Mapping[int, Chain],
         log_image: Callable[[int], Image],
         recall: Recall[SectionOdds] = compute_always,
-    ) -> bool:
+    ) -> Verdict:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
         usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
         frames = [frame for frame, chain in sorted(chains.items()) if chain.electrodes == usual]
         paths = np.array([chains[frame].pixels_uv for frame in frames])
         inside = np.array([chains[frame].scores > UNSEEN for frame in frames]).mean(axis=0) >= 1.0 - _MOST_OUTSIDE
         if np.count_nonzero(inside) < min(LEAST_VISIBLE, len(usual)):
-            return False
+            return Verdict(False)
 
         def sections_in(picture: IntArray) -> list[SectionOdds]:
             averaged = [frames[index] for index in picture]
@@ -127,21 +131,28 @@ class TrackEvidence:
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
         if _turn(paths[len(paths) // 2]) < _MOST_PROBE_TURN and _is_probe(pictures):
-            return False
+            return Verdict(False)
         odds = np.array([odds_of(sections) for sections in pictures])
-        middle = np.median(odds, axis=1)
         if len(usual) >= MANY_ELECTRODES:
+            odds_all_along = odds_of(sections_in(_all_along(len(frames))))
+            middle = max(float(np.median(odds, axis=1).mean()), float(np.median(odds_all_along)))
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
             displaced = odds.mean(axis=0).min() < _DENIED_LONG
             least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
-            return bool(middle.mean() >= least or np.median(odds_of(sections_in(_all_along(len(frames))))) >= least)
-        least = self._least(paths, _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR)
-        still = self._is_still(paths)
-        if middle.mean() >= least and _are_electrodes(odds.mean(axis=0), still):
-            return True
-        # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
+            return Verdict(middle >= least, middle)
+        # Twice as many frames have less noise. A run that is too short for two pictures is judged by all its frames.
         odds_all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
-        return bool(np.median(odds_all_along) >= least and _are_electrodes(odds_all_along, still))
+        said = [
+            (float(np.median(odds, axis=1).mean()), odds.mean(axis=0)),
+            (float(np.median(odds_all_along)), odds_all_along),
+        ]
+        limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
+        least, still = self._least(paths, limits), self._is_still(paths)
+        middle, of_each = max(said, key=lambda one: one[0])
+        is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)
+        hidden, worst = (limits.hidden_still, _LEAST_LOW_STILL) if still else (limits.hidden, _DENIED)
+        followed = self._is_followed(paths) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
+        return Verdict(is_catheter, middle, followed and middle >= hidden and of_each.min() >= worst)
 
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
