@@ -24,6 +24,7 @@ from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
+from fluoromap.segmenter.thick_lines import depths_along, is_thick_line
 from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
@@ -80,12 +81,13 @@ class SectionOdds:
     """The evidence for a part of a track, in the mean of some frames.
 
     log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
-    distances.
+    distances. depths : see :func:`~fluoromap.segmenter.thick_lines.depths_along`.
     """
 
     log_odds: Array
     beside: Array
     across: Array
+    depths: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -130,7 +132,8 @@ class TrackEvidence:
             return odds
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
-        if _turn(paths[len(paths) // 2]) < _MOST_PROBE_TURN and _is_probe(pictures):
+        is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
+        if not is_loop and (_is_probe(pictures) or is_thick_line([one.depths for sections in pictures for one in sections])):
             return Verdict(False)
         odds = np.array([odds_of(sections) for sections in pictures])
         if len(usual) >= MANY_ELECTRODES:
@@ -194,7 +197,8 @@ class TrackEvidence:
         shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
-        return SectionOdds(log_odds(seen.shares_at(middle - first)), beside, across)
+        odds = log_odds(seen.shares_at(middle - first))
+        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts))
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""

@@ -1,0 +1,63 @@
+"""Rows of parts on a thick dark line, as the connector of an ECG cable: it is dark between its parts too, and wider than a catheter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from fluoromap.contracts import Array
+from fluoromap.segmenter.linking import ShaftImage
+
+_ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
+"""Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""
+_LEAST_BETWEEN, _LEAST_BESIDE = 0.5, 0.28
+"""Shares of the electrodes' depth that a thick line has between them: on it, and as far beside it as no shaft reaches."""
+
+
+def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
+    """Return how dark a chain's line is at its electrodes and between them.
+
+    Parameters
+    ----------
+    chain_uv : (electrodes, 2)
+        Pixels.
+    shaft_image : ShaftImage
+
+    Returns
+    -------
+    (2 electrodes - 1, 2)
+        At each electrode and in the middle of each gap, from the tip on: the depth of the line, and of what lies 1 to 1.5 mm
+        beside it. Depths are those below the darker of both sides.
+    """
+    ways = np.diff(chain_uv, axis=0)
+    places = np.empty((2 * len(chain_uv) - 1, 2))
+    places[::2], places[1::2] = chain_uv, chain_uv[:-1] + 0.5 * ways
+    along = np.empty_like(places)
+    along[1::2] = ways
+    along[::2] = np.concatenate([ways[:1], ways[1:] + ways[:-1], ways[-1:]])
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    across_px = np.stack([-along[:, 1], along[:, 0]], axis=1) * shaft_image.px_per_mm
+    left = [*_BESIDE_MM, *_AROUND_MM]
+    offsets_mm = np.array([*_ON_MM, *left, *(-mm for mm in left)])
+    at = places[:, None] + across_px[:, None] * offsets_mm[:, None]
+    column, row = np.moveaxis((at + 0.5) / shaft_image.reduction - 0.5, -1, 0)
+    levels = map_coordinates(shaft_image.smooth, [row, column], order=1, mode="nearest").astype(np.float64)
+    on, left_beside, left_around, right_beside, right_around = (
+        part.mean(axis=1) for part in np.split(levels, [3, 6, 9, 12], axis=1)
+    )
+    around = np.minimum(left_around, right_around)
+    depths: Array = np.stack([around - on, around - 0.5 * (left_beside + right_beside)], axis=1)
+    return depths
+
+
+def is_thick_line(depths: Sequence[Array]) -> bool:
+    """Return whether a chain lies on a line that is dark and thick between its electrodes too.
+
+    A catheter's shaft is fainter than its electrodes, and ends 1.3 mm beside its middle. ``depths`` : of parts of the chain, or of
+    the chain in several pictures, see :func:`depths_along`.
+    """
+    electrodes = float(np.median(np.concatenate([part[::2, 0] for part in depths])))
+    between, beside = np.median(np.concatenate([part[1::2] for part in depths]), axis=0).tolist()
+    return electrodes > 0 and between >= _LEAST_BETWEEN * electrodes and beside >= _LEAST_BESIDE * electrodes
