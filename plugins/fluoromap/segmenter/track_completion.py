@@ -14,6 +14,7 @@ from fluoromap.segmenter.tracks import (
     Track,
     TrackJudge,
     farthest_px,
+    is_believed,
     mean_shift,
     meet,
     overlaps,
@@ -58,7 +59,8 @@ def completed(
         if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
             others = [other for other in tracks if other not in parts]
             _complete(track, others, frame_times_ms, catheters, search)
-            if len(track.chains) >= least and judge(track.chains).is_catheter:
+            track.verdict = judge(track.chains)
+            if len(track.chains) >= least and is_believed(track, others):
                 tracks = [*others, track]
     return tracks
 

@@ -23,6 +23,7 @@ from fluoromap.segmenter.tracks import (
     chain_distance,
     count_shared,
     farthest_px,
+    is_believed,
     kind_overlap,
     mean_shift,
     meet,
@@ -49,8 +50,6 @@ _TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
-_LESS_CLEAR = 2.0
-"""How much less clear than the run's other catheters a catheter may be, log-odds."""
 _ASKED_FOR_DIRECTION = 20
 """How many frames before and after the seed say which direction its chains have."""
 
@@ -231,16 +230,10 @@ def _accepted(
     for attempt in range(_MOST_RETRIES + 1):
         # Shorter tracks are dropped in any case.
         lasting = [track for track in tracks if track.manual or len(track.chains) >= _ACCEPTED_AT_LEAST * len(found)]
-        verdicts = {
-            track: judge(track.chains) for track in tracks if not track.manual and len(track.chains) >= judged
-        }
-        sure = [verdicts[track].log_odds for track in lasting if track in verdicts and verdicts[track].is_catheter]
-        least = float(np.median(sure)) - _LESS_CLEAR if sure else math.inf
-        wrong = [
-            track
-            for track, verdict in verdicts.items()
-            if not verdict.is_catheter and not (verdict.may_be_hidden and verdict.log_odds >= least)
-        ]
+        asked = [track for track in tracks if not track.manual and len(track.chains) >= judged]
+        for track in asked:
+            track.verdict = judge(track.chains)
+        wrong = [track for track in asked if not is_believed(track, lasting)]
         wrong += surplus([track for track in lasting if track not in wrong])
         tracks = [track for track in tracks if track not in wrong]
         found = [_without(entry, wrong) for entry in found]

@@ -21,6 +21,8 @@ _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
 _NEAREST_PX = 13.0
 _DISPLACED_WEIGHT = 0.5
+_LESS_CLEAR, _CLEAR = 2.0, 0.6
+"""How much less clear than the run's other catheters a catheter may be, and what is clear in itself, log-odds."""
 
 
 class ChainSearch(Protocol):
@@ -62,7 +64,7 @@ class Track:
 
     chain, time_ms : the chain that was assigned last, and its time. velocity : (2,) pixels a millisecond, forwards in time.
     detections : number of frames in which the segmenter found it. direction : sum of their log-odds that the tip is the
-    track's first electrode. from_seed : whether the seed contains it.
+    track's first electrode. from_seed : whether the seed contains it. verdict : what the judge said of it last.
     """
 
     chain: Chain
@@ -74,6 +76,7 @@ class Track:
     confirmed: bool = False
     manual: bool = False
     chains: dict[int, Chain] = field(default_factory=dict)
+    verdict: Verdict | None = None
 
 
 def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
@@ -157,3 +160,22 @@ def farthest_px(elapsed_ms: float) -> float:
 def reverse(chain: Chain) -> Chain:
     """Return the same chain with its tip at the other end."""
     return replace(chain.from_other_end(chain.electrodes[-1]), electrodes=chain.electrodes)
+
+
+def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
+    """Return whether a judged track is a catheter beside the run's other tracks.
+
+    Noise hides all catheters. Where the others are clear, a long track that is not is none: of so many places, those of other things
+    may look like electrodes.
+    """
+    verdict = track.verdict
+    if verdict is None:
+        return False
+    others = [other.verdict for other in tracks if other is not track and other.verdict is not None]
+    clear = [other.log_odds for other in others if other.is_catheter]
+    if not clear:
+        return verdict.is_catheter
+    as_clear = verdict.log_odds >= float(np.median(clear)) - _LESS_CLEAR
+    is_row = len(track.chain.electrodes) >= MANY_ELECTRODES
+    is_clear = as_clear or not is_row or verdict.log_odds >= _CLEAR
+    return (verdict.is_catheter and is_clear) or (verdict.may_be_hidden and as_clear)

@@ -6,7 +6,7 @@ import pytest
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.segmenter.track_names import surplus
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import Track
+from fluoromap.segmenter.tracks import Track, Verdict
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 
@@ -54,5 +54,5 @@ def test_a_second_track_of_one_catheter_is_left_out_of_a_run():
     def search(frame, known, shift, reach_px, taken, same_shape=False, confirmed=False):
         return known
 
-    entries = track_chains(frames, np.arange(12) * 66.7, 2, search, accepts=lambda chains: True)
+    entries = track_chains(frames, np.arange(12) * 66.7, 2, search, judge=lambda chains: Verdict(True))
     assert [[one.pixels_uv[0, 0] for one in entry.chains] for entry in entries] == [[0.0]] * 12

@@ -76,7 +76,7 @@ def test_a_seed_with_its_tip_at_the_other_end_is_turned_before_frames_are_search
 
     found = run([[chain(POINTS, tip_odds=1.0)] if frame != 5 else [] for frame in range(9)])
     seed = FrameChains(4, (chain(POINTS[::-1], tip_odds=0.2),))
-    for entry in track_chains(found, times(9), 1, search, seed, lambda chains: True):
+    for entry in track_chains(found, times(9), 1, search, seed, says(lambda chains: True)):
         assert all(np.array_equal(each.pixels_uv, POINTS) for each in entry.chains)
     # The frame without a chain, and none in which a chain had to be turned and fitted again.
     assert searched
@@ -293,14 +293,29 @@ def test_a_short_catheter_that_few_frames_show_may_be_anatomy():
 def test_a_faint_catheter_is_accepted_only_beside_a_clear_one():
     clear, faint = chain(POINTS + 100, "map"), chain(POINTS + 250, "rv")
 
-    def judge(chains):
-        return Verdict(False, -1.0, True) if chains[min(chains)].pixels_uv[0, 0] > 200 else Verdict(True, clear_odds)
+    def tracked(found, clear_odds=0.5):
+        def judge(chains):
+            is_faint = chains[min(chains)].pixels_uv[0, 0] > 200
+            return Verdict(False, -1.0, may_be_hidden=True) if is_faint else Verdict(True, clear_odds)
 
-    def tracked(found):
         entries = track_chains(run(found), times(10), 2, only_confirmed, judge=judge)
         return [len(entry.chains) for entry in entries]
 
     assert tracked([[clear, faint]] * 10) == [2] * 10
+    # Noise that hides one catheter hides all.
+    assert tracked([[clear, faint]] * 10, clear_odds=3.0) == [1] * 10
     assert tracked([[faint]] * 10) == [0] * 10
     # A catheter that is there for a moment does not vouch for another one.
     assert tracked([[clear, faint]] * 4 + [[faint]] * 6) == [0] * 10
+
+
+@pytest.mark.parametrize(("odds", "kept"), [(0.5, 1), (0.7, 2), (1.5, 2)])
+def test_a_long_row_that_is_far_less_clear_than_the_other_catheters_is_none(odds, kept):
+    row = chain(np.stack([np.arange(6) * 12.0, np.arange(6) * 3.0], axis=1) + 250, "cs")
+    clear = chain(POINTS + 100, "map")
+
+    def judge(chains):
+        return Verdict(True, odds if len(chains[min(chains)].electrodes) == 6 else 3.0)
+
+    entries = track_chains(run([[clear, row]] * 10), times(10), 2, only_confirmed, judge=judge)
+    assert [len(entry.chains) for entry in entries] == [kept] * 10

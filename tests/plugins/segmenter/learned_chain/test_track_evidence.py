@@ -52,7 +52,7 @@ def accepts(judge, track, log_image):
 
 def evidence(odds):
     """Return the evidence of log-odds (n,) for electrodes with nothing beside them."""
-    return SectionOdds(odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)))
+    return SectionOdds(odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)), np.zeros((2 * len(odds) - 1, 2)))
 
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):

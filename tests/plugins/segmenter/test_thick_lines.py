@@ -1,0 +1,54 @@
+"""Rows of parts on a thick dark line, and catheters with their shafts."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.thick_lines import depths_along, is_thick_line
+
+PX_PER_MM = 3.2
+CHAIN = np.stack([40.0 + 3.0 * PX_PER_MM * np.arange(6), np.full(6, 60.0)], axis=1)
+
+
+def picture(part, line, radius_mm, reduction=1):
+    """Draw a dark line of this half width along the chain, and darker parts of 1.2 mm at its places."""
+    v, u = np.mgrid[:120, :160].astype(float)
+    x = np.zeros((120, 160))
+    x[np.abs(v - 60.0) <= radius_mm * PX_PER_MM] -= line
+    for column, row in CHAIN:
+        x[(np.abs(u - column) <= 0.6 * PX_PER_MM) & (np.abs(v - row) <= max(radius_mm, 1.0) * PX_PER_MM)] -= part - line
+    smooth = gaussian_filter(x, 1.0)[::reduction, ::reduction].astype(np.float32)
+    return ShaftImage(np.ascontiguousarray(smooth), reduction, 0.1, PX_PER_MM)
+
+
+@pytest.mark.parametrize(
+    ("line", "radius_mm", "is_thick"),
+    [(0.7, 2.0, True), (0.3, 2.0, False), (0.9, 0.6, False), (0.3, 1.0, False), (0.0, 1.0, False)],
+)
+def test_a_thick_line_is_dark_between_its_parts_too(line, radius_mm, is_thick):
+    assert is_thick_line([depths_along(CHAIN, picture(1.0, line, radius_mm))]) == is_thick
+
+
+def test_depths_are_those_of_the_line_below_its_surroundings():
+    depths = depths_along(CHAIN, picture(1.0, 0.7, 2.0))
+    assert depths.shape == (11, 2)
+    np.testing.assert_allclose(depths[::2, 0], 1.0, atol=0.1)
+    np.testing.assert_allclose(depths[1::2, 0], 0.7, atol=0.1)
+    np.testing.assert_allclose(depths[1::2, 1], 0.7, atol=0.1)
+
+
+def test_an_edge_of_anatomy_beside_a_catheter_is_no_line():
+    shafts = picture(1.0, 0.2, 0.8)
+    shafts.smooth[66:] -= 2.0
+    assert not is_thick_line([depths_along(CHAIN, shafts)])
+
+
+def test_parts_of_a_chain_are_judged_together():
+    thick, thin = (depths_along(CHAIN, picture(1.0, 0.7, radius_mm)) for radius_mm in (2.0, 0.6))
+    assert is_thick_line([thick, thick, thin])
+    assert not is_thick_line([thick, thin, thin])
+
+
+def test_nothing_is_no_line():
+    assert not is_thick_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))])
