@@ -37,6 +37,7 @@ from fluoromap.segmenter.moved_means import moved_means
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.thick_lines import depths_along, is_thick_line
 from fluoromap.segmenter.track_agreement import is_same_shape
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
@@ -393,6 +394,15 @@ class ChainDetector:
         chains = best_chains(possible, linking.points_uv, families, self.px_per_mm, linking.proposed)
         return replace(linking, possible=possible, chains=chains)
 
+    def _lies_on_a_line(self, chain_uv: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
+        """Return whether a chain (n, 2) lies on parallel bars or on a thick dark line.
+
+        A loop on edge shows both sides as one line.
+        """
+        shafts = self._shafts(seen)
+        on_thick_line = not catheter.is_circular and is_thick_line([depths_along(chain_uv, shafts)])
+        return on_thick_line or follows_bars(products_beside(chain_uv, shafts))
+
     def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
         """Return which chains can be catheters of the catalogue, (n,).
 
@@ -408,7 +418,7 @@ class ChainDetector:
         for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
             family = self.family_of(chain)
             is_seen = chain.scores > UNSEEN
-            if family is None or follows_bars(products_beside(chain.pixels_uv[is_seen], self._shafts(seen))):
+            if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
                 continue
             onwards = EVEN_ODDS
             own = own[is_seen]
