@@ -17,6 +17,7 @@ from fluoromap.segmenter.bars import follows_bars, products_beside
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
+from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
 from fluoromap.segmenter.field_mask import FieldMask, are_in
 from fluoromap.segmenter.linking import (
@@ -37,7 +38,6 @@ from fluoromap.segmenter.moved_means import moved_means
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
-from fluoromap.segmenter.thick_lines import depths_along, is_thick_line
 from fluoromap.segmenter.track_agreement import is_same_shape
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
@@ -395,13 +395,13 @@ class ChainDetector:
         return replace(linking, possible=possible, chains=chains)
 
     def _lies_on_a_line(self, chain_uv: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
-        """Return whether a chain (n, 2) lies on parallel bars or on a thick dark line.
+        """Return whether a chain (n, 2) lies on parallel bars or on a dark line.
 
         A loop on edge shows both sides as one line.
         """
         shafts = self._shafts(seen)
-        on_thick_line = not catheter.is_circular and is_thick_line([depths_along(chain_uv, shafts)])
-        return on_thick_line or follows_bars(products_beside(chain_uv, shafts))
+        on_dark_line = not catheter.is_circular and is_dark_line([depths_along(chain_uv, shafts)])
+        return on_dark_line or follows_bars(products_beside(chain_uv, shafts))
 
     def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
         """Return which chains can be catheters of the catalogue, (n,).

@@ -161,7 +161,9 @@ def test_a_correction_searches_no_frame_again_in_which_the_run_without_it_shows_
 
     def segmented(marks):
         detector = HiddenInSomeFrames(12)
-        found = segment_run(run, CATALOGUE, marks, context, lambda field: detector, True, True, lambda *_: Verdict(True))
+        found = segment_run(
+            run, CATALOGUE, marks, context, lambda field: detector, True, True, lambda *_: Verdict(True)
+        )
         return found, detector.fitted
 
     found, searched = segmented({})
@@ -182,7 +184,9 @@ def test_a_mark_brings_back_detections_of_a_catheter_that_the_run_did_not_accept
 
     def segmented(marks):
         detector = Detector(12)
-        return segment_run(run, CATALOGUE, marks, Silent(), lambda field: detector, True, True, lambda *_: Verdict(False))
+        return segment_run(
+            run, CATALOGUE, marks, Silent(), lambda field: detector, True, True, lambda *_: Verdict(False)
+        )
 
     assert not any(entry.chains for entry in segmented({}).frames)
     found = segmented({5: (chain(None),)})

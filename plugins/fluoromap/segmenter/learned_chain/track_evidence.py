@@ -16,6 +16,7 @@ from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -24,7 +25,6 @@ from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
-from fluoromap.segmenter.thick_lines import depths_along, is_thick_line
 from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
@@ -81,7 +81,7 @@ class SectionOdds:
     """The evidence for a part of a track, in the mean of some frames.
 
     log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
-    distances. depths : see :func:`~fluoromap.segmenter.thick_lines.depths_along`.
+    distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`.
     """
 
     log_odds: Array
@@ -133,7 +133,7 @@ class TrackEvidence:
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
         is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
-        if not is_loop and (_is_probe(pictures) or is_thick_line([one.depths for sections in pictures for one in sections])):
+        if not is_loop and (_is_probe(pictures) or _is_on_dark_line(pictures)):
             return Verdict(False)
         odds = np.array([odds_of(sections) for sections in pictures])
         if len(usual) >= MANY_ELECTRODES:
@@ -218,6 +218,11 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
     beside = np.sum([np.concatenate([section.beside for section in sections], axis=2) for sections in pictures], axis=0)
     across = np.sum([np.concatenate([section.across for section in sections], axis=2) for sections in pictures], axis=0)
     return follows_bars(beside) or has_other_wall(across)
+
+
+def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
+    """Return whether pictures of a track show a dark line."""
+    return is_dark_line([np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)], True)
 
 
 def _turn(path_uv: Array) -> float:

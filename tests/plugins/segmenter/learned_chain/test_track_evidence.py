@@ -14,7 +14,6 @@ from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.track_evidence import SectionOdds, TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.log_image import LogTransform
-from fluoromap.segmenter.tracks import Verdict
 
 FRAMES = 8
 PX_PER_MM = 512 / 178 * 2
@@ -52,7 +51,9 @@ def accepts(judge, track, log_image):
 
 def evidence(odds):
     """Return the evidence of log-odds (n,) for electrodes with nothing beside them."""
-    return SectionOdds(odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)), np.zeros((2 * len(odds) - 1, 2)))
+    return SectionOdds(
+        odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)), np.zeros((2 * len(odds) - 1, 2))
+    )
 
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):

@@ -1,11 +1,11 @@
-"""Rows of parts on a thick dark line, and catheters with their shafts."""
+"""Rows of parts on a dark line, and catheters with their shafts."""
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.linking import ShaftImage
-from fluoromap.segmenter.thick_lines import depths_along, is_thick_line
 
 PX_PER_MM = 3.2
 CHAIN = np.stack([40.0 + 3.0 * PX_PER_MM * np.arange(6), np.full(6, 60.0)], axis=1)
@@ -23,11 +23,11 @@ def picture(part, line, radius_mm, reduction=1):
 
 
 @pytest.mark.parametrize(
-    ("line", "radius_mm", "is_thick"),
-    [(0.7, 2.0, True), (0.3, 2.0, False), (0.9, 0.6, False), (0.3, 1.0, False), (0.0, 1.0, False)],
+    ("line", "radius_mm", "is_dark"),
+    [(0.7, 2.0, True), (0.3, 2.0, False), (0.9, 0.6, True), (0.4, 0.6, False), (0.3, 1.0, False), (0.0, 1.0, False)],
 )
-def test_a_thick_line_is_dark_between_its_parts_too(line, radius_mm, is_thick):
-    assert is_thick_line([depths_along(CHAIN, picture(1.0, line, radius_mm))]) == is_thick
+def test_a_cable_is_dark_between_its_parts_too(line, radius_mm, is_dark):
+    assert is_dark_line([depths_along(CHAIN, picture(1.0, line, radius_mm))]) == is_dark
 
 
 def test_depths_are_those_of_the_line_below_its_surroundings():
@@ -41,14 +41,25 @@ def test_depths_are_those_of_the_line_below_its_surroundings():
 def test_an_edge_of_anatomy_beside_a_catheter_is_no_line():
     shafts = picture(1.0, 0.2, 0.8)
     shafts.smooth[66:] -= 2.0
-    assert not is_thick_line([depths_along(CHAIN, shafts)])
+    assert not is_dark_line([depths_along(CHAIN, shafts)])
 
 
-def test_parts_of_a_chain_are_judged_together():
-    thick, thin = (depths_along(CHAIN, picture(1.0, 0.7, radius_mm)) for radius_mm in (2.0, 0.6))
-    assert is_thick_line([thick, thick, thin])
-    assert not is_thick_line([thick, thin, thin])
+def test_one_clear_gap_shows_that_the_line_is_a_shaft():
+    thick, thin = (depths_along(CHAIN, picture(1.0, line, 2.0)) for line in (0.7, 0.2))
+    assert is_dark_line([thick, thick])
+    assert not is_dark_line([thick, thin])
+
+
+def test_a_mean_of_frames_needs_less_than_a_frame():
+    depths = [depths_along(CHAIN, picture(1.0, 0.35, 2.0))]
+    assert is_dark_line(depths, averaged=True)
+    assert not is_dark_line(depths)
 
 
 def test_nothing_is_no_line():
-    assert not is_thick_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))])
+    assert not is_dark_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))])
+
+
+def test_the_coil_of_a_lead_may_be_as_dark_as_its_rings():
+    assert not is_dark_line([depths_along(CHAIN[:2], picture(1.0, 0.9, 0.6))])
+    assert is_dark_line([depths_along(CHAIN[:3], picture(1.0, 0.9, 0.6))])
