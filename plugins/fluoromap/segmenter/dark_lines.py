@@ -1,4 +1,4 @@
-"""Rows of parts on a dark line, as the connector of an ECG cable: it is dark between its parts too, and often wider than a catheter."""
+"""Rows of parts on a dark line, as the connector of an ECG cable: it is dark between its parts too, and often thick."""
 
 from __future__ import annotations
 

@@ -309,13 +309,15 @@ def test_a_faint_catheter_is_accepted_only_beside_a_clear_one():
     assert tracked([[clear, faint]] * 4 + [[faint]] * 6) == [0] * 10
 
 
-@pytest.mark.parametrize(("odds", "kept"), [(0.5, 1), (0.7, 2), (1.5, 2)])
-def test_a_long_row_that_is_far_less_clear_than_the_other_catheters_is_none(odds, kept):
-    row = chain(np.stack([np.arange(6) * 12.0, np.arange(6) * 3.0], axis=1) + 250, "cs")
+@pytest.mark.parametrize(
+    ("electrodes", "odds", "kept"), [(6, 0.5, 1), (6, 0.7, 2), (6, 1.5, 2), (4, 0.2, 1), (4, 0.4, 2), (4, 1.5, 2)]
+)
+def test_a_track_that_is_far_less_clear_than_the_other_catheters_is_none(electrodes, odds, kept):
+    row = chain(np.stack([np.arange(electrodes) * 12.0, np.arange(electrodes) * 3.0], axis=1) + 250, "cs")
     clear = chain(POINTS + 100, "map")
 
     def judge(chains):
-        return Verdict(True, odds if len(chains[min(chains)].electrodes) == 6 else 3.0)
+        return Verdict(True, odds if chains[min(chains)].pixels_uv[0, 0] > 200 else 3.0)
 
     entries = track_chains(run([[clear, row]] * 10), times(10), 2, only_confirmed, judge=judge)
     assert [len(entry.chains) for entry in entries] == [kept] * 10
