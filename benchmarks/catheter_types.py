@@ -23,7 +23,7 @@ from fluoromap.training.anatomy import anatomy
 from fluoromap.training.appearance import take_picture
 from fluoromap.training.distractors import draw_distractors
 from fluoromap.training.drawing import Canvas
-from fluoromap.training.drawn_catheters import design_of, draw_catheter
+from fluoromap.training.drawn_catheters import design_of, draw_catheters
 from fluoromap.training.exposure import Exposure
 
 SIZE_PX = 512
@@ -77,10 +77,12 @@ def _scene(random: np.random.Generator, catheters: tuple[Catheter, ...], missing
     px_per_mm = float(random.uniform(3.0, 4.4))
     canvas = Canvas.empty(SIZE_PX)
     draw_distractors(random, canvas, px_per_mm)
-    places = {one.name: draw_catheter(random, canvas, px_per_mm, design_of(one), METAL)[:, :2] for one in catheters}
+    drawn = draw_catheters(random, canvas, px_per_mm, [design_of(one) for one in catheters], METAL)[:, :2]
+    ends = np.cumsum([one.electrodes for one in catheters])[:-1]
+    places = dict(zip((one.name for one in catheters), np.split(drawn, ends), strict=True))
     exposure = Exposure(
         photons=float(random.uniform(300.0, 5000.0)), scatter=float(random.uniform(0.0, 1.0)), metal=METAL, detector=1.0,
-        grain_px=0.6, gain=1.2, frontal=False, plain=False,
+        grain_px=0.6, gain=1.2, frontal=False, plain=False, printed=False,
     )  # fmt: skip
     body = anatomy(random, SIZE_PX, px_per_mm, exposure.frontal)
     pictures = [take_picture(random, canvas.depth, body, exposure).pixels] * FRAMES

@@ -15,9 +15,13 @@ Give other sizes to see how each figure grows: ``clinical_study.py 5``, ``clinic
 
 from __future__ import annotations
 
+import os
+
+# One thread for each process, as in a worker: threads of the matrix products would only wait for each other.
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
+
 import argparse
 import json
-import os
 import re
 import sqlite3
 import tempfile

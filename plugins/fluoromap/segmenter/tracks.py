@@ -21,8 +21,8 @@ _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
 _NEAREST_PX = 13.0
 _DISPLACED_WEIGHT = 0.5
-_LESS_CLEAR, _CLEAR, _CLEAR_ROW = 2.0, 0.3, 0.6
-"""How much less clear than the run's other catheters a catheter may be, and what is clear in itself, a long row too; log-odds."""
+_LESS_CLEAR, _CLEAR_ROW = 2.0, 0.6
+"""How much less clear than the run's other catheters a catheter may be, and what is clear in a long row in itself, log-odds."""
 
 
 class ChainSearch(Protocol):
@@ -165,8 +165,8 @@ def reverse(chain: Chain) -> Chain:
 def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     """Return whether a judged track is a catheter beside the run's other tracks.
 
-    Noise hides all catheters. Where the others are clear, a track that is not is none. A long row needs more: of so many places,
-    some of other things look like electrodes.
+    Noise hides all catheters. Where the others are clear, a long row that is not is none: of so many places, some of other things
+    look like electrodes. A short catheter may be unclear where it points to the X-ray source.
     """
     verdict = track.verdict
     if verdict is None:
@@ -176,5 +176,6 @@ def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     if not clear:
         return verdict.is_catheter
     as_clear = verdict.log_odds >= float(np.median(clear)) - _LESS_CLEAR
-    least = _CLEAR_ROW if len(track.chain.electrodes) >= MANY_ELECTRODES else _CLEAR
-    return (verdict.is_catheter and (as_clear or verdict.log_odds >= least)) or (verdict.may_be_hidden and as_clear)
+    is_row = len(track.chain.electrodes) >= MANY_ELECTRODES
+    is_clear = as_clear or not is_row or verdict.log_odds >= _CLEAR_ROW
+    return (verdict.is_catheter and is_clear) or (verdict.may_be_hidden and as_clear)
