@@ -165,7 +165,7 @@ def reverse(chain: Chain) -> Chain:
 def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     """Return whether a judged track is a catheter beside the run's other tracks.
 
-    Noise hides all catheters. Where the others are clear, a long row that is not is none: of so many places, some of other things
+    Noise hides all catheters. Where two others are clear, a long row that is not is none: of so many places, some of other things
     look like electrodes. A short catheter may be unclear where it points to the X-ray source.
     """
     verdict = track.verdict
@@ -176,6 +176,6 @@ def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     if not clear:
         return verdict.is_catheter
     as_clear = verdict.log_odds >= float(np.median(clear)) - _LESS_CLEAR
-    is_row = len(track.chain.electrodes) >= MANY_ELECTRODES
+    is_row = len(track.chain.electrodes) >= MANY_ELECTRODES and len(clear) > 1
     is_clear = as_clear or not is_row or verdict.log_odds >= _CLEAR_ROW
     return (verdict.is_catheter and is_clear) or (verdict.may_be_hidden and as_clear)

@@ -309,15 +309,16 @@ def test_a_faint_catheter_is_accepted_only_beside_a_clear_one():
     assert tracked([[clear, faint]] * 4 + [[faint]] * 6) == [0] * 10
 
 
-@pytest.mark.parametrize(
-    ("electrodes", "odds", "kept"), [(6, 0.5, 1), (6, 0.7, 2), (6, 1.5, 2), (4, 0.0, 2), (4, 1.5, 2)]
-)
-def test_a_long_row_that_is_far_less_clear_than_the_other_catheters_is_none(electrodes, odds, kept):
+@pytest.mark.parametrize(("electrodes", "odds", "kept"), [(6, 0.5, 2), (6, 0.7, 3), (6, 1.5, 3), (4, 0.0, 3)])
+def test_a_long_row_that_is_far_less_clear_than_two_other_catheters_is_none(electrodes, odds, kept):
     row = chain(np.stack([np.arange(electrodes) * 12.0, np.arange(electrodes) * 3.0], axis=1) + 250, "cs")
-    clear = chain(POINTS + 100, "map")
+    clear = [chain(POINTS + 100, "map"), chain(POINTS + np.array([400, 100]), "rv")]
 
     def judge(chains):
-        return Verdict(True, odds if chains[min(chains)].pixels_uv[0, 0] > 200 else 3.0)
+        return Verdict(True, odds if np.allclose(chains[min(chains)].pixels_uv[0], row.pixels_uv[0]) else 3.0)
 
-    entries = track_chains(run([[clear, row]] * 10), times(10), 2, only_confirmed, judge=judge)
-    assert [len(entry.chains) for entry in entries] == [kept] * 10
+    def tracked(found):
+        return [len(entry.chains) for entry in track_chains(run(found), times(10), 3, only_confirmed, judge=judge)]
+
+    assert tracked([[*clear, row]] * 10) == [kept] * 10
+    assert tracked([[clear[0], row]] * 10) == [2] * 10
