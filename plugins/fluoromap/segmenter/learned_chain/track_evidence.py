@@ -46,6 +46,8 @@ _DENIED, _DENIED_LONG = -3.0, -4.0
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
+_CLEAR = 1.0
+"""Log-odds of the middle electrode of a track that needs no more frames."""
 _MOST_PROBE_TURN = 2.4
 """Radians. What lies beside a loop, as another wall beside a probe's, is the loop's own other side."""
 _MOST_OUTSIDE = 0.5
@@ -136,26 +138,23 @@ class TrackEvidence:
         if not is_loop and (_is_probe(pictures) or _is_on_dark_line(pictures)):
             return Verdict(False)
         odds = np.array([odds_of(sections) for sections in pictures])
-        if len(usual) >= MANY_ELECTRODES:
-            odds_all_along = odds_of(sections_in(_all_along(len(frames))))
-            middle = max(float(np.median(odds, axis=1).mean()), float(np.median(odds_all_along)))
+        is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
+        said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
+        if said[0][0] < _CLEAR or not (is_row or _are_electrodes(said[0][1], still)):
+            # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
+            all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
+            said.append((float(np.median(all_along)), all_along))
+        middle, of_each = max(said, key=lambda one: one[0])
+        if is_row:
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
             displaced = odds.mean(axis=0).min() < _DENIED_LONG
-            least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
-            return Verdict(middle >= least, middle)
-        # Twice as many frames have less noise. A run that is too short for two pictures is judged by all its frames.
-        odds_all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
-        said = [
-            (float(np.median(odds, axis=1).mean()), odds.mean(axis=0)),
-            (float(np.median(odds_all_along)), odds_all_along),
-        ]
+            return Verdict(middle >= (_LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)), middle)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
-        least, still = self._least(paths, limits), self._is_still(paths)
-        middle, of_each = max(said, key=lambda one: one[0])
+        least = self._least(paths, limits)
         is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)
         hidden, worst = (limits.hidden_still, _LEAST_LOW_STILL) if still else (limits.hidden, _DENIED)
         followed = self._is_followed(paths) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
-        return Verdict(is_catheter, middle, followed and middle >= hidden and of_each.min() >= worst)
+        return Verdict(is_catheter, middle, bool(followed and middle >= hidden and of_each.min() >= worst))
 
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
