@@ -12,7 +12,7 @@ CHAIN = np.stack([40.0 + 3.0 * PX_PER_MM * np.arange(6), np.full(6, 60.0)], axis
 
 
 def picture(part, line, radius_mm, reduction=1):
-    """Draw a dark line of this half width along the chain, and darker parts of 1.2 mm at its places."""
+    """Draw a dark line along the chain, and darker parts at its places."""
     v, u = np.mgrid[:120, :160].astype(float)
     x = np.zeros((120, 160))
     x[np.abs(v - 60.0) <= radius_mm * PX_PER_MM] -= line
