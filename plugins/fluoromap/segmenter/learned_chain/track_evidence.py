@@ -43,6 +43,8 @@ _LEAST_LOW, _LEAST_LOW_STILL = -2.0, -0.7
 """Log-odds of the worst electrode, and of the worst one of a track that does not move."""
 _DENIED, _DENIED_LONG = -3.0, -4.0
 """Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
+_NOTHING, _BELOW_OTHERS = -1.0, 3.5
+"""Log-odds of a place without an electrode in a long row, in both means: below this, and so far below the middle electrode."""
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
@@ -140,7 +142,8 @@ class TrackEvidence:
         odds = np.array([odds_of(sections) for sections in pictures])
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
-        if said[0][0] < _CLEAR or not (is_row or _are_electrodes(said[0][1], still)):
+        settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], still)
+        if said[0][0] < _CLEAR or not settled:
             # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
             all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
             said.append((float(np.median(all_along)), all_along))
@@ -148,7 +151,12 @@ class TrackEvidence:
         if is_row:
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
             displaced = odds.mean(axis=0).min() < _DENIED_LONG
-            return Verdict(middle >= (_LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)), middle)
+            least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
+            # The places without an electrode may be beside a shorter catheter.
+            best = np.max([of_each for _, of_each in said], axis=0)
+            there = np.count_nonzero(best >= min(_NOTHING, middle - _BELOW_OTHERS))
+            is_shorter = there < min(len(best), MANY_ELECTRODES)
+            return Verdict(middle >= least and not is_shorter, middle)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits)
         is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)

@@ -277,3 +277,25 @@ def test_noise_is_an_excuse_in_a_run_that_shows_another_catheter(monkeypatch, od
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(found))[:, None, None] * np.array([0.0, float(moves)])
     assert judge(chains(row + beat), lambda frame: None).may_be_hidden == shown
+
+
+@pytest.mark.parametrize(
+    ("odds", "is_catheter"),
+    [
+        ([2.5, 2.5, -1.2, 2.5, 2.5, 2.5], False),
+        ([2.5, 2.5, -0.8, 2.5, 2.5, 2.5], True),
+        ([1.0, 1.0, -2.2, 1.0, 1.0, 1.0], True),
+        ([1.0, 1.0, -2.7, 1.0, 1.0, 1.0], False),
+        ([2.5] * 4 + [-1.2] + [2.5] * 5, True),
+    ],
+)
+def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch, odds, is_catheter):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+
+    def along(self, frames, path_uv, log_image):
+        place = np.rint((path_uv[0, :, 0] - 100.0) / 20.0).astype(int)
+        return evidence(np.array(odds)[place])
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
+    assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).is_catheter == is_catheter
