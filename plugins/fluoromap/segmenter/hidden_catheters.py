@@ -13,7 +13,7 @@ from fluoromap.contracts import Chain, FrameChains
 from fluoromap.segmenter.tracks import chain_distance
 
 _SEARCHED_AT = 0.25, 0.625, 0.875
-"""Where in the run catheters are searched: at two moments of different motion."""
+"""Where in the run catheters are searched: at three moments of different motion."""
 _SAME_ELECTRODE_MM, _SAME_CHAIN_PX = 1.2, 4.0
 
 MovingSearch = Callable[[int], Sequence[Chain]]

@@ -59,8 +59,10 @@ def completed(
         if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
             others = [other for other in tracks if other not in parts]
             _complete(track, others, frame_times_ms, catheters, search)
+            if len(track.chains) < least:
+                continue
             track.verdict = judge(track.chains)
-            if len(track.chains) >= least and is_believed(track, others):
+            if is_believed(track, others):
                 tracks = [*others, track]
     return tracks
 
