@@ -52,7 +52,7 @@ _BENDING, _LEAST_REACH_PX, _SMOOTH_PX = 0.12, 6.5, 35.0
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
 _LEAST_MOVING_ODDS, _LEAST_ROW_ODDS, _FAINT_CONTRAST = 0.2, -0.2, 11.0
-"""Least log-odds of the middle electrode in a moved mean: of any chain; of a long row whose contrast over noise is below the last."""
+"""Least log-odds of the middle electrode in a moved mean: of any chain, and of a long row of less contrast over noise."""
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
