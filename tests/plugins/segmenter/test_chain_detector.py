@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.contracts import Chain, FrameChains
 from fluoromap.segmenter.acceptance import UNSEEN, ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.field_mask import FieldMask
@@ -390,3 +391,26 @@ def test_a_catheter_that_leaves_the_picture_is_found_again():
     again = detector.find_again(image, chain, np.array([-20.0, 0.0]), 6.0, ())
     assert np.linalg.norm(again.pixels_uv - moved, axis=1)[shown].max() < 5.0
     assert (again.scores[~shown] == UNSEEN).all()
+
+
+@pytest.mark.parametrize(("contrast", "probability", "sizes"), [(8.0, 0.6, [10]), (8.0, 0.4, [4]), (20.0, 0.6, [4])])
+def test_a_row_of_faint_electrodes_in_a_moved_mean_comes_before_a_clearer_part_of_it(
+    monkeypatch, contrast, probability, sizes
+):
+    row = row_of("cs", (60, 100), 0.2)
+    image = np.zeros((SIZE, SIZE), np.float32)
+    # The first velocity is the row's, all others show a part of it more clearly.
+    of_row = Evidence(image, row, np.full(10, probability), np.ones(10), contrast=contrast)
+    of_part = Evidence(image, row[:4], np.full(4, 0.95), np.ones(4), contrast=contrast)
+    seen = iter([of_row, *[of_part] * 18])
+
+    def find_chains(self, x, frame, beside=()):
+        self._latest = x, next(seen)
+        points = self._latest[1].points
+        numbers, covariance = tuple(range(1, len(points) + 1)), np.tile(np.eye(2), (len(points), 1, 1))
+        return FrameChains(frame, (Chain(numbers, points, covariance, np.ones(len(points)), (("cs", 1.0),)),))
+
+    monkeypatch.setattr(ChainDetector, "find_chains", find_chains)
+    found = detector_of(of_row).find_moving([image] * 5, np.arange(5) * 16.7, 2, 2)
+    assert [len(chain.electrodes) for chain in found] == sizes
+    assert next(seen, None) is None

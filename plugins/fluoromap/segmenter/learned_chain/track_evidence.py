@@ -6,6 +6,7 @@ noise: a catheter becomes clear in it, while beads of contrast medium stay as im
 
 from __future__ import annotations
 
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -63,18 +64,19 @@ class _Least:
     Clutter rarely looks like the same catheter in every frame, and it rarely moves as the heart does.
 
     track : of any track. followed : of one that was found in nearly all frames. still : of one that does not move.
-    hidden, hidden_still : of one that was found in nearly all frames and that noise may hide, as it may hide the other catheters.
+    hidden, hidden_still : of one that was found in nearly all frames and that noise may hide, as it may hide the other catheters;
+    a long row has no such excuse.
     """
 
     track: float
     followed: float
     still: float
-    hidden: float
-    hidden_still: float
+    hidden: float = math.inf
+    hidden_still: float = math.inf
 
 
 _LEAST = _Least(0.5, followed=-0.4, still=1.2, hidden=-1.3, hidden_still=0.6)
-_LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0, hidden=-1.3, hidden_still=0.0)
+_LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0)
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
 _LEAST_PAIR = _Least(1.2, followed=0.8, still=1.6, hidden=0.8, hidden_still=1.6)
 """Of two electrodes, which is little: any two dark spots are a pair."""
@@ -229,7 +231,9 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
 
 def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
     """Return whether pictures of a track show a dark line."""
-    return is_dark_line([np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)], True)
+    return is_dark_line(
+        [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)], averaged=True
+    )
 
 
 def _turn(path_uv: Array) -> float:

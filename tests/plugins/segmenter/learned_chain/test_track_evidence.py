@@ -299,3 +299,21 @@ def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch,
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).is_catheter == is_catheter
+
+
+@pytest.mark.parametrize(("between", "accepted"), [(0.5, True), (0.7, False)])
+def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, between, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+
+    def along(self, frames, path_uv, log_image):
+        count = path_uv.shape[1]
+        depths = np.zeros((2 * count - 1, 2))
+        depths[:, 0] = np.where(np.arange(len(depths)) % 2, between, 1.0)
+        return replace(evidence(np.full(count, 3.0)), depths=depths)
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    angles = np.linspace(0.0, 5.5, 10)
+    loop = 200.0 + 40.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
+    assert accepts(judge, chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
+    assert accepts(judge, chains(np.repeat(loop[None], FRAMES, axis=0)), lambda frame: None)
