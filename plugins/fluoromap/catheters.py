@@ -180,6 +180,7 @@ CATHETER_TYPES: dict[str, tuple[tuple[float, ...], float, float]] = {
     "decapolar-2-2-2": ((2.0,) * 9, 2.0, 1.0),
     "decapolar-5-5-5": ((5.0,) * 9, 2.0, 1.0),
     "duodecapolar-2-2-2": ((2.0,) * 19, 2.0, 1.0),
+    "duodecapolar-2-8-2": (_alternating(10, 2.0, 8.0), 2.0, 1.0),
     "ablation-3.5": (_alternating(2, 2.0, 5.0), 3.5, 1.3),
     "ablation-4": (_alternating(2, 2.0, 5.0), 4.0, 1.3),
     "ablation-8": (_alternating(2, 2.0, 5.0), 8.0, 1.3),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fluoromap.catheters import Catheter
+from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.linking import (
@@ -169,6 +169,11 @@ def _with_places(fit: ElectrodeFit, places_uv: Array, there: BoolArray) -> Elect
     if not there.any():
         return fit
     return replace(fit, points_uv=np.where(there[..., None], places_uv, fit.points_uv))
+
+
+def names_with_long_tips(catalogue: Catalogue) -> frozenset[str]:
+    """Return the names of the catheters whose tips are longer than rings for certain."""
+    return frozenset(catheter.name for catheter in catalogue.catheters if catheter.tip_mm >= _LONG_TIP_MM)
 
 
 def _tip_shows(catheter: Catheter) -> bool:

@@ -17,6 +17,7 @@ from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.linking import ShaftImage
 
 _FAN_RAD, _LOOP_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9)), np.deg2rad(np.linspace(-45.0, 45.0, 15))
+_NARROW_FAN_RAD, _NEAR_REACH_MM = np.deg2rad(np.linspace(-15.0, 15.0, 7)), (2.4, 5.0)
 _BESIDE_LOOP_MM = 1.5
 _REACH_MM = 2.4, 8.0
 _SAMPLES = 12
@@ -42,6 +43,18 @@ def shaft_beyond_ends(chains_uv: Array, catheter: Catheter, shaft_image: ShaftIm
     before = _darkest_ray(from_tip, 0.5 * catheter.tip_mm - _HALF_RING_MM, catheter.is_circular, shaft_image)
     more: Array = behind - before
     return more
+
+
+def shafts_at_ends(path_uv: Array, shaft_image: ShaftImage) -> Array:
+    """Return how much a shaft shows beyond the first and the last place of a path, (2,) from -1 to 1.
+
+    The image has little noise, so that the shaft's direction is known better than in a single frame.
+    """
+    ends_uv, before_uv = path_uv[[0, -1]], path_uv[[1, -2]]
+    ways = ends_uv - before_uv
+    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _NARROW_FAN_RAD
+    darkest = ray_depths(ends_uv, angles, _NEAR_REACH_MM, shaft_image).max(axis=-1)
+    return np.where(np.isfinite(darkest), darkest, 0.0)
 
 
 def _darkest_ray(chains_uv: Array, later_mm: float, is_circular: bool, shaft_image: ShaftImage) -> Array:

@@ -50,6 +50,8 @@ _TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _LEAST_AGAINST = 2
+_OF_FRAMES, _MOST_TIP_ODDS = 0.75, 4.0
+"""How much of the frames' mean log-odds of the tip counts beside those of the judge, and how sure both are at most."""
 _ASKED_FOR_DIRECTION = 20
 """How many frames before and after the seed say which direction its chains have."""
 
@@ -126,8 +128,8 @@ def track_chains(
         rare = [track for track in tracks if track not in tracks_kept and len(track.chains) >= _judged_frames(found)]
         tracks_kept = completed(tracks_kept, rare, least, frame_times_ms, catheters, search, judge)
     for track in tracks_kept:
-        if track.direction < 0 and not track.manual:
-            track.chains = {frame: reverse(chain) for frame, chain in track.chains.items()}
+        if not track.manual:
+            track.chains = _from_tip(track)
         if search is not None and not track.manual:
             track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
     for number, track in enumerate(tracks_kept):
@@ -454,6 +456,23 @@ def _search(
     if not is_faint or abs(time_ms - track.time_ms) < _STALE_MS:
         _extend(track, recovered, frame, time_ms)
         present.append(recovered)
+
+
+def _from_tip(track: Track) -> dict[int, Chain]:
+    """Return a track's chains, numbered from the end that is more likely the tip.
+
+    Where the judge saw the shaft in the mean of many frames, that counts more than what single frames say.
+    """
+    verdict = track.verdict
+    odds = None
+    if verdict is not None and verdict.tip_odds is not None:
+        of_frames = track.direction / max(track.detections, 1)
+        odds = max(-_MOST_TIP_ODDS, min(_OF_FRAMES * of_frames + verdict.tip_odds, _MOST_TIP_ODDS))
+    turned = (track.direction if odds is None else odds) < 0
+    chains = {frame: reverse(chain) if turned else chain for frame, chain in track.chains.items()}
+    if odds is None:
+        return chains
+    return {frame: replace(chain, tip_odds=abs(odds)) for frame, chain in chains.items()}
 
 
 def _tip_odds(chain: Chain) -> float:

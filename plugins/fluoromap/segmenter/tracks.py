@@ -46,12 +46,14 @@ class Verdict:
     """What a judge says of a track.
 
     is_catheter : whether the run shows a catheter there. log_odds : of the middle electrode. may_be_hidden : whether it is a
-    catheter if noise hides the run's other catheters nearly as much.
+    catheter if noise hides the run's other catheters nearly as much. tip_odds : log-odds by the shaft that the track's first
+    electrode is the tip; None where single frames know better.
     """
 
     is_catheter: bool
     log_odds: float = 0.0
     may_be_hidden: bool = False
+    tip_odds: float | None = None
 
 
 TrackJudge = Callable[[Mapping[int, Chain]], Verdict]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import shlex
@@ -13,15 +14,16 @@ from pathlib import Path
 import numpy as np
 
 from fluoromap.catheters import Catheter, catheter_type
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
+from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
 from fluoromap.segmenter.learned_chain.weights import SHIPPED
 from fluoromap.training.anatomy import read_backgrounds
-from fluoromap.training.export import check_folded, halved, write_reference, write_weights
+from fluoromap.training.export import check_folded, halved, stacked, write_reference, write_weights
 from fluoromap.training.fitting import BATCH, STEPS_A_SHARD, Progress, fit
 from fluoromap.training.scenes import CLINICAL_CROWD, make_scene
 from fluoromap.training.shards import SCENES_A_SHARD, shards
 from fluoromap.training.validation import validate
 
+NETWORKS = 2
 SHARDS = 150
 VALIDATION_SCENES = 160
 _VALIDATION_PX = 320
@@ -29,7 +31,7 @@ _VALIDATION_KEY = 9_999_999
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Train and calibrate, then write the weights and their facts.
+    """Train the networks and calibrate their mean answer, then write the weights and their facts.
 
     The calibration uses scenes that the training did not see.
     """
@@ -39,11 +41,13 @@ def main(arguments: Sequence[str]) -> None:
         return
     catalogue = tuple(_catheter(entry) for entry in json.loads(given.catalogue.read_text())) if given.catalogue else ()
     backgrounds = read_backgrounds(given.backgrounds) if given.backgrounds else ()
-    scenes = shards(given.seed, given.shards, given.workers, catalogue, backgrounds)
-    trained = fit(scenes, given.shards, given.seed, given.threads, _show)
-    check_folded(trained)
-    weights = halved(trained)
-    network = ElectrodeNetwork.of_weights({name: value.astype(np.float32) for name, value in weights.items()})
+    trained = []
+    for seed in range(given.seed, given.seed + given.networks):
+        scenes = shards(seed, given.shards, given.workers, catalogue, backgrounds)
+        trained.append(fit(scenes, given.shards, seed, given.threads, functools.partial(_show, seed)))
+        check_folded(trained[-1])
+    weights = stacked([halved(network) for network in trained])
+    ensemble = NetworkEnsemble.of_weights({name: value.astype(np.float32) for name, value in weights.items()})
     fresh = [
         make_scene(
             np.random.default_rng([given.seed, _VALIDATION_KEY, k]),
@@ -54,13 +58,14 @@ def main(arguments: Sequence[str]) -> None:
         )
         for k in range(VALIDATION_SCENES)
     ]
-    validated = validate(network, fresh)
+    validated = validate(ensemble, fresh)
     facts = {
         "command": shlex.join(["python", "-m", "fluoromap.training", *arguments]),
         "seed": given.seed,
-        "scenes": given.shards * SCENES_A_SHARD,
-        "samples": given.shards * STEPS_A_SHARD * BATCH,
-        "parameters": sum(parameter.numel() for parameter in trained.parameters()),
+        "networks": given.networks,
+        "scenes_a_network": given.shards * SCENES_A_SHARD,
+        "samples_a_network": given.shards * STEPS_A_SHARD * BATCH,
+        "parameters_a_network": sum(parameter.numel() for parameter in trained[0].parameters()),
         "pictures": f"synthetic scenes and {len(backgrounds)} frames of a lab"
         if backgrounds
         else "synthetic scenes only",
@@ -76,7 +81,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--reference", type=Path, help="train nothing; write PyTorch's answers with the weights of --out to this file"
     )
-    parser.add_argument("--seed", type=int, default=1, help="same seed, same weights on the same kind of processor")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=1,
+        help="of the first network; same seed, same weights on the same kind of processor",
+    )
+    parser.add_argument("--networks", type=int, default=NETWORKS, help="networks to train, each from the next seed")
     parser.add_argument("--shards", type=int, default=SHARDS, help=f"lists of {SCENES_A_SHARD} scenes to train on")
     parser.add_argument(
         "--threads", type=int, default=1, help="of the fit; another number gives slightly other weights"
@@ -102,10 +113,10 @@ def _catheter(entry: dict[str, object]) -> Catheter:
     return Catheter(**values)  # type: ignore[arg-type]
 
 
-def _show(progress: Progress) -> None:
+def _show(seed: int, progress: Progress) -> None:
     heat, place, spread, tip = progress.losses
     print(
-        f"shard {progress.shard}: heat {heat:.3f} place {place:.3f} spread {spread:.3f} tip {tip:.3f}, {progress.seconds:.0f} s",
+        f"seed {seed}, shard {progress.shard}: heat {heat:.3f} place {place:.3f} spread {spread:.3f} tip {tip:.3f}, {progress.seconds:.0f} s",
         flush=True,
     )
 

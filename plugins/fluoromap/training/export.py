@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,11 @@ def halved(network: ElectrodeNetwork) -> dict[str, NDArray[np.float16]]:
     return {name: value.astype(np.float16) for name, value in folded(network).items()}
 
 
+def stacked(networks: Sequence[dict[str, NDArray[np.float16]]]) -> dict[str, NDArray[np.float16]]:
+    """Return the weights of several networks in arrays with a first axis of networks."""
+    return {name: np.stack([network[name] for network in networks]) for name in networks[0]}
+
+
 def check_folded(trained: ElectrodeNetwork) -> None:
     """Check that the segmenter's network with folded weights answers as the trained one does.
 
@@ -63,14 +69,20 @@ def check_folded(trained: ElectrodeNetwork) -> None:
         raise ArithmeticError(f"the folded network differs from the trained one by {worst:.3g}: compare their layers")
 
 
-def of_file(path: Path) -> ElectrodeNetwork:
-    """Return the PyTorch network of a weights file, its normalisation folded into the taps."""
+def of_file(path: Path) -> list[ElectrodeNetwork]:
+    """Return the PyTorch networks of a weights file, their normalisation folded into the taps."""
+    with np.load(path) as stored:
+        weights = {name: stored[name].astype(np.float32) for name in stored.files}
+    return [_of_weights(weights, number) for number in range(len(weights["heads.bias"]))]
+
+
+def _of_weights(weights: dict[str, NDArray[np.float32]], number: int) -> ElectrodeNetwork:
     network: ElectrodeNetwork = ElectrodeNetwork().eval()
-    with np.load(path) as stored, torch.no_grad():
+    with torch.no_grad():
         for name, layer in CONVOLUTIONS.items():
             convolution = network.get_submodule(name)
-            taps = torch.from_numpy(stored[f"{name}.taps"].astype(np.float32).transpose(3, 2, 0, 1).copy())
-            bias = torch.from_numpy(stored[f"{name}.bias"].astype(np.float32))
+            taps = torch.from_numpy(weights[f"{name}.taps"][number].transpose(3, 2, 0, 1).copy())
+            bias = torch.from_numpy(weights[f"{name}.bias"][number])
             convolution.get_parameter("weight").copy_(taps)
             if layer.rectified:
                 normalisation = network.get_submodule(f"{name}_norm")
@@ -84,13 +96,14 @@ def of_file(path: Path) -> ElectrodeNetwork:
 def write_reference(path: Path, weights: Path) -> None:
     """Write what PyTorch answers to a small picture with the weights of a file.
 
-    The arrays are ``picture`` (rows, columns), ``answers`` (rows / 2, columns / 2, heads) and ``sha256`` of the weights.
+    The arrays are ``picture`` (rows, columns), ``answers`` (networks, rows / 2, columns / 2, heads) and ``sha256`` of the weights.
     """
     picture = np.random.default_rng(0).normal(size=REFERENCE_SHAPE).astype(np.float16)
+    asked = torch.from_numpy(picture.astype(np.float32)[None, None])
     with torch.no_grad():
-        answers = of_file(weights)(torch.from_numpy(picture.astype(np.float32)[None, None]))[0]
+        answers = [network(asked)[0].permute(1, 2, 0).numpy() for network in of_file(weights)]
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-    np.savez(path, picture=picture, answers=answers.permute(1, 2, 0).numpy(), sha256=np.array(digest))
+    np.savez(path, picture=picture, answers=np.stack(answers), sha256=np.array(digest))
 
 
 def write_weights(

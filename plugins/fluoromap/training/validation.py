@@ -1,4 +1,4 @@
-"""What a trained network's answers are worth, on synthetic scenes that it has not seen."""
+"""What trained networks' answers are worth, on synthetic scenes that they have not seen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
+from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.training.scenes import CLEAR, Scene
@@ -62,12 +62,12 @@ class Validation:
         }
 
 
-def validate(network: ElectrodeNetwork, scenes: Sequence[Scene]) -> Validation:
-    """Compare the network's proposals with the electrodes of the scenes.
+def validate(ensemble: NetworkEnsemble, scenes: Sequence[Scene]) -> Validation:
+    """Compare the networks' proposals with the electrodes of the scenes.
 
     Proposals on electrodes that nobody could find are left out.
     """
-    trained = Trained(network, 1.0, 4.0, 1.0)
+    trained = Trained(ensemble, 1.0, 4.0, 1.0)
     logits, right, squared = [], [], []
     electrodes = 0
     for scene in scenes:

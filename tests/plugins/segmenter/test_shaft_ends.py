@@ -5,7 +5,7 @@ import pytest
 
 from fluoromap.catheters import catheter_type
 from fluoromap.segmenter.linking import ShaftImage
-from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
+from fluoromap.segmenter.shaft_ends import shaft_beyond_ends, shafts_at_ends
 
 PX = 3.2
 ABLATION = catheter_type("ablation-4", "ablation")
@@ -49,6 +49,17 @@ def test_outside_the_image_there_is_no_shaft():
     row, _ = row_and_shaft(0.0)
     shaft = ShaftImage(np.full((200, 200), 6.0, np.float32), 1, 0.1, PX)
     assert np.all(shaft_beyond_ends((row + np.array([120.0, 0.0]))[None], ABLATION, shaft) == 0.0)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 12.0, -12.0])
+def test_a_mean_shows_the_shaft_at_one_end_of_a_path(turn_deg):
+    row, path = row_and_shaft(np.deg2rad(turn_deg))
+    shaft = ShaftImage(drawn(path, depth=0.04), 1, 0.03, PX)
+    before, behind = shafts_at_ends(row, shaft)
+    assert behind > 0.8
+    assert before < 0.2
+    assert shafts_at_ends(row[::-1], shaft).tolist() == [behind, before]
+    assert shafts_at_ends(row + np.array([120.0, 0.0]), shaft)[1] == 0.0
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, -20.0, -40.0])

@@ -322,3 +322,18 @@ def test_a_long_row_that_is_far_less_clear_than_two_other_catheters_is_none(elec
 
     assert tracked([[*clear, row]] * 10) == [kept] * 10
     assert tracked([[clear[0], row]] * 10) == [2] * 10
+
+
+@pytest.mark.parametrize(("of_frames", "of_judge", "first", "odds"), [
+    (1.0, None, 0, 1.0),
+    (1.0, -2.0, 1, 1.25),
+    (1.0, 0.5, 0, 1.25),
+    (3.0, -2.0, 0, 0.25),
+    (3.0, 9.0, 0, 4.0),
+])  # fmt: skip
+def test_the_judge_and_the_frames_say_together_which_end_is_the_tip(of_frames, of_judge, first, odds):
+    found = run([[chain(POINTS + frame, tip_odds=of_frames)] for frame in range(8)])
+    entries = track_chains(found, times(8), 1, only_confirmed, judge=lambda _: Verdict(True, 2.0, tip_odds=of_judge))
+    for frame, entry in enumerate(entries):
+        assert entry.chains[0].pixels_uv[0].tolist() == (POINTS + frame)[-first].tolist()
+        assert entry.chains[0].tip_odds == pytest.approx(odds)

@@ -99,4 +99,4 @@ class NearbyNetwork:
         part = picture[first_v:last_v, first_u:last_u]
         u, v = left - first_u // CELL_PX, top - first_v // CELL_PX
         cells = Part(v, u, v + bottom - top, u + right - left)
-        return electrode_probability(self.trained, self.trained.network(padded(part), cells))
+        return electrode_probability(self.trained, self.trained.ensemble(padded(part), cells))

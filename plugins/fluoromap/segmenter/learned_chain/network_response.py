@@ -266,7 +266,7 @@ def answer(trained: Trained, picture: Image, orientations: int = 1) -> Image:
     ``orientations`` : see :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
     """
     rows, columns = picture.shape
-    answers = mean_answer(trained.network, padded(picture), orientations)
+    answers = mean_answer(trained.ensemble, padded(picture), orientations)
     return answers[: -(-rows // CELL_PX), : -(-columns // CELL_PX)]
 
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
+from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
@@ -80,6 +81,10 @@ class LearnedChain:
         def detector_of(field: FieldMask) -> Detector:
             return electrode_chains(catalogue, field, run.pixels, run.px_per_mm, trained, alone, frame_ms, answers)
 
-        judge = None if alone else TrackEvidence(trained, run.px_per_mm, run.frame_times_ms)
+        judge = (
+            None
+            if alone
+            else TrackEvidence(trained, run.px_per_mm, run.frame_times_ms, names_with_long_tips(catalogue))
+        )
         found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)
         return visible_part(found, _DIM_BELOW)

@@ -26,6 +26,7 @@ from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
+from fluoromap.segmenter.shaft_ends import shafts_at_ends
 from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
@@ -36,6 +37,12 @@ _MARGIN_PX = 40.0
 _SECTION = 5
 _KEPT_FRAMES = _PICTURES * _AVERAGED
 _SMOOTH_PX = 1.0
+_SHAFT, _OF_SHAFT = 0.03, 2.3
+"""Depth of a clear shaft, log units, and the log-odds of a tip where one end only has such a shaft.
+
+By logistic regression on simulated catheters.
+"""
+_LIKELY = 0.5
 _FOLLOWED, _FOLLOWED_FRAMES = 0.8, 6
 """Share of the run's frames, and how many the run has at least: fewer say little."""
 _STILL_MM, _MOMENT_MS = 1.2, 300.0
@@ -87,25 +94,28 @@ class SectionOdds:
     """The evidence for a part of a track, in the mean of some frames.
 
     log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
-    distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`.
+    distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`. shafts : see
+    :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`.
     """
 
     log_odds: Array
     beside: Array
     across: Array
     depths: Array
+    shafts: Array
 
 
 @dataclass(slots=True, eq=False)
 class TrackEvidence:
     """Judge of the tracks of one run.
 
-    frame_times_ms : (frames,) of the run.
+    frame_times_ms : (frames,) of the run. long_tips : names of the catheters whose tips are longer than rings for certain.
     """
 
     trained: Trained
     px_per_mm: float
     frame_times_ms: Array
+    long_tips: frozenset[str] = frozenset()
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
     def __call__(
@@ -142,6 +152,7 @@ class TrackEvidence:
         if not is_loop and (_is_probe(pictures) or _is_on_dark_line(pictures)):
             return Verdict(False)
         odds = np.array([odds_of(sections) for sections in pictures])
+        tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
         settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], still)
@@ -158,13 +169,21 @@ class TrackEvidence:
             best = np.max([of_each for _, of_each in said], axis=0)
             there = np.count_nonzero(best >= min(_NOTHING, middle - _BELOW_OTHERS))
             is_shorter = there < min(len(best), MANY_ELECTRODES)
-            return Verdict(middle >= least and not is_shorter, middle)
+            return Verdict(middle >= least and not is_shorter, middle, tip_odds=tip_odds)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits)
         is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)
         hidden, worst = (limits.hidden_still, _LEAST_LOW_STILL) if still else (limits.hidden, _DENIED)
         followed = self._is_followed(paths) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
-        return Verdict(is_catheter, middle, bool(followed and middle >= hidden and of_each.min() >= worst))
+        may_be_hidden = bool(followed and middle >= hidden and of_each.min() >= worst)
+        return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
+
+    def _has_long_tip(self, chains: Mapping[int, Chain]) -> bool:
+        """Return whether a track is likely a catheter whose single frames show which end is the tip."""
+        probabilities = [
+            probability for chain in chains.values() for name, probability in chain.kinds if name in self.long_tips
+        ]
+        return math.fsum(probabilities) >= _LIKELY * len(chains)
 
     def _least(self, path_uv: Array, least: _Least) -> float:
         """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
@@ -203,11 +222,11 @@ class TrackEvidence:
             add_moved(small, turn, offset, total)
         total /= len(frames)
         seen = NetworkResponse.of_reduced(total, self.trained, scale, _ORIENTATIONS)
-        shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, 0.0, self.px_per_mm * scale)
+        shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, _SHAFT, self.px_per_mm * scale)
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
         odds = log_odds(seen.shares_at(middle - first))
-        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts))
+        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), shafts_at_ends(chain_uv, shafts))
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
@@ -234,6 +253,12 @@ def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
     return is_dark_line(
         [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)], averaged=True
     )
+
+
+def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:
+    """Return the log-odds that a track begins at its tip: a shaft shows behind it and not before it."""
+    behind = np.mean([sections[-1].shafts[1] - sections[0].shafts[0] for sections in pictures])
+    return _OF_SHAFT * float(behind)
 
 
 def _turn(path_uv: Array) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork
+from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
 
 SHIPPED = Path(__file__).with_name("weights.npz")
 """Made by ``python -m fluoromap.training``; ``weights.json`` beside it has its SHA-256, command, seed and figures."""
@@ -17,13 +17,13 @@ SHIPPED = Path(__file__).with_name("weights.npz")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trained:
-    """A network and what its answers are worth, from synthetic scenes it was not trained on.
+    """Networks and what their answers are worth, from synthetic scenes they were not trained on.
 
-    odds_gain, odds_offset : an electrode's log-odds are the gain times the network's logit plus the offset.
-    variance_gain : the squared error of a place over the variance that the network states.
+    odds_gain, odds_offset : an electrode's log-odds are the gain times the networks' logit plus the offset.
+    variance_gain : the squared error of a place over the variance that the networks state.
     """
 
-    network: ElectrodeNetwork
+    ensemble: NetworkEnsemble
     odds_gain: float
     odds_offset: float
     variance_gain: float
@@ -43,8 +43,8 @@ def read_weights(path: Path) -> Trained:
             arrays = {name: stored[name].astype(np.float32) for name in stored.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} cannot be read as weights: make one with python -m fluoromap.training") from error
-    calibration = arrays.get("calibration")
+    calibration = arrays.pop("calibration", None)
     if calibration is None or calibration.shape != (3,):
         raise ValueError(f"{path} has no calibration: make it with python -m fluoromap.training of this version")
     gain, offset, variance = calibration.tolist()
-    return Trained(ElectrodeNetwork.of_weights(arrays), gain, offset, variance)
+    return Trained(NetworkEnsemble.of_weights(arrays), gain, offset, variance)

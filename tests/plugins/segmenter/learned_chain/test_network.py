@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import affine_transform
 
+from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
 from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork, Part
 from fluoromap.segmenter.learned_chain.layers import AROUND, CONVOLUTIONS, HEADS
 from fluoromap.segmenter.learned_chain.network_response import (
@@ -90,7 +91,29 @@ def test_it_answers_as_pytorch_does_with_the_shipped_weights():
     assert digest == hashlib.sha256(SHIPPED.read_bytes()).hexdigest(), (
         f"write {REFERENCE.name} again: python -m fluoromap.training --reference {REFERENCE}"
     )
-    np.testing.assert_allclose(read_weights(SHIPPED).network(picture), expected, atol=1e-4, rtol=1e-4)
+    networks = read_weights(SHIPPED).ensemble.networks
+    assert len(networks) == len(expected)
+    for network, of_pytorch in zip(networks, expected, strict=True):
+        np.testing.assert_allclose(network(picture), of_pytorch, atol=1e-4, rtol=1e-4)
+
+
+def test_an_ensemble_answers_the_mean_and_a_mixture_s_variance(weights):
+    other = {name: value[..., ::-1].copy() if name == "heads.taps" else value for name, value in weights.items()}
+    both = {name: np.stack([weights[name], other[name]]) for name in weights}
+    picture = np.random.default_rng(4).normal(size=(40, 48)).astype(np.float32)
+    ensemble = NetworkEnsemble.of_weights(both)
+    one, two = (network(picture).astype(np.float64) for network in ensemble.networks)
+    answers = ensemble(picture)
+    for name in ("heat", "offset_u", "offset_v", "tip"):
+        head = HEADS.index(name)
+        np.testing.assert_allclose(answers[..., head], 0.5 * (one + two)[..., head], atol=1e-4)
+    variance = HEADS.index("log_variance")
+    # Of two equally likely places, the variance is a quarter of their squared distance; u and v have one in common.
+    squares = sum((one - two)[..., HEADS.index(name)] ** 2 for name in ("offset_u", "offset_v"))
+    stated = 0.5 * (np.exp(one[..., variance]) + np.exp(two[..., variance]))
+    np.testing.assert_allclose(answers[..., variance], np.log(stated + squares / 8), atol=1e-3)
+    part = Part(3, 5, 11, 17)
+    np.testing.assert_allclose(ensemble(picture, part), answers[3:11, 5:17], atol=2e-4)
 
 
 def test_pictures_of_any_size_get_answers_for_all_their_cells():
@@ -105,7 +128,7 @@ def test_pictures_of_any_size_get_answers_for_all_their_cells():
     [Part(30, 40, 31, 41), Part(0, 0, 7, 9), Part(61, 50, 104, 128), Part(3, 17, 90, 111), Part(0, 0, 104, 128)],
 )
 def test_a_part_of_the_cells_gets_the_answers_that_it_has_in_the_whole_picture(cells):
-    network = read_weights(SHIPPED).network
+    network = read_weights(SHIPPED).ensemble
     picture = np.random.default_rng(3).normal(0.0, 1.0, (208, 256)).astype(np.float32)
     whole = network(picture)
     part = network(picture, cells)
@@ -167,11 +190,15 @@ def test_a_file_that_holds_no_weights_is_refused_by_name(tmp_path, content):
 def test_weights_of_another_network_are_refused(tmp_path, weights):
     path = tmp_path / "other.npz"
     calibration = np.array([1, 0, 1], np.float32)
-    np.savez(path, **{**weights, "heads.bias": np.zeros(3, np.float32)}, calibration=calibration)
+    of_one = {name: value[None] for name, value in weights.items()}
+    np.savez(path, **{**of_one, "heads.bias": np.zeros((1, 3), np.float32)}, calibration=calibration)
     with pytest.raises(ValueError, match="heads"):
         read_weights(path)
     np.savez(path, **weights)
     with pytest.raises(ValueError, match="calibration"):
+        read_weights(path)
+    np.savez(path, calibration=calibration)
+    with pytest.raises(ValueError, match="no network"):
         read_weights(path)
 
 

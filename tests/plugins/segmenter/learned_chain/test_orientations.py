@@ -27,7 +27,7 @@ def test_every_orientation_is_turned_back_onto_the_picture():
 
 
 def test_the_mean_does_not_depend_on_how_a_picture_lies():
-    network = read_weights(SHIPPED).network
+    network = read_weights(SHIPPED).ensemble
     picture = np.random.default_rng(1).normal(size=(96, 96)).astype(np.float32)
     transposed = mean_answer(network, np.ascontiguousarray(picture.T), ALL_ORIENTATIONS).transpose(1, 0, 2)
     answers = mean_answer(network, picture, ALL_ORIENTATIONS)

@@ -49,11 +49,22 @@ def accepts(judge, track, log_image):
     return judge(track, log_image).is_catheter
 
 
-def evidence(odds):
-    """Return the evidence of log-odds (n,) for electrodes with nothing beside them."""
-    return SectionOdds(
-        odds, np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3)), np.zeros((2 * len(odds) - 1, 2))
-    )
+def evidence(odds, shafts=(0.0, 0.0)):
+    """Return the evidence of log-odds (n,) for electrodes with nothing beside them, and shafts at the ends."""
+    beside, across = np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3))
+    return SectionOdds(odds, beside, across, np.zeros((2 * len(odds) - 1, 2)), np.array(shafts))
+
+
+@pytest.mark.parametrize(("shafts", "says"), [((0.1, 0.9), 1), ((0.9, 0.1), -1), ((0.5, 0.5), 0)])
+def test_the_shaft_in_the_means_says_which_end_of_a_track_is_the_tip(monkeypatch, shafts, says):
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    track = chains(np.repeat(row[None], FRAMES, axis=0))
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: evidence(np.full(4, 2.0), shafts))
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    assert np.sign(judge(track, lambda frame: None).tip_odds) == says
+    # Single frames show a long tip itself.
+    knows = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES], frozenset({"reference"}))
+    assert knows(track, lambda frame: None).tip_odds is None
 
 
 def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images):
