@@ -46,9 +46,10 @@ def shaft_beyond_ends(chains_uv: Array, catheter: Catheter, shaft_image: ShaftIm
 
 
 def shafts_at_ends(path_uv: Array, shaft_image: ShaftImage) -> Array:
-    """Return how much a shaft shows beyond the first and the last place of a path, (2,) from -1 to 1.
+    """Return how much a shaft shows beyond both ends of a path.
 
-    The image has little noise, so that the shaft's direction is known better than in a single frame.
+    The result (2,) lies between -1 and 1, and is 0 outside the image. The image has little noise, so that the shaft's direction is
+    known better than in a single frame.
     """
     ends_uv, before_uv = path_uv[[0, -1]], path_uv[[1, -2]]
     ways = ends_uv - before_uv

@@ -31,9 +31,9 @@ _VALIDATION_KEY = 9_999_999
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Train the networks and calibrate their mean answer, then write the weights and their facts.
+    """Train and calibrate, then write the weights and their facts.
 
-    The calibration uses scenes that the training did not see.
+    The networks are calibrated together, by their mean answer.     The calibration uses scenes that the training did not see.
     """
     given = _parser().parse_args(arguments)
     if given.reference:
@@ -116,7 +116,8 @@ def _catheter(entry: dict[str, object]) -> Catheter:
 def _show(seed: int, progress: Progress) -> None:
     heat, place, spread, tip = progress.losses
     print(
-        f"seed {seed}, shard {progress.shard}: heat {heat:.3f} place {place:.3f} spread {spread:.3f} tip {tip:.3f}, {progress.seconds:.0f} s",
+        f"seed {seed}, shard {progress.shard}: heat {heat:.3f} place {place:.3f} spread {spread:.3f} tip {tip:.3f}, "
+        f"{progress.seconds:.0f} s",
         flush=True,
     )
 

@@ -35,7 +35,7 @@ def test_the_mean_with_the_velocity_of_a_spot_shows_it_whole():
     assert all(mean.shape == (64, 64) for mean in means)
 
 
-def hidden_run(photons=5.0, through_ring=0.7):
+def hidden_run(photons=4.5, through_ring=0.7):
     """Return noisy frames of a moving decapolar catheter.
 
     Its electrodes (frames, 10, 2) are returned too; they move 1.5 px a frame.

@@ -46,7 +46,7 @@ class NetworkEnsemble:
     def __call__(self, picture: Image, cells: Part | None = None) -> Image:
         """Return the mean answers of cells; see :meth:`ElectrodeNetwork.__call__`.
 
-        The variance of a place is that of the networks' mixture (eq. after 2.4 there): the mean of the variances that they state, and
+        The variance of a place is that of the networks' mixture (section 2.4 there): the mean of the variances that they state, and
         how far apart their places lie.
         """
         answers = [network(picture, cells) for network in self.networks]

@@ -51,6 +51,8 @@ _LEAST_LOW, _LEAST_LOW_STILL = -2.0, -0.7
 """Log-odds of the worst electrode, and of the worst one of a track that does not move."""
 _DENIED, _DENIED_LONG = -3.0, -4.0
 """Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
+_MOST_DENIED = 1
+"""Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
 _NOTHING, _BELOW_OTHERS = -1.0, 3.5
 """Log-odds of a place without an electrode in a long row, in both means: below this, and so far below the middle electrode."""
 _LOW_QUANTILE = 0.1
@@ -169,7 +171,8 @@ class TrackEvidence:
             best = np.max([of_each for _, of_each in said], axis=0)
             there = np.count_nonzero(best >= min(_NOTHING, middle - _BELOW_OTHERS))
             is_shorter = there < min(len(best), MANY_ELECTRODES)
-            return Verdict(middle >= least and not is_shorter, middle, tip_odds=tip_odds)
+            denied = np.count_nonzero(best < _DENIED_LONG) > _MOST_DENIED
+            return Verdict(middle >= least and not is_shorter and not denied, middle, tip_odds=tip_odds)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits)
         is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)
@@ -179,7 +182,10 @@ class TrackEvidence:
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
 
     def _has_long_tip(self, chains: Mapping[int, Chain]) -> bool:
-        """Return whether a track is likely a catheter whose single frames show which end is the tip."""
+        """Return whether a track is likely a catheter with a long tip.
+
+        Its single frames show which end is the tip.
+        """
         probabilities = [
             probability for chain in chains.values() for name, probability in chain.kinds if name in self.long_tips
         ]
@@ -256,7 +262,10 @@ def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
 
 
 def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:
-    """Return the log-odds that a track begins at its tip: a shaft shows behind it and not before it."""
+    """Return the log-odds that a track begins at its tip.
+
+    A shaft shows behind a catheter and not before it.
+    """
     behind = np.mean([sections[-1].shafts[1] - sections[0].shafts[0] for sections in pictures])
     return _OF_SHAFT * float(behind)
 

@@ -50,7 +50,10 @@ def accepts(judge, track, log_image):
 
 
 def evidence(odds, shafts=(0.0, 0.0)):
-    """Return the evidence of log-odds (n,) for electrodes with nothing beside them, and shafts at the ends."""
+    """Return evidence for electrodes with nothing beside them.
+
+    ``odds`` : their log-odds, (n,). ``shafts`` : at both ends.
+    """
     beside, across = np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3))
     return SectionOdds(odds, beside, across, np.zeros((2 * len(odds) - 1, 2)), np.array(shafts))
 
