@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from fluoromap.contracts import Array
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.linking import ShaftImage
 
 _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
@@ -15,6 +16,8 @@ _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4,
 _LEAST_IN_FRAME, _LEAST_IN_MEAN = 0.75, 0.6
 """Of a dark line, in a single frame and in the mean of several, see :func:`is_dark_line`. Shafts in real frames stay below both."""
 _LEAST_GAPS = 2
+import os
+_SURE, _SURE_LONG = map(float,os.environ.get('DS','1.0,1.7').split(','))
 
 
 def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
@@ -72,3 +75,12 @@ def is_dark_line(depths: Sequence[Array], averaged: bool = False) -> bool:
     electrodes = float(np.median(np.concatenate([section[::2, 0] for section in depths])))
     thinnest = min(float(section[1::2].sum(axis=1).min()) for section in depths if len(section) > 1)
     return electrodes > 0 and thinnest >= (_LEAST_IN_MEAN if averaged else _LEAST_IN_FRAME) * electrodes
+
+
+def sure_on_dark_line(electrodes: int) -> float:
+    """Return from which log-odds on electrodes are believed on a dark line.
+
+    They are the middle electrode's. Some catheters' shafts are as dark as their rings, above all where the display evens out the
+    picture. Cables that look like electrodes look less like them; long rows of parts are longer on them.
+    """
+    return _SURE_LONG if electrodes >= MANY_ELECTRODES else _SURE

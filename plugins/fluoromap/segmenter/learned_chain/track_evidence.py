@@ -17,7 +17,7 @@ from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
+from fluoromap.segmenter.dark_lines import depths_along, is_dark_line, sure_on_dark_line
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -151,9 +151,10 @@ class TrackEvidence:
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
         is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
-        if not is_loop and (_is_probe(pictures) or _is_on_dark_line(pictures)):
-            return Verdict(False)
         odds = np.array([odds_of(sections) for sections in pictures])
+        may_be_line = np.median(odds, axis=1).mean() < sure_on_dark_line(odds.shape[1])
+        if not is_loop and (_is_probe(pictures) or (may_be_line and _is_on_dark_line(pictures))):
+            return Verdict(False)
         tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
