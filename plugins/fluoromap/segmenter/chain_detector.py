@@ -17,7 +17,7 @@ from fluoromap.segmenter.bars import follows_bars, products_beside
 from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
-from fluoromap.segmenter.dark_lines import depths_along, is_dark_line, sure_on_dark_line
+from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
 from fluoromap.segmenter.field_mask import FieldMask, are_in
 from fluoromap.segmenter.linking import (
@@ -395,14 +395,14 @@ class ChainDetector:
         chains = best_chains(possible, linking.points_uv, families, self.px_per_mm, linking.proposed)
         return replace(linking, possible=possible, chains=chains)
 
-    def _lies_on_a_line(self, chain_uv: Array, odds: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
+    def _lies_on_a_line(self, chain_uv: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
         """Return whether a chain (n, 2) lies on parallel bars or on a dark line.
 
-        A loop on edge shows both sides as one line. ``odds`` : log-odds of the electrodes; some shafts are as dark as they.
+        A loop on edge shows both sides as one line.
         """
         shafts = self._shafts(seen)
-        may_be_line = not catheter.is_circular and float(np.median(odds)) < sure_on_dark_line(len(odds))
-        on_dark_line = may_be_line and is_dark_line([depths_along(chain_uv, shafts)])
+        odds = log_odds(seen.scores_at(chain_uv))
+        on_dark_line = not catheter.is_circular and is_dark_line([depths_along(chain_uv, shafts)], odds)
         return on_dark_line or follows_bars(products_beside(chain_uv, shafts))
 
     def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
@@ -421,7 +421,7 @@ class ChainDetector:
             family = self.family_of(chain)
             is_seen = chain.scores > UNSEEN
             own = own[is_seen]
-            if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], own, seen, family.catheter):
+            if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
                 continue
             onwards = EVEN_ODDS
             if len(chain.electrodes) >= MANY_ELECTRODES:

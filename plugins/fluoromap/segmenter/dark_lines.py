@@ -16,8 +16,8 @@ _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4,
 _LEAST_IN_FRAME, _LEAST_IN_MEAN = 0.75, 0.6
 """Of a dark line, in a single frame and in the mean of several, see :func:`is_dark_line`. Shafts in real frames stay below both."""
 _LEAST_GAPS = 2
-import os
-_SURE, _SURE_LONG = map(float,os.environ.get('DS','1.0,1.7').split(','))
+_SURE, _SURE_LONG = 1.0, 1.7
+"""Log-odds of the middle electrode that is believed on a dark line, and that of a long row: lines have room for more parts."""
 
 
 def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
@@ -56,10 +56,11 @@ def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
     return depths
 
 
-def is_dark_line(depths: Sequence[Array], averaged: bool = False) -> bool:
+def is_dark_line(depths: Sequence[Array], odds: Array, averaged: bool = False) -> bool:
     """Return whether a chain lies on a line that is dark in each gap.
 
-    A catheter's shaft is fainter than its electrodes, and ends 1.3 mm beside its middle. Electrodes near each other may hide the
+    A catheter's shaft is fainter than its electrodes, and ends 1.3 mm beside its middle. Some shafts are as dark, above all where
+    the display evens out the picture; what clearly looks like electrodes is believed there. Electrodes near each other may hide the
     gap between them, but not the widest gap. The sum of both depths in each gap counts, as a share of the electrodes' depth. Of two
     electrodes it says nothing: the coil of a lead is as dark as its rings.
 
@@ -67,20 +68,14 @@ def is_dark_line(depths: Sequence[Array], averaged: bool = False) -> bool:
     ----------
     depths : sequence of (2 electrodes - 1, 2)
         Of the chain or of its sections, see :func:`depths_along`.
+    odds : (electrodes,)
+        Log-odds that they are electrodes.
     averaged : bool
         Whether they were measured in the mean of several frames.
     """
-    if sum(len(section) // 2 for section in depths) < _LEAST_GAPS:
+    sure = _SURE_LONG if len(odds) >= MANY_ELECTRODES else _SURE
+    if sum(len(section) // 2 for section in depths) < _LEAST_GAPS or np.median(odds) >= sure:
         return False
     electrodes = float(np.median(np.concatenate([section[::2, 0] for section in depths])))
     thinnest = min(float(section[1::2].sum(axis=1).min()) for section in depths if len(section) > 1)
     return electrodes > 0 and thinnest >= (_LEAST_IN_MEAN if averaged else _LEAST_IN_FRAME) * electrodes
-
-
-def sure_on_dark_line(electrodes: int) -> float:
-    """Return from which log-odds on electrodes are believed on a dark line.
-
-    They are the middle electrode's. Some catheters' shafts are as dark as their rings, above all where the display evens out the
-    picture. Cables that look like electrodes look less like them; long rows of parts are longer on them.
-    """
-    return _SURE_LONG if electrodes >= MANY_ELECTRODES else _SURE

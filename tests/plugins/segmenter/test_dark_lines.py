@@ -8,6 +8,8 @@ from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.linking import ShaftImage
 
 PX_PER_MM = 3.2
+DOUBT = np.zeros(6)
+"""Log-odds of electrodes."""
 CHAIN = np.stack([40.0 + 3.0 * PX_PER_MM * np.arange(6), np.full(6, 60.0)], axis=1)
 
 
@@ -27,7 +29,7 @@ def picture(part, line, radius_mm, reduction=1):
     [(0.7, 2.0, True), (0.3, 2.0, False), (0.9, 0.6, True), (0.4, 0.6, False), (0.3, 1.0, False), (0.0, 1.0, False)],
 )
 def test_a_cable_is_dark_between_its_parts_too(line, radius_mm, is_dark):
-    assert is_dark_line([depths_along(CHAIN, picture(1.0, line, radius_mm))]) == is_dark
+    assert is_dark_line([depths_along(CHAIN, picture(1.0, line, radius_mm))], DOUBT) == is_dark
 
 
 def test_depths_are_those_of_the_line_below_its_surroundings():
@@ -46,25 +48,33 @@ def test_a_reduced_picture_shows_the_same_line():
 def test_an_edge_of_anatomy_beside_a_catheter_is_no_line():
     shafts = picture(1.0, 0.2, 0.8)
     shafts.smooth[66:] -= 2.0
-    assert not is_dark_line([depths_along(CHAIN, shafts)])
+    assert not is_dark_line([depths_along(CHAIN, shafts)], DOUBT)
 
 
 def test_one_clear_gap_shows_that_the_line_is_a_shaft():
     thick, thin = (depths_along(CHAIN, picture(1.0, line, 2.0)) for line in (0.7, 0.2))
-    assert is_dark_line([thick, thick])
-    assert not is_dark_line([thick, thin])
+    assert is_dark_line([thick, thick], DOUBT)
+    assert not is_dark_line([thick, thin], DOUBT)
 
 
 def test_a_mean_of_frames_needs_less_than_a_frame():
     depths = [depths_along(CHAIN, picture(1.0, 0.35, 2.0))]
-    assert is_dark_line(depths, averaged=True)
-    assert not is_dark_line(depths)
+    assert is_dark_line(depths, DOUBT, averaged=True)
+    assert not is_dark_line(depths, DOUBT)
 
 
 def test_nothing_is_no_line():
-    assert not is_dark_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))])
+    assert not is_dark_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))], DOUBT)
 
 
 def test_the_coil_of_a_lead_may_be_as_dark_as_its_rings():
-    assert not is_dark_line([depths_along(CHAIN[:2], picture(1.0, 0.9, 0.6))])
-    assert is_dark_line([depths_along(CHAIN[:3], picture(1.0, 0.9, 0.6))])
+    assert not is_dark_line([depths_along(CHAIN[:2], picture(1.0, 0.9, 0.6))], DOUBT)
+    assert is_dark_line([depths_along(CHAIN[:3], picture(1.0, 0.9, 0.6))], DOUBT)
+
+
+@pytest.mark.parametrize(
+    ("electrodes", "odds", "is_dark"), [(4, 0.9, True), (4, 1.1, False), (6, 1.6, True), (6, 1.8, False)]
+)
+def test_what_clearly_looks_like_electrodes_has_a_dark_shaft(electrodes, odds, is_dark):
+    depths = [depths_along(CHAIN[:electrodes], picture(1.0, 0.9, 0.6))]
+    assert is_dark_line(depths, np.full(electrodes, odds)) == is_dark

@@ -17,7 +17,7 @@ from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.dark_lines import depths_along, is_dark_line, sure_on_dark_line
+from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -152,8 +152,7 @@ class TrackEvidence:
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
         is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
         odds = np.array([odds_of(sections) for sections in pictures])
-        may_be_line = np.median(odds, axis=1).mean() < sure_on_dark_line(odds.shape[1])
-        if not is_loop and (_is_probe(pictures) or (may_be_line and _is_on_dark_line(pictures))):
+        if not is_loop and (_is_probe(pictures) or _is_on_dark_line(pictures, odds.mean(axis=0))):
             return Verdict(False)
         tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
@@ -255,11 +254,10 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
     return follows_bars(beside) or has_other_wall(across)
 
 
-def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
-    """Return whether pictures of a track show a dark line."""
-    return is_dark_line(
-        [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)], averaged=True
-    )
+def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]], odds: Array) -> bool:
+    """Return whether pictures of a track with these log-odds (n,) show a dark line."""
+    depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
+    return is_dark_line(depths, odds, averaged=True)
 
 
 def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:

@@ -301,6 +301,8 @@ def test_noise_is_an_excuse_in_a_run_that_shows_another_catheter(monkeypatch, od
         ([1.0, 1.0, -2.2, 1.0, 1.0, 1.0], True),
         ([1.0, 1.0, -2.7, 1.0, 1.0, 1.0], False),
         ([2.5] * 4 + [-1.2] + [2.5] * 5, True),
+        ([2.5] * 4 + [-4.5] + [2.5] * 5, True),
+        ([2.5] * 4 + [-4.5] * 2 + [2.5] * 4, False),
     ],
 )
 def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch, odds, is_catheter):
@@ -315,15 +317,15 @@ def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch,
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).is_catheter == is_catheter
 
 
-@pytest.mark.parametrize(("between", "accepted"), [(0.5, True), (0.7, False)])
-def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, between, accepted):
+@pytest.mark.parametrize(("between", "odds", "accepted"), [(0.5, 1.6, True), (0.7, 1.6, False), (0.7, 1.8, True)])
+def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, between, odds, accepted):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
 
     def along(self, frames, path_uv, log_image):
         count = path_uv.shape[1]
         depths = np.zeros((2 * count - 1, 2))
         depths[:, 0] = np.where(np.arange(len(depths)) % 2, between, 1.0)
-        return replace(evidence(np.full(count, 3.0)), depths=depths)
+        return replace(evidence(np.full(count, odds)), depths=depths)
 
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     angles = np.linspace(0.0, 5.5, 10)
