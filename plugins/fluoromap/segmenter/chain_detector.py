@@ -398,7 +398,7 @@ class ChainDetector:
     def _lies_on_a_line(self, chain_uv: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
         """Return whether a chain (n, 2) lies on parallel bars or on a dark line.
 
-        A loop on edge shows both sides as one line.
+        A loop on edge shows both sides as one line. Scores that are no probabilities, but contrasts, count as sure.
         """
         shafts = self._shafts(seen)
         odds = log_odds(seen.scores_at(chain_uv))
