@@ -401,8 +401,9 @@ class ChainDetector:
         A loop on edge shows both sides as one line. Scores that are no probabilities, but contrasts, count as sure.
         """
         shafts = self._shafts(seen)
-        odds = log_odds(seen.scores_at(chain_uv))
-        on_dark_line = not catheter.is_circular and is_dark_line([depths_along(chain_uv, shafts)], odds)
+        on_dark_line = not catheter.is_circular and is_dark_line(
+            [depths_along(chain_uv, shafts)], log_odds(seen.scores_at(chain_uv))
+        )
         return on_dark_line or follows_bars(products_beside(chain_uv, shafts))
 
     def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
@@ -420,10 +421,10 @@ class ChainDetector:
         for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
             family = self.family_of(chain)
             is_seen = chain.scores > UNSEEN
-            own = own[is_seen]
             if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
                 continue
             onwards = EVEN_ODDS
+            own = own[is_seen]
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:

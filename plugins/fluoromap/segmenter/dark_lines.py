@@ -14,7 +14,8 @@ from fluoromap.segmenter.linking import ShaftImage
 _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
 """Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""
 _LEAST_IN_FRAME, _LEAST_IN_MEAN = 0.75, 0.6
-"""Of a dark line, in a single frame and in the mean of several, see :func:`is_dark_line`. Shafts in real frames stay below both."""
+"""Of a dark line, in a single frame and in the mean of several, see :func:`is_dark_line`. Shafts in the few labelled real frames
+stay below both."""
 _LEAST_GAPS = 2
 _SURE, _SURE_LONG = 1.0, 1.7
 """Log-odds of the middle electrode that is believed on a dark line, and that of a long row: lines have room for more parts."""

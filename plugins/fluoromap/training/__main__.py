@@ -33,7 +33,7 @@ _VALIDATION_KEY = 9_999_999
 def main(arguments: Sequence[str]) -> None:
     """Train and calibrate, then write the weights and their facts.
 
-    The networks are calibrated together, by their mean answer.     The calibration uses scenes that the training did not see.
+    The networks are calibrated together, by their mean answer, on scenes that the training did not see.
     """
     given = _parser().parse_args(arguments)
     if given.reference:
