@@ -8,6 +8,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.dark_lines import IN_FRAME, DarkLineLimits
 from fluoromap.segmenter.linking import ONE_BY_ONE, Trust
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
@@ -63,7 +64,7 @@ class Acceptance:
     where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
     so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
     trust : see :class:`~fluoromap.segmenter.linking.Trust`. faded_price : if ``strict``, what the score of a chain of six or more
-    loses for each place at its ends that shows no electrode.
+    loses for each place at its ends that shows no electrode. dark_lines : chains on such lines are not accepted, if ``strict``.
     """
 
     least_clearness: float
@@ -78,6 +79,7 @@ class Acceptance:
     row_score: float = np.inf
     trust: Trust = ONE_BY_ONE
     faded_price: float = 0.0
+    dark_lines: DarkLineLimits = IN_FRAME
 
     def accepts(self, scores: Array, chain_scores: Array, beside: bool = False) -> BoolArray:
         """Return whether chains are clear enough, (...).

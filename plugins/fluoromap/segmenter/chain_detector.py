@@ -402,7 +402,7 @@ class ChainDetector:
         """
         shafts = self._shafts(seen)
         on_dark_line = not catheter.is_circular and is_dark_line(
-            [depths_along(chain_uv, shafts)], log_odds(seen.scores_at(chain_uv))
+            [depths_along(chain_uv, shafts)], log_odds(seen.scores_at(chain_uv)), self.acceptance.dark_lines
         )
         return on_dark_line or follows_bars(products_beside(chain_uv, shafts))
 

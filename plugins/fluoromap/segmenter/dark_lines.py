@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -13,12 +15,7 @@ from fluoromap.segmenter.linking import ShaftImage
 
 _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
 """Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""
-_LEAST_IN_FRAME, _LEAST_IN_MEAN = 0.75, 0.6
-"""Of a dark line, in a single frame and in the mean of several, see :func:`is_dark_line`. Shafts in the few labelled real frames
-stay below both."""
 _LEAST_GAPS = 2
-_SURE, _SURE_LONG = 1.0, 1.7
-"""Log-odds of the middle electrode that is believed on a dark line, and that of a long row: lines have room for more parts."""
 
 
 def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
@@ -57,7 +54,40 @@ def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
     return depths
 
 
-def is_dark_line(depths: Sequence[Array], odds: Array, averaged: bool = False) -> bool:
+@dataclass(frozen=True, slots=True)
+class DarkLineLimits:
+    """From where on a chain lies on a dark line.
+
+    thinnest : depth of the faintest gap as a share of the electrodes' depth. sure, sure_long : log-odds of the middle
+    electrode that is believed on a dark line, and that of a row of six or more: lines have room for more parts.
+    """
+
+    thinnest: float
+    sure: float
+    sure_long: float
+
+
+IN_FRAME = DarkLineLimits(thinnest=0.75, sure=1.0, sure_long=1.7)
+"""For a single frame that nothing confirms. Shafts in the few labelled real frames are fainter."""
+
+
+def gap_share(depths: Sequence[Array]) -> float:
+    """Return how dark most gaps of a chain are, as a share of its electrodes' depth.
+
+    It is about 0 for separate spots, 1 for parts of a line. The depth of a gap is the sum of both :func:`depths_along`. It is
+    infinite where the electrodes are not dark.
+
+    Parameters
+    ----------
+    depths : sequence of (2 electrodes - 1, 2)
+        Of the chain or of its sections, see :func:`depths_along`.
+    """
+    electrodes = _depth_of_electrodes(depths)
+    gaps = np.concatenate(_depths_of_gaps(depths))
+    return float(np.median(gaps)) / electrodes if electrodes > 0 else math.inf
+
+
+def is_dark_line(depths: Sequence[Array], odds: Array, limits: DarkLineLimits) -> bool:
     """Return whether a chain lies on a line that is dark in each gap.
 
     A catheter's shaft is fainter than its electrodes, and ends 1.3 mm beside its middle. Some shafts are as dark, above all where
@@ -71,12 +101,19 @@ def is_dark_line(depths: Sequence[Array], odds: Array, averaged: bool = False) -
         Of the chain or of its sections, see :func:`depths_along`.
     odds : (electrodes,)
         Log-odds that they are electrodes.
-    averaged : bool
-        Whether they were measured in the mean of several frames.
+    limits : DarkLineLimits
     """
-    sure = _SURE_LONG if len(odds) >= MANY_ELECTRODES else _SURE
-    if sum(len(section) // 2 for section in depths) < _LEAST_GAPS or np.median(odds) >= sure:
+    sure = limits.sure_long if len(odds) >= MANY_ELECTRODES else limits.sure
+    gaps = _depths_of_gaps(depths)
+    if sum(len(section) for section in gaps) < _LEAST_GAPS or np.median(odds) >= sure:
         return False
-    electrodes = float(np.median(np.concatenate([section[::2, 0] for section in depths])))
-    thinnest = min(float(section[1::2].sum(axis=1).min()) for section in depths if len(section) > 1)
-    return electrodes > 0 and thinnest >= (_LEAST_IN_MEAN if averaged else _LEAST_IN_FRAME) * electrodes
+    electrodes = _depth_of_electrodes(depths)
+    return electrodes > 0 and min(float(section.min()) for section in gaps) >= limits.thinnest * electrodes
+
+
+def _depth_of_electrodes(depths: Sequence[Array]) -> float:
+    return float(np.median(np.concatenate([section[::2, 0] for section in depths])))
+
+
+def _depths_of_gaps(depths: Sequence[Array]) -> list[Array]:
+    return [section[1::2].sum(axis=1) for section in depths if len(section) > 1]

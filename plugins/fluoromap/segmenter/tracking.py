@@ -49,7 +49,8 @@ _REVERSED_PX = 4.0
 _TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
-_LEAST_AGAINST = 2
+_LEAST_AGAINST, _CONFIRMED_AGAINST = 2, 0.25
+"""Frames that outvote a track, and the share of its frames that does not outvote one that was found in a moved mean."""
 _OF_FRAMES, _MOST_TIP_ODDS = 0.75, 4.0
 """How much of the frames' mean log-odds of the tip counts beside those of the judge, and how sure both are at most."""
 _ASKED_FOR_DIRECTION = 20
@@ -276,7 +277,9 @@ def _is_outvoted(track: Track, found: Sequence[FrameChains]) -> bool:
             for other in found[frame].chains
             if other is not chain
         )
-    return not track.manual and against > max(track.detections, _LEAST_AGAINST - 1)
+    # What a moved mean shows is more certain than a few frames that noise hides it in.
+    most = _CONFIRMED_AGAINST * len(track.chains) if track.confirmed else _LEAST_AGAINST - 1
+    return not track.manual and against > max(track.detections, most)
 
 
 def _is_displaced(chain: Chain, other: Chain) -> bool:

@@ -1,10 +1,12 @@
 """Rows of parts on a dark line, and catheters with their shafts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
+from fluoromap.segmenter.dark_lines import IN_FRAME, depths_along, gap_share, is_dark_line
 from fluoromap.segmenter.linking import ShaftImage
 
 PX_PER_MM = 3.2
@@ -29,7 +31,7 @@ def picture(part, line, radius_mm, reduction=1):
     [(0.7, 2.0, True), (0.3, 2.0, False), (0.9, 0.6, True), (0.4, 0.6, False), (0.3, 1.0, False), (0.0, 1.0, False)],
 )
 def test_a_cable_is_dark_between_its_parts_too(line, radius_mm, is_dark):
-    assert is_dark_line([depths_along(CHAIN, picture(1.0, line, radius_mm))], DOUBT) == is_dark
+    assert is_dark_line([depths_along(CHAIN, picture(1.0, line, radius_mm))], DOUBT, IN_FRAME) == is_dark
 
 
 def test_depths_are_those_of_the_line_below_its_surroundings():
@@ -48,28 +50,28 @@ def test_a_reduced_picture_shows_the_same_line():
 def test_an_edge_of_anatomy_beside_a_catheter_is_no_line():
     shafts = picture(1.0, 0.2, 0.8)
     shafts.smooth[66:] -= 2.0
-    assert not is_dark_line([depths_along(CHAIN, shafts)], DOUBT)
+    assert not is_dark_line([depths_along(CHAIN, shafts)], DOUBT, IN_FRAME)
 
 
 def test_one_clear_gap_shows_that_the_line_is_a_shaft():
     thick, thin = (depths_along(CHAIN, picture(1.0, line, 2.0)) for line in (0.7, 0.2))
-    assert is_dark_line([thick, thick], DOUBT)
-    assert not is_dark_line([thick, thin], DOUBT)
+    assert is_dark_line([thick, thick], DOUBT, IN_FRAME)
+    assert not is_dark_line([thick, thin], DOUBT, IN_FRAME)
 
 
-def test_a_mean_of_frames_needs_less_than_a_frame():
+def test_the_faintest_gap_of_a_dark_line_reaches_its_limit():
     depths = [depths_along(CHAIN, picture(1.0, 0.35, 2.0))]
-    assert is_dark_line(depths, DOUBT, averaged=True)
-    assert not is_dark_line(depths, DOUBT)
+    assert is_dark_line(depths, DOUBT, replace(IN_FRAME, thinnest=0.6))
+    assert not is_dark_line(depths, DOUBT, IN_FRAME)
 
 
 def test_nothing_is_no_line():
-    assert not is_dark_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))], DOUBT)
+    assert not is_dark_line([depths_along(CHAIN, picture(0.0, 0.0, 2.0))], DOUBT, IN_FRAME)
 
 
 def test_the_coil_of_a_lead_may_be_as_dark_as_its_rings():
-    assert not is_dark_line([depths_along(CHAIN[:2], picture(1.0, 0.9, 0.6))], DOUBT)
-    assert is_dark_line([depths_along(CHAIN[:3], picture(1.0, 0.9, 0.6))], DOUBT)
+    assert not is_dark_line([depths_along(CHAIN[:2], picture(1.0, 0.9, 0.6))], DOUBT, IN_FRAME)
+    assert is_dark_line([depths_along(CHAIN[:3], picture(1.0, 0.9, 0.6))], DOUBT, IN_FRAME)
 
 
 @pytest.mark.parametrize(
@@ -77,4 +79,17 @@ def test_the_coil_of_a_lead_may_be_as_dark_as_its_rings():
 )
 def test_what_clearly_looks_like_electrodes_has_a_dark_shaft(electrodes, odds, is_dark):
     depths = [depths_along(CHAIN[:electrodes], picture(1.0, 0.9, 0.6))]
-    assert is_dark_line(depths, np.full(electrodes, odds)) == is_dark
+    assert is_dark_line(depths, np.full(electrodes, odds), IN_FRAME) == is_dark
+
+
+def test_separate_spots_have_clear_gaps_and_parts_of_a_line_have_dark_ones():
+    for line in (0.0, 0.3, 0.6):
+        thin = [depths_along(CHAIN, picture(1.0, line, 0.8))]
+        assert gap_share(thin) == pytest.approx(line, abs=0.12)
+    assert gap_share([depths_along(CHAIN, picture(1.0, 0.7, 2.0))]) == pytest.approx(1.4, abs=0.1)
+    assert gap_share([depths_along(CHAIN, picture(0.0, 0.0, 2.0))]) == np.inf
+
+
+def test_the_gaps_of_all_sections_count():
+    clear, dark = (depths_along(CHAIN, picture(1.0, line, 0.8)) for line in (0.0, 0.9))
+    assert gap_share([clear, clear, dark]) == pytest.approx(gap_share([clear]), abs=0.05)

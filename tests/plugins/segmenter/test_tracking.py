@@ -244,6 +244,15 @@ def test_a_catheter_of_moved_means_is_followed_where_no_frame_shows_it_and_a_fal
     assert not any(entry.chains for entry in track_chains(found, times(8), 1, only_confirmed, seed, says(accepts)))
 
 
+@pytest.mark.parametrize(("displaced", "kept"), [(3, True), (6, False)])
+def test_a_few_displaced_chains_do_not_outvote_a_catheter_of_moved_means(displaced, kept):
+    row = np.stack([np.arange(12) * 12.0, np.arange(12) * 3.0], axis=1) + 60
+    found = run([[chain(row[2:], "cs")] if frame < displaced else [] for frame in range(16)])
+    seed = FrameChains(10, (chain(row[:10], "cs"),))
+    entries = track_chains(found, times(16), 1, only_confirmed, seed, says(lambda chains: True), marks_first=False)
+    assert [np.allclose(one.pixels_uv, row[:10]) for entry in entries for one in entry.chains].count(True) == 16 * kept
+
+
 def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
     long = np.stack([np.arange(10) * 12.0, np.arange(10) * 3.0], axis=1) + 60
     whole, part = chain(long, "cs"), chain(long[3:7], "rv")

@@ -10,6 +10,7 @@ from fluoromap.contracts import PixelFacts
 from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
+from fluoromap.segmenter.dark_lines import IN_FRAME
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, near_distance_mm
@@ -34,12 +35,15 @@ IN_A_RUN = Acceptance(
     trust=Trust(share=0.25, chain=0.7),
     # Half of the least that an electrode adds to the value of a set of chains: it may be there and hidden.
     faded_price=0.75,
+    # The mean along the track decides about what single frames leave open.
+    dark_lines=replace(IN_FRAME, sure=0.3),
 )
 _ALONE = replace(
     IN_A_RUN,
     scores=ScoreLimits(0.5, seen=0.2, least_seen=0.85),
     scores_beside=ScoreLimits(0.4, seen=0.15, least_seen=0.7),
     faded_price=math.inf,
+    dark_lines=IN_FRAME,
 )
 """Scores are probabilities. In a single frame no other frame confirms a chain, but another catheter does."""
 

@@ -17,7 +17,7 @@ from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
+from fluoromap.segmenter.dark_lines import DarkLineLimits, depths_along, gap_share, is_dark_line
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -51,6 +51,10 @@ _LEAST_LOW, _LEAST_LOW_STILL = -2.0, -0.7
 """Log-odds of the worst electrode, and of the worst one of a track that does not move."""
 _DENIED, _DENIED_LONG = -3.0, -4.0
 """Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
+_DARK_LINES = DarkLineLimits(thinnest=0.6, sure=0.5, sure_long=2.0)
+_CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
+"""How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.dark_lines.gap_share`. Gaps of a loop are
+not measured: seen on edge, both of its sides are one line."""
 _MOST_DENIED = 1
 """Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
 _NOTHING, _BELOW_OTHERS = -1.0, 3.5
@@ -67,6 +71,22 @@ _MOST_OUTSIDE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
+class _ByGaps:
+    """A limit for rows of separate dark spots, and for rows of parts on a dark line; between them where gaps are neither.
+
+    In noise the network doubts an electrode, and says less of a row that it doubts than the gaps do: few other things leave
+    as many spots in a row with clear gaps.
+    """
+
+    clear: float
+    dark: float
+
+    def at(self, gap_share: float) -> float:
+        """Return the limit for gaps this dark."""
+        return float(np.interp(gap_share, (_CLEAR_GAPS, _DARK_GAPS), (self.clear, self.dark)))
+
+
+@dataclass(frozen=True, slots=True)
 class _Least:
     """Least log-odds of the middle electrode of a track, on average over the pictures.
 
@@ -78,16 +98,18 @@ class _Least:
     """
 
     track: float
-    followed: float
+    followed: _ByGaps
     still: float
-    hidden: float = math.inf
+    hidden: _ByGaps = _ByGaps(math.inf, math.inf)
     hidden_still: float = math.inf
 
 
-_LEAST = _Least(0.5, followed=-0.4, still=1.2, hidden=-1.3, hidden_still=0.6)
-_LEAST_LONG = _Least(0.0, followed=-1.3, still=0.0)
+_DISPLACED = _ByGaps(-5.0, -4.0)
+"""Mean log-odds of the worst place of a long row below which it may be displaced along its catheter."""
+_LEAST = _Least(0.5, _ByGaps(-0.4, 0.45), still=1.2, hidden=_ByGaps(-2.1, 0.45), hidden_still=0.6)
+_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8)
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
-_LEAST_PAIR = _Least(1.2, followed=0.8, still=1.6, hidden=0.8, hidden_still=1.6)
+_LEAST_PAIR = _Least(1.2, _ByGaps(0.8, 0.8), still=1.6, hidden=_ByGaps(0.8, 0.8), hidden_still=1.6)
 """Of two electrodes, which is little: any two dark spots are a pair."""
 
 
@@ -152,8 +174,11 @@ class TrackEvidence:
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
         is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
         odds = np.array([odds_of(sections) for sections in pictures])
-        if not is_loop and (_is_probe(pictures) or _is_on_dark_line(pictures, odds.mean(axis=0))):
+        depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
+        on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES)
+        if not is_loop and (_is_probe(pictures) or on_line):
             return Verdict(False)
+        gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
         tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
@@ -165,8 +190,8 @@ class TrackEvidence:
         middle, of_each = max(said, key=lambda one: one[0])
         if is_row:
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
-            displaced = odds.mean(axis=0).min() < _DENIED_LONG
-            least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG)
+            displaced = odds.mean(axis=0).min() < _DISPLACED.at(gaps)
+            least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG, gaps)
             # The places without an electrode may be beside a shorter catheter.
             best = np.max([of_each for _, of_each in said], axis=0)
             there = np.count_nonzero(best >= min(_NOTHING, middle - _BELOW_OTHERS))
@@ -174,9 +199,9 @@ class TrackEvidence:
             denied = np.count_nonzero(best < _DENIED_LONG) > _MOST_DENIED
             return Verdict(middle >= least and not is_shorter and not denied, middle, tip_odds=tip_odds)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
-        least = self._least(paths, limits)
+        least = self._least(paths, limits, gaps)
         is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)
-        hidden, worst = (limits.hidden_still, _LEAST_LOW_STILL) if still else (limits.hidden, _DENIED)
+        hidden, worst = (limits.hidden_still, _LEAST_LOW_STILL) if still else (limits.hidden.at(gaps), _DENIED)
         followed = self._is_followed(paths) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
         may_be_hidden = bool(followed and middle >= hidden and of_each.min() >= worst)
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
@@ -191,12 +216,12 @@ class TrackEvidence:
         ]
         return math.fsum(probabilities) >= _LIKELY * len(chains)
 
-    def _least(self, path_uv: Array, least: _Least) -> float:
-        """Return the least log-odds of a track with these places, (frames, electrodes, 2)."""
+    def _least(self, path_uv: Array, least: _Least, gaps: float) -> float:
+        """Return the least log-odds of a track with these places (frames, electrodes, 2) and with ``gaps`` this dark."""
         if self._is_still(path_uv):
             return least.still
         return (
-            least.followed
+            least.followed.at(gaps)
             if self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
             else least.track
         )
@@ -252,12 +277,6 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
     beside = np.sum([np.concatenate([section.beside for section in sections], axis=2) for sections in pictures], axis=0)
     across = np.sum([np.concatenate([section.across for section in sections], axis=2) for sections in pictures], axis=0)
     return follows_bars(beside) or has_other_wall(across)
-
-
-def _is_on_dark_line(pictures: Sequence[Sequence[SectionOdds]], odds: Array) -> bool:
-    """Return whether pictures of a track with these log-odds (n,) show a dark line."""
-    depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
-    return is_dark_line(depths, odds, averaged=True)
 
 
 def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:

@@ -49,13 +49,15 @@ def accepts(judge, track, log_image):
     return judge(track, log_image).is_catheter
 
 
-def evidence(odds, shafts=(0.0, 0.0)):
+def evidence(odds, shafts=(0.0, 0.0), gaps=0.0):
     """Return evidence for electrodes with nothing beside them.
 
-    ``odds`` : their log-odds, (n,). ``shafts`` : at both ends.
+    ``odds`` : their log-odds, (n,). ``shafts`` : at both ends. ``gaps`` : how dark they are, as a share of the electrodes' depth.
     """
     beside, across = np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3))
-    return SectionOdds(odds, beside, across, np.zeros((2 * len(odds) - 1, 2)), np.array(shafts))
+    depths = np.zeros((2 * len(odds) - 1, 2))
+    depths[::2, 0], depths[1::2, 0] = 1.0, gaps
+    return SectionOdds(odds, beside, across, depths, np.array(shafts))
 
 
 @pytest.mark.parametrize(("shafts", "says"), [((0.1, 0.9), 1), ((0.9, 0.1), -1), ((0.5, 0.5), 0)])
@@ -112,8 +114,8 @@ def test_chains_of_fewer_electrodes_than_usual_do_not_count(noisy, images):
         (4, 2.5, 2, False),
         (6, 0.5, 1, True),
         (10, 0.1, 2, True),
-        (10, -1.1, 2, True),
-        (10, -1.5, 0, False),
+        (10, -2.4, 2, True),
+        (10, -2.8, 0, False),
     ],
 )
 def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_doubted(
@@ -180,7 +182,7 @@ def test_electrodes_outside_the_field_do_not_count(monkeypatch):
     assert not accepts(judge, known, lambda frame: None)
 
 
-@pytest.mark.parametrize(("all_along", "accepted"), [(0.5, True), (-1.5, False)])
+@pytest.mark.parametrize(("all_along", "accepted"), [(0.5, True), (-2.8, False)])
 @pytest.mark.parametrize("electrodes", [4, 10])
 def test_a_catheter_at_rest_over_anatomy_or_in_noise_is_judged_by_frames_all_along_its_track(
     monkeypatch, electrodes, all_along, accepted
@@ -188,7 +190,7 @@ def test_a_catheter_at_rest_over_anatomy_or_in_noise_is_judged_by_frames_all_alo
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
 
     def along(self, frames, path_uv, log_image):
-        return evidence(np.full(path_uv.shape[1], all_along if np.ptp(frames) > FRAMES else -1.5))
+        return evidence(np.full(path_uv.shape[1], all_along if np.ptp(frames) > FRAMES else -2.8))
 
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
@@ -219,8 +221,8 @@ def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
         (4, 1.0, 24, False, False),
         (4, 1.3, 24, False, True),
         (10, -0.2, 12, True, False),
-        (10, 0.1, 24, False, True),
-        (10, -0.2, 24, False, False),
+        (10, 0.9, 24, False, True),
+        (10, 0.7, 24, False, False),
     ],
 )
 def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(
@@ -276,7 +278,8 @@ def test_a_short_track_that_does_not_move_needs_every_electrode(monkeypatch, ste
     [
         ([-0.6, -0.6, -1.2, -2.9], 24, True, True),
         ([-0.6, -0.6, -1.2, -3.1], 24, True, False),
-        ([-1.4, -1.4, -1.4, -1.4], 24, True, False),
+        ([-2.0, -2.0, -2.0, -2.0], 24, True, True),
+        ([-2.2, -2.2, -2.2, -2.2], 24, True, False),
         ([-0.6, -0.6, -0.6, -0.6], 18, True, False),
         ([0.8, 0.8, 0.8, -0.6], 24, False, True),
         ([0.8, 0.8, 0.8, -0.8], 24, False, False),
@@ -317,15 +320,49 @@ def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch,
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).is_catheter == is_catheter
 
 
-@pytest.mark.parametrize(("between", "odds", "accepted"), [(0.5, 1.6, True), (0.7, 1.6, False), (0.7, 1.8, True)])
+@pytest.mark.parametrize(
+    ("electrodes", "odds", "gaps", "accepted"),
+    [
+        (10, -2.4, 0.2, True),
+        (10, -2.8, 0.2, False),
+        (10, -1.2, 0.4, True),
+        (10, -1.4, 0.4, False),
+        (10, 0.1, 0.55, True),
+        (10, -0.1, 0.55, False),
+        (4, -0.3, 0.2, True),
+        (4, -0.3, 0.55, False),
+        (4, 0.5, 0.55, True),
+    ],
+)
+def test_a_row_of_separate_spots_is_a_catheter_in_more_noise_than_parts_of_a_line(
+    monkeypatch, electrodes, odds, gaps, accepted
+):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
+    monkeypatch.setattr(
+        TrackEvidence,
+        "evidence_along",
+        lambda self, frames, path_uv, log_image: evidence(np.full(path_uv.shape[1], odds), gaps=gaps),
+    )
+    row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
+    assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
+
+
+def test_what_is_not_dark_is_no_row_of_spots(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
+    flat = replace(evidence(np.full(5, -0.5)), depths=np.zeros((9, 2)))
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: flat)
+    row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
+    assert not accepts(judge, chains(row + beat), lambda frame: None)
+
+
+@pytest.mark.parametrize(("between", "odds", "accepted"), [(0.5, 1.9, True), (0.7, 1.9, False), (0.7, 2.1, True)])
 def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, between, odds, accepted):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
 
     def along(self, frames, path_uv, log_image):
-        count = path_uv.shape[1]
-        depths = np.zeros((2 * count - 1, 2))
-        depths[:, 0] = np.where(np.arange(len(depths)) % 2, between, 1.0)
-        return replace(evidence(np.full(count, odds)), depths=depths)
+        return evidence(np.full(path_uv.shape[1], odds), gaps=between)
 
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     angles = np.linspace(0.0, 5.5, 10)
