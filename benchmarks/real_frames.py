@@ -2,7 +2,8 @@
 
 DIR holds pictures (PNG, JPEG, TIFF) and DICOM files, and label files ``*_labels.csv`` with the columns ``file``, ``catheter``,
 ``electrode`` (1 is the tip), ``u_px``, ``v_px`` (the centre of the first pixel is (0, 0)). The files of one label file, in the
-order of their names, are one run. DICOM files without a label file are runs without catheters: all that is found in them is false.
+order of their names, are one run; a label file ``NAME_labels.csv`` without rows is of the pictures ``NAME_*.png``, in which no
+electrode is. DICOM files without a label file are runs without catheters: all that is found in them is false.
 Beside a label file, ``*_set.json`` may describe the run: ``{"px_per_mm": 3.1, "frame_ms": 66.7, "logarithmic": false, "catheters":
 [{"name": "cs", "type": "decapolar-2-5-2"}]}``; the catheters' names are those of the label file.
 
@@ -84,7 +85,10 @@ def _labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
         facts = json.loads(described.read_text()) if described.exists() else {}
         with path.open(newline="") as lines:
             rows = list(csv.DictReader(lines))
-        files = sorted({row["file"] for row in rows})[: given.frames]
+        name = path.name.removesuffix("_labels.csv")
+        # Of a run without electrodes no picture is named in the labels.
+        named = {row["file"] for row in rows} or {picture.name for picture in path.parent.glob(f"{name}_*.png")}
+        files = sorted(named)[: given.frames]
         labels: list[dict[str, dict[int, Array]]] = [{} for _ in files]
         for row in rows:
             if row["file"] in files:
@@ -121,9 +125,10 @@ def _catalogue(pairs: list[str], facts: dict[str, list[dict[str, str]]]) -> Cata
     catheters: list[Catheter] = [catheter_type(entry["type"], entry["name"]) for entry in facts.get("catheters", [])]
     if pairs:
         catheters = [catheter_type(type_name, name) for name, type_name in (pair.split("=") for pair in pairs)]
-    if len(catheters) < 2:
+    if not catheters:
         return DEFAULT_CATALOGUE
-    return Catalogue(tuple(catheters), catheters[0].name, catheters[-1].name)
+    reference = catheters[0].name if len(catheters) > 1 else None
+    return Catalogue(tuple(catheters), reference, catheters[-1].name)
 
 
 def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:

@@ -137,7 +137,7 @@ def refine(
         if np.count_nonzero(~is_hidden) >= 2:
             points[row, is_hidden] = predict_on_curve(points[row], is_hidden, arc_mm)
             covariance[row, is_hidden] = (_HIDDEN_MM * px_per_mm) ** 2 * np.eye(2)
-            misfits[row, is_hidden] = np.exp(np.log(misfits[row, ~is_hidden]).mean())
+            misfits[row, is_hidden] = np.exp(np.log(np.maximum(misfits[row, ~is_hidden], _LEAST_MISFIT)).mean())
     return fit
 
 

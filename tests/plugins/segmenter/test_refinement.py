@@ -48,3 +48,17 @@ def test_the_middle_of_a_long_tip_is_found_from_its_ends(first_guess_mm):
     error = fit.points_uv[0, 0, 0] - points[0, 0]
     # The template's end is round, that of the picture is not: triangulation adds this distance to the covariance.
     assert abs(error) < catheter.tip_centre_sd_mm(0.2) * px_per_mm
+
+
+def test_bands_that_fit_perfectly_say_as_much_of_a_hidden_one(monkeypatch):
+    def perfect(*arguments):
+        unit_sd, misfits = arguments[-2:]
+        unit_sd[:], misfits[:] = 1.0, 0.0
+
+    monkeypatch.setattr("fluoromap.segmenter.refinement._fit_bands", perfect)
+    catheter = catheter_type("quadripolar-5-5-5", "rv")
+    points = np.stack([40.0 + 6.0 * PX_PER_MM * np.arange(4), np.full(4, 60.0)], axis=1)
+    hidden = np.array([[False, False, True, False]])
+    with np.errstate(all="raise"):
+        fit = refine(np.zeros((120, 200), np.float32), points[None], catheter, PX_PER_MM, 0.01, hidden, ~hidden)
+    assert fit.misfits[0].max() < 0.05

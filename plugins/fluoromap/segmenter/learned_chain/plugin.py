@@ -63,11 +63,13 @@ class LearnedChain:
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
         found = self._segment(run, catalogue, marks, context, trained)
         if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
-            _log.warning(
-                "The electrodes are bright: the grey levels were inverted although the header does not say so."
-            )
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
-            found = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)
+            of_inverted = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)
+            if any(entry.chains for entry in of_inverted.frames):
+                _log.warning(
+                    "The electrodes are bright: the grey levels were inverted although the header does not say so."
+                )
+                found = of_inverted
         return found
 
     def _segment(

@@ -191,3 +191,10 @@ def test_frames_in_which_the_catheters_are_gone_stay_empty(simulated):
     found = segmented([*frames, gone, gone])
     assert [len(entry.chains) for entry in found.frames[11:]] == [0, 0]
     assert sum(len(entry.chains) for entry in found.frames[:11]) >= 28
+
+
+def test_nothing_is_said_of_bright_electrodes_where_the_inverted_picture_shows_none(monkeypatch, caplog):
+    monkeypatch.setattr("fluoromap.segmenter.learned_chain.plugin.is_inverted", lambda *_: True)
+    found = segmented([np.full((200, 200), 2000, np.uint16)] * 2)
+    assert not any(entry.chains for entry in found.frames)
+    assert not caplog.records

@@ -1,0 +1,43 @@
+"""What the benchmark of real frames reads from a folder of labels."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import real_frames
+from PIL import Image
+
+LABELS = "file,catheter,electrode,u_px,v_px\n"
+
+
+def read(folder: Path) -> list[real_frames.LabelledRun]:
+    given = argparse.Namespace(folder=folder, frames=1000, px_per_mm=None, catheter=[])
+    return real_frames._labelled_runs(given)
+
+
+def write(folder: Path, name: str, pictures: int, rows: str) -> None:
+    for number in range(pictures):
+        Image.fromarray(np.full((40, 50), 128, np.uint8)).save(folder / f"{name}_{number}.png")
+    (folder / f"{name}_labels.csv").write_text(LABELS + rows)
+    facts = {"px_per_mm": 4.0, "catheters": [{"name": "cs", "type": "decapolar-2-5-2"}]}
+    (folder / f"{name}_set.json").write_text(json.dumps(facts))
+
+
+def test_a_set_may_list_one_catheter(tmp_path: Path) -> None:
+    write(tmp_path, "a", 2, "a_0.png,cs,1,10.0,20.0\na_1.png,cs,1,11.0,20.0\n")
+    (one,) = read(tmp_path)
+    assert one.catalogue.names == ("cs",)
+    assert one.catalogue.reference is None
+    assert [list(labels) for labels in one.labels] == [["cs"], ["cs"]]
+
+
+def test_labels_without_rows_are_of_pictures_without_electrodes(tmp_path: Path) -> None:
+    write(tmp_path, "a", 3, "")
+    write(tmp_path, "b", 1, "b_0.png,cs,1,10.0,20.0\n")
+    empty, other = read(tmp_path)
+    assert len(empty.run.frames) == 3
+    assert empty.labels == [{}, {}, {}]
+    assert len(other.run.frames) == 1
