@@ -72,10 +72,10 @@ IN_FRAME = DarkLineLimits(thinnest=0.75, sure=1.0, sure_long=1.7)
 
 
 def gap_share(depths: Sequence[Array]) -> float:
-    """Return how dark most gaps of a chain are, as a share of its electrodes' depth.
+    """Return how dark the gaps of a chain are.
 
-    It is about 0 for separate spots, 1 for parts of a line. The depth of a gap is the sum of both :func:`depths_along`. It is
-    infinite where the electrodes are not dark.
+    That is their median depth as a share of the electrodes' depth. It is about 0 for separate spots, 1 for parts of a
+    line, and infinite where the electrodes are not dark. The depth of a gap is the sum of both :func:`depths_along`.
 
     Parameters
     ----------

@@ -217,7 +217,10 @@ class TrackEvidence:
         return math.fsum(probabilities) >= _LIKELY * len(chains)
 
     def _least(self, path_uv: Array, least: _Least, gaps: float) -> float:
-        """Return the least log-odds of a track with these places (frames, electrodes, 2) and with ``gaps`` this dark."""
+        """Return the least log-odds of a track with these places.
+
+        path_uv : (frames, electrodes, 2). gaps : how dark they are, see :func:`~fluoromap.segmenter.dark_lines.gap_share`.
+        """
         if self._is_still(path_uv):
             return least.still
         return (
