@@ -52,6 +52,7 @@ _LEAST_LOW, _LEAST_LOW_STILL = -2.0, -0.7
 _DENIED, _DENIED_LONG = -3.0, -4.0
 """Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
 _DARK_LINES = DarkLineLimits(thinnest=0.6, sure=0.5, sure_long=2.0)
+"""In the means along a track, which have less noise than a frame."""
 _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
 """How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.dark_lines.gap_share`. Gaps of a loop are
 not measured: seen on edge, both of its sides are one line."""
@@ -74,8 +75,7 @@ _MOST_OUTSIDE = 0.5
 class _ByGaps:
     """A limit for rows of separate dark spots, and for rows of parts on a dark line; between them where gaps are neither.
 
-    In noise the network doubts an electrode, and says less of a row that it doubts than the gaps do: few other things leave
-    as many spots in a row with clear gaps.
+    The network doubts electrodes in noise, but few other things are rows of spots with clear gaps.
     """
 
     clear: float
