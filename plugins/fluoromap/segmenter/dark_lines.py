@@ -16,6 +16,10 @@ from fluoromap.segmenter.linking import ShaftImage
 _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
 """Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""
 _LEAST_GAPS = 2
+_SOLID, _JOINED = 1.3, 0.45
+"""Depth of the gap within a doubted pair and of the gap beside it, as shares of the electrodes' depth."""
+_DOUBTED, _LESS_PROBABLE = 1.3, 1.75
+"""Most log-odds of both of a doubted pair, and how much less probable than the other pair it is on average."""
 
 
 def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
@@ -109,6 +113,27 @@ def is_dark_line(depths: Sequence[Array], odds: Array, limits: DarkLineLimits) -
         return False
     electrodes = _depth_of_electrodes(depths)
     return electrodes > 0 and min(float(section.min()) for section in gaps) >= limits.thinnest * electrodes
+
+
+def ends_on_coil(depths: Sequence[Array], odds: Array) -> bool:
+    """Return whether a chain of four is the ring and the tip of a lead, and two places on the lead's coil.
+
+    The network is sure of two of them and doubts the others, which no gap parts. Rings whose images merge are parted from the other
+    pair: there the gap is wider.
+
+    Parameters
+    ----------
+    depths, odds : as for :func:`is_dark_line`
+    """
+    gaps = np.concatenate(_depths_of_gaps(depths)) if len(depths) == 1 else np.empty(0)
+    electrodes = _depth_of_electrodes(depths)
+    if len(odds) != 4 or len(gaps) != 3 or electrodes <= 0:
+        return False
+    doubted, sure, gap = (
+        (odds[:2], odds[2:], gaps[0]) if odds[:2].sum() < odds[2:].sum() else (odds[2:], odds[:2], gaps[2])
+    )
+    in_doubt = doubted.max() <= _DOUBTED and sure.mean() - doubted.mean() >= _LESS_PROBABLE
+    return bool(in_doubt and gap >= _SOLID * electrodes and gaps[1] >= _JOINED * electrodes)
 
 
 def _depth_of_electrodes(depths: Sequence[Array]) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from fluoromap.segmenter.dark_lines import IN_FRAME, depths_along, gap_share, is_dark_line
+from fluoromap.segmenter.dark_lines import IN_FRAME, depths_along, ends_on_coil, gap_share, is_dark_line
 from fluoromap.segmenter.linking import ShaftImage
 
 PX_PER_MM = 3.2
@@ -93,3 +93,27 @@ def test_separate_spots_have_clear_gaps_and_parts_of_a_line_have_dark_ones():
 def test_the_gaps_of_all_sections_count():
     clear, dark = (depths_along(CHAIN, picture(1.0, line, 0.8)) for line in (0.0, 0.9))
     assert gap_share([clear, clear, dark]) == pytest.approx(gap_share([clear]), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("gaps", "odds", "is_coil"),
+    [
+        ((0.5, 0.75, 1.6), (3.0, 2.0, 0.5, 0.0), True),
+        ((1.6, 0.75, 0.5), (0.0, 0.5, 2.0, 3.0), True),
+        ((0.5, 0.4, 1.6), (3.0, 2.0, 0.5, 0.0), False),  # a wide gap parts a merged pair from the other
+        ((0.5, 0.75, 1.2), (3.0, 2.0, 0.5, 0.0), False),
+        ((1.6, 0.75, 0.5), (3.0, 2.0, 0.5, 0.0), False),  # the pair that is in doubt has a gap
+        ((0.5, 0.75, 1.6), (3.0, 2.0, 1.4, 0.0), False),
+        ((0.5, 0.75, 1.6), (2.0, 1.6, 0.5, 0.0), False),
+    ],
+)
+def test_the_coil_of_a_lead_has_no_gap_and_is_in_doubt(gaps, odds, is_coil):
+    depths = np.zeros((7, 2))
+    depths[::2, 0], depths[1::2, 0] = 1.0, gaps
+    assert ends_on_coil([depths], np.array(odds)) == is_coil
+
+
+def test_only_chains_of_four_may_be_the_ends_of_a_lead():
+    depths = np.ones((2 * 5 - 1, 2))
+    assert not ends_on_coil([depths], np.array([0.0, 0.0, 3.0, 3.0, 3.0]))
+    assert not ends_on_coil([np.zeros((7, 2))], np.array([0.0, 0.0, 3.0, 3.0]))

@@ -17,7 +17,7 @@ from fluoromap.contracts import Array, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.dark_lines import DarkLineLimits, depths_along, gap_share, is_dark_line
+from fluoromap.segmenter.dark_lines import DarkLineLimits, depths_along, ends_on_coil, gap_share, is_dark_line
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -45,10 +45,10 @@ By logistic regression on simulated catheters.
 _LIKELY = 0.5
 _FOLLOWED, _FOLLOWED_FRAMES = 0.8, 6
 """Share of the run's frames, and how many the run has at least: fewer say little."""
-_STILL_MM, _MOMENT_MS = 1.2, 300.0
-"""A catheter in a beating heart moves farther, but not in so short a time."""
-_LEAST_LOW, _LEAST_LOW_STILL = -2.0, -0.7
-"""Log-odds of the worst electrode, and of the worst one of a track that does not move."""
+_STILL_MM, _MOMENT_MS, _BEAT_MS = 1.2, 300.0, 1000.0
+"""A catheter in a beating heart moves farther, but not in so short a time as a moment, and perhaps not in less than a beat."""
+_LEAST_LOW = -2.0
+"""Log-odds of the worst electrode."""
 _DENIED, _DENIED_LONG = -3.0, -4.0
 """Mean log-odds of a place that is clearly no electrode: of short catheters, and of long ones, which clutter hides more often."""
 _DARK_LINES = DarkLineLimits(thinnest=0.6, sure=0.5, sure_long=2.0)
@@ -93,23 +93,27 @@ class _Least:
     Clutter rarely looks like the same catheter in every frame, and it rarely moves as the heart does.
 
     track : of any track. followed : of one that was found in nearly all frames. still : of one that does not move.
-    hidden, hidden_still : of one that was found in nearly all frames and that noise may hide, as it may hide the other catheters;
-    a long row has no such excuse.
+    waiting : of one that does not move, but was found in nearly all frames of a run shorter than a beat. hidden, hidden_still : of
+    one that was found in nearly all frames and that noise may hide, as it may hide the other catheters; a long row has no such
+    excuse.
     """
 
     track: float
     followed: _ByGaps
     still: float
+    waiting: _ByGaps
     hidden: _ByGaps = _ByGaps(math.inf, math.inf)
     hidden_still: float = math.inf
 
 
 _DISPLACED = _ByGaps(-5.0, -4.0)
 """Mean log-odds of the worst place of a long row below which it may be displaced along its catheter."""
-_LEAST = _Least(0.5, _ByGaps(-0.4, 0.45), still=1.2, hidden=_ByGaps(-2.1, 0.45), hidden_still=0.6)
-_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8)
+_LEAST_LOW_STILL, _LEAST_LOW_WAITING = -0.7, _ByGaps(-1.5, -0.7)
+"""Log-odds of the worst electrode of a track that does not move, and of one that may just not have moved yet."""
+_LEAST = _Least(0.5, _ByGaps(-0.4, 0.45), 1.2, _ByGaps(0.3, 1.2), hidden=_ByGaps(-2.1, 0.45), hidden_still=0.6)
+_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), 0.8, _ByGaps(0.3, 0.8))
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
-_LEAST_PAIR = _Least(1.2, _ByGaps(0.8, 0.8), still=1.6, hidden=_ByGaps(0.8, 0.8), hidden_still=1.6)
+_LEAST_PAIR = _Least(1.2, _ByGaps(0.8, 0.8), 1.6, _ByGaps(1.6, 1.6), hidden=_ByGaps(0.8, 0.8), hidden_still=1.6)
 """Of two electrodes, which is little: any two dark spots are a pair."""
 
 
@@ -175,14 +179,17 @@ class TrackEvidence:
         is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
         odds = np.array([odds_of(sections) for sections in pictures])
         depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
-        on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES)
+        on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES) or ends_on_coil(depths, odds.mean(axis=0))
         if not is_loop and (_is_probe(pictures) or on_line):
             return Verdict(False)
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
         tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
+        worst_still = None
+        if still:
+            worst_still = _LEAST_LOW_WAITING.at(gaps) if self._is_waiting(paths) else _LEAST_LOW_STILL
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
-        settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], still)
+        settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], worst_still)
         if said[0][0] < _CLEAR or not settled:
             # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
             all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
@@ -200,8 +207,8 @@ class TrackEvidence:
             return Verdict(middle >= least and not is_shorter and not denied, middle, tip_odds=tip_odds)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits, gaps)
-        is_catheter = any(middle >= least and _are_electrodes(of_each, still) for middle, of_each in said)
-        hidden, worst = (limits.hidden_still, _LEAST_LOW_STILL) if still else (limits.hidden.at(gaps), _DENIED)
+        is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still) for middle, of_each in said)
+        hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
         followed = self._is_followed(paths) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
         may_be_hidden = bool(followed and middle >= hidden and of_each.min() >= worst)
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
@@ -221,13 +228,15 @@ class TrackEvidence:
 
         path_uv : (frames, electrodes, 2). gaps : how dark they are, see :func:`~fluoromap.segmenter.dark_lines.gap_share`.
         """
+        followed = self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
         if self._is_still(path_uv):
-            return least.still
-        return (
-            least.followed.at(gaps)
-            if self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
-            else least.track
-        )
+            return least.waiting.at(gaps) if self._is_waiting(path_uv) else least.still
+        return least.followed.at(gaps) if followed else least.track
+
+    def _is_waiting(self, path_uv: Array) -> bool:
+        """Return whether nearly all frames show a track, in a run too short for its movement to show for certain."""
+        is_short = np.ptp(self.frame_times_ms) < _BEAT_MS and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
+        return bool(is_short) and self._is_followed(path_uv)
 
     def _is_still(self, path_uv: Array) -> bool:
         """Return whether places (frames, electrodes, 2) hardly move, although the run is long enough."""
@@ -297,14 +306,15 @@ def _turn(path_uv: Array) -> float:
     return float(abs(np.angle(ways[1:] * ways[:-1].conj()).sum()))
 
 
-def _are_electrodes(odds: Array, still: bool) -> bool:
+def _are_electrodes(odds: Array, least_still: float | None) -> bool:
     """Return whether log-odds (n,) are those of electrodes.
 
     Either all are high enough, or the others are so high that they excuse the worst. A place that is clearly none has no excuse.
-    Nothing excuses one in a track that does not move: drops of contrast medium at rest look the same in each frame.
+    Nothing excuses one below ``least_still`` in a track that does not move: drops of contrast medium at rest look the same in each
+    frame.
     """
-    if still:
-        return bool(odds.min() >= _LEAST_LOW_STILL)
+    if least_still is not None:
+        return bool(odds.min() >= least_still)
     if odds.min() < _DENIED:
         return False
     worst = np.quantile(odds, _LOW_QUANTILE, method="lower")

@@ -248,6 +248,30 @@ def test_a_moment_is_too_short_to_see_a_catheter_move(monkeypatch):
     assert accepts(judge, chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None)
 
 
+@pytest.mark.parametrize(
+    ("odds", "gaps", "frame_ms", "accepted"),
+    [
+        ([0.4, 0.4, 0.4, -1.4], 0.2, 66.7, True),
+        ([0.4, 0.4, 0.4, -1.6], 0.2, 66.7, False),
+        ([0.2, 0.2, 0.2, 0.2], 0.2, 66.7, False),
+        ([1.0, 1.0, 1.0, 1.0], 0.6, 66.7, False),
+        ([1.3, 1.3, 1.3, -0.9], 0.6, 66.7, False),
+        ([0.4, 0.4, 0.4, 0.4], 0.2, 250.0, False),
+        ([0.4] * 6, 0.2, 66.7, True),
+        ([0.7] * 6, 0.6, 66.7, False),
+    ],
+)
+def test_in_less_than_a_beat_separate_spots_may_not_have_moved_yet(monkeypatch, odds, gaps, frame_ms, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(6) * frame_ms)
+
+    def along(self, frames, path_uv, log_image):
+        return evidence(np.array(odds)[: path_uv.shape[1]], gaps=gaps)
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
+    assert accepts(judge, chains(np.repeat(row[None], 6, axis=0)), lambda frame: None) == accepted
+
+
 @pytest.mark.parametrize(("worst", "accepted"), [(-3.0, True), (-5.5, False)])
 def test_a_chain_that_is_displaced_along_its_catheter_has_places_that_are_clearly_none(monkeypatch, worst, accepted):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
@@ -266,7 +290,7 @@ def test_a_chain_that_is_displaced_along_its_catheter_has_places_that_are_clearl
 def test_a_short_track_that_does_not_move_needs_every_electrode(monkeypatch, step_px, accepted):
     frames = 6
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, 66.7 * np.arange(frames))
-    odds = np.array([2.0, 2.0, 2.0, -1.5])
+    odds = np.array([2.0, 2.0, 2.0, -1.6])
     monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(odds))
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     places = row + np.array([0.0, step_px]) * np.arange(frames)[:, None, None]
@@ -355,6 +379,17 @@ def test_what_is_not_dark_is_no_row_of_spots(monkeypatch):
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
     assert not accepts(judge, chains(row + beat), lambda frame: None)
+
+
+@pytest.mark.parametrize(("doubted", "accepted"), [(0.0, False), (1.0, True)])
+def test_the_ends_of_a_lead_and_places_on_its_coil_are_no_catheter(monkeypatch, doubted, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
+    lead = evidence(np.array([doubted, doubted, 2.5, 2.5]))
+    lead.depths[1::2, 0] = 1.5, 0.5, 0.3
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: lead)
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
+    assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
 
 
 @pytest.mark.parametrize(("between", "odds", "accepted"), [(0.5, 1.9, True), (0.7, 1.9, False), (0.7, 2.1, True)])
