@@ -87,19 +87,25 @@ def _parser() -> argparse.ArgumentParser:
         default=1,
         help="of the first network; same seed, same weights on the same kind of processor",
     )
-    parser.add_argument("--networks", type=int, default=NETWORKS, help="networks to train, each from the next seed")
-    parser.add_argument("--shards", type=int, default=SHARDS, help=f"lists of {SCENES_A_SHARD} scenes to train on")
+    parser.add_argument("--networks", type=_count, default=NETWORKS, help="networks to train, each from the next seed")
+    parser.add_argument("--shards", type=_count, default=SHARDS, help=f"lists of {SCENES_A_SHARD} scenes to train on")
     parser.add_argument(
-        "--threads", type=int, default=1, help="of the fit; another number gives slightly other weights"
+        "--threads", type=_count, default=1, help="of the fit; another number gives slightly other weights"
     )
     parser.add_argument(
-        "--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="processes that draw scenes"
+        "--workers", type=_count, default=max(1, (os.cpu_count() or 2) - 1), help="processes that draw scenes"
     )
     parser.add_argument(
         "--backgrounds", type=Path, help="folder of a lab's own frames without catheters, PNG, TIFF or JPEG"
     )
     parser.add_argument("--catalogue", type=Path, help="JSON list of a lab's own catheters, as in a study's catheters")
     return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is no number of 1 or more")
+    return int(text)
 
 
 def _catheter(entry: dict[str, object]) -> Catheter:
