@@ -116,10 +116,10 @@ def is_dark_line(depths: Sequence[Array], odds: Array, limits: DarkLineLimits) -
 
 
 def ends_on_coil(depths: Sequence[Array], odds: Array) -> bool:
-    """Return whether a chain of four is the ring and the tip of a lead, and two places on the lead's coil.
+    """Return whether a chain of four lies on a shock lead.
 
-    The network is sure of two of them and doubts the others, which no gap parts. Rings whose images merge are parted from the other
-    pair: there the gap is wider.
+    It is the lead's ring and tip, and two places on its coil. The network is sure of two of them and doubts the others, which no
+    gap parts. Rings whose images merge are parted from the other pair: there the gap is wider.
 
     Parameters
     ----------

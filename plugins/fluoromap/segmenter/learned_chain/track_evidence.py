@@ -234,7 +234,10 @@ class TrackEvidence:
         return least.followed.at(gaps) if followed else least.track
 
     def _is_waiting(self, path_uv: Array) -> bool:
-        """Return whether nearly all frames show a track, in a run too short for its movement to show for certain."""
+        """Return whether a followed track may just not have moved yet.
+
+        The run is shorter than a beat.
+        """
         is_short = np.ptp(self.frame_times_ms) < _BEAT_MS and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
         return bool(is_short) and self._is_followed(path_uv)
 
