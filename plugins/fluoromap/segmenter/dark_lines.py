@@ -125,7 +125,7 @@ def ends_on_coil(depths: Sequence[Array], odds: Array) -> bool:
     ----------
     depths, odds : as for :func:`is_dark_line`
     """
-    gaps = np.concatenate(_depths_of_gaps(depths)) if len(depths) == 1 else np.empty(0)
+    gaps = np.concatenate(_depths_of_gaps(depths))
     electrodes = _depth_of_electrodes(depths)
     if len(odds) != 4 or len(gaps) != 3 or electrodes <= 0:
         return False

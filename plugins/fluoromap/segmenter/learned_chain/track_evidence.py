@@ -110,10 +110,24 @@ _DISPLACED = _ByGaps(-5.0, -4.0)
 """Mean log-odds of the worst place of a long row below which it may be displaced along its catheter."""
 _LEAST_LOW_STILL, _LEAST_LOW_WAITING = -0.7, _ByGaps(-1.5, -0.7)
 """Log-odds of the worst electrode of a track that does not move, and of one that may just not have moved yet."""
-_LEAST = _Least(0.5, _ByGaps(-0.4, 0.45), 1.2, _ByGaps(0.3, 1.2), hidden=_ByGaps(-2.1, 0.45), hidden_still=0.6)
-_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), 0.8, _ByGaps(0.3, 0.8))
+_LEAST = _Least(
+    0.5,
+    _ByGaps(-0.4, 0.45),
+    still=1.2,
+    waiting=_ByGaps(0.3, 1.2),
+    hidden=_ByGaps(-2.1, 0.45),
+    hidden_still=0.6,
+)
+_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8, waiting=_ByGaps(0.3, 0.8))
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
-_LEAST_PAIR = _Least(1.2, _ByGaps(0.8, 0.8), 1.6, _ByGaps(1.6, 1.6), hidden=_ByGaps(0.8, 0.8), hidden_still=1.6)
+_LEAST_PAIR = _Least(
+    1.2,
+    _ByGaps(0.8, 0.8),
+    still=1.6,
+    waiting=_ByGaps(1.6, 1.6),
+    hidden=_ByGaps(0.8, 0.8),
+    hidden_still=1.6,
+)
 """Of two electrodes, which is little: any two dark spots are a pair."""
 
 
@@ -209,8 +223,7 @@ class TrackEvidence:
         least = self._least(paths, limits, gaps)
         is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still) for middle, of_each in said)
         hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
-        followed = self._is_followed(paths) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
-        may_be_hidden = bool(followed and middle >= hidden and of_each.min() >= worst)
+        may_be_hidden = bool(self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst)
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
 
     def _has_long_tip(self, chains: Mapping[int, Chain]) -> bool:
@@ -228,18 +241,16 @@ class TrackEvidence:
 
         path_uv : (frames, electrodes, 2). gaps : how dark they are, see :func:`~fluoromap.segmenter.dark_lines.gap_share`.
         """
-        followed = self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
         if self._is_still(path_uv):
             return least.waiting.at(gaps) if self._is_waiting(path_uv) else least.still
-        return least.followed.at(gaps) if followed else least.track
+        return least.followed.at(gaps) if self._is_followed_long(path_uv) else least.track
 
     def _is_waiting(self, path_uv: Array) -> bool:
         """Return whether a followed track may just not have moved yet.
 
         The run is shorter than a beat.
         """
-        is_short = np.ptp(self.frame_times_ms) < _BEAT_MS and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
-        return bool(is_short) and self._is_followed(path_uv)
+        return bool(np.ptp(self.frame_times_ms) < _BEAT_MS) and self._is_followed_long(path_uv)
 
     def _is_still(self, path_uv: Array) -> bool:
         """Return whether places (frames, electrodes, 2) hardly move, although the run is long enough."""
@@ -250,6 +261,13 @@ class TrackEvidence:
     def _is_followed(self, path_uv: Array) -> bool:
         """Return whether nearly all frames of the run show a track."""
         return len(path_uv) >= _FOLLOWED * len(self.frame_times_ms)
+
+    def _is_followed_long(self, path_uv: Array) -> bool:
+        """Return whether nearly all frames show a track.
+
+        In fewer than six frames it says little.
+        """
+        return self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
 
     def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
         """Return the evidence for electrodes in the mean of these frames.
