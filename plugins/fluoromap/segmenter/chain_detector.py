@@ -412,7 +412,8 @@ class ChainDetector:
         Others are part of a catheter with more electrodes than the catalogue has, or no catheter: their electrodes are places on
         parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
         dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
-        a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one.
+        a short one and 0.73 at most. The same holds for proposals in a short chain's line, if they are far less probable.
+        Electrodes of a long chain in another chain's line belong to the long one.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
@@ -423,8 +424,8 @@ class ChainDetector:
             is_seen = chain.scores > UNSEEN
             if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
                 continue
-            onwards = EVEN_ODDS
             own = own[is_seen]
+            onwards = min(max(EVEN_ODDS, float(own.min()) - self.acceptance.onwards_less), _MOST_EXCUSED)
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:
