@@ -110,6 +110,7 @@ _DISPLACED = _ByGaps(-5.0, -4.0)
 """Mean log-odds of the worst place of a long row below which it may be displaced along its catheter."""
 _LEAST_LOW_STILL, _LEAST_LOW_WAITING = -0.7, _ByGaps(-1.5, -0.7)
 """Log-odds of the worst electrode of a track that does not move, and of one that may just not have moved yet."""
+_SURE_MIDDLE, _EXCUSED_TIP = 1.5, -1.5
 _LEAST = _Least(
     0.5,
     _ByGaps(-0.4, 0.45),
@@ -203,7 +204,8 @@ class TrackEvidence:
         if still:
             worst_still = _LEAST_LOW_WAITING.at(gaps) if self._is_waiting(paths) else _LEAST_LOW_STILL
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
-        settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], worst_still)
+        waits = still and self._is_waiting(paths)
+        settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], worst_still, waits)
         if said[0][0] < _CLEAR or not settled:
             # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
             all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
@@ -221,7 +223,7 @@ class TrackEvidence:
             return Verdict(middle >= least and not is_shorter and not denied, middle, tip_odds=tip_odds)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits, gaps)
-        is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still) for middle, of_each in said)
+        is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said)
         hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
         may_be_hidden = bool(self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst)
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
@@ -327,7 +329,7 @@ def _turn(path_uv: Array) -> float:
     return float(abs(np.angle(ways[1:] * ways[:-1].conj()).sum()))
 
 
-def _are_electrodes(odds: Array, least_still: float | None) -> bool:
+def _are_electrodes(odds: Array, least_still: float | None, waits: bool) -> bool:
     """Return whether log-odds (n,) are those of electrodes.
 
     Either all are high enough, or the others are so high that they excuse the worst. A place that is clearly none has no excuse.
@@ -335,6 +337,8 @@ def _are_electrodes(odds: Array, least_still: float | None) -> bool:
     frame.
     """
     if least_still is not None:
+        if waits and np.median(odds) >= _SURE_MIDDLE and odds[1:-1].min() >= least_still:
+            return bool(min(odds[0], odds[-1]) >= _EXCUSED_TIP and max(odds[0], odds[-1]) >= least_still)
         return bool(odds.min() >= least_still)
     if odds.min() < _DENIED:
         return False
