@@ -53,6 +53,7 @@ _BESIDE_MM = 2.0
 _WEAKER = 0.25
 _LEAST_MOVING_ODDS, _LEAST_ROW_ODDS, _FAINT_CONTRAST = 0.2, -0.2, 11.0
 """Least log-odds of the middle electrode in a moved mean: of any chain, and of a long row of less contrast over noise."""
+_FOR_ONE_CROSSING = 8
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
@@ -445,11 +446,12 @@ class ChainDetector:
 
         sure, alike : proposals that no chain explains, (n, 2). row : proposals in whose line the chain may be.
         """
+        crossings = len(chain.electrodes) // _FOR_ONE_CROSSING
         # Those alike are among the sure ones.
         between = unexplained_between(chain, sure, catheter, self.px_per_mm)
         return (
             2 * between < len(chain.electrodes)
-            and not (between and unexplained_between(chain, alike, catheter, self.px_per_mm))
+            and not (between and unexplained_between(chain, alike, catheter, self.px_per_mm) > crossings)
             and not continues(chain, row, catheter, self.px_per_mm)
         )
 
