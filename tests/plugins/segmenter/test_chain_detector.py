@@ -149,12 +149,12 @@ def test_a_doubted_catheter_is_accepted_beside_a_sure_one_only():
         assert len(detector.search(image).entry(0).chains) == count
 
 
-@pytest.mark.parametrize(("between", "listed"), [(0.8, True), (0.995, False)])
-def test_a_long_chain_is_unlisted_only_where_what_lies_between_is_like_its_electrodes(between, listed):
+@pytest.mark.parametrize(("between", "listed"), [([0.8, 0.8], True), ([0.995], True), ([0.995, 0.995], False)])
+def test_a_long_chain_is_unlisted_where_more_than_one_thing_between_is_like_its_electrodes(between, listed):
     catheter = row_of("cs", (60, 60), 0.4)
-    extra = 0.5 * (catheter[3] + catheter[4])
-    points = np.concatenate([catheter, extra[None]])
-    found = chains_found(drawn([catheter]), points, [0.99] * 10 + [between], [0.9] * 10 + [0.9])
+    gaps = 0.5 * (catheter[[3, 5]] + catheter[[4, 6]])[: len(between)]
+    points = np.concatenate([catheter, gaps])
+    found = chains_found(drawn([catheter]), points, [0.99] * 10 + between, [0.9] * 10 + [0.9] * len(between))
     assert any(lies_on(chain, catheter) for chain in found) == listed
 
 
