@@ -80,6 +80,7 @@ class Acceptance:
     onwards_less: float = np.inf
     row_chain_score: float = np.inf
     row_score: float = np.inf
+    hidden_pair: ScoreLimits = ScoreLimits(np.inf)
     trust: Trust = ONE_BY_ONE
     faded_price: float = 0.0
     dark_lines: DarkLineLimits = IN_FRAME

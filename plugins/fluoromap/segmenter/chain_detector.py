@@ -357,7 +357,7 @@ class ChainDetector:
         accepted = []
         for (candidates, _), chain, scores in zip(clear, found, all_scores, strict=True):
             others = [other for other in found if other is not chain]
-            if self.acceptance.accepts(scores, chain.scores[0], beside):
+            if self.acceptance.accepts(scores, chain.scores[0], beside) or self._hides_a_pair(chain, scores, proposed):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
                 shown = np.where(np.isnan(scores), UNSEEN, scores)
                 accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=shown)))
@@ -371,6 +371,14 @@ class ChainDetector:
             tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if not kept),
             sure,
         )
+
+    def _hides_a_pair(self, chain: Chain, scores: Array, proposed: Proposals) -> bool:
+        """Return whether something hides a pair of a long catheter, and the chain is not displaced along it."""
+        if len(scores) < MANY_ELECTRODES or not self.acceptance.hidden_pair.allow(scores):
+            return False
+        family = self.family_of(chain)
+        sure = proposed.points_uv[proposed.probability >= SURE]
+        return family is not None and not continues(chain, sure, family.catheter, self.px_per_mm, least=1)
 
     def _link_without_rejected(
         self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
@@ -451,7 +459,7 @@ class ChainDetector:
         between = unexplained_between(chain, sure, catheter, self.px_per_mm)
         return (
             2 * between < len(chain.electrodes)
-            and not (between and unexplained_between(chain, alike, catheter, self.px_per_mm) > crossings)
+            and not (between > crossings and unexplained_between(chain, alike, catheter, self.px_per_mm))
             and not continues(chain, row, catheter, self.px_per_mm)
         )
 

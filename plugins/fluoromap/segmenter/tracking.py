@@ -256,7 +256,8 @@ def _accepted(
         # Followed again, parts of it may have taken its frames.
         if all(len(other.chain.electrodes) < len(track.chain.electrodes) for other in tracks if meet(track, other)):
             tracks.append(track)
-    return tracks
+    left_over = surplus(tracks)
+    return [track for track in tracks if track not in left_over]
 
 
 def _judged_frames(found: Sequence[FrameChains]) -> int:

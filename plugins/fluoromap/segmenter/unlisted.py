@@ -49,7 +49,9 @@ def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_p
     return int(np.count_nonzero(is_between.any(axis=1)))
 
 
-def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
+def continues(
+    chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float, least: int = _ROW_CONTINUES
+) -> bool:
     """Return whether points go on in the chain's line beyond an end.
 
     Three or more points are needed, no farther apart than the chain's electrodes are.
@@ -63,7 +65,7 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
     catheter : Catheter
     """
     free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
-    if len(free) < _ROW_CONTINUES:
+    if len(free) < least:
         return False
     way = np.diff(chain.pixels_uv, axis=0)
     seen = float(np.sqrt((way * way).sum(axis=1)).sum())
@@ -71,7 +73,7 @@ def continues(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: flo
     for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
         before = row[-3] if len(row) > 2 else row[-2]
         count = _count_onwards(row[-1], before, free, step)
-        if count >= _ROW_CONTINUES:
+        if count >= least:
             return True
     return False
 

@@ -33,6 +33,7 @@ IN_A_RUN = Acceptance(
     onwards_less=1.0,
     row_chain_score=2.0,
     row_score=0.2,
+    hidden_pair=ScoreLimits(0.7, seen=0.15, least_seen=0.75),
     trust=Trust(share=0.25, chain=0.7),
     # Half of the least that an electrode adds to the value of a set of chains: it may be there and hidden.
     faded_price=0.75,

@@ -58,6 +58,7 @@ _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
 not measured: seen on edge, both of its sides are one line."""
 _MOST_DENIED = 1
 """Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
+_LEAST_BESIDE_HIDDEN = 8
 _NOTHING, _BELOW_OTHERS = -1.0, 3.5
 """Log-odds of a place without an electrode in a long row, in both means: below this, and so far below the middle electrode."""
 _LOW_QUANTILE = 0.1
@@ -219,8 +220,10 @@ class TrackEvidence:
             best = np.max([of_each for _, of_each in said], axis=0)
             there = np.count_nonzero(best >= min(_NOTHING, middle - _BELOW_OTHERS))
             is_shorter = there < min(len(best), MANY_ELECTRODES)
-            denied = np.count_nonzero(best < _DENIED_LONG) > _MOST_DENIED
-            return Verdict(middle >= least and not is_shorter and not denied, middle, tip_odds=tip_odds)
+            denied = np.flatnonzero(best < _DENIED_LONG)
+            hides_pair = len(denied) == 2 and np.ptp(denied) == 1 and middle >= _CLEAR and there >= _LEAST_BESIDE_HIDDEN
+            is_denied = len(denied) > _MOST_DENIED and not hides_pair
+            return Verdict(middle >= least and not is_shorter and not is_denied, middle, tip_odds=tip_odds)
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits, gaps)
         is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said)

@@ -329,7 +329,11 @@ def test_noise_is_an_excuse_in_a_run_that_shows_another_catheter(monkeypatch, od
         ([1.0, 1.0, -2.7, 1.0, 1.0, 1.0], False),
         ([2.5] * 4 + [-1.2] + [2.5] * 5, True),
         ([2.5] * 4 + [-4.5] + [2.5] * 5, True),
-        ([2.5] * 4 + [-4.5] * 2 + [2.5] * 4, False),
+        ([2.5] * 4 + [-4.5] * 2 + [2.5] * 4, True),
+        ([2.5] * 8 + [-4.5] * 2, True),
+        ([2.5] * 7 + [-4.5] * 3, False),
+        ([2.5, 2.5, -4.5, 2.5, 2.5, 2.5, -4.5, 2.5, 2.5, 2.5], False),
+        ([2.5] * 4 + [-4.5] * 2, False),
     ],
 )
 def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch, odds, is_catheter):
