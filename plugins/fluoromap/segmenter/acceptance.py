@@ -64,7 +64,8 @@ class Acceptance:
     are less by this than those of its worst electrode.
     row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``scores``
     where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
-    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is.
+    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is. hidden_pair :
+    limits for such a catheter that does without a pair, which something may hide.
     trust : see :class:`~fluoromap.segmenter.linking.Trust`. faded_price : if ``strict``, what the score of a chain of six or more
     loses for each place at its ends that shows no electrode. dark_lines : chains on such lines are not accepted, if ``strict``.
     """

@@ -373,7 +373,10 @@ class ChainDetector:
         )
 
     def _hides_a_pair(self, chain: Chain, scores: Array, proposed: Proposals) -> bool:
-        """Return whether something hides a pair of a long catheter, and the chain is not displaced along it."""
+        """Return whether something hides a pair of a long catheter.
+
+        A chain that is displaced along its catheter leaves a pair beyond its other end.
+        """
         if len(scores) < MANY_ELECTRODES or not self.acceptance.hidden_pair.allow(scores):
             return False
         family = self.family_of(chain)

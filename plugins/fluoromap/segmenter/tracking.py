@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.track_agreement import ShapeSearch, with_common_kinds, with_common_shape
 from fluoromap.segmenter.track_completion import completed
 from fluoromap.segmenter.track_names import surplus
@@ -133,6 +134,8 @@ def track_chains(
             track.chains = _from_tip(track)
         if search is not None and not track.manual:
             track.chains = with_common_shape(track.chains, _search_beside(track, tracks_kept, search))
+        if track.verdict is not None and track.verdict.hidden:
+            track.chains = _without_hidden(track, track.verdict.hidden)
     for number, track in enumerate(tracks_kept):
         if track.manual:
             track.chains = {frame: chain.on_track(number) for frame, chain in track.chains.items()}
@@ -467,16 +470,43 @@ def _from_tip(track: Track) -> dict[int, Chain]:
 
     Where the judge saw the shaft in the mean of many frames, that counts more than what single frames say.
     """
-    verdict = track.verdict
-    odds = None
-    if verdict is not None and verdict.tip_odds is not None:
-        of_frames = track.direction / max(track.detections, 1)
-        odds = max(-_MOST_TIP_ODDS, min(_OF_FRAMES * of_frames + verdict.tip_odds, _MOST_TIP_ODDS))
-    turned = (track.direction if odds is None else odds) < 0
+    odds, turned = _odds_of_direction(track), _is_turned(track)
     chains = {frame: reverse(chain) if turned else chain for frame, chain in track.chains.items()}
     if odds is None:
         return chains
     return {frame: replace(chain, tip_odds=abs(odds)) for frame, chain in chains.items()}
+
+
+def _without_hidden(track: Track, hidden: Sequence[bool]) -> dict[int, Chain]:
+    """Return chains, numbered from the tip, in which places without an electrode are unseen.
+
+    hidden : of the track's places, in the order that its judge saw.
+    """
+    unseen = np.array(hidden[::-1] if _is_turned(track) else hidden)
+    return {
+        frame: chain
+        if chain.manual or len(chain.scores) != len(unseen)
+        else replace(chain, scores=np.where(unseen, UNSEEN, chain.scores))
+        for frame, chain in track.chains.items()
+    }
+
+
+def _is_turned(track: Track) -> bool:
+    """Return whether a track begins at the end that is less likely the tip."""
+    odds = _odds_of_direction(track)
+    return (track.direction if odds is None else odds) < 0
+
+
+def _odds_of_direction(track: Track) -> float | None:
+    """Return the log-odds that a track begins at its tip.
+
+    None where its shaft says nothing.
+    """
+    verdict = track.verdict
+    if verdict is None or verdict.tip_odds is None:
+        return None
+    of_frames = track.direction / max(track.detections, 1)
+    return max(-_MOST_TIP_ODDS, min(_OF_FRAMES * of_frames + verdict.tip_odds, _MOST_TIP_ODDS))
 
 
 def _tip_odds(chain: Chain) -> float:

@@ -47,13 +47,15 @@ class Verdict:
 
     is_catheter : whether the run shows a catheter there. log_odds : of the middle electrode. may_be_hidden : whether it is a
     catheter if noise hides the run's other catheters nearly as much. tip_odds : log-odds by the shaft that the track's first
-    electrode is the tip; None where single frames know better.
+    electrode is the tip; None where single frames know better. hidden : for each of the track's places whether the run clearly
+    shows no electrode there; empty where none is hidden.
     """
 
     is_catheter: bool
     log_odds: float = 0.0
     may_be_hidden: bool = False
     tip_odds: float | None = None
+    hidden: tuple[bool, ...] = ()
 
 
 TrackJudge = Callable[[Mapping[int, Chain]], Verdict]

@@ -59,6 +59,7 @@ not measured: seen on edge, both of its sides are one line."""
 _MOST_DENIED = 1
 """Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
 _LEAST_BESIDE_HIDDEN = 8
+"""Electrodes that a long row shows beside a pair that something hides, as an echo probe does."""
 _NOTHING, _BELOW_OTHERS = -1.0, 3.5
 """Log-odds of a place without an electrode in a long row, in both means: below this, and so far below the middle electrode."""
 _LOW_QUANTILE = 0.1
@@ -112,6 +113,7 @@ _DISPLACED = _ByGaps(-5.0, -4.0)
 _LEAST_LOW_STILL, _LEAST_LOW_WAITING = -0.7, _ByGaps(-1.5, -0.7)
 """Log-odds of the worst electrode of a track that does not move, and of one that may just not have moved yet."""
 _SURE_MIDDLE, _EXCUSED_TIP = 1.5, -1.5
+"""Log-odds of the middle electrode of a track that has just not moved yet, and of its worse end: the network doubts long tips."""
 _LEAST = _Least(
     0.5,
     _ByGaps(-0.4, 0.45),
@@ -201,11 +203,11 @@ class TrackEvidence:
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
         tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
+        waits = still and self._is_waiting(paths)
         worst_still = None
         if still:
-            worst_still = _LEAST_LOW_WAITING.at(gaps) if self._is_waiting(paths) else _LEAST_LOW_STILL
+            worst_still = _LEAST_LOW_WAITING.at(gaps) if waits else _LEAST_LOW_STILL
         said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
-        waits = still and self._is_waiting(paths)
         settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], worst_still, waits)
         if said[0][0] < _CLEAR or not settled:
             # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
@@ -216,14 +218,15 @@ class TrackEvidence:
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
             displaced = odds.mean(axis=0).min() < _DISPLACED.at(gaps)
             least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG, gaps)
-            # The places without an electrode may be beside a shorter catheter.
             best = np.max([of_each for _, of_each in said], axis=0)
-            there = np.count_nonzero(best >= min(_NOTHING, middle - _BELOW_OTHERS))
-            is_shorter = there < min(len(best), MANY_ELECTRODES)
-            denied = np.flatnonzero(best < _DENIED_LONG)
-            hides_pair = len(denied) == 2 and np.ptp(denied) == 1 and middle >= _CLEAR and there >= _LEAST_BESIDE_HIDDEN
-            is_denied = len(denied) > _MOST_DENIED and not hides_pair
-            return Verdict(middle >= least and not is_shorter and not is_denied, middle, tip_odds=tip_odds)
+            unseen = np.zeros(len(usual), np.bool_)
+            unseen[inside] = best < _DENIED
+            return Verdict(
+                middle >= least and _are_of_long_catheter(best, middle),
+                middle,
+                tip_odds=tip_odds,
+                hidden=tuple(unseen.tolist()) if unseen.any() else (),
+            )
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits, gaps)
         is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said)
@@ -336,17 +339,31 @@ def _are_electrodes(odds: Array, least_still: float | None, waits: bool) -> bool
     """Return whether log-odds (n,) are those of electrodes.
 
     Either all are high enough, or the others are so high that they excuse the worst. A place that is clearly none has no excuse.
-    Nothing excuses one below ``least_still`` in a track that does not move: drops of contrast medium at rest look the same in each
-    frame.
+    Nothing excuses one below ``least_still`` in a track that does not move, as drops of contrast medium at rest look the same in
+    each frame, except one end of a clear catheter that just ``waits``.
     """
     if least_still is not None:
-        if waits and np.median(odds) >= _SURE_MIDDLE and odds[1:-1].min() >= least_still:
-            return bool(min(odds[0], odds[-1]) >= _EXCUSED_TIP and max(odds[0], odds[-1]) >= least_still)
-        return bool(odds.min() >= least_still)
+        low = np.flatnonzero(odds < least_still)
+        is_doubted_tip = waits and np.median(odds) >= _SURE_MIDDLE and low.tolist() in ([0], [len(odds) - 1])
+        return not len(low) or bool(is_doubted_tip and odds.min() >= _EXCUSED_TIP)
     if odds.min() < _DENIED:
         return False
     worst = np.quantile(odds, _LOW_QUANTILE, method="lower")
     return bool(worst >= _LEAST_LOW or np.clip(odds, *_COUNTED).mean() >= _LEAST_MEAN)
+
+
+def _are_of_long_catheter(odds: Array, middle: float) -> bool:
+    """Return whether log-odds (n,) are those of a long catheter.
+
+    A shorter one lies beside places without electrodes. Something may hide one pair of a clear catheter. middle : log-odds of its
+    middle electrode.
+    """
+    there = np.count_nonzero(odds >= min(_NOTHING, middle - _BELOW_OTHERS))
+    if there < min(len(odds), MANY_ELECTRODES):
+        return False
+    denied = np.flatnonzero(odds < _DENIED_LONG)
+    hides_pair = len(denied) == 2 and np.ptp(denied) == 1 and middle >= _CLEAR and there >= _LEAST_BESIDE_HIDDEN
+    return bool(len(denied) <= _MOST_DENIED or hides_pair)
 
 
 def _first_and_last(frames: int) -> list[IntArray]:
