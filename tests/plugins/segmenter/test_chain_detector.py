@@ -165,6 +165,40 @@ def test_electrodes_of_a_long_catheter_in_its_line_do_not_make_a_short_chain_unl
     assert sorted(len(chain.electrodes) for chain in found) == [4, 10]
 
 
+@pytest.mark.parametrize(("onwards", "listed"), [(0.7, True), (0.95, False)])
+def test_what_goes_on_in_the_line_of_a_short_chain_belongs_to_it_where_it_is_like_its_electrodes(onwards, listed):
+    catheter = row_of("ablation", (200, 100), 0.0)
+    step = np.array([[16.0, 0.0]])
+    more = catheter[-1] + step * np.arange(1, 5)[:, None]
+    points = np.concatenate([catheter, more])
+    found = chains_found(drawn([catheter]), points, [0.99] * 4 + [onwards] * 4, [0.9] * 8)
+    assert any(lies_on(chain, catheter) for chain in found) == listed
+
+
+@pytest.mark.parametrize(("hidden", "found"), [(slice(8, 10), True), (slice(4, 6), True), (slice(7, 10), False)])
+def test_something_may_hide_a_pair_of_a_long_catheter(hidden, found):
+    catheter = row_of("cs", (60, 60), 0.4)
+    probability, scores = np.full(10, 0.95), np.full(10, 0.9)
+    probability[hidden], scores[hidden] = 0.02, 0.02
+    evidence = Evidence(drawn([catheter]), catheter, probability, scores)
+    assert (
+        any(lies_on(chain, catheter) for chain in detector_of(evidence).search(evidence.smooth).entry(0).chains)
+        == found
+    )
+
+
+def test_a_long_chain_a_pair_too_far_along_its_catheter_hides_no_pair():
+    catheter = row_of("cs", (60, 60), 0.4)
+    on = (catheter[-1] - catheter[0]) / np.linalg.norm(catheter[-1] - catheter[0])
+    shaft = catheter[-1] + np.outer(np.array([5.0, 7.0]) * PX * 0.9, on)
+    points = np.concatenate([catheter, shaft])
+    displaced = points[2:]
+    # Electrodes of the first pair are sure, but too weak for a chain of their own: the displaced chain would win.
+    evidence = Evidence(drawn([catheter]), points, [0.95] * 10 + [0.02] * 2, [0.9] * 10 + [0.02] * 2)
+    chains = detector_of(evidence).search(evidence.smooth).entry(0).chains
+    assert not any(lies_on(chain, displaced) for chain in chains)
+
+
 def test_pairs_that_were_found_as_one_are_split_where_a_catheter_is_missing():
     catheter = row_of("cs", (60, 60), 0.4, shortened=0.5)
     merged = 0.5 * (catheter[0::2] + catheter[1::2])[:4]

@@ -56,3 +56,25 @@ def test_a_second_track_of_one_catheter_is_left_out_of_a_run():
 
     entries = track_chains(frames, np.arange(12) * 66.7, 2, search, judge=lambda chains: Verdict(True))
     assert [[one.pixels_uv[0, 0] for one in entry.chains] for entry in entries] == [[0.0]] * 12
+
+
+def test_a_catheter_that_was_followed_to_two_places_has_one_track():
+    # Followed again without a wrong track, the search finds the catheter elsewhere.
+    first, second, wrong, other = (chain(at, ((name, 1.0),)) for at, name in zip(
+        (100.0, 300.0, 500.0, 700.0), ("map", "map", "rv", "cs"), strict=True
+    ))  # fmt: skip
+    rejected = []
+
+    def search(frame, known, shift, reach_px, taken, same_shape=False, confirmed=False):
+        at_first = np.allclose(known.pixels_uv, first.pixels_uv)
+        return (second if rejected and at_first else known) if confirmed else None
+
+    def judge(chains):
+        is_wrong = np.allclose(chains[min(chains)].pixels_uv, wrong.pixels_uv)
+        rejected.extend([True] * is_wrong)
+        return Verdict(not is_wrong)
+
+    found = [FrameChains(frame, (other,)) for frame in range(12)]
+    entries = track_chains(found, np.arange(12) * 66.7, 3, search, FrameChains(0, (first, wrong)), judge, False)
+    assert rejected
+    assert [sorted(one.kinds[0][0] for one in entry.chains) for entry in entries] == [["cs", "map"]] * 12

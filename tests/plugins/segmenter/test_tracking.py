@@ -5,6 +5,7 @@ import pytest
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.tracking import track_chains
 from fluoromap.segmenter.tracks import Verdict
 
@@ -346,3 +347,17 @@ def test_the_judge_and_the_frames_say_together_which_end_is_the_tip(of_frames, o
     for frame, entry in enumerate(entries):
         assert entry.chains[0].pixels_uv[0].tolist() == (POINTS + frame)[-first].tolist()
         assert entry.chains[0].tip_odds == pytest.approx(odds)
+
+
+@pytest.mark.parametrize("tip_odds", [3.0, -3.0])
+def test_places_that_something_hides_are_unseen(tip_odds):
+    row = np.stack([np.arange(6) * 12.0, np.arange(6) * 3.0], axis=1) + 100
+    found = run([[chain(row + frame)] for frame in range(8)])
+    hidden = (False,) * 4 + (True, True)
+    entries = track_chains(
+        found, times(8), 1, only_confirmed, judge=lambda _: Verdict(True, 2.0, tip_odds=tip_odds, hidden=hidden)
+    )
+    for frame, entry in enumerate(entries):
+        (one,) = entry.chains
+        unseen = one.pixels_uv[one.scores <= UNSEEN]
+        assert sorted(unseen.tolist()) == (row[4:] + frame).tolist()

@@ -256,6 +256,11 @@ def test_a_moment_is_too_short_to_see_a_catheter_move(monkeypatch):
         ([0.2, 0.2, 0.2, 0.2], 0.2, 66.7, False),
         ([1.0, 1.0, 1.0, 1.0], 0.6, 66.7, False),
         ([1.3, 1.3, 1.3, -0.9], 0.6, 66.7, False),
+        ([2.0, 2.0, 2.0, -1.4], 0.6, 66.7, True),
+        ([2.0, 2.0, 2.0, -1.6], 0.6, 66.7, False),
+        ([2.0, -1.4, 2.0, 2.0], 0.6, 66.7, False),
+        ([-1.4, 2.0, 2.0, -1.4], 0.6, 66.7, False),
+        ([2.0, 2.0, 2.0, -1.4], 0.6, 250.0, False),
         ([0.4, 0.4, 0.4, 0.4], 0.2, 250.0, False),
         ([0.4] * 6, 0.2, 66.7, True),
         ([0.7] * 6, 0.6, 66.7, False),
@@ -346,6 +351,20 @@ def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch,
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).is_catheter == is_catheter
+
+
+def test_the_places_that_something_hides_are_known(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    odds = np.array([2.5] * 8 + [-2.9, -3.1])
+
+    def along(self, frames, path_uv, log_image):
+        return evidence(odds[np.rint((path_uv[0, :, 0] - 100.0) / 20.0).astype(int)])
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
+    assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).hidden == (False,) * 9 + (True,)
+    odds[:] = 2.5
+    assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).hidden == ()
 
 
 @pytest.mark.parametrize(
