@@ -235,7 +235,7 @@ def _accepted(
     rare: list[Track] = []
     for attempt in range(_MOST_RETRIES + 1):
         # Shorter tracks are dropped in any case.
-        lasting = [track for track in tracks if track.manual or len(track.chains) >= _ACCEPTED_AT_LEAST * len(found)]
+        lasting = _lasting(tracks, len(found))
         asked = [track for track in tracks if not track.manual and len(track.chains) >= judged]
         for track in asked:
             track.verdict = judge(track.chains)
@@ -259,8 +259,13 @@ def _accepted(
         # Followed again, parts of it may have taken its frames.
         if all(len(other.chain.electrodes) < len(track.chain.electrodes) for other in tracks if meet(track, other)):
             tracks.append(track)
-    left_over = surplus(tracks)
+    left_over = surplus(_lasting(tracks, len(found)))
     return [track for track in tracks if track not in left_over]
+
+
+def _lasting(tracks: Sequence[Track], frames: int) -> list[Track]:
+    """Return the tracks that may be accepted in a run of so many frames."""
+    return [track for track in tracks if track.manual or len(track.chains) >= _ACCEPTED_AT_LEAST * frames]
 
 
 def _judged_frames(found: Sequence[FrameChains]) -> int:
