@@ -219,8 +219,9 @@ class TrackEvidence:
             displaced = odds.mean(axis=0).min() < _DISPLACED.at(gaps)
             least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG, gaps)
             best = np.max([of_each for _, of_each in said], axis=0)
+            # Noise may hide electrodes of a catheter that is not clear itself.
             unseen = np.zeros(len(usual), np.bool_)
-            unseen[inside] = best < _DENIED
+            unseen[inside] = (best < _DENIED) & (middle >= _CLEAR)
             return Verdict(
                 middle >= least and _are_of_long_catheter(best, middle),
                 middle,

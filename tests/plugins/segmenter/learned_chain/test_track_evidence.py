@@ -363,8 +363,9 @@ def test_the_places_that_something_hides_are_known(monkeypatch):
     monkeypatch.setattr(TrackEvidence, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).hidden == (False,) * 9 + (True,)
-    odds[:] = 2.5
-    assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).hidden == ()
+    for unhidden in (2.5, [0.9] * 9 + [-3.1]):
+        odds[:] = unhidden
+        assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).hidden == ()
 
 
 @pytest.mark.parametrize(
