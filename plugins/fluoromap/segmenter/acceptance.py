@@ -60,8 +60,6 @@ class Acceptance:
     image that shows another catheter; the same by default. unseen_evidence : an electrode that was not
     proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
     not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
-    onwards_less : proposals in the line of a chain of less than six electrodes are not part of its catheter where their log-odds
-    are less by this than those of its worst electrode.
     row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``scores``
     where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
     so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is. hidden_pair :
@@ -78,7 +76,6 @@ class Acceptance:
     scores_beside: ScoreLimits | None = None
     unseen_evidence: float = 0.0
     strict: bool = False
-    onwards_less: float = np.inf
     row_chain_score: float = np.inf
     row_score: float = np.inf
     hidden_pair: ScoreLimits = ScoreLimits(np.inf)

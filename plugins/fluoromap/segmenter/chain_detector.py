@@ -424,8 +424,8 @@ class ChainDetector:
         Others are part of a catheter with more electrodes than the catalogue has, or no catheter: their electrodes are places on
         parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
         dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
-        a short one and 0.73 at most. The same holds for proposals in a short chain's line, if they are far less probable.
-        Electrodes of a long chain in another chain's line belong to the long one.
+        a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one. Besides, one thing
+        may cross each eight electrodes of a chain that has no place without an electrode, as displaced ones have.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
@@ -436,8 +436,8 @@ class ChainDetector:
             is_seen = chain.scores > UNSEEN
             if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
                 continue
+            onwards = EVEN_ODDS
             own = own[is_seen]
-            onwards = min(max(EVEN_ODDS, float(own.min()) - self.acceptance.onwards_less), _MOST_EXCUSED)
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
             else:
@@ -446,18 +446,21 @@ class ChainDetector:
             row = not_on(proposed.points_uv[odds >= onwards], long_ones, self.px_per_mm)
             sure, alike = free[odds_of_free >= EVEN_ODDS], free[odds_of_free >= like]
             unexplained = sure, alike, row
-            listed[index] = self._explains(chain, family.catheter, *unexplained)
+            crossings = len(own) // _FOR_ONE_CROSSING if own.min() >= _NO_ELECTRODE else 0
+            listed[index] = self._explains(chain, family.catheter, crossings, *unexplained)
             if not listed[index]:
                 uncrossed = (self._not_crossed(points, chain, seen) for points in unexplained)
-                listed[index] = self._explains(chain, family.catheter, *uncrossed)
+                listed[index] = self._explains(chain, family.catheter, crossings, *uncrossed)
         return listed
 
-    def _explains(self, chain: Chain, catheter: Catheter, sure: Array, alike: Array, row: Array) -> bool:
+    def _explains(
+        self, chain: Chain, catheter: Catheter, crossings: int, sure: Array, alike: Array, row: Array
+    ) -> bool:
         """Return whether a chain leaves no electrodes of its catheter unexplained.
 
-        sure, alike : proposals that no chain explains, (n, 2). row : proposals in whose line the chain may be.
+        crossings : how many things may cross the chain. sure, alike : proposals that no chain explains, (n, 2). row : proposals in
+        whose line the chain may be.
         """
-        crossings = len(chain.electrodes) // _FOR_ONE_CROSSING
         # Those alike are among the sure ones.
         between = unexplained_between(chain, sure, catheter, self.px_per_mm)
         return (

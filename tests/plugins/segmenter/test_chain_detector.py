@@ -165,16 +165,6 @@ def test_electrodes_of_a_long_catheter_in_its_line_do_not_make_a_short_chain_unl
     assert sorted(len(chain.electrodes) for chain in found) == [4, 10]
 
 
-@pytest.mark.parametrize(("onwards", "listed"), [(0.7, True), (0.95, False)])
-def test_what_goes_on_in_the_line_of_a_short_chain_belongs_to_it_where_it_is_like_its_electrodes(onwards, listed):
-    catheter = row_of("ablation", (200, 100), 0.0)
-    step = np.array([[16.0, 0.0]])
-    more = catheter[-1] + step * np.arange(1, 5)[:, None]
-    points = np.concatenate([catheter, more])
-    found = chains_found(drawn([catheter]), points, [0.99] * 4 + [onwards] * 4, [0.9] * 8)
-    assert any(lies_on(chain, catheter) for chain in found) == listed
-
-
 @pytest.mark.parametrize(("hidden", "found"), [(slice(8, 10), True), (slice(4, 6), True), (slice(7, 10), False)])
 def test_something_may_hide_a_pair_of_a_long_catheter(hidden, found):
     catheter = row_of("cs", (60, 60), 0.4)

@@ -30,7 +30,6 @@ IN_A_RUN = Acceptance(
     scores=ScoreLimits(0.4, seen=0.15, least_seen=0.85),
     unseen_evidence=-0.9,
     strict=True,
-    onwards_less=1.0,
     row_chain_score=2.0,
     row_score=0.2,
     hidden_pair=ScoreLimits(0.7, seen=0.15, least_seen=0.75),
@@ -45,7 +44,7 @@ _ALONE = replace(
     scores=ScoreLimits(0.5, seen=0.2, least_seen=0.85),
     scores_beside=ScoreLimits(0.4, seen=0.15, least_seen=0.7),
     faded_price=math.inf,
-    onwards_less=math.inf,
+    hidden_pair=ScoreLimits(math.inf),
     dark_lines=IN_FRAME,
 )
 """Scores are probabilities. In a single frame no other frame confirms a chain, but another catheter does."""
