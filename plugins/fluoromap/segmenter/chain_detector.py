@@ -54,6 +54,7 @@ _WEAKER = 0.25
 _LEAST_MOVING_ODDS, _LEAST_ROW_ODDS, _FAINT_CONTRAST = 0.2, -0.2, 11.0
 """Least log-odds of the middle electrode in a moved mean: of any chain, and of a long row of less contrast over noise."""
 _FOR_ONE_CROSSING = 8
+"""Electrodes of a chain for which one thing may cross it."""
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0

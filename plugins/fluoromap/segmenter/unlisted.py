@@ -54,7 +54,7 @@ def continues(
 ) -> bool:
     """Return whether points go on in the chain's line beyond an end.
 
-    Three or more points are needed, no farther apart than the chain's electrodes are.
+    ``least`` or more points are needed, no farther apart than the chain's electrodes are.
 
     Parameters
     ----------
@@ -63,6 +63,7 @@ def continues(
     points_uv : (n, 2)
         Sure proposals of the image, pixels; its own electrodes and those of other chains may be among them.
     catheter : Catheter
+    least : int
     """
     free = points_uv[_apart(points_uv, chain.pixels_uv, _OWN_MM * px_per_mm)]
     if len(free) < least:
