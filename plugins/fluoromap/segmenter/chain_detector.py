@@ -426,7 +426,7 @@ class ChainDetector:
         parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
         dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
         a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one. Besides, one thing
-        may cross each eight electrodes of a chain that has no place without an electrode, as displaced ones have.
+        may cross each eight electrodes of a chain, unless it has places without an electrode, as displaced chains have.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]

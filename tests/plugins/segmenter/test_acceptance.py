@@ -1,7 +1,7 @@
 import numpy as np
 
 from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
-from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
+from fluoromap.segmenter.learned_chain.detector import ALONE, IN_A_RUN
 
 
 def test_a_long_row_is_accepted_with_less_from_each_electrode():
@@ -17,6 +17,14 @@ def test_a_row_displaced_by_a_pair_is_not_accepted():
     assert not IN_A_RUN.accepts(displaced, 5.0)
     assert not IN_A_RUN.accepts(displaced[::-1], 5.0)
     assert IN_A_RUN.accepts(np.array([0.9] * 6 + [0.01] * 2 + [0.9] * 2), 5.0)
+
+
+def test_something_may_hide_a_pair_in_a_run_only():
+    hidden = np.array([0.9] * 8 + [0.01] * 2)
+    assert IN_A_RUN.hidden_pair.allow(hidden)
+    assert not IN_A_RUN.hidden_pair.allow(np.array([0.9] * 7 + [0.01] * 3))
+    assert not IN_A_RUN.hidden_pair.allow(np.array([0.6] * 8 + [0.01] * 2))
+    assert not ALONE.hidden_pair.allow(hidden)
 
 
 def test_chains_are_accepted_one_by_one():

@@ -181,12 +181,20 @@ def test_a_long_chain_a_pair_too_far_along_its_catheter_hides_no_pair():
     catheter = row_of("cs", (60, 60), 0.4)
     on = (catheter[-1] - catheter[0]) / np.linalg.norm(catheter[-1] - catheter[0])
     shaft = catheter[-1] + np.outer(np.array([5.0, 7.0]) * PX * 0.9, on)
-    points = np.concatenate([catheter, shaft])
-    displaced = points[2:]
-    # Electrodes of the first pair are sure, but too weak for a chain of their own: the displaced chain would win.
-    evidence = Evidence(drawn([catheter]), points, [0.95] * 10 + [0.02] * 2, [0.9] * 10 + [0.02] * 2)
+    # The tip is not proposed, and two places on the shaft are: the displaced chain has more proposals.
+    points = np.concatenate([catheter[1:], shaft])
+    evidence = Evidence(drawn([catheter]), points, [0.95] * 9 + [0.9] * 2, [0.9] * 9 + [0.02] * 2)
     chains = detector_of(evidence).search(evidence.smooth).entry(0).chains
-    assert not any(lies_on(chain, displaced) for chain in chains)
+    assert any(lies_on(chain, catheter) for chain in chains)
+
+
+@pytest.mark.parametrize(("weakest", "listed"), [(0.3, True), (0.2, False)])
+def test_a_long_chain_with_a_place_of_nothing_has_no_excuse_for_what_lies_between(weakest, listed):
+    catheter = row_of("cs", (60, 60), 0.4)
+    points = np.concatenate([catheter, 0.5 * (catheter[3:4] + catheter[4:5])])
+    probability = [0.99] * 6 + [weakest] + [0.99] * 3 + [0.995]
+    found = chains_found(drawn([catheter]), points, probability, [0.9] * 11)
+    assert any(lies_on(chain, catheter) for chain in found) == listed
 
 
 def test_pairs_that_were_found_as_one_are_split_where_a_catheter_is_missing():

@@ -39,7 +39,7 @@ IN_A_RUN = Acceptance(
     # The mean along the track decides about what single frames leave open.
     dark_lines=replace(IN_FRAME, sure=0.3),
 )
-_ALONE = replace(
+ALONE = replace(
     IN_A_RUN,
     scores=ScoreLimits(0.5, seen=0.2, least_seen=0.85),
     scores_beside=ScoreLimits(0.4, seen=0.15, least_seen=0.7),
@@ -82,7 +82,7 @@ def electrode_chains(
         faint = 0.0 if alone else FAINT_LOG_ODDS
         return JointEvidence(network(x), blobs(x), px_per_mm, least_noise, faint, network.reach_cells)
 
-    detector = ChainDetector(catalogue, field, px_per_mm, ask, _ALONE if alone else IN_A_RUN)
+    detector = ChainDetector(catalogue, field, px_per_mm, ask, ALONE if alone else IN_A_RUN)
     near_px = near_distance_mm(frame_ms) * px_per_mm
     stored = StoredAnswers() if answers is None else answers
     return FrameSearch(detector, network, blobs, len(catalogue.catheters), frame_ms <= SHARED_MS, near_px, stored)
