@@ -48,6 +48,9 @@ _CONFIRMED_CONTRAST = 3.0
 _STRAY_PX = 5.0
 _HIDING_MM, _LEAST_FREE = 1.2, 2
 _WORST_FIT = 2.0
+_LESS_SURE = 1.7
+"""Factor of the covariance of a chain that was found again: frames that show it less well are searched this way. It is no
+doubt about the catheter's shape."""
 _BENDING, _LEAST_REACH_PX, _SMOOTH_PX = 0.12, 6.5, 35.0
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
@@ -528,11 +531,11 @@ class ChainDetector:
         found = place.points_uv[0]
         is_stray = np.linalg.norm(found - guess, axis=1) > _STRAY_PX
         covariance = np.where(is_stray[:, None, None], (4 * _STRAY_PX) ** 2 * np.eye(2), place.covariance_px2[0])
-        expected = chain.covariance_px2 + _bending_px(reach_px) ** 2 * np.eye(2)
+        expected = chain.covariance_px2 / _LESS_SURE + _bending_px(reach_px) ** 2 * np.eye(2)
         gain = expected @ np.linalg.inv(expected + covariance)
         points = guess + np.einsum("nij,nj->ni", gain, found - guess)
         covariance = gain @ covariance
-        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+        covariance = 0.5 * _LESS_SURE * (covariance + covariance.transpose(0, 2, 1))
         # Shape and clearness come before the scores: they need no pass of a network.
         is_seen = self._is_seen(points)
         if not shows_enough(is_seen) or place.clearness[0] < self.acceptance.again_clearness:

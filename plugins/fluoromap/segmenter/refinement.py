@@ -23,9 +23,12 @@ _APART_PX = 6.0
 _GAIN, _TIP_GAIN = (4.6, 5.3), (6.15, 6.35)
 _TIP_REACH = 0.8
 """How far a long tip's middle is searched, over half its length: the first guess may lie near one of its ends."""
-_FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.034, 0.048), (0.09, 0.056), (0.155, 0.056)
+_FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.027, 0.038), (0.072, 0.045), (0.124, 0.045)
 _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
+_USUAL_REST, _OF_REST, _TINY = np.array([1.2, 1.1]), np.array([0.63, 1.33]), 1e-12
+"""From which ratio to the chain's middle electrode on the unexplained rest, along and across, adds to the standard deviation, and
+in which power."""
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
 _SPACING_SD = 0.10
 _LONG_CATHETER = 6
@@ -108,7 +111,7 @@ def refine(
     points = np.array(points_uv, dtype=np.float64, order="C")
     arc_mm = catheter.arc_lengths_mm
     misfits, bands, arc = np.empty((3, *points.shape[:2]))
-    axes, unit_sd = np.empty((2, *points.shape))
+    axes, unit_sd, rests = np.empty((3, *points.shape))
     sides = np.empty(misfits.shape, np.int64)
     radius = 0.5 * _diameter_mm(catheter) * px_per_mm
     half = np.full(len(arc_mm), 0.5 * catheter.ring_mm * px_per_mm)
@@ -122,7 +125,7 @@ def refine(
         _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides)
         longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
         scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
-        _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, misfits)
+        _fit_bands(image, axes, bands, radius, shifts, sides, scratch, points, unit_sd, misfits, rests)
         shifts[:] = int(_LAST_REACH_PX / _STEP_PX)
         if attempt == 0 and tip_reach > _TIP_REACH_PX:
             shifts[:, 0] = int(_TIP_REACH_PX / _STEP_PX)
@@ -130,6 +133,8 @@ def refine(
     sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
     if len(arc_mm) >= 3:
         _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
+    # Not before: spacings of a bent catheter are no better than a disturbed fit.
+    sd = np.minimum(sd * _disturbance(rests), _APART_PX)
     fit = ElectrodeFit(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
     covariance = fit.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):
@@ -196,13 +201,15 @@ def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, bands, sides):  
             sides[row, k] = int(max(window, bands[row, k] + _LEAST_WINDOW_PX) / _STEP_PX)
 
 
-@kernel("f4[:,::1], f8[:,:,::1], f8[:,::1], f8, i8[:,::1], i8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1]")
-def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, misfits):  # type: ignore[no-untyped-def]  # pragma: no cover
+@kernel(
+    "f4[:,::1], f8[:,:,::1], f8[:,::1], f8, i8[:,::1], i8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"
+)
+def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, misfits, rests):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move the points to the best nearby positions of bands along these axes.
 
-    Writes the standard deviations along and across for a pixel noise of 1, and the share of the variance along the axis
-    that stays unexplained. A template moves over the profile, first along, then across the axis. A tip's far end is a
-    dome of its radius.
+    Writes the standard deviations along and across for a pixel noise of 1, the share of the variance along the axis that
+    stays unexplained, and what the unexplained rest of the profile would displace the band by if it were noise. A template moves
+    over the profile, first along, then across the axis. A tip's far end is a dome of its radius.
 
     shifts, sides : largest shift and half length of the template, in steps.
     scratch : three lines of work space.
@@ -269,6 +276,8 @@ def _fit_bands(x, axes, half, radius, shifts, sides, scratch, points, unit_sd, m
                     squares += value * value
                 best = scores[chosen]
                 depth = max(best, 0.0) / max(strength, 1e-9)
+                rest = max(squares - total * total / m - depth * best, 0.0)
+                rests[row, k, way] = math.sqrt(rest * _STEP_PX / (m * max(edges, 1e-9))) / max(depth, 1e-6)
                 if way == 0:
                     misfits[row, k] = max(1.0 - depth * best / max(squares - total * total / m, 1e-12), 0.0)
                 # Cramer-Rao bound of a shift in white noise of 1 a pixel, averaged over the band's width.
@@ -295,6 +304,17 @@ def _position_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:
     sd = noise_sd * gain * blur_gain[:, None, None]
     stated: Array = np.minimum(np.sqrt(sd * sd + floor * floor), _APART_PX)
     return stated
+
+
+def _disturbance(rests: Array) -> Array:
+    """Return factors of the standard deviations along and across, (n, electrodes, 2), from 1 on.
+
+    Where the template leaves more unexplained than at the chain's middle electrode, something else lies there, as a cable, and
+    displaces the electrode. ``rests`` : what is unexplained, of the same shape, see :func:`_fit_bands`.
+    """
+    usual = _USUAL_REST * np.maximum(np.median(rests, axis=1, keepdims=True), _TINY)
+    factors: Array = np.maximum(rests / usual, 1.0) ** _OF_REST
+    return factors
 
 
 @functools.lru_cache(maxsize=64)

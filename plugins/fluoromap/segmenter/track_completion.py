@@ -22,6 +22,8 @@ from fluoromap.segmenter.tracks import (
 
 _NOT_SEEN_MS = 20.0
 """How long noise may hide a catheter before the search ends."""
+_JUDGED_AGAIN = 1.25
+"""How many times as many frames as before a track has when it is judged again."""
 
 
 def completed(
@@ -34,6 +36,8 @@ def completed(
     judge: TrackJudge,
 ) -> list[Track]:
     """Return the tracks with chains in the frames that lacked them.
+
+    A track that many frames are added to is judged again: half of a run may look like a catheter where the whole run does not.
 
     Parameters
     ----------
@@ -51,9 +55,15 @@ def completed(
     judge : TrackJudge
     """
     tracks = list(kept)
+    wrong = []
     for track in tracks:
         if not track.manual:
+            judged = len(track.chains)
             _complete(track, tracks, frame_times_ms, catheters, search)
+            if len(track.chains) > _JUDGED_AGAIN * judged:
+                track.verdict = judge(track.chains)
+                wrong += [] if is_believed(track, kept) else [track]
+    tracks = [track for track in tracks if track not in wrong]
     for track in sorted(filter(_is_long, rare), key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
         parts = [other for other in tracks if _is_part(other, track)]
         if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):

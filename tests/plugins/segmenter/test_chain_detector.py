@@ -293,6 +293,19 @@ class WideEvidence(Evidence):
         return Likeness(maximum_filter(super().likeness.values, 5), 1.0, 0.0)
 
 
+def test_a_chain_that_was_found_again_is_less_sure_than_one_that_was_found():
+    catheter = row_of("cs", (60, 60), 0.3)
+    image = drawn([catheter])
+    (known,) = chains_found(image, catheter, [0.9] * 10, [0.9] * 10)
+    elsewhere = replace(known, covariance_px2=known.covariance_px2 + 9.0 * np.eye(2))
+    again = detector_of(WideEvidence(image, catheter, [0.9] * 10, [0.9] * 10)).find_again(
+        image, elsewhere, np.zeros(2), 3.0, ()
+    )
+    np.testing.assert_allclose(again.pixels_uv, known.pixels_uv, atol=0.2)
+    sizes = [np.trace(chain.covariance_px2, axis1=1, axis2=2) for chain in (again, known)]
+    assert np.median(sizes[0] / sizes[1]) > 1.3
+
+
 def test_contrast_shows_a_confirmed_chain_that_its_frame_s_proposer_doubts():
     catheter = row_of("cs", (60, 60), 0.3)
     image = drawn([catheter])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from frame_sources import Frames, displayed
+from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
@@ -68,3 +69,17 @@ def test_noise_that_compression_hides_still_displaces(simulated):
     fine, coarse = (BlobResponse.of_image(x, inside, 1.0, PX_PER_MM) for x in (plain, compressed))
     assert coarse.pixel_noise < 0.6 * fine.pixel_noise
     assert 0.8 < coarse.position_noise / fine.position_noise < 1.3
+
+
+def test_structures_displace_electrodes_in_a_mean_of_many_frames_too():
+    draw = np.random.default_rng(5)
+    structures = gaussian_filter(draw.normal(0.0, 1.0, (512, 512)), 5.0)
+    structures *= 0.02 / structures.std()
+    noise = draw.normal(0.0, 0.1, structures.shape)
+    inside = np.ones(structures.shape, np.bool_)
+    of_frame, of_mean, without_structures = (
+        BlobResponse.of_image(x.astype(np.float32), inside, 1.0, 6.0).position_noise
+        for x in (structures + noise, structures + noise / 10, noise / 10)
+    )
+    assert of_mean > 2.0 * without_structures
+    assert of_mean > 0.2 * of_frame

@@ -7,6 +7,7 @@ from fluoromap.catheters import catheter_type
 from fluoromap.segmenter.refinement import refine
 
 PX_PER_MM = 3.5
+CHI2_95_2D = 5.991464547107979
 
 
 def test_a_long_catheter_s_ends_stay_where_its_foreshortening_changes():
@@ -52,8 +53,8 @@ def test_the_middle_of_a_long_tip_is_found_from_its_ends(first_guess_mm):
 
 def test_bands_that_fit_perfectly_say_as_much_of_a_hidden_one(monkeypatch):
     def perfect(*arguments):
-        unit_sd, misfits = arguments[-2:]
-        unit_sd[:], misfits[:] = 1.0, 0.0
+        unit_sd, misfits, rests = arguments[-3:]
+        unit_sd[:], misfits[:], rests[:] = 1.0, 0.0, 0.0
 
     monkeypatch.setattr("fluoromap.segmenter.refinement._fit_bands", perfect)
     catheter = catheter_type("quadripolar-5-5-5", "rv")
@@ -62,3 +63,34 @@ def test_bands_that_fit_perfectly_say_as_much_of_a_hidden_one(monkeypatch):
     with np.errstate(all="raise"):
         fit = refine(np.zeros((120, 200), np.float32), points[None], catheter, PX_PER_MM, 0.01, hidden, ~hidden)
     assert fit.misfits[0].max() < 0.05
+
+
+def test_electrodes_that_something_lies_on_are_less_sure_and_stay_in_their_ellipses():
+    catheter = catheter_type("decapolar-2-5-2", "cs")
+    along = np.concatenate([[0.0], np.cumsum(catheter.spacing_mm)]) * PX_PER_MM
+    points = np.stack([40.0 + along, np.full(len(along), 60.0)], axis=1)
+    v, u = np.mgrid[:120, : int(points[-1, 0]) + 40].astype(np.float64)
+    catheter_alone = np.zeros(v.shape)
+    for k, (at, _) in enumerate(points):
+        half = 0.5 * (catheter.tip_mm if k == 0 else catheter.ring_mm) * PX_PER_MM
+        catheter_alone -= np.clip(0.5 + (half - np.abs(u - at)) / 2.0, 0.0, 1.0) * (np.abs(v - 60.0) < 3.5)
+    nothing = np.zeros((1, catheter.electrodes), np.bool_)
+    missed, wider = [], []
+    for seed in range(12):
+        draw = np.random.default_rng(seed)
+        noise = draw.normal(0.0, 0.05, v.shape)
+        crossed, slope = int(draw.integers(1, 9)), draw.uniform(0.5, 2.0)
+        cable = np.abs((v - 60.0) - slope * (u - points[crossed, 0] - draw.uniform(2.0, 5.0))) < 3.0 * np.hypot(
+            1.0, slope
+        )
+        alone, covered = (
+            refine(image.astype(np.float32), points[None], catheter, PX_PER_MM, 0.05, nothing, nothing)
+            for image in (catheter_alone + noise, catheter_alone - 0.25 * cable + noise)
+        )
+        error = covered.points_uv[0, crossed] - points[crossed]
+        missed.append(error @ np.linalg.solve(covered.covariance_px2[0, crossed], error))
+        wider.append(np.trace(covered.covariance_px2[0, crossed]) / np.trace(alone.covariance_px2[0, crossed]))
+        far = np.abs(np.arange(catheter.electrodes) - crossed) >= 3
+        np.testing.assert_allclose(covered.points_uv[0, far], alone.points_uv[0, far], atol=0.3)
+    assert np.median(wider) > 1.5
+    assert np.mean(np.array(missed) <= CHI2_95_2D) >= 0.8

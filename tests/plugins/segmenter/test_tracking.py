@@ -270,11 +270,20 @@ def test_a_long_catheter_that_few_frames_show_replaces_its_parts():
     assert tracked() == [[10]] * 16
     accepted.add(4)
     assert tracked() == [[10]] * 16
+
     # Not where the judge doubts it in the frames that were added.
-    entries = track_chains(
-        found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), says(lambda chains: len(chains) < 15)
-    )
+    def doubts(chains):
+        return len(chains) < 15 or len(chains[min(chains)].electrodes) == 4
+
+    entries = track_chains(found, times(16), 2, only_confirmed, FrameChains(0, (whole,)), says(doubts))
     assert [len(one.electrodes) for one in entries[-1].chains] == [4]
+
+
+@pytest.mark.parametrize(("seen", "kept"), [(12, True), (8, False)])
+def test_a_track_that_many_frames_are_added_to_is_judged_again(seen, kept):
+    found = run([[chain(POINTS + 100)] if frame < seen else [] for frame in range(14)])
+    entries = track_chains(found, times(14), 1, only_confirmed, judge=says(lambda chains: len(chains) < 14))
+    assert [bool(entry.chains) for entry in entries] == [kept] * 14
 
 
 def test_parts_do_not_take_the_frames_of_a_long_catheter_where_the_run_is_followed_again():

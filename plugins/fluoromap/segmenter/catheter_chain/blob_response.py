@@ -20,6 +20,8 @@ _CLEAR_SNR = 4.0
 _APART_MM = 0.57
 _MOST = 60
 _BLUR_MM = 1.75
+_OF_NOISE, _OF_STRUCTURES = 0.48, 0.44
+"""What the variances of a pixel at half the size and at an eighth displace electrodes by. Fitted to simulated runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,8 +34,9 @@ class BlobResponse:
     noise : (3,) robust standard deviation of ``stack`` inside the field.
     smooth : (rows, columns) the reduced log image at the smallest scale.
     pixel_noise : standard deviation of a pixel of the reduced log image.
-    position_noise : the same of the image at half its size, whatever the reduction. Compression removes noise between
-    neighbouring pixels; at half the size it stays, and displaces electrodes.
+    position_noise : what displaces electrodes, as the noise of a pixel of the image at half its size, whatever the reduction:
+    compression removes noise between neighbouring pixels, but at half the size it stays. Structures of the size of electrodes
+    displace them too, and a mean of frames has as many of them as a frame.
     """
 
     stack: Image
@@ -71,7 +74,10 @@ class BlobResponse:
             np.multiply(stack[level], np.float32(1.0 / noise[level]), out=other)
             np.maximum(best, other, out=best)
         of_pixels = pixel_noise(small, inside[::reduction, ::reduction])
-        of_positions = of_pixels if reduction == 2 else max(of_pixels, _noise_at_half_size(x, inside))
+        half = small if reduction == 2 else reduce_by(x, 2)
+        of_half = of_pixels if reduction == 2 else max(of_pixels, _noise_of(half, inside, 2))
+        of_structures = _noise_of(reduce_by(half, 4), inside, 8)
+        of_positions = math.sqrt(_OF_NOISE * of_half**2 + _OF_STRUCTURES * of_structures**2)
         return cls(stack, best, noise, smooth, of_pixels, of_positions, reduction, px_per_mm)
 
     @property
@@ -200,9 +206,13 @@ def _half_laplacian(x: Image, sigma: float, out: Image) -> None:
     out[0] = out[-1] = out[:, 0] = out[:, -1] = 0
 
 
-def _noise_at_half_size(x: Image, inside: BoolArray) -> float:
-    half = reduce_by(x, 2)
-    return pixel_noise(half, inside[: 2 * half.shape[0] : 2, : 2 * half.shape[1] : 2])
+def _noise_of(reduced: Image, inside: BoolArray, factor: int) -> float:
+    """Return the noise of a pixel of an image.
+
+    The image is ``factor`` times smaller than the field.
+    """
+    rows, columns = reduced.shape
+    return pixel_noise(reduced, inside[::factor, ::factor][:rows, :columns])
 
 
 @kernel("f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4, f4[::1]")
