@@ -48,7 +48,7 @@ _CONFIRMED_CONTRAST = 3.0
 _STRAY_PX = 5.0
 _HIDING_MM, _LEAST_FREE = 1.2, 2
 _WORST_FIT = 2.0
-_LESS_SURE = 1.7
+_LESS_SURE = 2.2
 """Factor of the covariance of a chain that was found again: frames that show it less well are searched this way. It is no
 doubt about the catheter's shape."""
 _BENDING, _LEAST_REACH_PX, _SMOOTH_PX = 0.12, 6.5, 35.0
