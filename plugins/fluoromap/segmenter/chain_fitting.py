@@ -72,7 +72,8 @@ def fit_chains(
     shaft_image : ShaftImage
     families : tuple of CatheterFamily
     noise : float
-        Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+        Standard deviation of a pixel, log units, see
+        :attr:`~fluoromap.segmenter.proposals.ImageEvidence.position_noise`.
     sure : int
         Number of candidates with a blob of their own; they come first. All by default.
     tip_logits_at : callable, optional

@@ -49,7 +49,8 @@ def follow_chains(
     px_per_mm : float
         At the isocentre.
     noise : float
-        Standard deviation of a pixel, log units, see :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+        Standard deviation of a pixel, log units, see
+        :attr:`~fluoromap.segmenter.proposals.ImageEvidence.position_noise`.
     reach_px : float
         Largest distance of an electrode from its expected place.
     """

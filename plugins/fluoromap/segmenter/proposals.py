@@ -85,7 +85,7 @@ class ImageEvidence(Protocol):
 
     @property
     def position_noise(self) -> float:
-        """Standard deviation of a pixel of the log image at half its size: the noise that displaces electrodes."""
+        """Standard deviation of a pixel of the log image at half its size, from what displaces electrodes: noise and structures."""
 
     @property
     def likeness(self) -> Likeness: ...

@@ -27,8 +27,8 @@ _FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.027, 0.038), (0.072, 0.045), (
 _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
 _USUAL_REST, _OF_REST, _TINY = np.array([1.2, 1.1]), np.array([0.63, 1.33]), 1e-12
-"""From which ratio to the chain's middle electrode on the unexplained rest, along and across, adds to the standard deviation, and
-in which power."""
+"""The unexplained rest of a profile, along and across, as a multiple of that of the chain's middle electrode: from here on it
+widens the standard deviation, in this power."""
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
 _SPACING_SD = 0.10
 _LONG_CATHETER = 6
@@ -101,7 +101,7 @@ def refine(
         At the isocentre.
     noise : float
         Standard deviation of a pixel of the log image at half its size, log units, see
-        :func:`~fluoromap.segmenter.log_image.pixel_noise`.
+        :attr:`~fluoromap.segmenter.proposals.ImageEvidence.position_noise`.
     hidden : (n, electrodes)
         Electrodes behind another catheter. They are put on the curve through the others and get the mean misfit of the
         others.
