@@ -62,7 +62,7 @@ _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
 _EXCHANGED = 2
-_LEAST_PLACES = 4
+_LEAST_PLACES, _TWICE = 4, 3.0
 _SAME_PLACE_MM = 1.0
 
 
@@ -77,6 +77,7 @@ class _Linking:
     proposed: int
     possible: PossibleChains
     chains: tuple[CandidateChain, ...]
+    is_merged: BoolArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,7 +250,7 @@ class ChainDetector:
         weights, variance = self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
         possible = self._without_shorter_catheters(possible, points, seen, families)
-        possible = _with_enough_places(possible, len(points) - halves, halves)
+        possible = _with_whole_places(possible, points, families, len(points) - halves, halves)
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
             return _Linking(points, len(points), possible, self._with_clearer_electrodes(linked, possible, weights))
@@ -281,10 +282,10 @@ class ChainDetector:
             completed.rows,
         )
         possible = self._without_shorter_catheters(possible, completed.points_uv, seen, families)
-        possible = _with_enough_places(possible, len(points) - halves, halves)
-        linked = best_chains(possible, completed.points_uv, families, self.px_per_mm, len(points))
+        possible = _with_whole_places(possible, completed.points_uv, families, len(points) - halves, halves)
+        linked = best_chains(possible, completed.points_uv, families, self.px_per_mm, len(points), completed.is_merged)
         clearer = self._with_clearer_electrodes(linked, possible, completed.weights)
-        return _Linking(completed.points_uv, len(points), possible, clearer)
+        return _Linking(completed.points_uv, len(points), possible, clearer, completed.is_merged)
 
     def _with_clearer_electrodes(
         self, linked: tuple[CandidateChain, ...], possible: PossibleChains, weights: Array
@@ -408,7 +409,7 @@ class ChainDetector:
                     good[(rows == np.array(chain.candidates)).all(axis=1)] = chain in result.candidates
             allowed.append(good)
         possible = linking.possible.where(allowed)
-        chains = best_chains(possible, linking.points_uv, families, self.px_per_mm, linking.proposed)
+        chains = best_chains(possible, linking.points_uv, families, self.px_per_mm, linking.proposed, linking.is_merged)
         return replace(linking, possible=possible, chains=chains)
 
     def _lies_on_a_line(self, chain_uv: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
@@ -643,18 +644,29 @@ def _away(points_uv: Array, from_uv: Array) -> Array:
     return nearest
 
 
-def _with_enough_places(possible: PossibleChains, first_half: int, halves: int) -> PossibleChains:
-    """Return the chains that show at least four separate places.
+def _with_whole_places(
+    possible: PossibleChains, points_uv: Array, families: Sequence[CatheterFamily], first_half: int, halves: int
+) -> PossibleChains:
+    """Return the chains that show at least four separate places, each of them once.
 
-    The ``halves`` candidates from ``first_half`` on are electrodes of split pairs: two of them are one place. Three drops of
-    contrast medium may lie like a pair and two rings.
+    The ``halves`` candidates from ``first_half`` on are electrodes of split pairs: two of them are one place, and a chain that has
+    one pays for having the candidate that was split too. Later candidates were not proposed. Three drops of contrast medium may
+    lie like a pair and two rings.
     """
     if not halves:
         return possible
-    return possible.where(
-        [
-            np.count_nonzero((rows >= first_half) & (rows < first_half + halves), axis=1)
-            <= 2 * max(rows.shape[1] - _LEAST_PLACES, 0)
-            for rows in possible.rows
-        ]
-    )
+    last = first_half + halves
+    place = np.arange(len(points_uv))
+    apart = points_uv[first_half:last, None] - points_uv[:first_half]
+    place[first_half:last] = np.argmin((apart * apart).sum(axis=2), axis=1)
+    allowed, scores = [], []
+    for family, rows, of_family in zip(families, possible.rows, possible.scores, strict=True):
+        is_half = (rows >= first_half) & (rows < last)
+        places = np.sort(np.where(rows < last, place[rows], -1), axis=1)
+        separate = (places[:, :1] >= 0).sum(axis=1) + (np.diff(places, axis=1) > 0).sum(axis=1)
+        twice = ((rows[:, :, None] == place[rows][:, None, :]) & is_half[:, None, :]).any(axis=1).sum(axis=1)
+        priced = of_family - _TWICE * twice
+        few = is_half.any(axis=1) & (separate < min(_LEAST_PLACES, rows.shape[1]))
+        allowed.append(~few & ((twice == 0) | (priced >= family.floor - _COMPANION_SLACK)))
+        scores.append(priced)
+    return PossibleChains(possible.rows, tuple(scores)).where(allowed)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES, TURNING_ELECTRODES
 from fluoromap.segmenter.linking import (
     CandidateChain,
     CatheterFamily,
@@ -31,6 +31,7 @@ _LONG_TIP_MM, _MOST_BANDS = 3.0, 1.0
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
+_MERGED_MM, _MERGED_SD_MM = 1.5, 0.8
 _LEAST_GAP = 0.15
 """Of the spacing at the isocentre. Nearer than that, two electrodes are fitted to one dark place."""
 
@@ -186,16 +187,24 @@ def _tip_shows(catheter: Catheter) -> bool:
 
 
 def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) -> Array:
-    """Return the chain's covariances, widened near electrodes of other chains.
+    """Return the chain's covariances, widened near other electrodes.
 
-    Bands that lie close together disturb each other's fit.
+    Bands that lie close together disturb each other's fit: those of other chains, and those of a long catheter that turns through
+    the viewing direction, where several of its electrodes may be fitted to one dark place.
     """
+    covariance = chain.covariance_px2
+    if len(chain.electrodes) >= TURNING_ELECTRODES:
+        apart = np.linalg.norm(chain.pixels_uv[:, None] - chain.pixels_uv, axis=2) + _MERGED_MM * px_per_mm * np.eye(
+            len(chain.electrodes)
+        )
+        merged = np.maximum(1.0 - apart.min(axis=1) / (_MERGED_MM * px_per_mm), 0.0)
+        covariance = covariance + ((_MERGED_SD_MM * px_per_mm * merged) ** 2)[:, None, None] * np.eye(2)
     if not others:
-        return chain.covariance_px2
+        return covariance
     beside = np.concatenate([other.pixels_uv for other in others])
     difference = chain.pixels_uv[:, None] - beside
     near = np.sqrt((difference * difference).sum(axis=2).min(axis=1)) < _NEAR_MM * px_per_mm
-    return np.where(near[:, None, None], _NEAR_FACTOR, 1.0) * chain.covariance_px2
+    return np.where(near[:, None, None], _NEAR_FACTOR, 1.0) * covariance
 
 
 def _candidates_of_others(

@@ -12,9 +12,10 @@ import numpy as np
 from numba import njit
 
 from fluoromap.contracts import Array, IntArray
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES, TURNING_ELECTRODES
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.row_shape import row_fit
 
 _SPACING_SD, _LOOP_SPACING_SD = 0.06, 0.12
 """Of the ratio between visible and true spacing. Loops are made in several sizes, and some can be tightened."""
@@ -29,6 +30,7 @@ _FORESHORTENED, _FORESHORTENED_WEIGHT = 0.75, 2.0
 _LOOP_SCALE, _LOOP_SIZE_SD = 1.1, 0.2
 _LOOP_TURN_SD, _MOST_UNLIKE_LOOP = 0.9, 3.0
 _LEAST_SEEN = 0.1
+_ROW_WEIGHT, _TURNING_PRICE = 2.0, 4.0
 _UNLIKE_WEIGHT = 0.6
 _BEHIND_MM = 2.4, 5.9
 _BEFORE_MM = 2.1, 3.5
@@ -41,6 +43,9 @@ def score_paths(
 ) -> Array:  # fmt: skip
     """Return the score of each path, (n,).
 
+    A row of eight or more is scored in two ways, of which the better one counts: its foreshortening changes slowly, as it does
+    nearly always, or it turns through the viewing direction, see :mod:`~fluoromap.segmenter.row_shape`.
+
     The score is -inf for a path that cannot reach ``least`` even with a perfect shaft. The shafts of these paths are not
     measured.
     """
@@ -49,6 +54,13 @@ def score_paths(
     freedom = bend_freedom(spacing_px / px_per_mm)
     _score_shapes(chosen, points, weights, variance_px2, sure, lost, spacing_px, freedom, places, variances, out)
     out += spacing_fit(places, spacing_px, variances, curvature_per_mm, px_per_mm)
+    if len(spacing_px) + 1 >= TURNING_ELECTRODES and not curvature_per_mm:
+        turning, freedom = np.empty(len(chosen)), np.full(len(freedom), np.inf)
+        _score_shapes(
+            chosen, points, weights, variance_px2, sure, lost, spacing_px, freedom, places, variances, turning
+        )
+        turning += _ROW_WEIGHT * row_fit(places, tuple((spacing_px / px_per_mm).tolist()), variances, px_per_mm)
+        out = np.maximum(out, turning - _TURNING_PRICE)
     out += loop_fit(places, spacing_px, curvature_per_mm, px_per_mm)
     hopeful = out + 3.0 * shaft_weight >= least
     out[~hopeful] = -np.inf

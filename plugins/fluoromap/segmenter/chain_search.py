@@ -22,6 +22,9 @@ A foreshortened catheter has a smaller ratio, a catheter nearer to the source a 
 MANY_ELECTRODES = 6
 """From here on a catheter is long. Of a shorter one, more than one electrode is rarely missing."""
 
+TURNING_ELECTRODES = 8
+"""From here on a row is known even where it turns through the viewing direction and a part of its electrodes merge."""
+
 _END_SLACK = 0.55, 1.1
 _SPREAD, _SPREAD_A_GAP, _MOST_SPREAD = 0.6, 0.06, 0.9
 """How far the ratios of two gaps may differ: of neighbours, more for each gap between, at most. Long catheters turn in depth."""

@@ -236,21 +236,23 @@ def best_chains(
     families: Sequence[CatheterFamily],
     px_per_mm: float,
     sure: int | None = None,
+    is_merged: BoolArray | None = None,
 ) -> tuple[CandidateChain, ...]:
     """Return the best set of these chains, best first.
 
     The value of a set is the sum of its scores plus 1.5 for each electrode, 6 at least for each chain, so that a third,
     weaker catheter is not dropped, nor a part of a long one preferred. The first ``sure`` candidates were proposed,
-    all by default; of the others only those count that a chain needs, see :func:`_needless`. Crossing catheters may share one
-    candidate at a price, but two chains must not exclude each other, see :func:`~fluoromap.segmenter.chain_search.count_shared`.
-    A set has at most as many chains of a family as the catalogue has catheters.
+    all by default; of the others only those count that a chain needs, see :func:`_needless`, and none that ``is_merged``.
+    Crossing catheters may share one candidate at a price, but two chains must not exclude each other, see
+    :func:`~fluoromap.segmenter.chain_search.count_shared`. A set has at most as many chains of a family as the catalogue has
+    catheters.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
     # A long catheter has many chains that differ in one electrode: they must not crowd out the other families.
     most = max(_LEAST_OF_FAMILY, _BEST // len(families))
     likely = possible.where([np.isfinite(scores) for scores in possible.scores])
     compared = [np.argsort(-scores, kind="stable")[:most] for scores in likely.scores]
-    chosen = _best_set(likely, compared, points, families, px_per_mm, sure)
+    chosen = _best_set(likely, compared, points, families, px_per_mm, sure, is_merged)
     # Nor must parts of a long catheter crowd out another one of their own family, which lies elsewhere.
     for _ in range(len(families)):
         if len(chosen) in (0, sum(len(family.names) for family in families)):
@@ -267,7 +269,7 @@ def best_chains(
             own = [np.flatnonzero((paths == np.array(candidates)).all(axis=1))[:1] for candidates in of_family]
             compared.append(np.concatenate([*own, elsewhere[np.argsort(-scores[elsewhere], kind="stable")[:most]]]))
         # The chosen chains are compared again, so that another set has a higher value.
-        more = _best_set(likely, compared, points, families, px_per_mm, sure)
+        more = _best_set(likely, compared, points, families, px_per_mm, sure, is_merged)
         if set(more) == set(chosen):
             break
         chosen = more
@@ -281,6 +283,7 @@ def _best_set(
     families: Sequence[CatheterFamily],
     px_per_mm: float,
     sure: int | None,
+    is_merged: BoolArray | None,
 ) -> tuple[CandidateChain, ...]:
     """Return the best set of some chains, best first.
 
@@ -297,7 +300,8 @@ def _best_set(
     of_each = np.array([each.worth / each.catheter.electrodes for each in families])[family]
     electrodes = (within >= 0).sum(axis=1)
     if sure is not None and longest >= MANY_ELECTRODES:
-        electrodes -= _needless(within, family, sure)
+        merged = np.zeros(len(points), np.bool_) if is_merged is None else is_merged
+        electrodes -= _needless(within, family, sure, merged)
     values = scores + of_each * electrodes
     order = np.argsort(-values, kind="stable")
     within, family, scores = within[order], family[order], scores[order]
@@ -318,14 +322,16 @@ def _best_set(
     )
 
 
-def _needless(chosen: IntArray, family: IntArray, sure: int) -> IntArray:
+def _needless(chosen: IntArray, family: IntArray, sure: int, is_merged: BoolArray) -> IntArray:
     """Return how many electrodes of each chain nobody proposed and nobody needs, (n,).
 
     A chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain. So a
     long chain needs as many such electrodes as the chain of its family that has the fewest of them and half of its
-    candidates. A short one needs none. Rows of ``chosen`` are filled up with -1.
+    candidates. A short one needs none, and nobody needs an electrode that another one covers. Rows of ``chosen`` are filled up
+    with -1.
     """
-    needless: IntArray = (chosen >= sure).sum(axis=1)
+    merged = (is_merged[chosen] & (chosen >= 0)).sum(axis=1)
+    needless: IntArray = (chosen >= sure).sum(axis=1) - merged
     for index in np.unique(family):
         own = np.flatnonzero(family == index)
         electrodes = np.count_nonzero(chosen[own[0]] >= 0)
@@ -334,6 +340,7 @@ def _needless(chosen: IntArray, family: IntArray, sure: int) -> IntArray:
             member[np.arange(len(own))[:, None], chosen[own, :electrodes]] = 1.0
             alike = member @ member.T >= electrodes / 2
             needless[own] -= np.where(alike, needless[own], electrodes).min(axis=1)
+    needless += merged
     return needless
 
 

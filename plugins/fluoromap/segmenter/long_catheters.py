@@ -1,33 +1,33 @@
-"""Chains of catheters with many electrodes, some of which were not proposed.
+"""Rows of catheters with many electrodes, some of which were not proposed.
 
-Every pair of neighbouring candidates starts a trace. It runs along the row both ways, takes the candidates that it meets where the
-next electrode is expected, and steps over the electrodes that it does not meet.
+A search from each end follows the rows that are most probable so far. They take candidates where the next electrode is expected,
+and step over electrodes that they do not meet. Where the catheter turns through the viewing direction, its electrodes merge: one
+candidate stands for several.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit
 
+from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter.chain_search import LONGEST, SHORTEST
+from fluoromap.segmenter.chain_search import LONGEST, TURNING_ELECTRODES
+from fluoromap.segmenter.field_mask import are_in
+from fluoromap.segmenter.linking import searched_spacing_px
+from fluoromap.segmenter.row_shape import next_place, smooth_places
 
-_MOST_SEEDS = 45
+_FOLLOWED = 400
 _MOST_MISSING = 0.34
 _MISSING_IN_A_ROW = 2
-_GATE, _GATE_PX = 0.33, 1.5
-_MISSING_PRICE = 1.5
-_KEPT_BEND = 0.8
-"""Share of the last bend, for its length, that is expected to go on."""
-_MOST_ROWS = 4000
+_GATE = 2.5
+_MISSING_PRICE = 2.5
+_MOST_MERGED, _MERGED_PRICE, _MERGED_PX = 3, 2.0, 1.5
 
 
 def trace_rows(
-    points_uv: Array, weights: Array, spacing_px: Array, most: int, inside: BoolArray
-) -> tuple[IntArray, Array]:
-    """Return the best traces through candidates.
+    points_uv: Array, weights: Array, catheter: Catheter, px_per_mm: float, most: int, inside: BoolArray
+) -> tuple[IntArray, Array, IntArray]:
+    """Return the best rows of candidates.
 
     Parameters
     ----------
@@ -35,10 +35,11 @@ def trace_rows(
         Candidates, pixels.
     weights : (n,)
         Their :func:`~fluoromap.segmenter.linking.evidence`.
-    spacing_px : (electrodes - 1,)
-        Spacings from the tip on, at the isocentre, not foreshortened.
+    catheter : Catheter
+    px_per_mm : float
+        At the isocentre.
     most : int
-        At most so many traces are returned.
+        At most so many rows are returned.
     inside : (rows, columns) bool
         The field. Up to half of the electrodes may lie outside it.
 
@@ -47,125 +48,77 @@ def trace_rows(
     rows : (k, electrodes)
         Index of the candidate of each electrode from the tip on, -1 where one is missing; best first.
     places_uv : (k, electrodes, 2)
-        The candidates' places; missing electrodes lie between their neighbours or straight on.
+        Where the electrodes are expected.
+    merged : (k, electrodes)
+        For a missing electrode, the candidate of another electrode that covers it, -1 where there is none.
     """
-    best = np.sort(np.argsort(-weights, kind="stable")[:_MOST_SEEDS])
-    electrodes = len(spacing_px) + 1
-    rows = np.empty((_MOST_ROWS, electrodes), np.int64)
-    places, scores = np.empty((_MOST_ROWS, electrodes, 2)), np.empty(_MOST_ROWS)
-    count = _trace(points_uv, weights, spacing_px, best, int(_MOST_MISSING * electrodes), inside, rows, places, scores)
-    rows, first = np.unique(rows[:count], axis=0, return_index=True)
-    order = np.argsort(-scores[first], kind="stable")[:most]
-    rows, places = rows[order], places[first[order]]
-    _interpolate(rows, spacing_px, places)
-    return rows, places
+    from_tip, score_from_tip = _rows_from_one_end(points_uv, weights, catheter, px_per_mm, inside, 1)
+    from_end, score_from_end = _rows_from_one_end(points_uv, weights, catheter, px_per_mm, inside, -1)
+    rows, first = np.unique(np.concatenate([from_tip, from_end[:, ::-1]]), axis=0, return_index=True)
+    scores = np.concatenate([score_from_tip, score_from_end])[first]
+    rows = rows[np.argsort(-scores, kind="stable")[:most]]
+    merged = np.where(rows < -1, -2 - rows, -1)
+    seen_at = points_uv[np.maximum(rows, merged)]
+    variance = np.where(rows >= 0, 1.0, np.where(merged >= 0, _MERGED_PX**2, np.inf))
+    places = smooth_places(seen_at, catheter.spacing_mm, catheter.curvature_per_mm, variance, px_per_mm)
+    return np.maximum(rows, -1), places, merged
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _trace(points, weights, spacing, seeds, most_missing, inside, rows, places, scores):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write all traces with few enough missing electrodes; return how many."""
-    m = spacing.size + 1
-    count = 0
-    row = np.empty(m, np.int64)
-    place = np.empty((m, 2))
-    for i in seeds:
-        for j in seeds:
-            du, dv = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-            length = math.sqrt(du * du + dv * dv)
-            if i == j or length < 1e-6:
-                continue
-            for a in range(m - 1):
-                seen = length / spacing[a]
-                if seen < SHORTEST or seen > LONGEST:
-                    continue
-                for k in range(m):
-                    row[k] = -1
-                row[a], row[a + 1] = i, j
-                place[a, 0], place[a, 1] = points[i, 0], points[i, 1]
-                place[a + 1, 0], place[a + 1, 1] = points[j, 0], points[j, 1]
-                score = weights[i] + weights[j]
-                missing = beyond = 0
-                for way in range(2):
-                    step = 1 if way == 0 else -1
-                    at = a + 1 if way == 0 else a
-                    direction_u, direction_v = step * du / length, step * dv / length
-                    ratio = seen
-                    before, bend = length, 0.0
-                    gap = 0
-                    while 0 <= at + step < m and missing <= most_missing:
-                        space = spacing[at] if step > 0 else spacing[at - 1]
-                        reach = space * ratio
-                        turn = 0.5 * bend * (before + reach)
-                        cosine, sine = math.cos(turn), math.sin(turn)
-                        direction_u, direction_v = (
-                            cosine * direction_u - sine * direction_v,
-                            sine * direction_u + cosine * direction_v,
-                        )
-                        eu, ev = place[at, 0] + direction_u * reach, place[at, 1] + direction_v * reach
-                        gate = _GATE * reach + _GATE_PX
-                        found = -1
-                        value = -1e9
-                        for c in range(points.shape[0]):
-                            au, av = points[c, 0] - eu, points[c, 1] - ev
-                            square = au * au + av * av
-                            if square > gate * gate:
-                                continue
-                            taken = False
-                            for k in range(m):
-                                if row[k] == c:
-                                    taken = True
-                            worth = weights[c] - 1.5 * square / (gate * gate)
-                            if not taken and worth > value:
-                                value = worth
-                                found = c
-                        at += step
-                        before = reach
-                        if found < 0:
-                            place[at, 0], place[at, 1] = eu, ev
-                            if (
-                                eu < 0
-                                or ev < 0
-                                or eu >= inside.shape[1]
-                                or ev >= inside.shape[0]
-                                or not inside[int(ev), int(eu)]
-                            ):
-                                beyond += 1
-                                continue
-                            missing += 1
-                            gap += 1
-                            if gap > _MISSING_IN_A_ROW:
-                                missing = m
-                            continue
-                        gap = 0
-                        row[at] = found
-                        place[at, 0], place[at, 1] = points[found, 0], points[found, 1]
-                        score += value
-                        mu, mv = place[at, 0] - place[at - step, 0], place[at, 1] - place[at - step, 1]
-                        moved = max(math.sqrt(mu * mu + mv * mv), 1e-9)
-                        ratio = min(max(0.5 * ratio + 0.5 * moved / space, SHORTEST), LONGEST)
-                        mu, mv = mu / moved, mv / moved
-                        ahead_u, ahead_v = (
-                            cosine * direction_u + sine * direction_v,
-                            cosine * direction_v - sine * direction_u,
-                        )
-                        bent = math.atan2(ahead_u * mv - ahead_v * mu, ahead_u * mu + ahead_v * mv)
-                        bend = _KEPT_BEND * bent / max(0.5 * (before + moved), 1e-9)
-                        direction_u, direction_v, before = mu, mv, moved
-                if missing > most_missing or 2 * (missing + beyond) > m or count == rows.shape[0]:
-                    continue
-                for k in range(m):
-                    rows[count, k] = row[k]
-                    places[count, k, 0], places[count, k, 1] = place[k, 0], place[k, 1]
-                scores[count] = score - _MISSING_PRICE * missing
-                count += 1
-    return count
+def _rows_from_one_end(
+    points: Array, weights: Array, catheter: Catheter, px_per_mm: float, inside: BoolArray, way: int
+) -> tuple[IntArray, Array]:
+    """Return rows and their scores, in the order of the search: from the tip on for ``way`` 1, towards it for -1.
 
-
-def _interpolate(rows: IntArray, spacing_px: Array, places: Array) -> None:
-    """Put missing electrodes between their neighbours, in place."""
-    arc = np.concatenate([[0.0], np.cumsum(spacing_px)])
-    for row, place in zip(rows, places, strict=True):
-        known = np.flatnonzero(row >= 0)
-        inner = np.flatnonzero((row < 0) & (np.arange(len(row)) > known[0]) & (np.arange(len(row)) < known[-1]))
-        for axis in (0, 1):
-            place[inner, axis] = np.interp(arc[inner], arc[known], place[known, axis])
+    In a row, -1 is a missing electrode and -2 - c one that candidate c covers, which has another electrode.
+    """
+    longest_px = LONGEST * searched_spacing_px(catheter, px_per_mm)[::way]
+    electrodes, count = catheter.electrodes, len(points)
+    most_missing = int(_MOST_MISSING * electrodes)
+    most_merged = most_missing if electrodes >= TURNING_ELECTRODES else 0
+    rows, uses = np.arange(count)[:, None], np.eye(count, dtype=np.int64)
+    places, scores = points[:, None], weights
+    missing, merged, in_a_row, beyond = np.zeros((4, count), np.int64)
+    for at in range(1, electrodes):
+        coefficients, sd_mm = next_place(catheter.spacing_mm[::way], catheter.curvature_per_mm, at)
+        expected = np.einsum("k,rkx->rx", coefficients, places)
+        variance = (sd_mm * px_per_mm) ** 2
+        from_expected = points - expected[:, None]
+        square = from_expected[..., 0] ** 2 + from_expected[..., 1] ** 2
+        from_last = points - places[:, -1:]
+        is_taken = uses > 0
+        spread = np.where(is_taken, variance + _MERGED_PX**2, variance)
+        may_miss = missing < most_missing
+        # An end that another electrode covers is no end of a row.
+        may_merge = may_miss & (merged < most_merged) & (at < electrodes - 1)
+        allowed = (square < _GATE**2 * spread) & (uses < _MOST_MERGED) & (may_merge[:, None] | ~is_taken)
+        allowed &= from_last[..., 0] ** 2 + from_last[..., 1] ** 2 < longest_px[at - 1] ** 2
+        # What speaks for a candidate counts once.
+        worth = np.where(is_taken, -_MERGED_PRICE, weights) - 0.5 * square / spread
+        is_beyond = ~are_in(inside, expected)
+        may_miss &= in_a_row < _MISSING_IN_A_ROW
+        may_miss |= is_beyond & (2 * (missing + beyond) < electrodes)
+        of_row, candidate = np.nonzero(np.column_stack([allowed, may_miss]))
+        steps = np.column_stack([worth, np.where(is_beyond, 0.0, -_MISSING_PRICE)])
+        total = scores[of_row] + steps[of_row, candidate]
+        if len(total) > _FOLLOWED:
+            best = np.argpartition(-total, _FOLLOWED)[:_FOLLOWED]
+            of_row, candidate, total = of_row[best], candidate[best], total[best]
+        scores = total
+        is_seen = candidate < count
+        taken = is_seen & (uses[of_row, np.minimum(candidate, count - 1)] > 0)
+        share = np.where(taken, variance / (variance + _MERGED_PX**2), is_seen)[:, None]
+        seen_at = points[np.minimum(candidate, count - 1)]
+        places = np.concatenate(
+            [places[of_row], (expected[of_row] + share * (seen_at - expected[of_row]))[:, None]], axis=1
+        )
+        entry = np.where(taken, -2 - candidate, np.where(is_seen, candidate, -1))
+        rows = np.column_stack([rows[of_row], entry])
+        uses = uses[of_row]
+        uses[np.flatnonzero(is_seen), candidate[is_seen]] += 1
+        is_beyond = is_beyond[of_row] & ~is_seen
+        beyond = beyond[of_row] + is_beyond
+        lacking = ~is_seen & ~is_beyond
+        merged = merged[of_row] + taken
+        missing = missing[of_row] + (taken | lacking)
+        in_a_row = np.where(lacking, in_a_row[of_row] + 1, 0)
+    return rows, scores

@@ -16,14 +16,15 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.linking import CatheterFamily, searched_spacing_px
+from fluoromap.segmenter.field_mask import are_in
+from fluoromap.segmenter.linking import CatheterFamily
 from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.proposals import answers_for_each
 from fluoromap.segmenter.refinement import predict_on_curve
 
 _LEAST_KNOWN = 3
-_INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM = 0.4, 0.7, 0.9
-_TRACED_LEAST = -1.0
+_INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM, _MERGED_SD_MM = 0.4, 0.7, 0.9, 0.5
+_TRACED_EVIDENCE, _MERGED_EVIDENCE = (-2.0, -1.0), -1.5
 _MOST = 100
 
 
@@ -33,12 +34,14 @@ class CompletedChains:
 
     points_uv, weights, variance_px2 : the candidates, then the predicted electrodes.
     rows : for each family, the indices of its chains from the tip on, (n, electrodes).
+    is_merged : which points are electrodes that another one covers, (all points,).
     """
 
     points_uv: Array
     weights: Array
     variance_px2: Array
     rows: tuple[IntArray, ...]
+    is_merged: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,11 +50,13 @@ class _IncompleteChains:
 
     rows : indices of the candidates from the tip on, (n, electrodes - 1); of a long catheter one row (1, electrodes) with -1 for
     missing electrodes. missing : indices of the missing electrodes. places_uv : where they are predicted, (n, 2) or (missing, 2).
+    merged : of a long catheter, (missing,) candidates of other electrodes that cover the missing ones, or -1.
     """
 
     rows: IntArray
     missing: IntArray
     places_uv: Array
+    merged: IntArray
 
 
 def complete_chains(
@@ -87,7 +92,7 @@ def complete_chains(
     incomplete = [_incomplete_chains(points, weights, family.catheter, px_per_mm, inside) for family in families]
     predicted = [chains.places_uv for of_family in incomplete for chains in of_family]
     dark_of = iter(answers_for_each(evidence_at, predicted))
-    places, gained, spread = [points], [weights], [variance_px2]
+    places, gained, spread, merged = [points], [weights], [variance_px2], [np.zeros(len(points), np.bool_)]
     count = len(points)
     rows: list[IntArray] = []
     for family, of_family in zip(families, incomplete, strict=True):
@@ -98,8 +103,10 @@ def complete_chains(
             kept = np.arange(len(dark))
             if electrodes >= MANY_ELECTRODES:
                 # The electrodes on both sides vouch for the place; what shows there may be another catheter.
-                dark = np.clip(dark, _TRACED_LEAST, 0.0)
-                sd = _TRACED_SD_MM
+                is_merged = chains.merged >= 0
+                traced = np.where(are_in(inside, chains.places_uv), np.clip(dark - 1.0, *_TRACED_EVIDENCE), 0.0)
+                dark = np.where(is_merged, _MERGED_EVIDENCE, traced)
+                sd = np.where(is_merged, _MERGED_SD_MM, _TRACED_SD_MM)
                 row = chains.rows.copy()
                 row[0, chains.missing] = count + kept
                 complete.append(row)
@@ -107,14 +114,17 @@ def complete_chains(
                 value = dark + weights[chains.rows].sum(axis=1)
                 kept = np.flatnonzero(dark > least_evidence)
                 kept = kept[np.argsort(-value[kept], kind="stable")[:_MOST]]
-                sd = _END_SD_MM if chains.missing[0] in (0, electrodes - 1) else _INNER_SD_MM
+                sd = np.full(len(kept), _END_SD_MM if chains.missing[0] in (0, electrodes - 1) else _INNER_SD_MM)
                 complete.append(np.insert(chains.rows[kept], chains.missing[0], count + np.arange(len(kept)), axis=1))
             places.append(chains.places_uv[kept])
             gained.append(dark[kept])
-            spread.append(np.full(len(kept), (sd * px_per_mm) ** 2))
+            spread.append((sd * px_per_mm) ** 2)
+            merged.append(np.broadcast_to(chains.merged >= 0, len(dark))[kept])
             count += len(kept)
         rows.append(np.concatenate(complete))
-    return CompletedChains(np.concatenate(places), np.concatenate(gained), np.concatenate(spread), tuple(rows))
+    return CompletedChains(
+        np.concatenate(places), np.concatenate(gained), np.concatenate(spread), tuple(rows), np.concatenate(merged)
+    )
 
 
 def _incomplete_chains(
@@ -123,15 +133,16 @@ def _incomplete_chains(
     """Return the chains of candidates (n, 2) that lack electrodes of a catheter."""
     electrodes, found = catheter.electrodes, []
     if electrodes >= MANY_ELECTRODES:
-        spacing_px = searched_spacing_px(catheter, px_per_mm)
-        for row, position in zip(*trace_rows(points, weights, spacing_px, _MOST, inside), strict=True):
+        traced = trace_rows(points, weights, catheter, px_per_mm, _MOST, inside)
+        for row, position, merged in zip(*traced, strict=True):
             missing = np.flatnonzero(row < 0)
-            found.append(_IncompleteChains(row[None], missing, position[missing]))
+            found.append(_IncompleteChains(row[None], missing, position[missing], merged[missing]))
     elif electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1:
         for number in range(electrodes):
             arc_mm = np.delete(catheter.arc_lengths_mm, number)
             paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm, px_per_mm)
-            found.append(_IncompleteChains(paths, np.array([number]), _curve_weights(catheter, number) @ points[paths]))
+            places_uv = _curve_weights(catheter, number) @ points[paths]
+            found.append(_IncompleteChains(paths, np.array([number]), places_uv, np.array([-1])))
     return found
 
 
