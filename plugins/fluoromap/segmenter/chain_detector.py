@@ -647,7 +647,7 @@ def _away(points_uv: Array, from_uv: Array) -> Array:
 def _with_whole_places(
     possible: PossibleChains, points_uv: Array, families: Sequence[CatheterFamily], first_half: int, halves: int
 ) -> PossibleChains:
-    """Return the chains that show at least four separate places, each of them once.
+    """Return the chains that show at least four separate places.
 
     The ``halves`` candidates from ``first_half`` on are electrodes of split pairs: two of them are one place, and a chain that has
     one pays for having the candidate that was split too. Later candidates were not proposed. Three drops of contrast medium may

@@ -16,7 +16,7 @@ from fluoromap.segmenter.field_mask import are_in
 from fluoromap.segmenter.linking import searched_spacing_px
 from fluoromap.segmenter.row_shape import next_place, smooth_places
 
-_FOLLOWED = 400
+_FOLLOWED = 150
 _MOST_MISSING = 0.34
 _MISSING_IN_A_ROW = 2
 _GATE = 2.5
@@ -67,9 +67,10 @@ def trace_rows(
 def _rows_from_one_end(
     points: Array, weights: Array, catheter: Catheter, px_per_mm: float, inside: BoolArray, way: int
 ) -> tuple[IntArray, Array]:
-    """Return rows and their scores, in the order of the search: from the tip on for ``way`` 1, towards it for -1.
+    """Return rows and their scores, in the order of the search.
 
-    In a row, -1 is a missing electrode and -2 - c one that candidate c covers, which has another electrode.
+    The search goes from the tip on for ``way`` 1, towards it for -1. In a row, -1 is a missing electrode and -2 - c one that
+    candidate c covers, which has another electrode.
     """
     longest_px = LONGEST * searched_spacing_px(catheter, px_per_mm)[::way]
     electrodes, count = catheter.electrodes, len(points)

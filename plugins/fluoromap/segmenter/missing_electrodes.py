@@ -25,7 +25,7 @@ from fluoromap.segmenter.refinement import predict_on_curve
 _LEAST_KNOWN = 3
 _INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM, _MERGED_SD_MM = 0.4, 0.7, 0.9, 0.5
 _TRACED_EVIDENCE, _MERGED_EVIDENCE = (-2.0, -1.0), -1.5
-_MOST = 100
+_MOST, _MOST_ROWS = 100, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +133,7 @@ def _incomplete_chains(
     """Return the chains of candidates (n, 2) that lack electrodes of a catheter."""
     electrodes, found = catheter.electrodes, []
     if electrodes >= MANY_ELECTRODES:
-        traced = trace_rows(points, weights, catheter, px_per_mm, _MOST, inside)
+        traced = trace_rows(points, weights, catheter, px_per_mm, _MOST_ROWS, inside)
         for row, position, merged in zip(*traced, strict=True):
             missing = np.flatnonzero(row < 0)
             found.append(_IncompleteChains(row[None], missing, position[missing], merged[missing]))

@@ -98,9 +98,10 @@ def _fit_shapes(gaps, variance_px2, covariance, out):  # type: ignore[no-untyped
 def smooth_places(
     places: Array, spacing_mm: tuple[float, ...], curvature_per_mm: float, variance_px2: Array, px_per_mm: float
 ) -> Array:
-    """Return the most probable places (n, electrodes, 2) of electrodes that were seen at ``places`` with these variances.
+    """Return the most probable places of electrodes, (n, electrodes, 2).
 
-    An electrode that was not seen has an infinite variance. The parameters are those of :func:`row_fit`.
+    They were seen at ``places`` with these variances. An electrode that was not seen has an infinite variance. The parameters are
+    those of :func:`row_fit`.
     """
     weights = 1.0 / variance_px2
     covariance = place_covariance_mm2(spacing_mm, curvature_per_mm) * px_per_mm**2

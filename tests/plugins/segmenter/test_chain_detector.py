@@ -459,3 +459,17 @@ def test_a_row_of_faint_electrodes_in_a_moved_mean_comes_before_a_clearer_part_o
     found = detector_of(of_row).find_moving([image] * 5, np.arange(5) * 16.7, 2, 2)
     assert [len(chain.electrodes) for chain in found] == sizes
     assert next(seen, None) is None
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_predicted_electrodes_are_no_places_beside_those_of_split_pairs(missing):
+    hexapolar = Catalogue((catheter_type("hexapolar-2-5-2", "his"), catheter_type("ablation-4", "map")), "his", "map")
+    row = np.array([60.0, 60.0]) + np.outer(hexapolar["his"].arc_lengths_mm * PX * 0.5, [np.cos(0.4), np.sin(0.4)])
+    merged = 0.5 * (row[0:4:2] + row[1:4:2])
+    # Two pairs are split, and of the third one or two rings are seen: three places or four.
+    points = np.concatenate([merged, row[4 : 6 - missing]])
+    sure = [0.95] * len(points)
+    detector = detector_of(Evidence(drawn([row]), points, sure, sure, halves=row[:4]), hexapolar)
+    image = drawn([row])
+    found = detector.split_pairs(detector.search(image)).entry(0).chains
+    assert any(lies_on(chain, row) for chain in found) == (missing == 0)

@@ -198,7 +198,7 @@ def test_the_trace_of_a_long_catheter_follows_its_bend_over_a_missing_electrode(
     angles = arc / radius
     points = 250.0 + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     seen = np.delete(points, 5, axis=0)
-    rows, places = trace_rows(seen, np.ones(9), np.diff(arc), 10, np.ones((512, 512), np.bool_))
+    rows, places, _ = trace_rows(seen, np.ones(9), catheter, PX, 10, np.ones((512, 512), np.bool_))
     expected = [0, 1, 2, 3, 4, -1, 5, 6, 7, 8]
     (row,) = np.flatnonzero((rows == expected).all(axis=1))
     assert np.linalg.norm(places[row, 5] - points[5]) < 1.5 * PX
