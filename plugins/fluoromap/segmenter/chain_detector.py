@@ -250,7 +250,7 @@ class ChainDetector:
         weights, variance = self._evidence(proposed.probability), proposed.variance_px2
         possible = possible_chains(points, weights, variance, shaft_image, families, slack=_COMPANION_SLACK)
         possible = self._without_shorter_catheters(possible, points, seen, families)
-        possible = _with_whole_places(possible, points, families, len(points) - halves, halves)
+        possible = with_whole_places(possible, points, families, len(points) - halves, halves)
         linked = best_chains(possible, points, families, self.px_per_mm)
         if self._is_complete(linked, weights):
             return _Linking(points, len(points), possible, self._with_clearer_electrodes(linked, possible, weights))
@@ -282,7 +282,7 @@ class ChainDetector:
             completed.rows,
         )
         possible = self._without_shorter_catheters(possible, completed.points_uv, seen, families)
-        possible = _with_whole_places(possible, completed.points_uv, families, len(points) - halves, halves)
+        possible = with_whole_places(possible, completed.points_uv, families, len(points) - halves, halves)
         linked = best_chains(possible, completed.points_uv, families, self.px_per_mm, len(points), completed.is_merged)
         clearer = self._with_clearer_electrodes(linked, possible, completed.weights)
         return _Linking(completed.points_uv, len(points), possible, clearer, completed.is_merged)
@@ -644,7 +644,7 @@ def _away(points_uv: Array, from_uv: Array) -> Array:
     return nearest
 
 
-def _with_whole_places(
+def with_whole_places(
     possible: PossibleChains, points_uv: Array, families: Sequence[CatheterFamily], first_half: int, halves: int
 ) -> PossibleChains:
     """Return the chains that show at least four separate places.

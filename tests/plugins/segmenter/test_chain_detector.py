@@ -9,9 +9,10 @@ from scipy.ndimage import maximum_filter
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.segmenter.acceptance import UNSEEN, ScoreLimits
-from fluoromap.segmenter.chain_detector import ChainDetector
+from fluoromap.segmenter.chain_detector import ChainDetector, with_whole_places
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
+from fluoromap.segmenter.linking import PossibleChains, best_chains, catheter_families
 from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds
 
 PX = 4.0
@@ -473,3 +474,17 @@ def test_predicted_electrodes_are_no_places_beside_those_of_split_pairs(missing)
     image = drawn([row])
     found = detector.split_pairs(detector.search(image)).entry(0).chains
     assert any(lies_on(chain, row) for chain in found) == (missing == 0)
+
+
+def test_a_pair_s_halves_are_preferred_to_one_of_them_and_the_whole():
+    families = catheter_families(Catalogue((catheter_type("decapolar-2-5-2", "cs"),), None, "cs"))
+    catheter = row_of("cs", (60, 60), 0.4, shortened=0.5)
+    # Nine candidates, the first of them split in two.
+    points = np.concatenate([catheter[:1], catheter[2:], catheter[:2] + 0.5])
+    both, whole_and_half = [9, 10, *range(1, 9)], [0, 10, *range(1, 9)]
+    possible = PossibleChains((np.array([both, whole_and_half]),), (np.array([2.0, 2.5]),))
+    priced = with_whole_places(possible, points, families, 9, 2)
+    (chosen,) = best_chains(priced, points, families, PX)
+    assert chosen.candidates == tuple(both)
+    weak = replace(possible, scores=(np.array([2.0, -3.0]),))
+    assert len(with_whole_places(weak, points, families, 9, 2).rows[0]) == 1

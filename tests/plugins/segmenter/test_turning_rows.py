@@ -6,8 +6,10 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
 from fluoromap.segmenter.chain_fitting import widen_covariance
+from fluoromap.segmenter.field_mask import are_in
 from fluoromap.segmenter.linking import PossibleChains, ShaftImage, best_chains, catheter_families, possible_chains
 from fluoromap.segmenter.long_catheters import trace_rows
+from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.row_shape import next_place, place_covariance_mm2, row_fit, smooth_places
 
 PX = 3.5
@@ -150,3 +152,49 @@ def test_electrodes_of_a_turning_row_that_lie_at_one_place_are_less_certain(gap_
     sd = np.sqrt(widen_covariance(chain, [], PX)[:, 0, 0])
     assert (sd[4] > 1.5) == (gap_px < 1.0)
     np.testing.assert_allclose(np.delete(sd, [4, 5]), np.sqrt(0.1))
+
+
+def test_an_end_that_another_electrode_covers_is_no_end():
+    row = turning_row(CATHETER.arc_lengths_mm[-1] - 1.0)
+    _, _, covered = trace_rows(row[:9], np.ones(9), CATHETER, PX, 40, EVERYWHERE)
+    assert (covered[:, [0, -1]] < 0).all()
+
+
+def test_what_speaks_for_a_candidate_counts_once():
+    row = turning_row(20.0)
+    closest = int(np.argmin(np.linalg.norm(np.diff(row, axis=0), axis=1)))
+    weights = np.full(10, 2.0)
+    weights[closest + 1] = -1.0
+    (best, *_), _, _ = trace_rows(row, weights, CATHETER, PX, 40, EVERYWHERE)
+    assert set(best.tolist()) == set(range(10))
+
+
+def test_electrodes_without_a_candidate_have_their_price_in_the_field_only():
+    catalogue = Catalogue((CATHETER, catheter_type("ablation-4", "ablation")), "cs", "ablation")
+    families = catheter_families(catalogue)
+
+    def gained(candidates, inside=EVERYWHERE):
+        count = len(candidates)
+        completed = complete_chains(
+            candidates, np.ones(count), np.full(count, 0.3), lambda at: np.zeros(len(at)), -0.9, families, PX, inside
+        )
+        rows = completed.rows[0]
+        complete = rows[np.isin(np.arange(count), rows).all() & ((rows < count).sum(axis=1) == count)]
+        predicted = complete[complete >= count]
+        return completed.weights[predicted], completed.is_merged[predicted], completed.points_uv[predicted]
+
+    row = straight_row()
+    weights, is_merged, _ = gained(np.delete(row, 4, axis=0))
+    assert (weights[~is_merged] == -1.0).all()
+    assert len(weights[~is_merged])
+    cut = EVERYWHERE.copy()
+    cut[:, int(row[6, 0]) :] = False
+    weights, is_merged, places = gained(row[:6], cut)
+    expected = np.where(are_in(cut, places), -1.0, 0.0)
+    assert np.array_equal(weights[~is_merged], expected[~is_merged])
+    assert (expected == 0.0).any()
+    turning = turning_row(20.0)
+    closest = int(np.argmin(np.linalg.norm(np.diff(turning, axis=0), axis=1)))
+    weights, is_merged, _ = gained(np.delete(turning, closest + 1, axis=0))
+    assert (weights[is_merged] < -1.0).all()
+    assert is_merged.any()
