@@ -194,9 +194,8 @@ def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) ->
     """
     covariance = chain.covariance_px2
     if len(chain.electrodes) >= TURNING_ELECTRODES:
-        apart = np.linalg.norm(chain.pixels_uv[:, None] - chain.pixels_uv, axis=2) + _MERGED_MM * px_per_mm * np.eye(
-            len(chain.electrodes)
-        )
+        apart = np.linalg.norm(chain.pixels_uv[:, None] - chain.pixels_uv, axis=2)
+        np.fill_diagonal(apart, np.inf)
         merged = np.maximum(1.0 - apart.min(axis=1) / (_MERGED_MM * px_per_mm), 0.0)
         covariance = covariance + ((_MERGED_SD_MM * px_per_mm * merged) ** 2)[:, None, None] * np.eye(2)
     if not others:

@@ -24,13 +24,13 @@ from fluoromap.segmenter.refinement import predict_on_curve
 
 _LEAST_KNOWN = 3
 _INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM, _MERGED_SD_MM = 0.4, 0.7, 0.9, 0.5
-_TRACED_EVIDENCE, _MERGED_EVIDENCE = (-2.0, -1.0), -1.5
+_TRACED_LEAST, _TRACED_PRICE, _MERGED_EVIDENCE = -1.0, 1.0, -1.5
 _MOST, _MOST_ROWS = 100, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompletedChains:
-    """Chains of candidates with one predicted electrode each.
+    """Chains of candidates with predicted electrodes: one each, or a few of many.
 
     points_uv, weights, variance_px2 : the candidates, then the predicted electrodes.
     rows : for each family, the indices of its chains from the tip on, (n, electrodes).
@@ -104,7 +104,8 @@ def complete_chains(
             if electrodes >= MANY_ELECTRODES:
                 # The electrodes on both sides vouch for the place; what shows there may be another catheter.
                 is_merged = chains.merged >= 0
-                traced = np.where(are_in(inside, chains.places_uv), np.clip(dark - 1.0, *_TRACED_EVIDENCE), 0.0)
+                price = _TRACED_PRICE * are_in(inside, chains.places_uv)
+                traced = np.clip(dark, _TRACED_LEAST, 0.0) - price
                 dark = np.where(is_merged, _MERGED_EVIDENCE, traced)
                 sd = np.where(is_merged, _MERGED_SD_MM, _TRACED_SD_MM)
                 row = chains.rows.copy()

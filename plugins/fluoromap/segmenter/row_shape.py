@@ -26,7 +26,8 @@ _STEP_MM = 0.1
 def place_covariance_mm2(spacing_mm: tuple[float, ...], curvature_per_mm: float) -> Array:
     """Return the covariance of one coordinate of the electrodes' places, (electrodes, electrodes).
 
-    The first electrode lies at 0. Spacings are those from the tip on.
+    The first electrode lies at 0. Spacings are those from the tip on. A loop has the curvature of its circle: its direction turns
+    by that on the way, whatever side it is seen from.
     """
     arc = np.concatenate([[0.0], np.cumsum(spacing_mm)])
     steps = np.arange(0.0, arc[-1], _STEP_MM) + 0.5 * _STEP_MM

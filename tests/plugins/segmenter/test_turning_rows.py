@@ -122,11 +122,7 @@ def test_the_turn_of_a_row_does_not_cost_its_score():
         possible = possible_chains(
             row, np.ones(10), np.full(10, 0.3), ShaftImage(image, 1, 0.05, PX), families, slack=20.0
         )
-        (scores,) = (
-            of_family[(rows == np.arange(10)).all(axis=1)]
-            for rows, of_family in zip(possible.rows[:1], possible.scores[:1], strict=True)
-        )
-        return float(scores[0])
+        return float(possible.scores[0][(possible.rows[0] == np.arange(10)).all(axis=1)][0])
 
     assert score(turning_row(20.0)) > score(straight_row()) - 6.0
 
