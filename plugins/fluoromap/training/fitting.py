@@ -48,6 +48,8 @@ def fit(
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(True)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    # A processor without bfloat16 takes seven times as long for it as for single precision.
+    fast_halves = device.type == "cuda" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     network: ElectrodeNetwork = ElectrodeNetwork().to(device, memory_format=torch.channels_last)
     averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=_DECAY)
@@ -61,7 +63,7 @@ def fit(
             for group in optimiser.param_groups:
                 group["lr"] = _rate(step, last_step)
             inputs = pictures.to(device, memory_format=torch.channels_last)
-            with torch.autocast(device.type, torch.bfloat16):
+            with torch.autocast(device.type, torch.bfloat16, enabled=fast_halves):
                 answer = network(inputs)
             parts = losses(answer.float(), targets.to(device))
             optimiser.zero_grad()

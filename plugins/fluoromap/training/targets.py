@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -55,28 +56,37 @@ def training_pair(random: Generator, prepared: Prepared) -> tuple[Image, Image]:
 
 
 def _targets(scene: Scene, places: NDArray[np.float64], cells: int) -> Image:
+    return _drawn_targets(places / CELL_PX, scene.tip.astype(np.float64), scene.clearness >= CLEAR, cells)
+
+
+@numba.njit(cache=True, nogil=True)
+def _drawn_targets(
+    places: NDArray[np.float64], tips: NDArray[np.float64], clear: NDArray[np.bool_], cells: int
+) -> Image:
     target = np.zeros((5, cells, cells), np.float32)
     unknown = np.zeros((cells, cells), np.bool_)
     closest = np.full((cells, cells), np.inf)
-    for (a, b), tip, clearness in zip(places / CELL_PX, scene.tip, scene.clearness, strict=True):
-        u0, u1, v0, v1 = max(int(a) - 3, 0), min(int(a) + 5, cells), max(int(b) - 3, 0), min(int(b) + 5, cells)
-        if u0 >= u1 or v0 >= v1:
-            continue
-        du, dv = a - np.arange(u0, u1), (b - np.arange(v0, v1))[:, None]
-        squares = du**2 + dv**2
-        if clearness < CLEAR:
-            unknown[v0:v1, u0:u1] |= squares < _UNKNOWN_WITHIN
-            continue
-        part = target[:, v0:v1, u0:u1]
-        np.maximum(part[0], np.exp(-0.5 * squares / _HEAT_SD_CELLS**2), out=part[0])
-        own = (squares < closest[v0:v1, u0:u1]) & (squares < _OFFSETS_WITHIN)
-        closest[v0:v1, u0:u1][own] = squares[own]
-        part[1][own] = np.broadcast_to(du, own.shape)[own]
-        part[2][own] = np.broadcast_to(dv, own.shape)[own]
-        part[3][own] = tip
-        part[4][own] = 1.0
-        row, column = round(float(b)), round(float(a))
-        if 0 <= row < cells and 0 <= column < cells:
+    for electrode in range(len(places)):
+        a, b = places[electrode]
+        for v in range(max(int(b) - 3, 0), min(int(b) + 5, cells)):
+            for u in range(max(int(a) - 3, 0), min(int(a) + 5, cells)):
+                square = (a - u) ** 2 + (b - v) ** 2
+                if not clear[electrode]:
+                    unknown[v, u] |= square < _UNKNOWN_WITHIN
+                    continue
+                heat = np.float32(math.exp(-0.5 * square / _HEAT_SD_CELLS**2))
+                target[0, v, u] = max(target[0, v, u], heat)
+                if square < closest[v, u] and square < _OFFSETS_WITHIN:
+                    closest[v, u] = square
+                    target[1, v, u] = a - u
+                    target[2, v, u] = b - v
+                    target[3, v, u] = tips[electrode]
+                    target[4, v, u] = 1.0
+        row, column = round(b), round(a)
+        if clear[electrode] and 0 <= row < cells and 0 <= column < cells:
             target[0, row, column] = 1.0
-    target[0][unknown & (target[0] < 0.3)] = -1.0
+    for v in range(cells):
+        for u in range(cells):
+            if unknown[v, u] and target[0, v, u] < 0.3:
+                target[0, v, u] = -1.0
     return target
