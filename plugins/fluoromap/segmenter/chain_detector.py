@@ -62,6 +62,7 @@ _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
 _EXCHANGED = 2
+_PAIR = 2
 _LEAST_PLACES, _TWICE = 4, 3.0
 _SAME_PLACE_MM = 1.0
 
@@ -435,22 +436,31 @@ class ChainDetector:
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
         odds_of_free, odds, *odds_of_chains = answers_for_each(seen.kind_odds_at, places)
-        listed = np.zeros(len(chains), np.bool_)
-        for index, (chain, own) in enumerate(zip(chains, odds_of_chains, strict=True)):
+        listed = np.ones(len(chains), np.bool_)
+        # What is no catheter of the catalogue explains nothing in the line of a shorter chain.
+        for index in sorted(range(len(chains)), key=lambda one: -len(chains[one].electrodes)):
+            chain, own = chains[index], odds_of_chains[index]
             family = self.family_of(chain)
             is_seen = chain.scores > UNSEEN
             if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
+                listed[index] = False
                 continue
             onwards = EVEN_ODDS
             own = own[is_seen]
             if len(chain.electrodes) >= MANY_ELECTRODES:
-                like = onwards = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
+                like = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
+                onwards = min(like, _MOST_EXCUSED)
             else:
                 like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
-            long_ones = [other for other in chains if other is not chain and len(other.electrodes) >= MANY_ELECTRODES]
+            long_ones = [
+                other
+                for other, kept in zip(chains, listed, strict=True)
+                if kept and other is not chain and len(other.electrodes) >= MANY_ELECTRODES
+            ]
             row = not_on(proposed.points_uv[odds >= onwards], long_ones, self.px_per_mm)
             sure, alike = free[odds_of_free >= EVEN_ODDS], free[odds_of_free >= like]
-            unexplained = sure, alike, row
+            pair = free[odds_of_free >= max(float(own.min()) - _CLEARLY_LESS, _MOST_EXCUSED)]
+            unexplained = sure, alike, row, pair
             crossings = len(own) // _FOR_ONE_CROSSING if own.min() >= _NO_ELECTRODE else 0
             listed[index] = self._explains(chain, family.catheter, crossings, *unexplained)
             if not listed[index]:
@@ -459,7 +469,7 @@ class ChainDetector:
         return listed
 
     def _explains(
-        self, chain: Chain, catheter: Catheter, crossings: int, sure: Array, alike: Array, row: Array
+        self, chain: Chain, catheter: Catheter, crossings: int, sure: Array, alike: Array, row: Array, pair: Array
     ) -> bool:
         """Return whether a chain leaves no electrodes of its catheter unexplained.
 
@@ -472,6 +482,7 @@ class ChainDetector:
             2 * between < len(chain.electrodes)
             and not (between > crossings and unexplained_between(chain, alike, catheter, self.px_per_mm))
             and not continues(chain, row, catheter, self.px_per_mm)
+            and not continues(chain, pair, catheter, self.px_per_mm, _PAIR)
         )
 
     def _not_crossed(self, points_uv: Array, chain: Chain, seen: ImageEvidence) -> Array:

@@ -19,8 +19,10 @@ EVEN_ODDS = 0.0
 _OWN_MM = 1.2
 _BESIDE_MM = 1.0
 _ROW_CONTINUES = 3
-_LEAST_COSINE = 0.88
+_LEAST_COSINE = 0.85
 _LONGEST_STEP = 1.25
+_TURNS_ON = 0.75
+"""How far a row turns to the next electrodes, as a share of the turn between its halves."""
 _ROW, _ROW_STEP_MM = 4, 10.0
 
 
@@ -73,10 +75,19 @@ def continues(
     step = _LONGEST_STEP * max(catheter.spacing_mm) * seen / sum(catheter.spacing_mm)
     for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
         before = row[-3] if len(row) > 2 else row[-2]
-        count = _count_onwards(row[-1], before, free, step)
-        if count >= least:
-            return True
+        for origin in (before, _before_turn(row)):
+            if _count_onwards(row[-1], origin, free, step) >= least:
+                return True
     return False
+
+
+def _before_turn(row: Array) -> Array:
+    """Return a point before the end of a row (n, 2) that turns on as it does, so that the row goes on in line with both."""
+    half = (len(row) + 1) // 2
+    first, last = ((points[-1] - points[0]) @ np.array([1.0, 1.0j]) for points in (row[:half], row[-half:]))
+    turned = last * np.exp(1j * _TURNS_ON * np.angle(last / first)) if first else last
+    point: Array = row[-1] - np.array([turned.real, turned.imag])
+    return point
 
 
 def shows_row(points_uv: Array, px_per_mm: float) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fluoromap.contracts import Array, Chain, IntArray
+from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
@@ -62,6 +62,9 @@ _LEAST_BESIDE_HIDDEN = 8
 """Electrodes that a long row shows beside a pair that something hides, as an echo probe does."""
 _NOTHING, _BELOW_OTHERS = -1.0, 3.5
 """Log-odds of a place without an electrode in a long row, in both means: below this, and so far below the middle electrode."""
+_MOST_BLANK, _FOR_ONE_BLANK, _BLANK_DEPTH = 1, 5, 0.35
+"""Places of a track that may show nothing, or one for each five electrodes, and the depth below which they show nothing, as a share
+of the darker electrodes' depth. The mean of all frames may blur what lies there until it looks like electrodes."""
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
@@ -194,11 +197,13 @@ class TrackEvidence:
             return odds
 
         pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
-        is_loop = _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
+        is_loop = len(usual) >= MANY_ELECTRODES and _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
         odds = np.array([odds_of(sections) for sections in pictures])
         depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
         on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES) or ends_on_coil(depths, odds.mean(axis=0))
         if not is_loop and (_is_probe(pictures) or on_line):
+            return Verdict(False)
+        if _count_blank(depths, odds.mean(axis=0), inside) > max(_MOST_BLANK, len(usual) // _FOR_ONE_BLANK):
             return Verdict(False)
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
         tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
@@ -351,6 +356,16 @@ def _are_electrodes(odds: Array, least_still: float | None, waits: bool) -> bool
         return False
     worst = np.quantile(odds, _LOW_QUANTILE, method="lower")
     return bool(worst >= _LEAST_LOW or np.clip(odds, *_COUNTED).mean() >= _LEAST_MEAN)
+
+
+def _count_blank(depths: Sequence[Array], odds: Array, inside: BoolArray) -> int:
+    """Return how many places of a track neither are dark nor look like electrodes to the network.
+
+    odds : of the places ``inside`` the field.
+    """
+    depth = np.concatenate([section[::2, 0] for section in depths])[inside]
+    dark = np.median(np.sort(depth)[len(depth) // 2 :])
+    return int(np.count_nonzero((depth < _BLANK_DEPTH * dark) & (odds < _NOTHING)))
 
 
 def _are_of_long_catheter(odds: Array, middle: float) -> bool:
