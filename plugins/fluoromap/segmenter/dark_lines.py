@@ -15,6 +15,10 @@ from fluoromap.segmenter.linking import ShaftImage
 
 _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
 """Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""
+_FAN_RAD, _BEYOND_MM, _SAMPLES = np.deg2rad(np.linspace(-24.0, 24.0, 9)), (4.5, 8.0), 8
+"""Directions of lines beyond a chain's ends, and where they are measured: past half of the longest tip."""
+_GOES_ON = 0.45
+"""Depth of a line beyond a chain, as a share of the electrodes' depth."""
 _LEAST_GAPS = 2
 _SOLID, _JOINED = 1.3, 0.45
 """Depth of the gap within a doubted pair and of the gap beside it, as shares of the electrodes' depth."""
@@ -44,6 +48,35 @@ def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
     along[1::2] = ways
     along[::2] = np.concatenate([ways[:1], ways[1:] + ways[:-1], ways[-1:]])
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    return _depths_at(places, along, shaft_image)
+
+
+def depths_beyond(chain_uv: Array, shaft_image: ShaftImage) -> Array:
+    """Return how dark the darkest line is that goes on beyond each end of a chain.
+
+    Parameters
+    ----------
+    chain_uv : (electrodes, 2)
+        Pixels.
+    shaft_image : ShaftImage
+
+    Returns
+    -------
+    (2,)
+        Before the tip and behind the last electrode: the sum of both :func:`depths_along`, the median of places along the line.
+    """
+    ends, ways = chain_uv[[0, -1]], chain_uv[[0, -1]] - chain_uv[[1, -2]]
+    angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
+    along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[:, :, None]
+    steps = np.linspace(*_BEYOND_MM, _SAMPLES)[:, None] * shaft_image.px_per_mm
+    places = ends[:, None, None] + along * steps
+    depths = _depths_at(places.reshape(-1, 2), np.broadcast_to(along, places.shape).reshape(-1, 2), shaft_image)
+    darkest: Array = np.median(depths.sum(axis=1).reshape(places.shape[:3]), axis=2).max(axis=1)
+    return darkest
+
+
+def _depths_at(places: Array, along: Array, shaft_image: ShaftImage) -> Array:
+    """Return the depths of a line and of what lies beside it at places (n, 2) with these directions."""
     across_px = np.stack([-along[:, 1], along[:, 0]], axis=1) * shaft_image.px_per_mm
     left = [*_BESIDE_MM, *_AROUND_MM]
     offsets_mm = np.array([*_ON_MM, *left, *(-mm for mm in left)])
@@ -113,6 +146,22 @@ def is_dark_line(depths: Sequence[Array], odds: Array, limits: DarkLineLimits) -
         return False
     electrodes = _depth_of_electrodes(depths)
     return electrodes > 0 and min(float(section.min()) for section in gaps) >= limits.thinnest * electrodes
+
+
+def goes_on(depths: Sequence[Array], beyond: Array) -> bool:
+    """Return whether a chain is a part of a line, as a cable or a guide wire, that goes on beyond both of its ends.
+
+    No shaft leaves a catheter's tip, and few lines cross there in the catheter's direction.
+
+    Parameters
+    ----------
+    depths : sequence of (2 electrodes - 1, 2)
+        Of the chain or of its sections, see :func:`depths_along`.
+    beyond : (2,)
+        See :func:`depths_beyond`.
+    """
+    electrodes = _depth_of_electrodes(depths)
+    return electrodes > 0 and float(beyond.min()) >= _GOES_ON * electrodes
 
 
 def ends_on_coil(depths: Sequence[Array], odds: Array) -> bool:

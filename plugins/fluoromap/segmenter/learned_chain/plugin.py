@@ -86,7 +86,13 @@ class LearnedChain:
         judge = (
             None
             if alone
-            else TrackEvidence(trained, run.px_per_mm, run.frame_times_ms, names_with_long_tips(catalogue))
+            else TrackEvidence(
+                trained,
+                run.px_per_mm,
+                run.frame_times_ms,
+                names_with_long_tips(catalogue),
+                frozenset(catheter.name for catheter in catalogue.catheters if catheter.is_circular),
+            )
         )
         found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)
         return visible_part(found, _DIM_BELOW)

@@ -17,7 +17,15 @@ from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.dark_lines import DarkLineLimits, depths_along, ends_on_coil, gap_share, is_dark_line
+from fluoromap.segmenter.dark_lines import (
+    DarkLineLimits,
+    depths_along,
+    depths_beyond,
+    ends_on_coil,
+    gap_share,
+    goes_on,
+    is_dark_line,
+)
 from fluoromap.segmenter.gaussian_blur import gaussian
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
@@ -152,6 +160,7 @@ class SectionOdds:
     across: Array
     depths: Array
     shafts: Array
+    beyond: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -159,12 +168,14 @@ class TrackEvidence:
     """Judge of the tracks of one run.
 
     frame_times_ms : (frames,) of the run. long_tips : names of the catheters whose tips are longer than rings for certain.
+    circular : names of the circular ones.
     """
 
     trained: Trained
     px_per_mm: float
     frame_times_ms: Array
     long_tips: frozenset[str] = frozenset()
+    circular: frozenset[str] = frozenset()
     _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
 
     def __call__(
@@ -203,10 +214,14 @@ class TrackEvidence:
         on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES) or ends_on_coil(depths, odds.mean(axis=0))
         if not is_loop and (_is_probe(pictures) or on_line):
             return Verdict(False)
+        beyond = np.mean([(sections[0].beyond[0], sections[-1].beyond[1]) for sections in pictures], axis=0)
+        if not self._is_likely(chains, self.circular) and goes_on(depths, beyond):
+            return Verdict(False)
         if _count_blank(depths, odds.mean(axis=0), inside) > max(_MOST_BLANK, len(usual) // _FOR_ONE_BLANK):
             return Verdict(False)
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
-        tip_odds = None if is_loop or self._has_long_tip(chains) else _tip_odds(pictures)
+        # Of a long tip single frames show which end it is.
+        tip_odds = None if is_loop or self._is_likely(chains, self.long_tips) else _tip_odds(pictures)
         is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
         waits = still and self._is_waiting(paths)
         worst_still = None
@@ -240,14 +255,9 @@ class TrackEvidence:
         may_be_hidden = bool(self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst)
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
 
-    def _has_long_tip(self, chains: Mapping[int, Chain]) -> bool:
-        """Return whether a track is likely a catheter with a long tip.
-
-        Its single frames show which end is the tip.
-        """
-        probabilities = [
-            probability for chain in chains.values() for name, probability in chain.kinds if name in self.long_tips
-        ]
+    def _is_likely(self, chains: Mapping[int, Chain], names: frozenset[str]) -> bool:
+        """Return whether a track is likely one of these catheters."""
+        probabilities = [probability for chain in chains.values() for name, probability in chain.kinds if name in names]
         return math.fsum(probabilities) >= _LIKELY * len(chains)
 
     def _least(self, path_uv: Array, least: _Least, gaps: float) -> float:
@@ -304,7 +314,8 @@ class TrackEvidence:
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
         odds = log_odds(seen.shares_at(middle - first))
-        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), shafts_at_ends(chain_uv, shafts))
+        ends = shafts_at_ends(chain_uv, shafts)
+        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), ends, depths_beyond(chain_uv, shafts))
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
