@@ -14,6 +14,7 @@ from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
 from fluoromap.segmenter.linking import PossibleChains, best_chains, catheter_families
 from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds
+from fluoromap.segmenter.unlisted import continues
 
 PX = 4.0
 SIZE = 360
@@ -164,6 +165,45 @@ def test_electrodes_of_a_long_catheter_in_its_line_do_not_make_a_short_chain_unl
     points = np.concatenate([ablation, cs])
     found = chains_found(drawn([ablation, cs]), points, [0.99] * 14, [0.9] * 14)
     assert sorted(len(chain.electrodes) for chain in found) == [4, 10]
+
+
+def test_a_row_that_the_catalogue_does_not_list_is_not_two_catheters_end_to_end():
+    catalogue = Catalogue(
+        (catheter_type("hexapolar-2-5-2", "cs"), catheter_type("quadripolar-2-5-2", "his")), "cs", "his"
+    )
+    row = row_of("cs", (60, 60), 0.4)
+    evidence = Evidence(drawn([row]), row, [0.99] * 10, [0.9] * 10)
+    assert detector_of(evidence, catalogue).search(evidence.smooth).entry(0).chains == ()
+
+
+@pytest.mark.parametrize(("second", "listed"), [(0.9, False), (0.6, True)])
+def test_a_short_chain_is_a_part_of_a_catheter_with_one_more_pair_as_sure_as_its_own_electrodes(second, listed):
+    arc_mm = catheter_type("hexapolar-2-5-2", "his").arc_lengths_mm
+    row = np.array([60.0, 60.0]) + np.outer(arc_mm * PX * 0.9, [np.cos(0.3), np.sin(0.3)])
+    catalogue = Catalogue((catheter_type("quadripolar-2-5-2", "his"),), None, "his")
+    evidence = Evidence(drawn([row]), row, [0.9] * 5 + [second], [0.9] * 6)
+    chains = detector_of(evidence, catalogue).search(evidence.smooth).entry(0).chains
+    assert bool(chains) == listed
+
+
+@pytest.mark.parametrize(("more", "listed"), [(0.75, False), (0.7, True)])
+def test_a_long_chain_in_a_longer_row_is_unlisted_where_the_others_are_sure_too(more, listed):
+    row = row_of("cs", (60, 60), 0.4)
+    catalogue = Catalogue((catheter_type("hexapolar-2-5-2", "cs"),), None, "cs")
+    evidence = Evidence(drawn([row]), row, [0.97] * 6 + [more] * 4, [0.9] * 10)
+    chains = detector_of(evidence, catalogue).search(evidence.smooth).entry(0).chains
+    assert any(lies_on(chain, row[:6]) for chain in chains) == listed
+
+
+def test_a_part_of_a_loop_is_a_part_of_a_longer_row():
+    angles = np.deg2rad([0.0, 12.0, 42.0, 54.0, 84.0, 96.0, 126.0, 138.0])
+    loop = 180.0 + 12.0 * PX * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    numbers, covariance = (1, 2, 3, 4), np.tile(np.eye(2), (4, 1, 1))
+    chain = Chain(numbers, loop[:4], covariance, np.ones(4), (("his", 1.0),))
+    his = catheter_type("quadripolar-2-5-2", "his")
+    assert continues(chain, loop, his, PX)
+    aside = loop[3] + np.outer(np.arange(1, 5) * 4.0 * PX, [np.cos(0.9), np.sin(0.9)])
+    assert not continues(chain, aside, his, PX)
 
 
 @pytest.mark.parametrize(("hidden", "found"), [(slice(8, 10), True), (slice(4, 6), True), (slice(7, 10), False)])

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from fluoromap.segmenter.dark_lines import IN_FRAME, depths_along, ends_on_coil, gap_share, is_dark_line
+from fluoromap.segmenter.dark_lines import (
+    IN_FRAME,
+    depths_along,
+    depths_beyond,
+    ends_on_coil,
+    gap_share,
+    goes_on,
+    is_dark_line,
+)
 from fluoromap.segmenter.linking import ShaftImage
 
 PX_PER_MM = 3.2
@@ -117,3 +125,34 @@ def test_only_chains_of_four_may_be_the_ends_of_a_lead():
     depths = np.ones((2 * 5 - 1, 2))
     assert not ends_on_coil([depths], np.array([0.0, 0.0, 3.0, 3.0, 3.0]))
     assert not ends_on_coil([np.zeros((7, 2))], np.array([0.0, 0.0, 3.0, 3.0]))
+
+
+@pytest.mark.parametrize(
+    ("line", "first_mm", "last_mm", "part_of_line"),
+    [(0.6, -12.0, 27.0, True), (0.6, 0.0, 27.0, False), (0.6, -12.0, 15.0, False), (0.3, -12.0, 27.0, False)],
+)
+def test_a_cable_goes_on_beyond_both_ends_and_a_catheter_ends_at_its_tip(line, first_mm, last_mm, part_of_line):
+    shafts = picture(1.0, line, 0.8)
+    first, last = (int(CHAIN[0, 0] + mm * PX_PER_MM) for mm in (first_mm, last_mm))
+    if first_mm == 0.0:
+        first -= 3
+    if last_mm == 15.0:
+        last += 3
+    shafts.smooth[:, :first] = shafts.smooth[:, last:] = 0.0
+    beyond = depths_beyond(CHAIN, shafts)
+    assert goes_on([depths_along(CHAIN, shafts)], beyond) == part_of_line
+    np.testing.assert_array_equal(depths_beyond(CHAIN[::-1], shafts), beyond[::-1])
+
+
+def test_a_line_beyond_an_end_may_bend():
+    v, u = np.mgrid[:120, :160].astype(float)
+    bent = 60.0 + np.tan(np.deg2rad(18.0)) * np.maximum(u - CHAIN[-1, 0], 0.0)
+    x = -0.6 * (np.abs(v - bent) <= 0.8 * PX_PER_MM)
+    shafts = ShaftImage(gaussian_filter(x, 1.0).astype(np.float32), 1, 0.1, PX_PER_MM)
+    assert depths_beyond(CHAIN, shafts).min() > 0.45
+    shafts.smooth[:70] = 0.0
+    assert depths_beyond(CHAIN, shafts).min() < 0.1
+
+
+def test_what_is_not_dark_goes_on_nowhere():
+    assert not goes_on([np.zeros((11, 2))], np.zeros(2))

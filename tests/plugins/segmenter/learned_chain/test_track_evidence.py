@@ -49,15 +49,16 @@ def accepts(judge, track, log_image):
     return judge(track, log_image).is_catheter
 
 
-def evidence(odds, shafts=(0.0, 0.0), gaps=0.0):
+def evidence(odds, shafts=(0.0, 0.0), gaps=0.0, beyond=(0.0, 0.0)):
     """Return evidence for electrodes with nothing beside them.
 
-    ``odds`` : their log-odds, (n,). ``shafts`` : at both ends. ``gaps`` : how dark they are, as a share of the electrodes' depth.
+    ``odds`` : their log-odds, (n,). ``shafts`` : at both ends. ``gaps`` and ``beyond`` both ends: how dark it is there, as a share
+    of the electrodes' depth.
     """
     beside, across = np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3))
     depths = np.zeros((2 * len(odds) - 1, 2))
     depths[::2, 0], depths[1::2, 0] = 1.0, gaps
-    return SectionOdds(odds, beside, across, depths, np.array(shafts))
+    return SectionOdds(odds, beside, across, depths, np.array(shafts), np.array(beyond))
 
 
 @pytest.mark.parametrize(("shafts", "says"), [((0.1, 0.9), 1), ((0.9, 0.1), -1), ((0.5, 0.5), 0)])
@@ -429,3 +430,46 @@ def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, be
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     assert accepts(judge, chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
     assert accepts(judge, chains(np.repeat(loop[None], FRAMES, axis=0)), lambda frame: None)
+
+
+@pytest.mark.parametrize(("beyond", "accepted"), [((0.6, 0.6), False), ((0.1, 0.6), True), ((0.6, 0.1), True)])
+def test_a_track_on_a_line_that_goes_on_beyond_both_ends_is_no_catheter_but_a_circular_one(
+    monkeypatch, beyond, accepted
+):
+    seen = evidence(np.full(5, 3.0), beyond=beyond)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: seen)
+    weights, none = read_weights(Path(SHIPPED)), frozenset()
+    row = np.stack([100.0 + 20.0 * np.arange(5), np.full(5, 200.0)], axis=1)
+    track = chains(np.repeat(row[None], FRAMES, axis=0))
+    for circular, expected in ((none, accepted), (frozenset({"reference"}), True)):
+        judge = TrackEvidence(weights, PX_PER_MM, TIMES_MS[:FRAMES], none, circular)
+        assert accepts(judge, track, lambda frame: None) == expected
+
+
+@pytest.mark.parametrize(
+    ("blank", "doubt", "accepted"), [([1, 2], -1.5, False), ([1], -1.5, True), ([1, 2], -0.5, True), ([], -1.5, True)]
+)
+def test_two_places_where_nothing_shows_are_no_electrodes_whatever_the_mean_of_all_frames_says(
+    monkeypatch, blank, doubt, accepted
+):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
+
+    def along(self, frames, path_uv, log_image):
+        seen = evidence(np.full(4, 1.5))
+        if np.ptp(frames) < FRAMES:
+            seen.log_odds[[1, 2]] = doubt
+        seen.depths[2 * np.array(blank, np.int64), 0] = 0.1
+        return seen
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(2 * FRAMES))[:, None, None] * np.array([0.0, 1.0])
+    assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
+
+
+def test_a_short_chain_that_turns_back_is_no_loop(monkeypatch):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
+    dark = evidence(np.full(4, 0.4), gaps=0.9)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: dark)
+    turned = np.array([[100.0, 200.0], [110.0, 205.0], [112.0, 213.0], [102.0, 208.0]])
+    assert not accepts(judge, chains(np.repeat(turned[None], FRAMES, axis=0)), lambda frame: None)
