@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -174,12 +175,14 @@ class ChainDetector:
         Such pairs were proposed as one electrode. The result is the image as it was searched before, where the split explains no
         more electrodes, and as many no better although a long chain had places that are clearly none.
         """
-        # Split pairs must not make a part of an unlisted catheter a listed one. A longer listed one may be what it is a part of.
+        # Split pairs must not make a part of an unlisted catheter a listed one, but a longer one that lacks may be what it is a
+        # part of.
         sure = [chain for chain in searched.found.chains if not _is_doubtful(chain, searched.seen)]
         doubtful = len(sure) < len(searched.found.chains)
-        longest = max(catheter.electrodes for catheter in self.catalogue.catheters)
-        is_longer = any(len(one.candidates) >= longest for one in searched.found.unlisted)
-        if (searched.found.explained >= self._electrodes and not doubtful) or is_longer:
+        missing = Counter(catheter.electrodes for catheter in self.catalogue.catheters)
+        missing -= Counter(len(chain.electrodes) for chain in searched.found.chains)
+        is_unlisted = any(len(one.candidates) >= max(missing, default=0) for one in searched.found.unlisted)
+        if (searched.found.explained >= self._electrodes and not doubtful) or is_unlisted:
             return searched
         halves = searched.seen.halves_of_pairs(self.field.candidates)
         if not len(halves):
@@ -451,10 +454,9 @@ class ChainDetector:
             own = own[is_seen]
             if len(chain.electrodes) >= MANY_ELECTRODES:
                 like = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
-                onwards, pair = min(like, _MOST_EXCUSED), free[:0]
+                onwards = min(like, _MOST_EXCUSED)
             else:
                 like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
-                pair = free[odds_of_free >= max(float(np.median(own)) - _CLEARLY_LESS, _MOST_EXCUSED)]
             long_ones = [
                 other
                 for other, kept in zip(chains, listed, strict=True)
@@ -462,6 +464,7 @@ class ChainDetector:
             ]
             row = not_on(proposed.points_uv[odds >= onwards], long_ones, self.px_per_mm)
             sure, alike = free[odds_of_free >= EVEN_ODDS], free[odds_of_free >= like]
+            pair = free[odds_of_free >= max(float(np.median(own)) - _CLEARLY_LESS, _MOST_EXCUSED)]
             unexplained = sure, alike, row, pair
             crossings = len(own) // _FOR_ONE_CROSSING if own.min() >= _NO_ELECTRODE else 0
             listed[index] = self._explains(chain, family.catheter, crossings, *unexplained)
