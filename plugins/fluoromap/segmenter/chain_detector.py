@@ -62,8 +62,7 @@ _FOR_ONE_CROSSING = 8
 _CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
 _NO_ELECTRODE = -1.0
-_EXCHANGED = 2
-_PAIR = 2
+_EXCHANGED = _PAIR = 2
 _LEAST_PLACES, _TWICE = 4, 3.0
 _SAME_PLACE_MM = 1.0
 
@@ -175,10 +174,9 @@ class ChainDetector:
         Such pairs were proposed as one electrode. The result is the image as it was searched before, where the split explains no
         more electrodes, and as many no better although a long chain had places that are clearly none.
         """
-        # Split pairs must not make a part of an unlisted catheter a listed one, but a longer one that lacks may be what it is a
-        # part of.
         sure = [chain for chain in searched.found.chains if not _is_doubtful(chain, searched.seen)]
         doubtful = len(sure) < len(searched.found.chains)
+        # Split pairs must not make a part of an unlisted catheter a listed one, unless that is longer than the part.
         missing = Counter(catheter.electrodes for catheter in self.catalogue.catheters)
         missing -= Counter(len(chain.electrodes) for chain in searched.found.chains)
         is_unlisted = any(len(one.candidates) >= max(missing, default=0) for one in searched.found.unlisted)
@@ -435,8 +433,10 @@ class ChainDetector:
         Others are part of a catheter with more electrodes than the catalogue has, or no catheter: their electrodes are places on
         parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
         dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
-        a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one. Besides, one thing
-        may cross each eight electrodes of a chain, unless it has places without an electrode, as displaced chains have.
+        a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one, if that is
+        listed. Two in the line that are nearly as probable as the chain's middle electrode are a pair of a longer catheter.
+        Besides, one thing may cross each eight electrodes of a chain, unless it has places without an electrode, as displaced
+        chains have.
         """
         free = not_on(proposed.points_uv, chains, self.px_per_mm)
         places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
@@ -479,7 +479,7 @@ class ChainDetector:
         """Return whether a chain leaves no electrodes of its catheter unexplained.
 
         crossings : how many things may cross the chain. sure, alike : proposals that no chain explains, (n, 2). row : proposals in
-        whose line the chain may be.
+        whose line the chain may be. pair : those that no chain explains and that are like its electrodes, so that two are enough.
         """
         # Those alike are among the sure ones.
         between = unexplained_between(chain, sure, catheter, self.px_per_mm)

@@ -52,7 +52,7 @@ def depths_along(chain_uv: Array, shaft_image: ShaftImage) -> Array:
 
 
 def depths_beyond(chain_uv: Array, shaft_image: ShaftImage) -> Array:
-    """Return how dark the darkest line is that goes on beyond each end of a chain.
+    """Return how dark lines are that go on beyond a chain's ends.
 
     Parameters
     ----------
@@ -63,7 +63,8 @@ def depths_beyond(chain_uv: Array, shaft_image: ShaftImage) -> Array:
     Returns
     -------
     (2,)
-        Before the tip and behind the last electrode: the sum of both :func:`depths_along`, the median of places along the line.
+        Before the tip and behind the last electrode, of the darkest line there: the sum of both :func:`depths_along`, the median of
+        places along the line.
     """
     ends, ways = chain_uv[[0, -1]], chain_uv[[0, -1]] - chain_uv[[1, -2]]
     angles = np.arctan2(ways[:, 1], ways[:, 0])[:, None] + _FAN_RAD
@@ -76,7 +77,10 @@ def depths_beyond(chain_uv: Array, shaft_image: ShaftImage) -> Array:
 
 
 def _depths_at(places: Array, along: Array, shaft_image: ShaftImage) -> Array:
-    """Return the depths of a line and of what lies beside it at places (n, 2) with these directions."""
+    """Return the depths of a line and of what lies beside it.
+
+    It has these directions (n, 2) at the places (n, 2).
+    """
     across_px = np.stack([-along[:, 1], along[:, 0]], axis=1) * shaft_image.px_per_mm
     left = [*_BESIDE_MM, *_AROUND_MM]
     offsets_mm = np.array([*_ON_MM, *left, *(-mm for mm in left)])
@@ -149,9 +153,10 @@ def is_dark_line(depths: Sequence[Array], odds: Array, limits: DarkLineLimits) -
 
 
 def goes_on(depths: Sequence[Array], beyond: Array) -> bool:
-    """Return whether a chain is a part of a line, as a cable or a guide wire, that goes on beyond both of its ends.
+    """Return whether a line goes on beyond both ends of a chain.
 
-    No shaft leaves a catheter's tip, and few lines cross there in the catheter's direction.
+    The chain is a part of it then, as of a cable or a guide wire. No shaft leaves a catheter's tip, and few lines cross there in
+    the catheter's direction.
 
     Parameters
     ----------

@@ -56,7 +56,8 @@ def continues(
 ) -> bool:
     """Return whether points go on in the chain's line beyond an end.
 
-    ``least`` or more points are needed, no farther apart than the chain's electrodes are.
+    ``least`` or more points are needed, no farther apart than the chain's electrodes are. The line may be straight, or turn on as
+    the chain does: electrodes of a loop lie on a circle.
 
     Parameters
     ----------
@@ -82,7 +83,10 @@ def continues(
 
 
 def _before_turn(row: Array) -> Array:
-    """Return a point before the end of a row (n, 2) that turns on as it does, so that the row goes on in line with both."""
+    """Return a point before the end of a row (n, 2).
+
+    A line through both goes on beyond the row as the row turns.
+    """
     half = (len(row) + 1) // 2
     first, last = ((points[-1] - points[0]) @ np.array([1.0, 1.0j]) for points in (row[:half], row[-half:]))
     turned = last * np.exp(1j * _TURNS_ON * np.angle(last / first)) if first else last

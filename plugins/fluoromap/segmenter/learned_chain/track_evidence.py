@@ -152,7 +152,8 @@ class SectionOdds:
 
     log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
     distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`. shafts : see
-    :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`.
+    :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`. beyond : see
+    :func:`~fluoromap.segmenter.dark_lines.depths_beyond`.
     """
 
     log_odds: Array
@@ -370,9 +371,9 @@ def _are_electrodes(odds: Array, least_still: float | None, waits: bool) -> bool
 
 
 def _count_blank(depths: Sequence[Array], odds: Array, inside: BoolArray) -> int:
-    """Return how many places of a track neither are dark nor look like electrodes to the network.
+    """Return at how many places of a track nothing shows.
 
-    odds : of the places ``inside`` the field.
+    They are not dark, and the network denies them. odds : of the places ``inside`` the field.
     """
     depth = np.concatenate([section[::2, 0] for section in depths])[inside]
     dark = np.median(np.sort(depth)[len(depth) // 2 :])
