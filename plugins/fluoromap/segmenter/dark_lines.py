@@ -17,8 +17,8 @@ _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4,
 """Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""
 _FAN_RAD, _BEYOND_MM, _SAMPLES = np.deg2rad(np.linspace(-24.0, 24.0, 9)), (4.5, 8.0), 8
 """Directions of lines beyond a chain's ends, and where they are measured: past half of the longest tip."""
-_GOES_ON = 0.45
-"""Depth of a line beyond a chain, as a share of the electrodes' depth."""
+_GOES_ON, _LIGHT = 0.45, -0.25
+"""Depth of a line beyond a chain, and of a gap that is clearly no part of it, as shares of the electrodes' depth."""
 _LEAST_GAPS = 2
 _SOLID, _JOINED = 1.3, 0.45
 """Depth of the gap within a doubted pair and of the gap beside it, as shares of the electrodes' depth."""
@@ -155,8 +155,8 @@ def is_dark_line(depths: Sequence[Array], odds: Array, limits: DarkLineLimits) -
 def goes_on(depths: Sequence[Array], beyond: Array) -> bool:
     """Return whether a line goes on beyond both ends of a chain.
 
-    The chain is a part of it then, as of a cable or a guide wire. No shaft leaves a catheter's tip, and few lines cross there in
-    the catheter's direction.
+    The chain is a part of it then, as of a cable or a guide wire, if none of its gaps is clear. No shaft leaves a catheter's tip,
+    and few lines cross there in the catheter's direction.
 
     Parameters
     ----------
@@ -166,7 +166,8 @@ def goes_on(depths: Sequence[Array], beyond: Array) -> bool:
         See :func:`depths_beyond`.
     """
     electrodes = _depth_of_electrodes(depths)
-    return electrodes > 0 and float(beyond.min()) >= _GOES_ON * electrodes
+    is_line = electrodes > 0 and min(float(section.min()) for section in _depths_of_gaps(depths)) >= _LIGHT * electrodes
+    return is_line and float(beyond.min()) >= _GOES_ON * electrodes
 
 
 def ends_on_coil(depths: Sequence[Array], odds: Array) -> bool:

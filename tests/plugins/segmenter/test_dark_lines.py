@@ -154,5 +154,13 @@ def test_a_line_beyond_an_end_may_bend():
     assert depths_beyond(CHAIN, shafts).min() < 0.1
 
 
+def test_a_clear_gap_is_no_part_of_the_line_beyond_both_ends():
+    shafts = picture(1.0, 0.6, 0.8)
+    depths, beyond = depths_along(CHAIN, shafts), depths_beyond(CHAIN, shafts)
+    assert goes_on([depths], beyond)
+    depths[5] = -0.2
+    assert not goes_on([depths], beyond)
+
+
 def test_what_is_not_dark_goes_on_nowhere():
     assert not goes_on([np.zeros((11, 2))], np.zeros(2))
