@@ -48,7 +48,7 @@ def fit(
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(True)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    # A processor without bfloat16 takes seven times as long for it as for single precision.
+    # A processor without bfloat16 takes several times as long for it as for single precision.
     fast_halves = device.type == "cuda" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     network: ElectrodeNetwork = ElectrodeNetwork().to(device, memory_format=torch.channels_last)
     averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
