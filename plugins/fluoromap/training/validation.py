@@ -18,7 +18,6 @@ from fluoromap.training.scenes import CLEAR, Scene
 NEAR_PX = 4.0
 """A proposal this near to an electrode is right, at the network's scale."""
 
-_NETWORK_PX_PER_MM = 3.2
 _ROUNDS = 25
 
 
@@ -73,7 +72,7 @@ def validate(ensemble: NetworkEnsemble, scenes: Sequence[Scene]) -> Validation:
     for scene in scenes:
         everywhere = np.ones(scene.pixels.shape, np.bool_)
         x = scene.pixels.astype(np.float32)
-        proposed = NetworkResponse.of_image(x, trained, _NETWORK_PX_PER_MM).proposals(everywhere, 1)
+        proposed = NetworkResponse.of_reduced(x, trained, 1.0).proposals(everywhere, 1)
         within = ((scene.electrodes_uv >= 0) & (scene.electrodes_uv <= len(x) - 1)).all(axis=1)
         clear = (scene.clearness >= CLEAR) & within
         electrodes += int(clear.sum())

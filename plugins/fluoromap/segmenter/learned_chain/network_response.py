@@ -18,10 +18,14 @@ from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import Proposals
 
-NETWORK_PX_PER_MM = 3.2
-"""The scale in the middle of those the network is trained on."""
+NETWORK_PX_PER_MM = 3.0
+"""The scale at which the networks know most electrodes.
 
-_TAKEN_AS_IS = 0.8, 1.2
+They are trained on 2.3 to 4.6 px/mm, mostly on thin catheters. A wide ablation catheter looks like those in a
+smaller picture.
+"""
+
+_TAKEN_AS_IS = 0.95, 1.1
 _LEAST_PROBABILITY = 0.03
 _APART_CELLS = 1.2
 _FLOOR_CELLS = 0.4

@@ -40,6 +40,8 @@ from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 _AVERAGED = 8
 _ORIENTATIONS = 2
+_SCALES = 1.0, 0.87
+"""Over that of the network. What it says at one scale and denies at the other is luck."""
 _PICTURES = 2
 _MARGIN_PX = 40.0
 _SECTION = 5
@@ -310,11 +312,14 @@ class TrackEvidence:
             small = self._small(frame, log_image, scale)
             add_moved(small, turn, offset, total)
         total /= len(frames)
-        seen = NetworkResponse.of_reduced(total, self.trained, scale, _ORIENTATIONS)
+        answers = [
+            NetworkResponse.of_reduced(resampled(total, less), self.trained, scale * less, _ORIENTATIONS)
+            for less in _SCALES
+        ]
+        odds = np.mean([log_odds(seen.shares_at(middle - first)) for seen in answers], axis=0)
         shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, _SHAFT, self.px_per_mm * scale)
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
-        odds = log_odds(seen.shares_at(middle - first))
         ends = shafts_at_ends(chain_uv, shafts)
         return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), ends, depths_beyond(chain_uv, shafts))
 

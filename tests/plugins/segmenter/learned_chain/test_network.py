@@ -167,7 +167,8 @@ def test_moved_pictures_are_those_of_scipy():
 
 def test_frames_near_the_network_s_scale_are_taken_as_they_are():
     assert network_scale(3.1) == 1.0
-    assert network_scale(5.75) == pytest.approx(NETWORK_PX_PER_MM / 5.75)
+    for px_per_mm in (3.6, 5.75):
+        assert network_scale(px_per_mm) == pytest.approx(NETWORK_PX_PER_MM / px_per_mm)
 
 
 def test_the_shipped_weights_are_small_and_their_origin_is_known():

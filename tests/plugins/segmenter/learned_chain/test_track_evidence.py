@@ -14,6 +14,7 @@ from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.track_evidence import SectionOdds, TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.log_image import LogTransform
+from fluoromap.segmenter.proposals import log_odds
 
 FRAMES = 8
 PX_PER_MM = 512 / 178 * 2
@@ -82,6 +83,27 @@ def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images)
         odds = judge.evidence_along(list(range(FRAMES)), path_uv, lambda frame: images[frame]).log_odds
         single = [np.median(seen.probability_at(points)) for seen, points in zip(alone, path_uv, strict=True)]
         assert 1.0 / (1.0 + np.exp(-np.median(odds))) > np.median(single)
+
+
+def test_the_network_is_asked_at_two_scales(monkeypatch, noisy, images):
+    trained = read_weights(Path(SHIPPED))
+    judge = TrackEvidence(trained, PX_PER_MM, TIMES_MS[:FRAMES])
+    path_uv = noisy.truth.pixels_uv["reference"]
+    ask, said = NetworkResponse.of_reduced, {}
+
+    def record(small, trained, scale, orientations):
+        seen = ask(small, trained, scale, orientations)
+        said[scale] = seen
+        return seen
+
+    monkeypatch.setattr(NetworkResponse, "of_reduced", record)
+    odds = judge.evidence_along([0], path_uv[:1], lambda frame: images[frame]).log_odds
+    assert len(said) == 2
+    largest, smaller = sorted(said, reverse=True)
+    assert smaller < 0.9 * largest
+    corner = np.floor(path_uv[0].min(axis=0) - 40.0 / largest)
+    each = [log_odds(seen.shares_at(path_uv[0] - corner)) for seen in said.values()]
+    np.testing.assert_allclose(odds, np.mean(each, axis=0))
 
 
 def test_a_track_beside_the_catheters_is_rejected(noisy, images):
