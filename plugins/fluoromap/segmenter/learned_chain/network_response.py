@@ -25,7 +25,7 @@ They are trained on 2.3 to 4.6 px/mm, mostly on thin catheters. A wide ablation 
 smaller picture.
 """
 
-_TAKEN_AS_IS = 0.95, 1.1
+_TAKEN_AS_IS = 0.85, 1.1
 _LEAST_PROBABILITY = 0.03
 _APART_CELLS = 1.2
 _FLOOR_CELLS = 0.4

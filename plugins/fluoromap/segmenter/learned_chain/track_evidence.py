@@ -128,8 +128,8 @@ _LEAST_LOW_STILL, _LEAST_LOW_WAITING = -0.7, _ByGaps(-1.5, -0.7)
 _SURE_MIDDLE, _EXCUSED_TIP = 1.5, -1.5
 """Log-odds of the middle electrode of a track that has just not moved yet, and of its worse end: the network doubts long tips."""
 _LEAST = _Least(
-    0.5,
-    _ByGaps(-0.4, 0.45),
+    0.35,
+    _ByGaps(-0.4, 0.35),
     still=1.2,
     waiting=_ByGaps(0.3, 1.2),
     hidden=_ByGaps(-2.1, 0.45),
