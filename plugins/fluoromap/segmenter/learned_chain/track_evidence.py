@@ -52,6 +52,11 @@ _SHAFT, _OF_SHAFT = 0.03, 2.3
 
 By logistic regression on simulated catheters.
 """
+_OF_TIPS, _MOST_TIPS = 0.5, 4.0
+"""Log-odds of a tip for one by which the ends' logits differ, and how much they differ at most.
+
+Less than half of what regression gives: single frames say the same.
+"""
 _LIKELY = 0.5
 _FOLLOWED, _FOLLOWED_FRAMES = 0.8, 6
 """Share of the run's frames, and how many the run has at least: fewer say little."""
@@ -155,7 +160,8 @@ class SectionOdds:
     log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
     distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`. shafts : see
     :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`. beyond : see
-    :func:`~fluoromap.segmenter.dark_lines.depths_beyond`.
+    :func:`~fluoromap.segmenter.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first and the last
+    electrode.
     """
 
     log_odds: Array
@@ -164,6 +170,7 @@ class SectionOdds:
     depths: Array
     shafts: Array
     beyond: Array
+    tips: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -321,7 +328,9 @@ class TrackEvidence:
         chain_uv = (middle - first + 0.5) * scale - 0.5
         beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
         ends = shafts_at_ends(chain_uv, shafts)
-        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), ends, depths_beyond(chain_uv, shafts))
+        beyond = depths_beyond(chain_uv, shafts)
+        tips = np.mean([seen.tip_logits_at((middle - first)[[0, -1]]) for seen in answers], axis=0)
+        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), ends, beyond, tips)
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""
@@ -346,10 +355,11 @@ def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
 def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:
     """Return the log-odds that a track begins at its tip.
 
-    A shaft shows behind a catheter and not before it.
+    A shaft shows behind a catheter and not before it. The network knows tips: most are darker and longer than rings.
     """
     behind = np.mean([sections[-1].shafts[1] - sections[0].shafts[0] for sections in pictures])
-    return _OF_SHAFT * float(behind)
+    tips = np.mean([sections[0].tips[0] - sections[-1].tips[1] for sections in pictures])
+    return _OF_SHAFT * float(behind) + _OF_TIPS * float(np.clip(tips, -_MOST_TIPS, _MOST_TIPS))
 
 
 def _turn(path_uv: Array) -> float:

@@ -50,23 +50,35 @@ def accepts(judge, track, log_image):
     return judge(track, log_image).is_catheter
 
 
-def evidence(odds, shafts=(0.0, 0.0), gaps=0.0, beyond=(0.0, 0.0)):
+def evidence(odds, shafts=(0.0, 0.0), gaps=0.0, beyond=(0.0, 0.0), tips=(0.0, 0.0)):
     """Return evidence for electrodes with nothing beside them.
 
-    ``odds`` : their log-odds, (n,). ``shafts`` : at both ends. ``gaps`` and ``beyond`` both ends: how dark it is there, as a share
-    of the electrodes' depth.
+    ``odds`` : their log-odds, (n,). ``shafts``, ``tips`` : at both ends. ``gaps`` and ``beyond`` both ends: how dark it is there,
+    as a share of the electrodes' depth.
     """
     beside, across = np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3))
     depths = np.zeros((2 * len(odds) - 1, 2))
     depths[::2, 0], depths[1::2, 0] = 1.0, gaps
-    return SectionOdds(odds, beside, across, depths, np.array(shafts), np.array(beyond))
+    return SectionOdds(odds, beside, across, depths, np.array(shafts), np.array(beyond), np.array(tips))
 
 
-@pytest.mark.parametrize(("shafts", "says"), [((0.1, 0.9), 1), ((0.9, 0.1), -1), ((0.5, 0.5), 0)])
-def test_the_shaft_in_the_means_says_which_end_of_a_track_is_the_tip(monkeypatch, shafts, says):
+@pytest.mark.parametrize(
+    ("shafts", "tips", "says"),
+    [
+        ((0.1, 0.9), (0.0, 0.0), 1),
+        ((0.9, 0.1), (0.0, 0.0), -1),
+        ((0.5, 0.5), (0.0, 0.0), 0),
+        ((0.5, 0.5), (2.0, -1.0), 1),
+        ((0.5, 0.5), (-1.0, 2.0), -1),
+        ((0.4, 0.6), (-2.0, 2.0), -1),
+        # However sure the network is, a clear shaft says more.
+        ((0.0, 1.0), (-20.0, 20.0), 1),
+    ],
+)
+def test_shaft_and_network_in_the_means_say_which_end_of_a_track_is_the_tip(monkeypatch, shafts, tips, says):
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     track = chains(np.repeat(row[None], FRAMES, axis=0))
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: evidence(np.full(4, 2.0), shafts))
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: evidence(np.full(4, 2.0), shafts, tips=tips))
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     assert np.sign(judge(track, lambda frame: None).tip_odds) == says
     # Single frames show a long tip itself.
