@@ -21,8 +21,8 @@ from fluoromap.segmenter.proposals import Proposals
 NETWORK_PX_PER_MM = 3.0
 """The scale at which the networks know most electrodes.
 
-They are trained on 2.3 to 4.6 px/mm, mostly on thin catheters. A wide ablation catheter looks like those in a
-smaller picture.
+They are trained on 2.3 to 4.6 px/mm, mostly on thin catheters. In a smaller picture a wide ablation catheter
+looks like those.
 """
 
 _TAKEN_AS_IS = 0.85, 1.1

@@ -55,7 +55,7 @@ By logistic regression on simulated catheters.
 _OF_TIPS, _MOST_TIPS = 0.5, 4.0
 """Log-odds of a tip for one by which the ends' logits differ, and how much they differ at most.
 
-Less than half of what regression gives: single frames say the same.
+A third of what their spread over simulated tracks gives: single frames say the same.
 """
 _LIKELY = 0.5
 _FOLLOWED, _FOLLOWED_FRAMES = 0.8, 6
