@@ -122,37 +122,6 @@ def test_a_long_tip_near_its_ring_may_make_one_bar():
     assert 0.25 < np.mean(darkest) < 0.95
 
 
-def _drawn(type_name: str, count: int = 60) -> list[np.ndarray]:
-    design = design_of(catheter_type(type_name, "one"))
-    return [
-        draw_catheters(np.random.default_rng(seed), Canvas.empty(64), 3.0, [design], (1.0, 1.01)) for seed in range(count)
-    ]
-
-
-def test_most_catheters_that_ablate_are_wide():
-    ablation, diagnostic = (
-        np.array([labels[0, 5] / 3.0 for labels in _drawn(name)]) for name in ("ablation-4", "decapolar-2-5-2")
-    )
-    assert (ablation > 1.05).mean() > 0.7
-    assert (diagnostic > 1.05).mean() < 0.6
-
-
-def test_rings_of_half_of_the_catheters_are_paler_than_their_tips():
-    # The tip of this type is as long as its rings, so an oblique view changes all alike.
-    paler = [labels[1:, 3].mean() < 0.75 * labels[0, 3] for labels in _drawn("circular-10")]
-    assert 0.2 < np.mean(paler) < 0.7
-
-
-def test_half_of_the_long_rows_lie_round_a_valve():
-    def turned(type_name: str) -> float:
-        """Return the share of catheters whose ends are nearer to each other than their middle is to both."""
-        ends = [labels[[0, len(labels) // 2, -1], :2] for labels in _drawn(type_name)]
-        return float(np.mean([np.linalg.norm(c - a) < np.linalg.norm(0.5 * (a + c) - b) for a, b, c in ends]))
-
-    assert turned("duodecapolar-2-8-2") > 0.15
-    assert turned("decapolar-2-5-2") < 0.05
-
-
 def test_a_printed_picture_keeps_its_size_and_its_places():
     levels = np.full((120, 120), 200, np.uint8)
     levels[58:63, 38:43] = 20
