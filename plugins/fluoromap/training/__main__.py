@@ -24,7 +24,7 @@ from fluoromap.training.shards import SCENES_A_SHARD, shards
 from fluoromap.training.validation import validate
 
 NETWORKS = 2
-SHARDS = 110
+SHARDS = 150
 VALIDATION_SCENES = 160
 _VALIDATION_PX = 320
 _VALIDATION_KEY = 9_999_999

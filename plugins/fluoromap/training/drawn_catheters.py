@@ -27,12 +27,7 @@ _IN_PLANE, _LEAST_SEEN = 0.97, 0.2
 _SIDE_BY_SIDE = 0.2
 _LONG_TIP_MM, _SHORT_GAP_MM, _MERGED_TIPS = 3.0, 3.0, 0.5
 """A long tip's thermocouple and leads often make one dark bar of the tip and a ring that is near."""
-_RADII_MM = 0.67, 0.83, 1.0, 1.0, 1.0, 1.17, 1.17, 1.33
-_WIDE_RADII_MM, _WIDE = (1.17, 1.17, 1.33), 0.85
-"""Radii of 4F to 8F. Most catheters with long tips, which ablate, are wide: there is a wire, a sensor and water inside."""
-_PALE_RINGS = 0.5
-_LONG_ROW, _LONG_ROW_TURNS = 12, 0.5
-"""Electrodes of a catheter that is made to lie round a valve, and how often it does."""
+_FRENCH_RADII_MM = 0.67, 0.83, 1.0, 1.0, 1.0, 1.17, 1.17, 1.33
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,15 +61,15 @@ def random_design(random: Generator, catalogue: Sequence[Catheter] = ()) -> Desi
         return design_of(catalogue[int(random.integers(len(catalogue)))])
     kind = random.random()
     ring = between(random, 0.9, 1.4) if chance(random, 0.6) else scaled(random, 0.8, 2.0)
-    if kind < 0.28:
+    if kind < 0.30:
         electrodes, tip = (4 if chance(random, 0.85) else int(random.integers(2, 4))), between(random, 3.0, 8.5)
-    elif kind < 0.50:
+    elif kind < 0.54:
         electrodes, tip = 4, _diagnostic_tip(random)
-    elif kind < 0.58:
+    elif kind < 0.64:
         electrodes, tip = int(random.integers(5, 9)), _diagnostic_tip(random)
-    elif kind < 0.82:
+    elif kind < 0.89:
         electrodes, tip = 10, _diagnostic_tip(random)
-    elif kind < 0.92:
+    elif kind < 0.95:
         electrodes, tip = int(random.choice([12, 14, 16, 20])), _diagnostic_tip(random)
     else:
         electrodes, tip = int(random.integers(8, 21)), ring
@@ -93,7 +88,7 @@ def _gaps(random: Generator, count: int) -> Array:
     if pattern < 0.5:
         pair, gap = (
             float(random.choice([1.0, 2.0, 2.0, 2.0, 2.5])),
-            float(random.choice([4.0, 5.0, 5.0, 5.0, 6.0, 8.0, 10.0])),
+            float(random.choice([4.0, 5.0, 5.0, 5.0, 6.0, 8.0])),
         )
         return np.where(np.arange(count) % 2 == 0, pair, gap)
     if pattern < 0.65:
@@ -146,7 +141,7 @@ def _draw_along(
     course = to_border(course, canvas.size / px_per_mm)
     centres, headings, shortenings = course.at(design.centres_mm)
     line, places = course.points_mm * px_per_mm, centres * px_per_mm
-    radius = _radius_mm(random, design) * px_per_mm
+    radius = float(random.choice(_FRENCH_RADII_MM)) * px_per_mm
     metal = scaled(random, *metal_between)
     _draw_shaft(random, canvas, line, _shaft_depth(random, course, design), radius, metal, px_per_mm)
     labels = _draw_electrodes(random, canvas, design, places, headings, shortenings, radius, metal, px_per_mm)
@@ -156,17 +151,12 @@ def _draw_along(
     return labels
 
 
-def _radius_mm(random: Generator, design: Design) -> float:
-    wide = float(design.lengths_mm[0]) >= _LONG_TIP_MM and chance(random, _WIDE)
-    return float(random.choice(_WIDE_RADII_MM if wide else _RADII_MM))
-
-
 def _course(random: Generator, design: Design, scene_mm: float) -> Curve:
     """Draw a course from the tip on, with one of the electrodes in the scene."""
     length = float(design.centres_mm[-1])
     shaft = between(random, 0.4, 1.5) * scene_mm
-    if design.loop or (len(design.centres_mm) >= _LONG_ROW and chance(random, _LONG_ROW_TURNS)):
-        turns = between(random, 0.75 if design.loop else 0.4, 1.05)
+    if design.loop:
+        turns = between(random, 0.75, 1.05)
         curve = loop_curve(random, max(length / (2.0 * math.pi * turns), 5.0), turns, shaft, _STEP_MM)
     else:
         curve = random_curve(
@@ -215,7 +205,6 @@ def _draw_electrodes(
     tip_hollow = hollow if chance(random, 0.3) else 0.0
     wide = radius * between(random, 0.9, 1.12)
     edge = between(random, 0.4, 1.0)
-    ring_metal = metal * (between(random, 0.35, 0.9) if chance(random, _PALE_RINGS) else 1.0)
     labels = np.zeros((len(places), LABEL_COLUMNS))
     if chance(random, 0.25):
         _fill_gaps(random, canvas, places, wide, metal, px_per_mm)
@@ -229,7 +218,7 @@ def _draw_electrodes(
         length = float(design.lengths_mm[number])
         tilted = math.sqrt(max(0.0, 1.0 - shortening * shortening))
         half = 0.5 * length * px_per_mm * shortening + 0.45 * wide * tilted
-        even = (ring_metal if number else metal) * between(random, 0.8, 1.2)
+        even = metal * between(random, 0.8, 1.2)
         if number and chance(random, 0.02):
             even *= between(random, 0.2, 0.6)
         # A ray runs a longer way through a band that is seen obliquely.

@@ -15,8 +15,6 @@ from fluoromap.training.randomness import between, chance, scaled
 _POOR = 0.45
 _STORED_PLAIN = 0.7
 _PRINTED = 0.22
-_NOISE_REDUCED = 0.35
-"""Of clear exposures: noise of a run as workstations show it, a mean over frames and places."""
 _FRONTAL_CLEAR = 0.3
 _DETECTORS = 1.0, 1.0, 1.25, 1.3, 1.4, 1.6, 1.8, 2.0
 _GRAIN_FROM_PX = 0.35
@@ -77,7 +75,7 @@ def random_exposure(random: Generator) -> Exposure:
             printed=chance(random, _PRINTED),
         )
     return Exposure(
-        photons=scaled(random, *((2e3, 6e4) if chance(random, _NOISE_REDUCED) else (60.0, 1e4))),
+        photons=scaled(random, 60.0, 10000.0),
         scatter=between(random, 0.0, 1.2) ** 2,
         metal=(0.2, 2.3),
         detector=1.0,

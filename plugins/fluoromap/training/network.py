@@ -12,7 +12,7 @@ EPSILON = 1e-5
 
 
 class ElectrodeNetwork(nn.Module):
-    """Proposes electrodes on a grid of 2 px from pictures of 2.2 to 4.2 px/mm.
+    """Proposes electrodes on a grid of 2 px from pictures of 2.3 to 4.6 px/mm.
 
     Features at a half, a quarter and an eighth of the size; what the eighth has seen of the surroundings (60 mm) is added to the
     quarter, which answers for the 2 x 2 cells of 2 px that it covers. Layers are those of

@@ -20,7 +20,7 @@ from fluoromap.training.exposure import random_exposure
 from fluoromap.training.leads import draw_lead
 from fluoromap.training.randomness import between, chance, scaled, whole
 
-SCALES_PX_PER_MM = 2.2, 4.2
+SCALES_PX_PER_MM = 2.3, 4.6
 """Of the pictures; the network sees frames of 3.0 to 6.5 px/mm reduced to its own scale, and that scale is often misjudged."""
 CLEAR = 6.5
 """Contrast over noise, summed over an electrode, from which on the network has to find it."""
