@@ -164,7 +164,7 @@ def compute_always(kind: type[T], inputs: tuple[object, ...], compute: Callable[
     return compute()
 
 
-def _recall_for(run: Run, catalogue: Catalogue, context: Context) -> Recall[Any]:
+def recall_for(run: Run, catalogue: Catalogue, context: Context) -> Recall[Any]:
     """Return :meth:`Context.recall` for partial results of one run.
 
     A run without a hash of its content has none.
@@ -214,7 +214,7 @@ def segment_run(
     """
     context.check()
     # Marks change the tracks, but not what the images show.
-    recall = _recall_for(run, catalogue, context)
+    recall = recall_for(run, catalogue, context)
     field = field_mask(recall(ExposedField, (), lambda: exposed_field(run.frames, run.pixels)), run.frames.shape)
     transform = LogTransform.of_run(run.pixels, field.mean_level)
     count = len(run.frames)

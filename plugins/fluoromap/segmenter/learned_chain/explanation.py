@@ -76,6 +76,18 @@ def is_inverted(run: Run, catalogue: Catalogue, trained: Trained | None = None) 
     return _explains_more(of_inverted, as_it_says)
 
 
+def better_scales(
+    run: Run, catalogue: Catalogue, scales_px_per_mm: Sequence[float], trained: Trained | None = None
+) -> tuple[float, ...]:
+    """Return those scales that explain more electrodes than the run's own.
+
+    A few frames of the run are searched.
+    ``trained`` : the shipped network by default.
+    """
+    own, *others = _explanations(run, run.pixels, catalogue, (run.px_per_mm, *scales_px_per_mm), trained)
+    return tuple(one.px_per_mm for one in others if one.electrodes > own.electrodes)
+
+
 def _inverted(pixels: PixelFacts) -> PixelFacts:
     return replace(pixels, monochrome1=not pixels.monochrome1)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -15,11 +16,12 @@ from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
-from fluoromap.segmenter.learned_chain.explanation import is_inverted
+from fluoromap.segmenter.learned_chain.explanation import better_scales, is_inverted
 from fluoromap.segmenter.learned_chain.frame_answers import StoredAnswers
+from fluoromap.segmenter.learned_chain.other_scales import ChosenScale, choose_scale
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
-from fluoromap.segmenter.run_segmentation import Detector, segment_run
+from fluoromap.segmenter.run_segmentation import Detector, recall_for, segment_run
 from fluoromap.segmenter.visible_part import visible_part
 from fluoromap.segmenter.warm_up import prepare
 
@@ -47,7 +49,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "30"
+    version: ClassVar[str] = "31"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -61,7 +63,24 @@ class LearnedChain:
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
-        found = self._segment(run, catalogue, marks, context, trained)
+        tried: dict[float, Segmentation] = {}
+
+        def automatic(px_per_mm: float) -> Segmentation:
+            if px_per_mm not in tried:
+                shown = replace(run, px_per_mm=px_per_mm)
+                tried[px_per_mm] = self._segment(shown, catalogue, {}, context, trained)
+            return tried[px_per_mm]
+
+        def choose() -> ChosenScale:
+            def promising(scales_px_per_mm: Sequence[float]) -> Sequence[float]:
+                return better_scales(run, catalogue, scales_px_per_mm, trained)
+
+            return choose_scale(run.px_per_mm, catalogue, automatic, promising)
+
+        # Marks must not change the scale, else they would change the automatic chains beside them.
+        chosen = recall_for(run, catalogue, context)(ChosenScale, (), choose).px_per_mm
+        shown = replace(run, px_per_mm=chosen)
+        found = self._segment(shown, catalogue, marks, context, trained) if marks else automatic(chosen)
         if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
             of_inverted = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)

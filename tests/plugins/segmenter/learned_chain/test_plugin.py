@@ -88,6 +88,13 @@ def test_a_scale_that_is_off_by_forty_per_cent_invents_nothing(simulated, wrong)
     assert electrodes_right(found, simulated.truth)[1] <= 4
 
 
+def test_a_stated_scale_that_is_a_quarter_too_small_still_shows_the_catheters():
+    spec = StudySpec(313, sites=1, frames=8, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA"))
+    frontal = simulate_study(spec).sites[0].runs[1]
+    found = segmented(frontal.frames, px_per_mm=PX_PER_MM / 1.3)
+    assert electrodes_right(found, frontal.truth) == (1.0, 0)
+
+
 def test_a_decapolar_catheter_does_not_pass_for_two_quadripolar_ones():
     random = np.random.default_rng(0)
     deca = catheter_type("decapolar-2-5-2", "cs")

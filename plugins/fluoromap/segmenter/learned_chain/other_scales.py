@@ -1,0 +1,109 @@
+"""Other scales than the stated one, for runs in which catheters lack.
+
+A heart lies up to 10 cm beside the isocentre, makers' spacings differ from those of a type, and some scales are estimates. What
+is longer in the image than its description is not found. A smaller scale gives the network a larger picture, in which it separates
+electrodes that lie close together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fluoromap.catheters import Catalogue
+from fluoromap.contracts import Array, Chain, Segmentation
+
+OTHER_SCALES = 1.18, 0.85
+"""Over the stated one."""
+
+_LEAST_SEEN = 0.85
+"""Length seen over length in space of the catheters that a larger scale adds: shorter ones fit the stated scale as well."""
+_BESIDE_MM = 1.5
+_CONFIRMED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenScale:
+    """The scale at which a run is segmented, pixels per mm at the isocentre."""
+
+    px_per_mm: float
+
+
+def choose_scale(
+    stated: float,
+    catalogue: Catalogue,
+    segment: Callable[[float], Segmentation],
+    promising: Callable[[Sequence[float]], Sequence[float]],
+) -> ChosenScale:
+    """Return the scale that explains most electrodes of a run.
+
+    It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
+    like one catheter at some scale.
+
+    Parameters
+    ----------
+    stated : float
+        Pixels per mm at the isocentre.
+    catalogue : Catalogue
+    segment : callable
+        Segments the run at a scale.
+    promising : callable
+        Returns those of some scales that are worth a segmentation.
+    """
+    best, found = stated, segment(stated)
+    if _usual_catheters(found) >= len(catalogue.catheters):
+        return ChosenScale(stated)
+    least = 1 if _count_electrodes(found) else _CONFIRMED
+    for scale in promising([factor * stated for factor in OTHER_SCALES]):
+        other = segment(scale)
+        if _count_electrodes(other) <= _count_electrodes(found) or _usual_catheters(other) < least:
+            continue
+        if scale < best or _median_length_seen(other, found, catalogue, scale) >= _LEAST_SEEN:
+            best, found = scale, other
+    return ChosenScale(best)
+
+
+def _usual_catheters(found: Segmentation) -> float:
+    """Return how many chains half of the frames have."""
+    return float(np.median([len(entry.chains) for entry in found.frames]))
+
+
+def _count_electrodes(found: Segmentation) -> int:
+    return sum(len(chain.electrodes) for entry in found.frames for chain in entry.chains)
+
+
+def _median_length_seen(other: Segmentation, found: Segmentation, catalogue: Catalogue, px_per_mm: float) -> float:
+    """Return the median length of the chains that only the other segmentation has.
+
+    It is the length seen over that in space, of the longest whole chain of each frame; 0 where there is none.
+    """
+    longest = []
+    for entry, before in zip(other.frames, found.frames, strict=True):
+        taken = np.concatenate([np.zeros((0, 2)), *(chain.pixels_uv for chain in before.chains)])
+        new = [chain for chain in entry.chains if _lies_elsewhere(chain, taken, _BESIDE_MM * px_per_mm)]
+        seen = [_length_seen(chain, catalogue, px_per_mm) for chain in new]
+        if seen:
+            longest.append(max(seen))
+    return float(np.median(longest)) if longest else 0.0
+
+
+def _lies_elsewhere(chain: Chain, taken_uv: Array, reach_px: float) -> bool:
+    """Return whether half of a chain's electrodes lie beside all these places."""
+    if not len(taken_uv):
+        return True
+    away = np.linalg.norm(chain.pixels_uv[:, None] - taken_uv, axis=2).min(axis=1)
+    return bool(2 * np.count_nonzero(away > reach_px) >= len(chain.electrodes))
+
+
+def _length_seen(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> float:
+    """Return a chain's length in the image over its catheter's.
+
+    It is 0 for a part of a catheter.
+    """
+    catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
+    if len(chain.electrodes) < catheter.electrodes:
+        return 0.0
+    seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1).sum()
+    return float(seen / (sum(catheter.spacing_mm) * px_per_mm))

@@ -1,0 +1,54 @@
+"""The scale of a run in which catheters lack: another one counts where it shows more, and not what the stated one could."""
+
+import numpy as np
+import pytest
+
+from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.contracts import Chain, FrameChains, Segmentation
+from fluoromap.segmenter.learned_chain.other_scales import choose_scale
+
+CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "a"), catheter_type("quadripolar-5-5-5", "b")), "a", "b")
+
+
+def chain(name: str, v: float, px_per_mm: float, seen: float = 1.0) -> Chain:
+    along = np.concatenate([[0.0], np.cumsum(CATALOGUE[name].spacing_mm)]) * px_per_mm * seen
+    points = np.stack([along, np.full(4, v)], axis=1)
+    return Chain((1, 2, 3, 4), points, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), ((name, 1.0),))
+
+
+def showing(*chains: Chain) -> Segmentation:
+    frames = tuple(FrameChains(frame, chains) for frame in range(3))
+    return Segmentation(frames, frames[0], (0,), np.zeros(3), np.arange(3.0), ())
+
+
+def chosen(by_scale: dict[float, Segmentation]) -> float:
+    asked: list[float] = []
+
+    def segment(px_per_mm: float) -> Segmentation:
+        asked.append(px_per_mm)
+        return by_scale[round(px_per_mm, 2)]
+
+    return round(choose_scale(3.0, CATALOGUE, segment, lambda scales: scales).px_per_mm, 2)
+
+
+def test_the_stated_scale_stays_where_it_shows_all():
+    assert chosen({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0))}) == 3.0
+
+
+def test_a_larger_scale_counts_where_a_catheter_is_too_long_for_the_stated_one():
+    few, nothing_more = showing(chain("a", 10.0, 3.0)), showing()
+    long = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.54, 0.95))
+    short = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.54, 0.6))
+    assert chosen({3.0: few, 3.54: long, 2.55: nothing_more}) == 3.54
+    assert chosen({3.0: few, 3.54: short, 2.55: nothing_more}) == 3.0
+
+
+def test_a_smaller_scale_counts_where_it_shows_more():
+    few, more = showing(chain("a", 10.0, 3.0)), showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55, 0.5))
+    assert chosen({3.0: few, 3.54: few, 2.55: more}) == 2.55
+
+
+@pytest.mark.parametrize(("shown", "scale"), [(1, 3.0), (2, 2.55)])
+def test_one_catheter_is_not_enough_where_the_stated_scale_shows_none(shown, scale):
+    both = chain("a", 10.0, 2.55), chain("b", 90.0, 2.55)
+    assert chosen({3.0: showing(), 3.54: showing(), 2.55: showing(*both[:shown])}) == scale
