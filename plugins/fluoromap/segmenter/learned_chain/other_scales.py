@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Chain, Segmentation
+from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 
 OTHER_SCALES = 1.18, 0.85
 """Over the stated one."""
@@ -22,6 +22,7 @@ _LEAST_SEEN = 0.85
 """Length seen over length in space of the catheters that a larger scale adds: shorter ones fit the stated scale as well."""
 _BESIDE_MM = 1.5
 _CONFIRMED = 2
+_LEAST_KEPT = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ def choose_scale(
     """Return the scale that explains most electrodes of a run.
 
     It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
-    like one catheter at some scale.
+    like one catheter at some scale. Else another one has to keep what was found.
 
     Parameters
     ----------
@@ -60,6 +61,8 @@ def choose_scale(
         other = segment(scale)
         if _count_electrodes(other) <= _count_electrodes(found) or _usual_catheters(other) < least:
             continue
+        if _share_kept(found, other, _BESIDE_MM * scale) < _LEAST_KEPT:
+            continue
         if scale < best or _median_length_seen(other, found, catalogue, scale) >= _LEAST_SEEN:
             best, found = scale, other
     return ChosenScale(best)
@@ -74,6 +77,15 @@ def _count_electrodes(found: Segmentation) -> int:
     return sum(len(chain.electrodes) for entry in found.frames for chain in entry.chains)
 
 
+def _share_kept(found: Segmentation, other: Segmentation, reach_px: float) -> float:
+    """Return the share of the found electrodes that the other segmentation has too."""
+    kept = 0
+    for entry, after in zip(found.frames, other.frames, strict=True):
+        places = _places(after)
+        kept += sum(int(np.count_nonzero(_away(chain.pixels_uv, places) <= reach_px)) for chain in entry.chains)
+    return kept / _count_electrodes(found) if _count_electrodes(found) else 1.0
+
+
 def _median_length_seen(other: Segmentation, found: Segmentation, catalogue: Catalogue, px_per_mm: float) -> float:
     """Return the median length of the chains that only the other segmentation has.
 
@@ -81,7 +93,7 @@ def _median_length_seen(other: Segmentation, found: Segmentation, catalogue: Cat
     """
     longest = []
     for entry, before in zip(other.frames, found.frames, strict=True):
-        taken = np.concatenate([np.zeros((0, 2)), *(chain.pixels_uv for chain in before.chains)])
+        taken = _places(before)
         new = [chain for chain in entry.chains if _lies_elsewhere(chain, taken, _BESIDE_MM * px_per_mm)]
         seen = [_length_seen(chain, catalogue, px_per_mm) for chain in new]
         if seen:
@@ -91,10 +103,18 @@ def _median_length_seen(other: Segmentation, found: Segmentation, catalogue: Cat
 
 def _lies_elsewhere(chain: Chain, taken_uv: Array, reach_px: float) -> bool:
     """Return whether half of a chain's electrodes lie beside all these places."""
-    if not len(taken_uv):
-        return True
-    away = np.linalg.norm(chain.pixels_uv[:, None] - taken_uv, axis=2).min(axis=1)
+    away = _away(chain.pixels_uv, taken_uv)
     return bool(2 * np.count_nonzero(away > reach_px) >= len(chain.electrodes))
+
+
+def _places(entry: FrameChains) -> Array:
+    return np.concatenate([np.zeros((0, 2)), *(chain.pixels_uv for chain in entry.chains)])
+
+
+def _away(points_uv: Array, from_uv: Array) -> Array:
+    """Return the distance of each point to the nearest of others, (n,), infinite without others."""
+    nearest: Array = np.linalg.norm(points_uv[:, None] - from_uv, axis=2).min(axis=1, initial=np.inf)
+    return nearest
 
 
 def _length_seen(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> float:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -28,7 +28,25 @@ from fluoromap.segmenter.warm_up import prepare
 _DIM_BELOW = 0.02
 """Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""
 
+T = TypeVar("T")
+
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _WithoutProgress:
+    """A context of work that is repeated: it may be stopped, and reports no progress."""
+
+    context: Context
+
+    def progress(self, fraction: float) -> None:
+        """Report nothing."""
+
+    def check(self) -> None:
+        self.context.check()
+
+    def recall(self, kind: type[T], inputs: tuple[object, ...], compute: Callable[[], T]) -> T:
+        return self.context.recall(kind, inputs, compute)
 
 
 class LearnedChainParams(BaseModel, extra="forbid"):
@@ -68,7 +86,9 @@ class LearnedChain:
         def automatic(px_per_mm: float) -> Segmentation:
             if px_per_mm not in tried:
                 shown = replace(run, px_per_mm=px_per_mm)
-                tried[px_per_mm] = self._segment(shown, catalogue, {}, context, trained)
+                # Progress must not begin again.
+                watched = _WithoutProgress(context) if tried else context
+                tried[px_per_mm] = self._segment(shown, catalogue, {}, watched, trained)
             return tried[px_per_mm]
 
         def choose() -> ChosenScale:

@@ -48,6 +48,11 @@ def test_a_smaller_scale_counts_where_it_shows_more():
     assert chosen({3.0: few, 3.54: few, 2.55: more}) == 2.55
 
 
+def test_a_scale_that_loses_what_the_stated_one_shows_does_not_count():
+    others = showing(chain("a", 50.0, 2.55), chain("b", 90.0, 2.55))
+    assert chosen({3.0: showing(chain("a", 10.0, 3.0)), 3.54: showing(), 2.55: others}) == 3.0
+
+
 @pytest.mark.parametrize(("shown", "scale"), [(1, 3.0), (2, 2.55)])
 def test_one_catheter_is_not_enough_where_the_stated_scale_shows_none(shown, scale):
     both = chain("a", 10.0, 2.55), chain("b", 90.0, 2.55)

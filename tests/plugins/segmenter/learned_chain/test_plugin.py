@@ -15,7 +15,9 @@ from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainP
 PX_PER_MM = 512 / 178 * 2
 
 
-def segmented(frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, px_per_mm=PX_PER_MM, marks=None):
+def segmented(
+    frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, px_per_mm=PX_PER_MM, marks=None, frame_ms=1000 / 60
+):
     class Source:
         shape = np.asarray(frames[0]).shape
 
@@ -28,7 +30,7 @@ def segmented(frames, bits=12, monochrome1=False, catalogue=DEFAULT_CATALOGUE, p
         def __iter__(self):
             return iter(frames)
 
-    run = Run(Source(), np.arange(len(frames)) * 1000 / 60, px_per_mm, PixelFacts(False, bits, monochrome1))
+    run = Run(Source(), np.arange(len(frames)) * frame_ms, px_per_mm, PixelFacts(False, bits, monochrome1))
     return LearnedChain().segment(run, catalogue, marks or {}, Silent())
 
 
@@ -89,10 +91,14 @@ def test_a_scale_that_is_off_by_forty_per_cent_invents_nothing(simulated, wrong)
 
 
 def test_a_stated_scale_that_is_a_quarter_too_small_still_shows_the_catheters():
+    """A mark of all catheters in one frame does not change the scale that the others need."""
     spec = StudySpec(313, sites=1, frames=8, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA"))
     frontal = simulate_study(spec).sites[0].runs[1]
-    found = segmented(frontal.frames, px_per_mm=PX_PER_MM / 1.3)
-    assert electrodes_right(found, frontal.truth) == (1.0, 0)
+    automatic = segmented(frontal.frames, px_per_mm=PX_PER_MM / 1.3, frame_ms=100.0)
+    assert electrodes_right(automatic, frontal.truth) == (1.0, 0)
+    marks = {0: automatic.frames[0].chains}
+    corrected = segmented(frontal.frames, px_per_mm=PX_PER_MM / 1.3, frame_ms=100.0, marks=marks)
+    assert electrodes_right(corrected, frontal.truth) == (1.0, 0)
 
 
 def test_a_decapolar_catheter_does_not_pass_for_two_quadripolar_ones():
