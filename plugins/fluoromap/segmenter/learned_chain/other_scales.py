@@ -41,7 +41,7 @@ def choose_scale(
     """Return the scale that explains most electrodes of a run.
 
     It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
-    like one catheter at some scale. Else another one has to keep what was found.
+    like one catheter at some scale. Else another one has to keep those that it shows.
 
     Parameters
     ----------
