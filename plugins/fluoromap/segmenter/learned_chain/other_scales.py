@@ -14,6 +14,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
+from fluoromap.reasons import Reason
 
 OTHER_SCALES = 1.18, 0.85
 """Over the stated one."""
@@ -40,8 +41,9 @@ def choose_scale(
 ) -> ChosenScale:
     """Return the scale that explains most electrodes of a run.
 
-    It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
-    like one catheter at some scale. Else another one has to keep those that it shows.
+    It is the stated one where that shows all catheters, or one that is not listed: that one is no other at another scale. Where
+    it shows none, another one has to show two: contrast medium may lie like one catheter at some scale. Else another one has to
+    keep those that it shows.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ def choose_scale(
         Returns those of some scales that are worth a segmentation.
     """
     best, found = stated, segment(stated)
-    if _usual_catheters(found) >= len(catalogue.catheters):
+    if _usual_catheters(found) >= len(catalogue.catheters) or _shows_unlisted(found):
         return ChosenScale(stated)
     least = 1 if _count_electrodes(found) else _CONFIRMED
     for scale in promising([factor * stated for factor in OTHER_SCALES]):
@@ -71,6 +73,10 @@ def choose_scale(
 def _usual_catheters(found: Segmentation) -> float:
     """Return how many chains half of the frames have."""
     return float(np.median([len(entry.chains) for entry in found.frames]))
+
+
+def _shows_unlisted(found: Segmentation) -> bool:
+    return found.diastole is not None and found.diastole.manual_needed is Reason.EXTRA_CATHETER
 
 
 def _count_electrodes(found: Segmentation) -> int:

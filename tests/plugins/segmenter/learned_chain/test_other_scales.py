@@ -5,6 +5,7 @@ import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, Segmentation
+from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.other_scales import choose_scale
 
 CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "a"), catheter_type("quadripolar-5-5-5", "b")), "a", "b")
@@ -16,9 +17,9 @@ def chain(name: str, v: float, px_per_mm: float, seen: float = 1.0) -> Chain:
     return Chain((1, 2, 3, 4), points, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), ((name, 1.0),))
 
 
-def showing(*chains: Chain) -> Segmentation:
+def showing(*chains: Chain, reason: Reason | None = None) -> Segmentation:
     frames = tuple(FrameChains(frame, chains) for frame in range(3))
-    return Segmentation(frames, frames[0], (0,), np.zeros(3), np.arange(3.0), ())
+    return Segmentation(frames, FrameChains(0, chains, reason), (0,), np.zeros(3), np.arange(3.0), ())
 
 
 def chosen(by_scale: dict[float, Segmentation]) -> float:
@@ -33,6 +34,10 @@ def chosen(by_scale: dict[float, Segmentation]) -> float:
 
 def test_the_stated_scale_stays_where_it_shows_all():
     assert chosen({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0))}) == 3.0
+
+
+def test_the_stated_scale_stays_where_it_shows_an_unlisted_catheter():
+    assert chosen({3.0: showing(chain("a", 10.0, 3.0), reason=Reason.EXTRA_CATHETER)}) == 3.0
 
 
 def test_a_larger_scale_counts_where_a_catheter_is_too_long_for_the_stated_one():
