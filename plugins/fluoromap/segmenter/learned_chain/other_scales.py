@@ -41,9 +41,9 @@ def choose_scale(
 ) -> ChosenScale:
     """Return the scale that explains most electrodes of a run.
 
-    It is the stated one where that shows all catheters, or one that is not listed: that one is no other at another scale. Where
-    it shows none, another one has to show two: contrast medium may lie like one catheter at some scale. Else another one has to
-    keep those that it shows.
+    It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
+    like one catheter at some scale. Else another one has to keep those that it shows. Where it shows one that is not listed,
+    another scale has to show three: an unlisted catheter may look like a listed one of another size.
 
     Parameters
     ----------
@@ -56,9 +56,11 @@ def choose_scale(
         Returns those of some scales that are worth a segmentation.
     """
     best, found = stated, segment(stated)
-    if _usual_catheters(found) >= len(catalogue.catheters) or _shows_unlisted(found):
+    if _usual_catheters(found) >= len(catalogue.catheters):
         return ChosenScale(stated)
     least = 1 if _count_electrodes(found) else _CONFIRMED
+    if _shows_unlisted(found):
+        least = _CONFIRMED + 1
     for scale in promising([factor * stated for factor in OTHER_SCALES]):
         other = segment(scale)
         if _count_electrodes(other) <= _count_electrodes(found) or _usual_catheters(other) < least:

@@ -36,8 +36,12 @@ def test_the_stated_scale_stays_where_it_shows_all():
     assert chosen({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0))}) == 3.0
 
 
-def test_the_stated_scale_stays_where_it_shows_an_unlisted_catheter():
-    assert chosen({3.0: showing(chain("a", 10.0, 3.0), reason=Reason.EXTRA_CATHETER)}) == 3.0
+def test_two_catheters_are_not_enough_where_the_stated_scale_shows_an_unlisted_one():
+    stated = showing(chain("a", 10.0, 3.0), reason=Reason.EXTRA_CATHETER)
+    two = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55))
+    three = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55), chain("b", 150.0, 2.55))
+    assert chosen({3.0: stated, 3.54: stated, 2.55: two}) == 3.0
+    assert chosen({3.0: stated, 3.54: stated, 2.55: three}) == 2.55
 
 
 def test_a_larger_scale_counts_where_a_catheter_is_too_long_for_the_stated_one():
