@@ -81,8 +81,7 @@ def better_scales(
 ) -> tuple[float, ...]:
     """Return those scales that explain more electrodes than the run's own.
 
-    A few frames of the run are searched.
-    ``trained`` : the shipped network by default.
+    A few frames of the run are searched. ``trained`` : the shipped network by default.
     """
     own, *others = _explanations(run, run.pixels, catalogue, (run.px_per_mm, *scales_px_per_mm), trained)
     return tuple(one.px_per_mm for one in others if one.electrodes > own.electrodes)

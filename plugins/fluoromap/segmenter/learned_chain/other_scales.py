@@ -86,12 +86,10 @@ def _count_electrodes(found: Segmentation) -> int:
 
 
 def _share_kept(found: Segmentation, other: Segmentation, reach_px: float) -> float:
-    """Return the share of the found electrodes that the other segmentation has too."""
-    kept = 0
-    for entry, after in zip(found.frames, other.frames, strict=True):
-        places = _places(after)
-        kept += sum(int(np.count_nonzero(_away(chain.pixels_uv, places) <= reach_px)) for chain in entry.chains)
-    return kept / _count_electrodes(found) if _count_electrodes(found) else 1.0
+    """Return the share of the found electrodes that the other segmentation has too; 1 where none is found."""
+    frames = zip(found.frames, other.frames, strict=True)
+    away = np.concatenate([_away(_places(entry), _places(after)) for entry, after in frames])
+    return float(np.mean(away <= reach_px)) if len(away) else 1.0
 
 
 def _median_length_seen(other: Segmentation, found: Segmentation, catalogue: Catalogue, px_per_mm: float) -> float:

@@ -23,10 +23,7 @@ def showing(*chains: Chain, reason: Reason | None = None) -> Segmentation:
 
 
 def chosen(by_scale: dict[float, Segmentation]) -> float:
-    asked: list[float] = []
-
     def segment(px_per_mm: float) -> Segmentation:
-        asked.append(px_per_mm)
         return by_scale[round(px_per_mm, 2)]
 
     return round(choose_scale(3.0, CATALOGUE, segment, lambda scales: scales).px_per_mm, 2)
