@@ -86,7 +86,10 @@ def _count_electrodes(found: Segmentation) -> int:
 
 
 def _share_kept(found: Segmentation, other: Segmentation, reach_px: float) -> float:
-    """Return the share of the found electrodes that the other segmentation has too; 1 where none is found."""
+    """Return the share of the found electrodes that the other segmentation has.
+
+    It is 1 where none is found.
+    """
     frames = zip(found.frames, other.frames, strict=True)
     away = np.concatenate([_away(_places(entry), _places(after)) for entry, after in frames])
     return float(np.mean(away <= reach_px)) if len(away) else 1.0
