@@ -19,7 +19,7 @@ class ConvexHull:
     """Fuser ``convex-hull``: flat between the outermost sites, so that its volume is smaller than the chamber's."""
 
     name: ClassVar[str] = "convex-hull"
-    version: ClassVar[str] = "3"
+    version: ClassVar[str] = "4"
     Params: ClassVar[type[BaseModel]] = ConvexHullParams
 
     def __init__(self, params: ConvexHullParams) -> None:

@@ -23,7 +23,7 @@ class SmoothSurface:
     """
 
     name: ClassVar[str] = "smooth-surface"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "3"
     Params: ClassVar[type[BaseModel]] = SmoothSurfaceParams
 
     def __init__(self, params: SmoothSurfaceParams) -> None:

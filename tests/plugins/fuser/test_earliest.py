@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fluoromap.fuser.earliest import earliest_sites
@@ -17,6 +17,7 @@ def test_two_sites_agree_with_the_normal_distribution():
 
 
 @settings(max_examples=20, deadline=None)
+@example([0.0] * 6 + [-13.0], 688)
 @given(st.lists(st.floats(-50, 50), min_size=2, max_size=8), st.integers(0, 1000))
 def test_agrees_with_drawing_lots(times, seed):
     rng = np.random.default_rng(seed)
@@ -32,3 +33,20 @@ def test_agrees_with_drawing_lots(times, seed):
 def test_equal_sites_share():
     answer = earliest_sites(("a", "b", "c"), np.array([5.0, 5.0, 80.0]), np.ones(3))
     assert dict(answer) == {"a": pytest.approx(0.5), "b": pytest.approx(0.5)}
+
+
+def test_many_improbable_sites_are_not_hidden_by_a_probable_one():
+    """Forty sites of about 1 % each leave the first one uncertain."""
+    lat = np.concatenate([[0.0], np.full(40, 13.0)])
+    answer = earliest_sites(tuple(f"S{index}" for index in range(41)), lat, np.full(41, 5.0))
+    rng = np.random.default_rng(0)
+    drawn = np.mean((lat + 5.0 * rng.normal(size=(20_000, 41))).argmin(axis=1) == 0)
+    assert drawn < 0.8
+    assert answer[0] == ("S0", pytest.approx(drawn, abs=0.02))
+    assert 0.99 <= sum(probability for _, probability in answer) <= 1 + 1e-9
+
+
+def test_two_hundred_equal_sites_are_all_as_probable():
+    answer = earliest_sites(tuple(f"S{index}" for index in range(200)), np.zeros(200), np.ones(200))
+    assert len(answer) >= 198
+    assert [probability for _, probability in answer] == pytest.approx([1 / 200] * len(answer))

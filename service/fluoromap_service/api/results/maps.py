@@ -101,7 +101,7 @@ class ActivationMap(BaseModel):
     lat_sd_ms: list[float | None]
     covered: list[bool]
     sites: list[MapSite]
-    earliest: list[Earliest] = Field(description="Most probable first.")
+    earliest: list[Earliest] = Field(description="Most probable first, until they reach 99 % together.")
     total_activation_time_ms: float
     leave_one_out_rms_ms: float | None
     volume_ml: float
