@@ -50,6 +50,7 @@ _REVERSED_PX = 4.0
 _TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
+_AS_CLEAR = 0.8
 _LEAST_AGAINST, _CONFIRMED_AGAINST = 2, 0.25
 """Frames that outvote a track, and the share of its frames that does not outvote one that was found in a moved mean."""
 _OF_FRAMES, _MOST_TIP_ODDS = 0.75, 4.0
@@ -390,7 +391,7 @@ def _advance(
         ]
         for number, track in enumerate(tracks):
             if track.confirmed and number not in numbers:
-                _search(track, entry.frame, time_ms, catheters, search, present, sure)
+                _search(track, entry, time_ms, catheters, search, present, sure)
         numbers = [
             -1 if number >= 0 and not tracks[number].confirmed and overlaps(chain, present) else number
             for chain, number in zip(entry.chains, numbers, strict=True)
@@ -415,7 +416,12 @@ def _advance(
         track = tracks[number]
         shift, reach = _expected(track, time_ms)
         recovered = search(entry.frame, track.chain, shift, reach, present) if search is not None else None
-        if recovered is not None and not _is_bent(track, recovered, time_ms) and not overlaps(recovered, present):
+        if (
+            recovered is not None
+            and not _is_bent(track, recovered, time_ms)
+            and not overlaps(recovered, present)
+            and not _is_clearer(chain, recovered)
+        ):
             chain = replace(recovered, kinds=chain.kinds, tip_odds=chain.tip_odds)
         _extend(track, chain, entry.frame, time_ms)
         present.append(chain)
@@ -423,7 +429,7 @@ def _advance(
     if search is not None and not by_hand:
         for number, track in enumerate(tracks):
             if number not in numbers and not track.confirmed:
-                _search(track, entry.frame, time_ms, catheters, search, present)
+                _search(track, entry, time_ms, catheters, search, present, loose=loose)
     for chain in loose:
         if chain.manual or (entry.manual_needed is None and not overlaps(chain, present)):
             present.append(chain)
@@ -445,29 +451,43 @@ def _fitted_again(chain: Chain, frame: int, beside: Sequence[Chain], search: Cha
 
 def _search(
     track: Track,
-    frame: int,
+    entry: FrameChains,
     time_ms: float,
     catheters: int,
     search: ChainSearch,
     present: list[Chain],
     others: Sequence[Chain] = (),
+    loose: Sequence[Chain] = (),
 ) -> None:
     """Search a track that got no chain of its frame.
 
-    Where it is found, it is added to ``present``. ``others`` : chains that count as present, too.
+    Where it is found, it is added to ``present``. ``others`` : chains that count as present, too. ``loose`` : the frame's chains on no
+    track; a clearer one at the same place is taken.
     """
     taken = [*present, *others]
     if len(taken) >= catheters:
         return
     shift, reach = _expected(track, time_ms)
-    recovered = search(frame, track.chain, shift, reach, taken, confirmed=track.confirmed)
+    recovered = search(entry.frame, track.chain, shift, reach, taken, confirmed=track.confirmed)
     if recovered is None or overlaps(recovered, taken):
         return
+    for chain in loose:
+        alike = chain.electrodes == recovered.electrodes and kind_overlap(track.chain, chain) > 0
+        if alike and overlaps(chain, [recovered]) and _is_clearer(chain, recovered):
+            recovered = min((chain, reverse(chain)), key=lambda one: chain_distance(track.chain, one, shift)[0])
     is_faint = np.median(recovered.scores) < _FAINT * track.chain.scores.max()
     # Far from an old place there may be anything.
     if not is_faint or abs(time_ms - track.time_ms) < _STALE_MS:
-        _extend(track, recovered, frame, time_ms)
+        _extend(track, recovered, entry.frame, time_ms)
         present.append(recovered)
+
+
+def _is_clearer(chain: Chain, recovered: Chain) -> bool:
+    """Return whether a frame's own chain is clearly more like electrodes than what a search found.
+
+    After a frame with a wrong shape the search would find that shape again.
+    """
+    return bool(np.median(recovered.scores) < _AS_CLEAR * np.median(chain.scores))
 
 
 def _from_tip(track: Track) -> dict[int, Chain]:

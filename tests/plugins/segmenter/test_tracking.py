@@ -12,9 +12,10 @@ from fluoromap.segmenter.tracks import Verdict
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 
 
-def chain(points, name="reference", **more):
+def chain(points, name="reference", scores=None, **more):
     n = len(points)
-    return Chain(tuple(range(1, n + 1)), points, np.tile(np.eye(2), (n, 1, 1)), np.ones(n), ((name, 1.0),), **more)
+    likely = np.ones(n) if scores is None else scores
+    return Chain(tuple(range(1, n + 1)), points, np.tile(np.eye(2), (n, 1, 1)), likely, ((name, 1.0),), **more)
 
 
 def run(chains_of_frame, unsure=()):
@@ -192,6 +193,24 @@ def test_a_chain_a_pair_too_far_along_its_catheter_does_not_keep_it_out():
     entries = track_chains(found, times(6), 1, search, seed)
     for entry in entries:
         np.testing.assert_allclose(entry.chains[0].pixels_uv, row[:10] + entry.frame)
+
+
+@pytest.mark.parametrize("bent_px", [0.0, -8.0])
+@pytest.mark.parametrize(("clearness", "shown_px"), [(0.5, 0.0), (0.9, 3.0)])
+def test_a_clear_chain_stays_where_the_search_finds_the_wrong_shape_of_the_frame_before(bent_px, clearness, shown_px):
+    """What a search found replaces the frame's own chain only where it is about as clear."""
+    row = np.stack([np.arange(10) * 14.0, np.zeros(10)], axis=1)
+    at_end = np.where(np.arange(10)[:, None] >= 7, [0.0, 1.0], 0.0)
+
+    def search(frame, known, shift, reach_px, taken, same_shape=False, confirmed=False):
+        if same_shape or frame == 3:
+            return None
+        return chain(row + 8.0 * at_end + [0.0, 3.0], scores=np.full(10, clearness))
+
+    displaced_px = [0.0, 0.0, 0.0, 8.0, bent_px, 0.0, 0.0, 0.0]
+    found = run([[chain(row + displaced * at_end)] for displaced in displaced_px])
+    after = track_chains(found, times(8), 1, search)[4]
+    assert after.chains[0].pixels_uv[0].tolist() == [0.0, shown_px]
 
 
 def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():

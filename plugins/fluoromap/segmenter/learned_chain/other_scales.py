@@ -15,6 +15,7 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 
 OTHER_SCALES = 1.18, 0.85
 """Over the stated one."""
@@ -43,7 +44,7 @@ def choose_scale(
 
     It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
     like one catheter at some scale. Else another one has to keep those that it shows. Where it shows one that is not listed,
-    another scale has to show three: an unlisted catheter may look like a listed one of another size.
+    another scale has to show three, or six more electrodes: four of an unlisted catheter may lie like a listed one of another size.
 
     Parameters
     ----------
@@ -59,11 +60,13 @@ def choose_scale(
     if _usual_catheters(found) >= len(catalogue.catheters):
         return ChosenScale(stated)
     least = 1 if _count_electrodes(found) else _CONFIRMED
-    if _shows_unlisted(found):
-        least = _CONFIRMED + 1
+    has_unlisted = _shows_unlisted(found)
     for scale in promising([factor * stated for factor in OTHER_SCALES]):
         other = segment(scale)
-        if _count_electrodes(other) <= _count_electrodes(found) or _usual_catheters(other) < least:
+        more = _count_electrodes(other) - _count_electrodes(found)
+        if more <= 0 or _usual_catheters(other) < least:
+            continue
+        if has_unlisted and _usual_catheters(other) <= _CONFIRMED and more < MANY_ELECTRODES * len(found.frames):
             continue
         if _share_kept(found, other, _BESIDE_MM * scale) < _LEAST_KEPT:
             continue

@@ -8,13 +8,16 @@ from fluoromap.contracts import Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.other_scales import choose_scale
 
-CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "a"), catheter_type("quadripolar-5-5-5", "b")), "a", "b")
+TYPES = {"a": "quadripolar-2-5-2", "b": "quadripolar-5-5-5", "c": "hexapolar-2-5-2"}
+CATALOGUE = Catalogue(tuple(catheter_type(type_, name) for name, type_ in TYPES.items()), "a", "b")
 
 
 def chain(name: str, v: float, px_per_mm: float, seen: float = 1.0) -> Chain:
-    along = np.concatenate([[0.0], np.cumsum(CATALOGUE[name].spacing_mm)]) * px_per_mm * seen
-    points = np.stack([along, np.full(4, v)], axis=1)
-    return Chain((1, 2, 3, 4), points, np.tile(np.eye(2), (4, 1, 1)), np.ones(4), ((name, 1.0),))
+    along = CATALOGUE[name].arc_lengths_mm * px_per_mm * seen
+    count = len(along)
+    points = np.stack([along, np.full(count, v)], axis=1)
+    numbers = tuple(range(1, count + 1))
+    return Chain(numbers, points, np.tile(np.eye(2), (count, 1, 1)), np.ones(count), ((name, 1.0),))
 
 
 def showing(*chains: Chain, reason: Reason | None = None) -> Segmentation:
@@ -30,7 +33,7 @@ def chosen(by_scale: dict[float, Segmentation]) -> float:
 
 
 def test_the_stated_scale_stays_where_it_shows_all():
-    assert chosen({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0))}) == 3.0
+    assert chosen({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0), chain("c", 150.0, 3.0))}) == 3.0
 
 
 def test_two_catheters_are_not_enough_where_the_stated_scale_shows_an_unlisted_one():
@@ -39,6 +42,12 @@ def test_two_catheters_are_not_enough_where_the_stated_scale_shows_an_unlisted_o
     three = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55), chain("b", 150.0, 2.55))
     assert chosen({3.0: stated, 3.54: stated, 2.55: two}) == 3.0
     assert chosen({3.0: stated, 3.54: stated, 2.55: three}) == 2.55
+
+
+def test_six_more_electrodes_are_enough_where_the_stated_scale_shows_an_unlisted_catheter():
+    """A hexapolar catheter that does not fit the stated scale is reported as unlisted there."""
+    stated = showing(chain("a", 10.0, 3.0), reason=Reason.EXTRA_CATHETER)
+    assert chosen({3.0: stated, 3.54: stated, 2.55: showing(chain("a", 10.0, 3.0), chain("c", 90.0, 2.55))}) == 2.55
 
 
 def test_a_larger_scale_counts_where_a_catheter_is_too_long_for_the_stated_one():
