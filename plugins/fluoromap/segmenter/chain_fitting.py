@@ -20,7 +20,7 @@ from fluoromap.segmenter.linking import (
 )
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.proposals import answers_for_each
-from fluoromap.segmenter.refinement import ElectrodeFit, predict_on_curve, refine
+from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, predict_on_curve, refine
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 
 _SHAFT_WEIGHT = 1.0
@@ -32,8 +32,6 @@ _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
 _MERGED_MM, _MERGED_SD_MM = 1.5, 0.8
-_LEAST_GAP = 0.15
-"""Of the spacing at the isocentre. Nearer than that, two electrodes are fitted to one dark place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +152,7 @@ def _apart(fit: ElectrodeFit, candidates_uv: Array, catheter: Catheter, px_per_m
     both places adds to its covariance.
     """
     gaps = np.linalg.norm(np.diff(fit.points_uv, axis=1), axis=2)
-    meets = gaps < _LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)
+    meets = gaps < LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)
     if not meets.any():
         return fit
     moved = np.linalg.norm(fit.points_uv - candidates_uv, axis=2)

@@ -15,8 +15,10 @@ from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, 
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.field_mask import ExposedField, FieldMask, evenly_spaced_frames, exposed_field, field_mask
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
+from fluoromap.segmenter.lag import measure_lag, widen_by_lag
 from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
+from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
@@ -152,6 +154,20 @@ class FoundMoving:
     chains: tuple[Chain, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class ObliquePlaces:
+    """The answer of :func:`~fluoromap.segmenter.oblique_places.place_obliquely` for a frame."""
+
+    chains: tuple[Chain, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RunLag:
+    """The answer of :func:`~fluoromap.segmenter.lag.measure_lag`."""
+
+    lag: float
+
+
 @dataclass(frozen=True, slots=True)
 class ExtraCatheter:
     """The answer of :meth:`Detector.shows_extra_catheter` for the mean image."""
@@ -185,6 +201,7 @@ def segment_run(
     search_again: bool = False,
     search_moving: bool = False,
     shows_catheter: RunJudge | None = None,
+    oblique: bool = False,
 ) -> Segmentation:
     """Segment a run: tracked chains of all frames, and diastolic chains.
 
@@ -211,6 +228,8 @@ def segment_run(
         Whether to search for catheters without a track with :meth:`Detector.find_moving`.
     shows_catheter : RunJudge, optional
         Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
+    oblique : bool
+        Whether the chains get the places of :func:`~fluoromap.segmenter.oblique_places.place_obliquely` in the end.
     """
     context.check()
     # Marks change the tracks, but not what the images show.
@@ -287,6 +306,11 @@ def segment_run(
             lambda: ExtraCatheter(detector.shows_extra_catheter(mean_x, chains)),
         )
         reason = Reason.EXTRA_CATHETER if extra.is_shown else None
+    if oblique:
+        entries = _placed_obliquely(run, catalogue, entries, log_image, recall)
+        chains = place_obliquely(mean_x, chains, catalogue, run.px_per_mm)
+    lag = recall(RunLag, (), lambda: RunLag(measure_lag(run.frames, field.inside))).lag
+    entries = widen_by_lag(entries, lag, run.px_per_mm)
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
     return Segmentation(
@@ -297,6 +321,24 @@ def segment_run(
         frame_times_ms=run.frame_times_ms,
         r_wave_frames=run.r_wave_frames,
     )
+
+
+def _placed_obliquely(
+    run: Run,
+    catalogue: Catalogue,
+    entries: Sequence[FrameChains],
+    log_image: Callable[[int], Image],
+    recall: Recall[ObliquePlaces],
+) -> tuple[FrameChains, ...]:
+    placed = []
+    for entry in entries:
+
+        def place(entry: FrameChains = entry) -> ObliquePlaces:
+            return ObliquePlaces(place_obliquely(log_image(entry.frame), entry.chains, catalogue, run.px_per_mm))
+
+        chains = recall(ObliquePlaces, (entry.frame, *entry.chains), place).chains if entry.chains else ()
+        placed.append(replace(entry, chains=chains))
+    return tuple(placed)
 
 
 def _with_marks(tracked: Sequence[FrameChains], detections: Sequence[FrameChains], marks: Marks) -> list[FrameChains]:

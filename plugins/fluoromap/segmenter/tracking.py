@@ -461,8 +461,8 @@ def _search(
 ) -> None:
     """Search a track that got no chain of its frame.
 
-    Where it is found, it is added to ``present``. ``others`` : chains that count as present, too. ``loose`` : the frame's chains on no
-    track; a clearer one at the same place is taken.
+    Where it is found, it is added to ``present``. ``others`` : chains that count as present, too. ``loose`` : the frame's chains
+    on no track; a clearer one at the same place is taken.
     """
     taken = [*present, *others]
     if len(taken) >= catheters:
@@ -483,7 +483,7 @@ def _search(
 
 
 def _is_clearer(chain: Chain, recovered: Chain) -> bool:
-    """Return whether a frame's own chain is clearly more like electrodes than what a search found.
+    """Return whether a frame's own chain is clearer than a found one.
 
     After a frame with a wrong shape the search would find that shape again.
     """

@@ -67,7 +67,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "31"
+    version: ClassVar[str] = "32"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -133,5 +133,5 @@ class LearnedChain:
                 frozenset(catheter.name for catheter in catalogue.catheters if catheter.is_circular),
             )
         )
-        found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge)
+        found = segment_run(run, catalogue, marks, context, detector_of, True, True, judge, oblique=True)
         return visible_part(found, _DIM_BELOW)

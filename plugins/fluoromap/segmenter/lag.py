@@ -1,0 +1,103 @@
+"""Lag of a run's frames: a recursive noise filter mixes each frame with the ones before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource
+from fluoromap.segmenter.tracks import mean_shift
+
+_TRIPLES, _BLOCK_PX = 3, 16
+_STILL_SHARE = 0.6
+_LEAST_LAG, _MOST_LAG = 0.05, 0.9
+_TINY = 1e-9
+_OF_SHIFT, _MOST_MM = 2.0, 0.2
+"""Standard deviation that lag adds, over lag times the shift since the frame before, and at most: a shadow that has come
+apart from its electrode displaces it no more."""
+
+
+def measure_lag(frames: FrameSource, inside: BoolArray) -> float:
+    """Return the share of the frame before in each frame, 0 to 0.9.
+
+    A filter y(t) = lag y(t - 1) + (1 - lag) x(t) leaves noise that is correlated in time: differences of frames that are two apart
+    have 1 + lag times the variance of differences of successive ones. The stillest blocks of the picture count. Quantisation and
+    compression add noise of their own, so the result is a lower bound.
+
+    Parameters
+    ----------
+    frames : FrameSource
+    inside : (rows, columns) bool
+        The exposed field.
+    """
+    if len(frames) < 3:
+        return 0.0
+    middles = np.unique(np.linspace(1, len(frames) - 2, _TRIPLES).round().astype(np.int64))
+    whole = _block_means(inside.astype(np.float64)) == 1.0
+    one_apart, two_apart = [], []
+    for middle in middles:
+        before, at, after = (_fine_structure(frames[int(middle) + step]) for step in (-1, 0, 1))
+        one_apart += [0.5 * (_block_means((at - before) ** 2) + _block_means((after - at) ** 2))[whole]]
+        two_apart += [_block_means((after - before) ** 2)[whole]]
+    if not whole.any():
+        return 0.0
+    one, two = np.median(one_apart, axis=0), np.median(two_apart, axis=0)
+    still = (two <= np.quantile(two, _STILL_SHARE)) & (one > _TINY)
+    if not still.any():
+        return 0.0
+    lag = float(np.median(two[still] / one[still])) - 1.0
+    return min(lag, _MOST_LAG) if lag >= _LEAST_LAG else 0.0
+
+
+def widen_by_lag(entries: Sequence[FrameChains], lag: float, px_per_mm: float) -> tuple[FrameChains, ...]:
+    """Return the chains of all frames, wider along their motion.
+
+    A shadow of the frame before draws the place of a moving electrode towards where it was. Chains that were set by hand keep their
+    covariance.
+
+    Parameters
+    ----------
+    entries : sequence of FrameChains
+        Tracked chains of successive frames.
+    lag : float
+        See :func:`measure_lag`.
+    px_per_mm : float
+    """
+    if lag == 0.0:
+        return tuple(entries)
+    tracks = [{chain.track: chain for chain in entry.chains} for entry in entries]
+    widened = []
+    for index, entry in enumerate(entries):
+        nearest = [tracks[beside] for beside in (index - 1, index + 1) if 0 <= beside < len(entries)]
+        chains = tuple(_widened(chain, nearest, lag, _MOST_MM * px_per_mm) for chain in entry.chains)
+        widened.append(replace(entry, chains=chains))
+    return tuple(widened)
+
+
+def _widened(chain: Chain, nearest: Sequence[Mapping[int, Chain]], lag: float, most_px: float) -> Chain:
+    beside = next((chains[chain.track] for chains in nearest if chain.track in chains), None)
+    if beside is None or chain.manual:
+        return chain
+    shift = mean_shift(beside, chain)
+    length = float(np.linalg.norm(shift))
+    if length == 0.0:
+        return chain
+    along = min(_OF_SHIFT * lag * length, most_px) / length * shift
+    return replace(chain, covariance_px2=chain.covariance_px2 + np.outer(along, along))
+
+
+def _fine_structure(frame: NDArray[np.generic]) -> Array:
+    """Return a frame without what is larger than two pixels."""
+    x = frame.astype(np.float64)
+    fine: Array = x - np.roll(x, 1, axis=1)
+    return fine
+
+
+def _block_means(x: Array) -> Array:
+    rows, columns = (size // _BLOCK_PX for size in x.shape)
+    blocks = x[: rows * _BLOCK_PX, : columns * _BLOCK_PX].reshape(rows, _BLOCK_PX, columns, _BLOCK_PX)
+    means: Array = blocks.mean(axis=(1, 3))
+    return means
