@@ -8,7 +8,7 @@ Beside a label file, ``*_set.json`` may describe the run: ``{"px_per_mm": 3.1, "
 [{"name": "cs", "type": "decapolar-2-5-2"}]}``; the catheters' names are those of the label file.
 
 Prints, for each run: electrodes found within 5 px, missed, false, found with the right catheter's name, found with the right
-number too, milliseconds a frame.
+number too, milliseconds a frame, frames, and the lag of the frames.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from scipy.optimize import linear_sum_assignment
 from fluoromap.catheters import CATHETER_TYPES, DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Segmenter, Silent
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.field_mask import find_field
+from fluoromap.segmenter.lag import measure_lag
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
 from fluoromap_service.dicom import open_frames, read_instance
 
@@ -53,7 +55,7 @@ def main() -> None:
     """Measure the segmenters on all runs of a folder."""
     given = _arguments()
     runs = [*_labelled_runs(given), *_empty_runs(given)]
-    print(f"{'':44}{'found':>12}{'missed':>8}{'false':>7}{'named':>7}{'numbered':>10}{'ms':>7}  frames")
+    print(f"{'':44}{'found':>12}{'missed':>8}{'false':>7}{'named':>7}{'numbered':>10}{'ms':>7}  frames   lag")
     for name in given.segmenter:
         for one in runs:
             _measure(name, one, given)
@@ -142,7 +144,7 @@ def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:
     found, missed, false, named, numbered = sums.tolist()
     print(
         f"{name + ' ' + one.name:44}{found:>7}/{found + missed:<4}{missed:>8}{false:>7}{named:>7}{numbered:>10}{spent:>7.1f}"
-        f"  {len(entries)}"
+        f"  {len(entries):<6}{measure_lag(one.run.frames, find_field(one.run.frames, one.run.pixels).inside):>6.2f}"
     )
     if given.draw:
         given.draw.mkdir(parents=True, exist_ok=True)
