@@ -112,8 +112,7 @@ def refine(
     without_blob : (n, electrodes)
         Electrodes without a blob of their own. They are searched only close by.
     """
-    long_tip = _TIP_REACH * 0.5 * catheter.tip_mm * px_per_mm
-    tip_reach = max(_TIP_REACH_PX, long_tip)
+    tip_reach = max(_TIP_REACH_PX, 0.5 * _TIP_REACH * catheter.tip_mm * px_per_mm)
     reach = np.full(points_uv.shape[:2], _REACH_PX)
     reach[:, 0] = tip_reach
     reach[hidden | without_blob] = _LAST_REACH_PX

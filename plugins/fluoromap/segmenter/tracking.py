@@ -51,6 +51,7 @@ _TURNED_REACH_PX = 4.0
 _MOST_RETRIES, _JUDGED_FRAMES = 2, 4
 _ACCEPTED_AT_LEAST = 0.5
 _AS_CLEAR = 0.8
+"""Share of the median score of a frame's own chain below which a searched one is less clear."""
 _LEAST_AGAINST, _CONFIRMED_AGAINST = 2, 0.25
 """Frames that outvote a track, and the share of its frames that does not outvote one that was found in a moved mean."""
 _OF_FRAMES, _MOST_TIP_ODDS = 0.75, 4.0
