@@ -463,7 +463,7 @@ def _search(
     """Search a track that got no chain of its frame.
 
     Where it is found, it is added to ``present``. ``others`` : chains that count as present, too. ``loose`` : the frame's chains
-    on no track; a clearer one at the same place is taken.
+    on no track; a clearer one at the same place and within reach is taken.
     """
     taken = [*present, *others]
     if len(taken) >= catheters:
@@ -473,9 +473,11 @@ def _search(
     if recovered is None or overlaps(recovered, taken):
         return
     for chain in loose:
+        nearer = min((chain, reverse(chain)), key=lambda one: chain_distance(track.chain, one, shift))
         alike = chain.electrodes == recovered.electrodes and kind_overlap(track.chain, chain) > 0
-        if alike and overlaps(chain, [recovered]) and _is_clearer(chain, recovered):
-            recovered = min((chain, reverse(chain)), key=lambda one: chain_distance(track.chain, one, shift)[0])
+        in_reach = chain_distance(track.chain, nearer, shift)[0] <= reach
+        if alike and in_reach and overlaps(chain, [recovered]) and _is_clearer(chain, recovered):
+            recovered = nearer
     is_faint = np.median(recovered.scores) < _FAINT * track.chain.scores.max()
     # Far from an old place there may be anything.
     if not is_faint or abs(time_ms - track.time_ms) < _STALE_MS:

@@ -213,6 +213,17 @@ def test_a_clear_chain_stays_where_the_search_finds_the_wrong_shape_of_the_frame
     assert after.chains[0].pixels_uv[0].tolist() == [0.0, shown_px]
 
 
+def test_a_clear_chain_farther_away_than_the_track_moves_is_not_taken():
+    """It has two of the searched electrodes, and two of another catheter."""
+
+    def search(frame, known, shift, reach_px, taken, same_shape=False, confirmed=False):
+        return None if same_shape else chain(POINTS, scores=np.full(4, 0.3))
+
+    wrong = POINTS + np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 50.0], [0.0, 70.0]])
+    found = run([[chain(wrong if frame == 4 else POINTS)] for frame in range(8)])
+    assert np.array_equal(track_chains(found, times(8), 1, search)[4].chains[0].pixels_uv, POINTS)
+
+
 def test_the_tip_end_of_a_longer_catheter_does_not_keep_it_out():
     long = np.stack([np.arange(6) * 12.0, np.arange(6) * 3.0], axis=1) + 60
     found = run([[chain(long + frame, "cs")] for frame in range(6)])
