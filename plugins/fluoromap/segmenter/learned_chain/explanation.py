@@ -81,10 +81,11 @@ def better_scales(
 ) -> tuple[float, ...]:
     """Return those scales that explain more electrodes than the run's own.
 
-    A few frames of the run are searched. ``trained`` : the shipped network by default.
+    A few frames of the run are searched. Where its own scale does not show a clear chain in each of them, another one has to.
+    ``trained`` : the shipped network by default.
     """
     own, *others = _explanations(run, run.pixels, catalogue, (run.px_per_mm, *scales_px_per_mm), trained)
-    return tuple(one.px_per_mm for one in others if one.electrodes > own.electrodes)
+    return tuple(one.px_per_mm for one in others if one.electrodes > own.electrodes and (own.sure or one.sure))
 
 
 def _inverted(pixels: PixelFacts) -> PixelFacts:
