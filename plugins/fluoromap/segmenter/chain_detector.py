@@ -15,7 +15,7 @@ from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import UNSEEN, Acceptance, shows_enough
 from fluoromap.segmenter.bars import follows_bars, products_beside
-from fluoromap.segmenter.chain_fitting import FittedChain, fit_chains, widen_covariance
+from fluoromap.segmenter.chain_fitting import HIDING_MM, FittedChain, are_hidden, fit_chains, widen_covariance
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
@@ -47,7 +47,7 @@ _COMPANION_SLACK = 2.5
 _AGAIN_SLACK = 2.5
 _CONFIRMED_CONTRAST = 3.0
 _STRAY_PX = 5.0
-_HIDING_MM, _LEAST_FREE = 1.2, 2
+_LEAST_FREE = 2
 _WORST_FIT = 2.0
 _LESS_SURE = 2.2
 """Factor of the covariance of a chain that was found again: frames that show it less well are searched this way. It is no
@@ -529,11 +529,7 @@ class ChainDetector:
             return None
         seen = self.image_evidence(x)
         guess = rigid_search(seen.likeness, chain.pixels_uv, shift, reach_px, taken, self.px_per_mm)
-        hidden = np.zeros(len(guess), np.bool_)
-        for other in taken:
-            near = np.linalg.norm(guess[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
-            hidden |= near < _HIDING_MM * self.px_per_mm
-        hidden |= ~self._is_seen(guess)
+        hidden = are_hidden(guess, taken, self.px_per_mm) | ~self._is_seen(guess)
         if np.count_nonzero(~hidden) < _LEAST_FREE:
             return None
         place = refine(
@@ -594,7 +590,7 @@ class ChainDetector:
                     found.append((faint_row, odds, chain))
         best: list[Chain] = []
         for _, _, chain in sorted(found, key=lambda one: one[:2], reverse=True):
-            shared = (_away(chain.pixels_uv, other.pixels_uv) < _HIDING_MM * self.px_per_mm for other in best)
+            shared = (_away(chain.pixels_uv, other.pixels_uv) < HIDING_MM * self.px_per_mm for other in best)
             if all(np.count_nonzero(near) < 2 for near in shared):
                 best.append(chain)
         return tuple(best)

@@ -30,6 +30,8 @@ _LONG_TIP_MM, _MOST_BANDS = 3.0, 1.0
 """Tips that are longer than rings for certain, and how much the bands of shorter ones say: makers' tips differ."""
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
+HIDING_MM = 1.2
+"""An electrode of another catheter hides what is nearer to it."""
 _NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
 _MERGED_MM, _MERGED_SD_MM = 1.5, 0.8
 
@@ -182,6 +184,15 @@ def _tip_shows(catheter: Catheter) -> bool:
     The tip of a quadripolar catheter is as long as its rings.
     """
     return catheter.tip_mm >= _LONG_TIP_MM or catheter.electrodes >= MANY_ELECTRODES
+
+
+def are_hidden(points_uv: Array, others: Sequence[Chain], px_per_mm: float) -> BoolArray:
+    """Return which points (n, 2) lie behind electrodes of other catheters."""
+    hidden = np.zeros(len(points_uv), np.bool_)
+    for other in others:
+        away = np.linalg.norm(points_uv[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
+        hidden |= away < HIDING_MM * px_per_mm
+    return hidden
 
 
 def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) -> Array:

@@ -33,17 +33,15 @@ def measure_lag(frames: FrameSource, inside: BoolArray) -> float:
     inside : (rows, columns) bool
         The exposed field.
     """
-    if len(frames) < 3:
+    whole = _block_means(inside.astype(np.float64)) == 1.0
+    if len(frames) < 3 or not whole.any():
         return 0.0
     middles = np.unique(np.linspace(1, len(frames) - 2, _TRIPLES).round().astype(np.int64))
-    whole = _block_means(inside.astype(np.float64)) == 1.0
     one_apart, two_apart = [], []
     for middle in middles:
         before, at, after = (_fine_structure(frames[int(middle) + step]) for step in (-1, 0, 1))
         one_apart += [0.5 * (_block_means((at - before) ** 2) + _block_means((after - at) ** 2))[whole]]
         two_apart += [_block_means((after - before) ** 2)[whole]]
-    if not whole.any():
-        return 0.0
     one, two = np.median(one_apart, axis=0), np.median(two_apart, axis=0)
     still = (two <= np.quantile(two, _STILL_SHARE)) & (one > _TINY)
     if not still.any():

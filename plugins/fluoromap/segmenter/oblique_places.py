@@ -10,13 +10,13 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.acceptance import UNSEEN
+from fluoromap.segmenter.chain_fitting import are_hidden
 from fluoromap.segmenter.linking import shape_fit
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, fit_obliquely
 
 _MORE_LIKELY = 0.5
 """How much the log-likelihood of an electrode has to rise."""
-_HIDING_MM = 1.2
 _SD_OF_WAY = 0.5
 """Standard deviation that is added, as a share of the way that an electrode moves: the two fits differ by that way."""
 
@@ -25,7 +25,7 @@ def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_
     """Return a picture's chains, those whose electrodes are oblique cylinders with new places.
 
     A chain gets them where they are more likely, with the shape of its catheter. It remains as it is if it was set by hand or
-    is not whole. Electrodes that are unseen or near another chain keep their places.
+    is not whole. Electrodes that are unseen or behind another chain keep their places.
 
     Parameters
     ----------
@@ -46,10 +46,7 @@ def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogu
     if chain.manual or len(chain.electrodes) != catheter.electrodes:
         return chain
     places = chain.pixels_uv
-    stays = chain.scores <= UNSEEN
-    for other in others:
-        away = np.linalg.norm(places[:, None] - other.pixels_uv, axis=2).min(axis=1)
-        stays |= away < _HIDING_MM * px_per_mm
+    stays = (chain.scores <= UNSEEN) | are_hidden(places, others, px_per_mm)
     bands, cylinders = fit_obliquely(x, places, catheter, px_per_mm, stays)
     gained = _log_likelihood(cylinders, catheter, px_per_mm) - _log_likelihood(bands, catheter, px_per_mm)
     if gained <= _MORE_LIKELY * catheter.electrodes or _any_meet(cylinders, catheter, px_per_mm):
