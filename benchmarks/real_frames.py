@@ -142,9 +142,11 @@ def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:
     for entry, labels in zip(entries, one.labels, strict=True):
         sums += score(entry.chains, labels)
     found, missed, false, named, numbered = sums.tolist()
+    inside = find_field(one.run.frames, one.run.pixels).inside
+    lag = measure_lag(one.run.frames, inside, one.run.pixels)
     print(
         f"{name + ' ' + one.name:44}{found:>7}/{found + missed:<4}{missed:>8}{false:>7}{named:>7}{numbered:>10}{spent:>7.1f}"
-        f"  {len(entries):<6}{measure_lag(one.run.frames, find_field(one.run.frames, one.run.pixels).inside):>6.2f}"
+        f"  {len(entries):<6}{lag:>6.2f}"
     )
     if given.draw:
         given.draw.mkdir(parents=True, exist_ok=True)

@@ -7,31 +7,51 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
-from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource
+from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource, PixelFacts
+from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.tracks import mean_shift
 
 _TRIPLES, _BLOCK_PX = 3, 16
 _STILL_SHARE = 0.6
 _LEAST_LAG, _MOST_LAG = 0.05, 0.9
 _TINY = 1e-9
+_SAMPLED, _LEAST_SAMPLED, _SMOOTHED_PX = 12, 4, 3
+_EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 200
+"""Quantile over time that shows what lies behind moving things, quantile over the picture that is the darkest of these, how dark a
+pixel is to count, as a share of that and over the noise, and how many such pixels there are at least."""
+_LEFT, _LEFT_TOO, _SAME = 0.05, 0.15, 0.12
+"""Quantiles of the share of darkness that is left, and how near they are where things have moved away from enough pixels."""
 _OF_SHIFT, _MOST_MM = 2.0, 0.2
 """Standard deviation that lag adds, over lag times the shift since the frame before, and at most: a shadow that has come
 apart from its electrode displaces it no more."""
 
 
-def measure_lag(frames: FrameSource, inside: BoolArray) -> float:
+def measure_lag(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:
     """Return the share of the frame before in each frame, 0 to 0.9.
 
-    A filter y(t) = lag y(t - 1) + (1 - lag) x(t) leaves noise that is correlated in time: differences of frames that are two apart
-    have 1 + lag times the variance of differences of successive ones. The stillest blocks of the picture count. Quantisation and
-    compression add noise of their own, so the result is a lower bound.
+    It is the larger of two measures. A filter y(t) = lag y(t - 1) + (1 - lag) x(t) leaves noise that is correlated in time.
+    Quantisation and compression add noise of their own, so that measure is a lower bound. The filter also leaves a shadow where a
+    dark thing was in the frame before, and that share of its darkness is the lag itself; it needs things that move by their width.
 
     Parameters
     ----------
     frames : FrameSource
     inside : (rows, columns) bool
         The exposed field.
+    pixels : PixelFacts
+        They say which values are dark.
+    """
+    lag = max(_lag_of_noise(frames, inside), _lag_of_shadows(frames, inside, pixels))
+    return min(lag, _MOST_LAG) if lag >= _LEAST_LAG else 0.0
+
+
+def _lag_of_noise(frames: FrameSource, inside: BoolArray) -> float:
+    """Return the lag that noise has.
+
+    Differences of frames two apart have 1 + lag times the variance of successive ones. The stillest blocks of the picture
+    count.
     """
     whole = _block_means(inside.astype(np.float64)) == 1.0
     if len(frames) < 3 or not whole.any():
@@ -44,10 +64,37 @@ def measure_lag(frames: FrameSource, inside: BoolArray) -> float:
         two_apart += [_block_means((after - before) ** 2)[whole]]
     one, two = np.median(one_apart, axis=0), np.median(two_apart, axis=0)
     still = (two <= np.quantile(two, _STILL_SHARE)) & (one > _TINY)
-    if not still.any():
+    return float(np.median(two[still] / one[still])) - 1.0 if still.any() else 0.0
+
+
+def _lag_of_shadows(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:
+    """Return the least share of darkness that pixels keep.
+
+    From one frame to the next it is the lag wherever something dark has moved away. 0 where too few pixels agree on it.
+    """
+    if len(frames) < _LEAST_SAMPLED:
         return 0.0
-    lag = float(np.median(two[still] / one[still])) - 1.0
-    return min(lag, _MOST_LAG) if lag >= _LEAST_LAG else 0.0
+    sign = -1.0 if pixels.monochrome1 else 1.0
+
+    def smooth(frame: int) -> Image:
+        smoothed: Image = uniform_filter(sign * frames[frame].astype(np.float32), _SMOOTHED_PX)
+        return smoothed
+
+    later = np.unique(np.linspace(1, len(frames) - 1, min(_SAMPLED, len(frames) - 1)).round().astype(np.int64)).tolist()
+    pairs = [(smooth(frame - 1), smooth(frame)) for frame in later]
+    empty = np.quantile([after for _, after in pairs], _EMPTY, axis=0)
+    differences = np.concatenate([np.abs(after - before)[inside] for before, after in pairs])
+    noise = float(np.median(differences)) if len(differences) else 0.0
+    kept = []
+    for before, after in pairs:
+        dark = empty - before
+        counts = inside & (dark > max(_DARK * float(np.quantile(dark, _DARKEST)), _DARK_NOISE * noise, _TINY))
+        kept.append((empty - after)[counts] / dark[counts])
+    shares = np.concatenate(kept)
+    if len(shares) < _LEAST_PIXELS:
+        return 0.0
+    least, also = np.quantile(shares, (_LEFT, _LEFT_TOO))
+    return float(least) if also - least < _SAME else 0.0
 
 
 def widen_by_lag(entries: Sequence[FrameChains], lag: float, px_per_mm: float) -> tuple[FrameChains, ...]:

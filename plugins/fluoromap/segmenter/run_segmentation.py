@@ -20,6 +20,7 @@ from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
+from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
 from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict, chain_distance, overlaps, reverse
@@ -236,16 +237,18 @@ def segment_run(
     recall = recall_for(run, catalogue, context)
     field = field_mask(recall(ExposedField, (), lambda: exposed_field(run.frames, run.pixels)), run.frames.shape)
     transform = LogTransform.of_run(run.pixels, field.mean_level)
-    count = len(run.frames)
+    lag = recall(RunLag, (), lambda: RunLag(measure_lag(run.frames, field.inside, run.pixels))).lag
+    frames = ShadowlessFrames(run.frames, lag, run.pixels.bits_stored) if lag else run.frames
+    count = len(frames)
 
     def log_image(frame: int) -> Image:
-        return field.fill(transform(run.frames[frame]))
+        return field.fill(transform(frames[frame]))
 
     @functools.cache
     def mean_image(averaged: tuple[int, ...]) -> Image:
-        total = np.zeros(run.frames.shape, np.float64)
+        total = np.zeros(frames.shape, np.float64)
         for index in averaged:
-            total += run.frames[index].astype(np.float64)
+            total += frames[index].astype(np.float64)
         return field.fill(transform(total / len(averaged)))
 
     detections = recall(
@@ -309,7 +312,6 @@ def segment_run(
     if oblique:
         entries = _placed_obliquely(run, catalogue, entries, log_image, recall)
         chains = place_obliquely(mean_x, chains, catalogue, run.px_per_mm)
-    lag = recall(RunLag, (), lambda: RunLag(measure_lag(run.frames, field.inside))).lag
     entries = widen_by_lag(entries, lag, run.px_per_mm)
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)

@@ -1,11 +1,17 @@
-"""Lag of a recursive noise filter: measured from the noise, and part of the ellipses of what moves."""
+"""Lag of a recursive noise filter: measured from noise and shadows, taken out of the frames, part of the ellipses of what moves."""
 
 import numpy as np
 import pytest
+from frame_sources import Frames as FrameList
+from scipy.ndimage import gaussian_filter
 
-from fluoromap.contracts import Chain, FrameChains
+from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
 from fluoromap.segmenter.lag import measure_lag, widen_by_lag
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
+from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
 
+PIXELS = PixelFacts(logarithmic=False, bits_stored=16, monochrome1=False)
 EVERYWHERE = np.ones((128, 128), np.bool_)
 
 
@@ -28,18 +34,73 @@ def filtered(lag: float, count: int = 8, quantised: bool = False) -> Frames:
 
 @pytest.mark.parametrize("lag", [0.0, 0.2, 0.5, 0.7])
 def test_lag_is_measured_beside_what_moves(lag):
-    assert measure_lag(filtered(lag), EVERYWHERE) == pytest.approx(lag, abs=0.03)
+    assert measure_lag(filtered(lag), EVERYWHERE, PIXELS) == pytest.approx(lag, abs=0.03)
 
 
 def test_quantisation_makes_it_a_lower_bound():
-    assert 0.1 < measure_lag(filtered(0.5, quantised=True), EVERYWHERE) <= 0.5
+    assert 0.1 < measure_lag(filtered(0.5, quantised=True), EVERYWHERE, PIXELS) <= 0.5
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_few_frames_and_frames_without_noise_have_none(count):
-    assert measure_lag(filtered(0.5, count), EVERYWHERE) == 0.0
-    assert measure_lag(Frames([np.full((128, 128), 7, np.uint8)] * 5), EVERYWHERE) == 0.0
-    assert measure_lag(filtered(0.5), ~EVERYWHERE) == 0.0
+    assert measure_lag(filtered(0.5, count), EVERYWHERE, PIXELS) == 0.0
+    assert measure_lag(Frames([np.full((128, 128), 7, np.uint8)] * 5), EVERYWHERE, PIXELS) == 0.0
+    assert measure_lag(filtered(0.5), ~EVERYWHERE, PIXELS) == 0.0
+
+
+def shadowed(lag: float, step: int, level: float = 120.0, monochrome1: bool = False) -> Frames:
+    """Return filtered pictures of 8 bits.
+
+    A dark bar of eight pixels moves by ``step`` from frame to frame. Their noise is finer than a grey level, so that it says nothing of the lag.
+    """
+    random = np.random.default_rng(3)
+    state, frames = None, Frames()
+    for frame in range(12):
+        exposure = level + 0.05 * random.standard_normal((128, 128))
+        exposure[40:80, 20 + step * frame : 28 + step * frame] *= 0.5
+        state = exposure if state is None else lag * state + (1.0 - lag) * exposure
+        frames.append(np.round(255 - state if monochrome1 else state).astype(np.uint8))
+    return frames
+
+
+@pytest.mark.parametrize("monochrome1", [False, True])
+@pytest.mark.parametrize("lag", [0.0, 0.25, 0.5])
+def test_lag_is_measured_where_something_dark_was(lag, monochrome1):
+    pixels = PixelFacts(logarithmic=False, bits_stored=8, monochrome1=monochrome1)
+    frames = shadowed(lag, 8, monochrome1=monochrome1)
+    assert measure_lag(frames, EVERYWHERE, pixels) == pytest.approx(lag, abs=0.03)
+
+
+def test_what_hardly_moves_shows_no_lag():
+    assert measure_lag(shadowed(0.0, 1), EVERYWHERE, PIXELS) == 0.0
+
+
+@pytest.mark.parametrize("step", [2, 8])
+def test_the_shadow_is_taken_out_and_the_pixels_keep_their_type(step):
+    with_shadow, without = shadowed(0.45, step), shadowed(0.0, step)
+    corrected = ShadowlessFrames(with_shadow, 0.45, 8)
+    assert (corrected.shape, len(corrected), len(list(corrected))) == ((128, 128), 12, 12)
+    for frame in (0, 5, 11, 6):
+        assert corrected[frame].dtype == np.uint8
+        np.testing.assert_allclose(corrected[frame].astype(float), without[frame], atol=2.0)
+    assert np.abs(with_shadow[5].astype(float) - without[5]).max() > 20.0
+
+
+def test_noise_that_the_filter_has_removed_does_not_come_back():
+    frames = filtered(0.5, quantised=False)
+    noise = [np.round(frame).astype(np.uint16) for frame in frames]
+    corrected = ShadowlessFrames(Frames(noise), 0.5, 16)
+    still = np.s_[:, 60:]
+    before, after = ((frames_[4][still] - frames_[5][still].astype(float)).std() for frames_ in (noise, corrected))
+    assert after < 1.25 * before
+
+
+def test_values_stay_within_their_bits():
+    frames = Frames([np.full((128, 128), level, np.uint16) for level in (0, 0, 4000)])
+    frames[2][:, 64:] = 0
+    frames[1][:, :64] = 4000
+    corrected = ShadowlessFrames(frames, 0.5, 12)
+    assert max(int(frame.max()) for frame in corrected) <= 4095
 
 
 def chain(u: float, track: int = 0, manual: bool = False) -> Chain:
@@ -64,3 +125,30 @@ def test_ellipses_are_wider_along_the_motion_only():
 def test_what_a_user_set_keeps_its_ellipses():
     run = [FrameChains(0, (chain(10.0),)), FrameChains(1, (chain(14.0, manual=True),))]
     assert widen_by_lag(run, 0.5, 4.0)[1] == run[1]
+
+
+def test_electrodes_are_found_where_they_are_beside_their_shadows():
+    catalogue = Catalogue((catheter_type("decapolar-2-5-2", "cs"),), None, "cs")
+    cs, px_per_mm = catalogue["cs"], 3.5
+    random = np.random.default_rng(4)
+    v, u = np.mgrid[0:256, 0:256].astype(np.float64)
+    direction = np.array([np.cos(0.6), np.sin(0.6)])
+    state, frames, truth = None, [], []
+    for frame in range(10):
+        tip = np.array([70.0, 50.0]) + np.array([22.0, -14.0]) * np.sin(1.3 * frame)
+        along = (u - tip[0]) * direction[0] + (v - tip[1]) * direction[1]
+        across = (v - tip[1]) * direction[0] - (u - tip[0]) * direction[1]
+        passed = np.where((np.abs(across) < 3.0) & (along > 0), 0.9, 1.0)
+        arcs = cs.arc_lengths_mm * px_per_mm
+        for index, arc in enumerate(arcs):
+            half = 0.5 * px_per_mm * (cs.tip_mm if index == 0 else cs.ring_mm)
+            passed = np.where((np.abs(along - arc) < half) & (np.abs(across) < 3.5), 0.35, passed)
+        exposure = random.poisson(400.0 * gaussian_filter(passed, 0.7)).astype(np.float64)
+        state = exposure if state is None else 0.45 * state + 0.55 * exposure
+        frames.append(np.round(state).astype(np.uint16))
+        truth.append(tip + arcs[:, None] * direction)
+    run = Run(FrameList(frames), np.arange(10) * 133.3, px_per_mm, PixelFacts(False, 12, False))
+    found = LearnedChain().segment(run, catalogue, {}, Silent()).frames
+    for entry, places in zip(found[1:], truth[1:], strict=True):
+        (chain_,) = entry.chains
+        np.testing.assert_allclose(chain_.pixels_uv, places[np.array(chain_.electrodes) - 1], atol=2.5)
