@@ -19,9 +19,6 @@ from pydicom.uid import (
     XRayAngiographicImageStorage,
 )
 
-from fluoromap.phantom import StudySpec
-from fluoromap_service.dicom.simulation import simulate
-
 HERE = Path(__file__).parent
 # A namespace without other machines: root makes one at once, another user as root of a user namespace.
 ALONE = ["unshare", "-n"] if os.geteuid() == 0 else ["unshare", "-rn"]
@@ -40,17 +37,16 @@ def orthanc() -> None:
 
 
 @pytest.mark.usefixtures("orthanc")
-def test_sixteen_runs_become_results_in_orthanc(tmp_path: Path) -> None:
-    simulate(tmp_path / "study", StudySpec(seed=7, sites=8, frames=20), processes=2)
+def test_ten_runs_become_results_in_orthanc(simulated_study: Path, tmp_path: Path) -> None:
     paths = [HERE, *sys.path]
     answer = subprocess.run(
-        [*ALONE, sys.executable, HERE / "orthanc_round_trip.py", tmp_path / "study", tmp_path],
+        [*ALONE, sys.executable, HERE / "orthanc_round_trip.py", simulated_study, tmp_path],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}, capture_output=True, text=True,
     )  # fmt: skip
     assert answer.returncode == 0, answer.stderr
     held = json.loads(answer.stdout.splitlines()[-1])
     assert Counter(held["classes"]) == {
-        XRayAngiographicImageStorage: 16,
+        XRayAngiographicImageStorage: 10,
         Comprehensive3DSRStorage: 1,
         MultiFrameTrueColorSecondaryCaptureImageStorage: 2,
         EncapsulatedSTLStorage: 1,

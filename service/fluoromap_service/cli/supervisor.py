@@ -154,6 +154,8 @@ class Supervisor:
     dicom, sender : bool, optional
         Whether to run the DICOM listener and the sender too. The supervisor restarts them when they die; it does not look
         whether they hang.
+    worker : bool, optional
+        Whether to run a worker. Without one the API takes files and shows them, and is ready as soon as it answers.
     """
 
     def __init__(
@@ -165,11 +167,13 @@ class Supervisor:
         *,
         dicom: bool = False,
         sender: bool = False,
+        worker: bool = True,
     ) -> None:
         settings = dict(environment) | {"FLUOROMAP_HOST": host, "FLUOROMAP_PORT": str(port)}
         self._worker = _Child(["worker"], log_folder and log_folder / "worker.log", settings)
         self._api = _Child(["api"], log_folder and log_folder / "api.log", settings)
-        self._children = [self._api, self._worker]
+        self._children = [self._api, self._worker] if worker else [self._api]
+        self._ready_path = "/v1/ready" if worker else "/v1/health"
         for name in ["dicom-listener"] * dicom + ["sender"] * sender:
             self._children.append(_Child([name], log_folder and log_folder / f"{name}.log", settings))
         self._log_folder = log_folder
@@ -185,7 +189,7 @@ class Supervisor:
             child.start()
 
     def wait_until_ready(self, stop: threading.Event | None = None) -> None:
-        """Wait until the API reports that it and a worker are ready.
+        """Wait until the API reports that it and the worker are ready.
 
         Parameters
         ----------
@@ -202,7 +206,7 @@ class Supervisor:
             while time.monotonic() < end and not (stop and stop.is_set()):
                 self.check_children()
                 with suppress(httpx.HTTPError):
-                    if client.get(f"{self.url}/v1/ready").status_code == 200:
+                    if client.get(f"{self.url}{self._ready_path}").status_code == 200:
                         self._was_ready = True
                         return
                 time.sleep(0.1)
@@ -309,8 +313,8 @@ def _exit(number: int, frame: object) -> None:
 
 
 @contextmanager
-def private_service(data_dir: Path, *, workers: int | None = None) -> Iterator[str]:
-    """Run the whole service on one data folder and yield its address.
+def private_service(data_dir: Path, *, workers: int | None = None, computes: bool = True) -> Iterator[str]:
+    """Run the service on one data folder and yield its address.
 
     It listens on a free port of the loopback address. It ignores the FLUOROMAP_* variables of this user, so that it cannot
     touch the database or broker of another service.
@@ -321,6 +325,8 @@ def private_service(data_dir: Path, *, workers: int | None = None) -> Iterator[s
         Folder of the files, the database and the broker.
     workers : int, optional
         Number of stages that run at the same time; by default one a processor.
+    computes : bool, optional
+        Whether a worker runs too. It takes longer to start than the API.
 
     Raises
     ------
@@ -328,10 +334,10 @@ def private_service(data_dir: Path, *, workers: int | None = None) -> Iterator[s
         When another service runs on the folder, the database cannot be made or the service is not ready in time.
     """
     with only_one(data_dir):
-        yield from _served(data_dir, workers)
+        yield from _served(data_dir, workers, computes)
 
 
-def _served(data_dir: Path, workers: int | None) -> Iterator[str]:
+def _served(data_dir: Path, workers: int | None, computes: bool) -> Iterator[str]:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
     environment["FLUOROMAP_DATA_DIR"] = str(data_dir.resolve())
     if workers is not None:
@@ -343,7 +349,7 @@ def _served(data_dir: Path, workers: int | None) -> Iterator[str]:
         raise CommandFailed(
             migration.stderr.strip().removeprefix("fluoromap: ") or f"The database in {data_dir} cannot be made."
         )
-    supervisor = Supervisor("127.0.0.1", free_port(), environment, log_folder=data_dir)
+    supervisor = Supervisor("127.0.0.1", free_port(), environment, log_folder=data_dir, worker=computes)
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         # The default action ends this process at once and leaves its children running.
         signal.signal(signal.SIGTERM, _exit)

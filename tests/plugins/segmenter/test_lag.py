@@ -51,7 +51,8 @@ def test_few_frames_and_frames_without_noise_have_none(count):
 def shadowed(lag: float, step: int, level: float = 120.0, monochrome1: bool = False) -> Frames:
     """Return filtered pictures of 8 bits.
 
-    A dark bar of eight pixels moves by ``step`` from frame to frame. Their noise is finer than a grey level, so that it says nothing of the lag.
+    A dark bar of eight pixels moves by ``step`` from frame to frame. Their noise is finer than a grey level, so that it says
+    nothing of the lag.
     """
     random = np.random.default_rng(3)
     state, frames = None, Frames()

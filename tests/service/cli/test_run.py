@@ -67,8 +67,10 @@ def test_the_example_of_the_page_binds_a_simulated_study(
 def test_a_guess_by_order_is_shown_and_its_lines_confirm_it(fluoromap: Program, tmp_path: Path) -> None:
     folder = _pairs(tmp_path / "study")
     (folder / "activation_times.csv").write_text(ORDER)
-    guess = fluoromap("run", "study", "--dry-run")
+    guess = fluoromap("run", "study", "--dry-run", "--data-dir", "kept")
     assert guess.returncode == 0
+    assert (tmp_path / "kept" / "api.log").exists()
+    assert not (tmp_path / "kept" / "worker.log").exists(), "nothing is computed, so nobody waits for a worker"
     rows = _rows(guess.stdout)
     assert all("order" in row and "paired_by_order" in row for row in rows.values())
     assert "paired_by_order: The site's runs are a guess" in guess.stdout

@@ -48,7 +48,7 @@ def run(
     with ExitStack() as stack:
         service_dir = data_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fluoromap-run-")))
         with console.status("starting the service"):
-            url = stack.enter_context(private_service(service_dir))
+            url = stack.enter_context(private_service(service_dir, computes=not dry_run))
         client = stack.enter_context(Client(url))
         with progress_bars(console) as progress:
             sent = upload(client, files, folder.resolve().name, progress)
