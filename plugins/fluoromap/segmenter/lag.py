@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource, PixelFacts
+from fluoromap.segmenter.gaussian_blur import reduce_by
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.tracks import mean_shift
 
@@ -17,8 +17,8 @@ _TRIPLES, _BLOCK_PX = 3, 16
 _STILL_SHARE = 0.6
 _LEAST_LAG, _MOST_LAG = 0.05, 0.9
 _TINY = 1e-9
-_SAMPLED, _LEAST_SAMPLED, _SMOOTHED_PX = 12, 4, 3
-_EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 200
+_SAMPLED, _LEAST_SAMPLED, _REDUCED = 12, 4, 2
+_EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 50
 """Quantile over time that shows what lies behind moving things, quantile over the picture that is the darkest of these, how dark a
 pixel is to count, as a share of that and over the noise, and how many such pixels there are at least."""
 _LEFT, _LEFT_TOO, _SAME = 0.05, 0.15, 0.12
@@ -76,12 +76,12 @@ def _lag_of_shadows(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) 
         return 0.0
     sign = -1.0 if pixels.monochrome1 else 1.0
 
-    def smooth(frame: int) -> Image:
-        smoothed: Image = uniform_filter(sign * frames[frame].astype(np.float32), _SMOOTHED_PX)
-        return smoothed
+    def reduced(frame: int) -> Image:
+        return reduce_by(sign * frames[frame].astype(np.float32), _REDUCED)
 
+    inside = inside[::_REDUCED, ::_REDUCED]
     later = np.unique(np.linspace(1, len(frames) - 1, min(_SAMPLED, len(frames) - 1)).round().astype(np.int64)).tolist()
-    pairs = [(smooth(frame - 1), smooth(frame)) for frame in later]
+    pairs = [(reduced(frame - 1), reduced(frame)) for frame in later]
     empty = np.quantile([after for _, after in pairs], _EMPTY, axis=0)
     differences = np.concatenate([np.abs(after - before)[inside] for before, after in pairs])
     noise = float(np.median(differences)) if len(differences) else 0.0
