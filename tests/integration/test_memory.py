@@ -34,7 +34,7 @@ def _noise(frames: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def _study(folder: Path, frames: int) -> Path:
-    """Write a site of two runs that contain noise only; the second one is always short."""
+    """Write a site of two runs of noise, of which the second is short."""
     folder.mkdir()
     for number, (primary_deg, count) in enumerate(((90.0, frames), (0.0, SHORT))):
         write_cine(
