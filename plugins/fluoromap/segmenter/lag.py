@@ -21,8 +21,9 @@ _SAMPLED, _LEAST_SAMPLED, _REDUCED = 12, 4, 2
 _EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 50
 """Quantile over time that shows what lies behind moving things, quantile over the picture that is the darkest of these, how dark a
 pixel is to count, as a share of that and over the noise, and how many such pixels there are at least."""
-_LEFT, _LEFT_TOO, _SAME = 0.05, 0.15, 0.12
-"""Quantiles of the share of darkness that is left, and how near they are where things have moved away from enough pixels."""
+_LEFT, _LEFT_TOO, _SAME, _MOST_LEFT = 0.05, 0.15, 0.12, 0.65
+"""Quantiles of the share of darkness that is left, how near they are where things have moved away from enough pixels, and the
+largest share that is lag: contrast medium flows away more slowly than that."""
 _OF_SHIFT, _MOST_MM = 2.0, 0.2
 """Standard deviation that lag adds, over lag times the shift since the frame before, and at most: a shadow that has come
 apart from its electrode displaces it no more."""
@@ -70,7 +71,8 @@ def _lag_of_noise(frames: FrameSource, inside: BoolArray) -> float:
 def _lag_of_shadows(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:
     """Return the least share of darkness that pixels keep.
 
-    From one frame to the next it is the lag wherever something dark has moved away. 0 where too few pixels agree on it.
+    From one frame to the next it is the lag wherever something dark has moved away. The edges of what moves slowly keep a share
+    too, and they show it backwards in time as well: lag does not. 0 where too few pixels agree or both directions do.
     """
     if len(frames) < _LEAST_SAMPLED:
         return 0.0
@@ -85,16 +87,19 @@ def _lag_of_shadows(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) 
     empty = np.quantile([after for _, after in pairs], _EMPTY, axis=0)
     differences = np.concatenate([np.abs(after - before)[inside] for before, after in pairs])
     noise = float(np.median(differences)) if len(differences) else 0.0
-    kept = []
-    for before, after in pairs:
-        dark = empty - before
+
+    def shared(dark: Image, beside: Image) -> Image:
         counts = inside & (dark > max(_DARK * float(np.quantile(dark, _DARKEST)), _DARK_NOISE * noise, _TINY))
-        kept.append((empty - after)[counts] / dark[counts])
-    shares = np.concatenate(kept)
-    if len(shares) < _LEAST_PIXELS:
+        return beside[counts] / dark[counts]
+
+    darkness = [(empty - before, empty - after) for before, after in pairs]
+    left = np.concatenate([shared(before, after) for before, after in darkness])
+    arrived = np.concatenate([shared(after, before) for before, after in darkness])
+    if min(len(left), len(arrived)) < _LEAST_PIXELS:
         return 0.0
-    least, also = np.quantile(shares, (_LEFT, _LEFT_TOO))
-    return float(least) if also - least < _SAME else 0.0
+    least, also = np.quantile(left, (_LEFT, _LEFT_TOO))
+    is_lag = also - least < _SAME and np.quantile(arrived, _LEFT_TOO) < least < _MOST_LEFT
+    return float(least) if is_lag else 0.0
 
 
 def widen_by_lag(entries: Sequence[FrameChains], lag: float, px_per_mm: float) -> tuple[FrameChains, ...]:

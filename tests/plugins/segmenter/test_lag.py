@@ -7,6 +7,8 @@ from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
+from fluoromap.geometry import Gantry
+from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.lag import measure_lag, widen_by_lag
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
@@ -74,6 +76,24 @@ def test_lag_is_measured_where_something_dark_was(lag, monochrome1):
 
 def test_what_hardly_moves_shows_no_lag():
     assert measure_lag(shadowed(0.0, 1), EVERYWHERE, PIXELS) == 0.0
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_what_moves_slowly_leaves_no_lag(view):
+    gantries = tuple(Gantry(primary, 0.0, 1000.0, 500.0, (2 / 4.1, 2 / 4.1), 512, 512) for primary in (90.0, 0.0))
+    spec = StudySpec(9723, sites=1, frames=8, frame_rate_hz=60.0, heart="dog", gantries=gantries)
+    run = simulate_study(spec).sites[0].runs[view]
+    assert measure_lag(run.frames, np.ones((512, 512), np.bool_), PIXELS) == 0.0
+
+
+def test_contrast_that_flows_away_is_no_lag():
+    random = np.random.default_rng(7)
+    frames = Frames()
+    for frame in range(16):
+        exposure = random.normal(1000.0, 5.0, (128, 128))
+        exposure[40:80, 30:40] -= 600.0 * 0.8**frame
+        frames.append(np.round(exposure).astype(np.uint16))
+    assert measure_lag(frames, EVERYWHERE, PIXELS) == 0.0
 
 
 @pytest.mark.parametrize("step", [2, 8])
