@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import servers
+import structlog
 
 from fluoromap_service.cli.environment import limit_threads
 
@@ -31,10 +32,14 @@ Fresh = Callable[[], AbstractContextManager[str]]
 def pytest_configure(config: pytest.Config) -> None:
     """Prepare the environment before pytest imports the test modules; xdist workers inherit it."""
     limit_threads()
+    # structlog's own lines show the variables of every frame of a failure, which takes a minute.
+    structlog.configure(processors=[structlog.processors.format_exc_info, structlog.processors.JSONRenderer()])
     # Tests run jobs within the calling process, unless they start servers of their own.
     os.environ["FLUOROMAP_BROKER_URL"] = "eager"
     if not _is_xdist_worker(config):
         os.environ[_FOLDER] = str(servers.session_folder())
+        # Kernels are compiled once for the tests and all programs that they start.
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(config.cache.mkdir("numba")))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

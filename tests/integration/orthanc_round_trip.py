@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import subprocess
 import sys
 import time
@@ -102,8 +101,8 @@ def service(folder: Path, *, sites: int) -> Iterator[None]:
     configuration = folder / "fluoromap.toml"
     configuration.write_text(CONFIGURATION.format(sites=sites))
     environment = environment_of(
-        folder / "data", Path(os.environ.get("NUMBA_CACHE_DIR", folder / "numba")), FLUOROMAP_CONFIG=str(configuration),
-        FLUOROMAP_DICOM_ALLOW="ORTHANC@127.0.0.1", FLUOROMAP_LEASE_SECONDS="60",
+        folder / "data", FLUOROMAP_CONFIG=str(configuration), FLUOROMAP_DICOM_ALLOW="ORTHANC@127.0.0.1",
+        FLUOROMAP_LEASE_SECONDS="60",
     )  # fmt: skip
     with process("up", environment=environment):
         yield

@@ -78,10 +78,9 @@ def with_servers(environment: dict[str, str], port: int) -> Iterator[Kill]:
         yield kill
 
 
-def environment_of(data_dir: Path, numba_cache: Path, **settings: str) -> dict[str, str]:
+def environment_of(data_dir: Path, **settings: str) -> dict[str, str]:
     data_dir.mkdir()
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
-    environment.setdefault("NUMBA_CACHE_DIR", str(numba_cache))
     return environment | {
         "FLUOROMAP_DATA_DIR": str(data_dir),
         "FLUOROMAP_WORKERS": "2",

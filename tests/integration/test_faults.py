@@ -88,7 +88,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, simulated_study: Path) -> 
     """The running service, shared by the tests of this module."""
     folder = tmp_path_factory.mktemp("faults")
     faulty_plugins.install(folder)
-    environment = environment_of(folder / "data", simulated_study.parent / "numba")
+    environment = environment_of(folder / "data")
     paths = (str(folder), str(Path(faulty_plugins.__file__).parent), os.environ.get("PYTHONPATH", ""))
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     port = free_port()

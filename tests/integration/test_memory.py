@@ -64,7 +64,7 @@ def _peak_mib(pid: int) -> float:
 
 def _peaks_of_a_job(tmp_path: Path, frames: int) -> tuple[float, float]:
     data_dir = tmp_path / f"data-{frames}"
-    environment = environment_of(data_dir, tmp_path.parent / "numba", FLUOROMAP_WORKERS="1")
+    environment = environment_of(data_dir, FLUOROMAP_WORKERS="1")
     port = free_port()
     with ExitStack() as stack:
         api = stack.enter_context(process("up", "--port", str(port), environment=environment))

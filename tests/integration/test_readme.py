@@ -30,7 +30,7 @@ def test_curl_lines_work_without_and_with_a_token(simulated_study: Path, tmp_pat
     assert block is not None
     lines = block[1]
     assert (lines.count("ask "), lines.count("curl")) == (11, 1)
-    environment = environment_of(tmp_path / "data", simulated_study.parent / "numba")
+    environment = environment_of(tmp_path / "data")
     port = free_port()
     with embedded(environment, port):
         wait_until_ready(f"http://127.0.0.1:{port}", tmp_path / "data")

@@ -63,7 +63,7 @@ def test_a_killed_worker_changes_nothing(
             if stack == "servers":
                 settings["FLUOROMAP_DATABASE_URL"] = opened.enter_context(fresh_postgres())
                 settings["FLUOROMAP_BROKER_URL"] = opened.enter_context(fresh_redis())
-            environment = environment_of(data_dir, simulated_study.parent / "numba", **settings)
+            environment = environment_of(data_dir, **settings)
             port = free_port()
             start = embedded if stack == "embedded" else with_servers
             kill = opened.enter_context(start(environment, port))

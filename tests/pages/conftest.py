@@ -33,7 +33,7 @@ ClickPixel = Callable[[Any, str, float, float], None]
 def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Yield the address of an open service with one worker."""
     folder = tmp_path_factory.mktemp("pages")
-    environment = environment_of(folder / "data", folder / "numba", FLUOROMAP_WORKERS="1")
+    environment = environment_of(folder / "data", FLUOROMAP_WORKERS="1")
     port = servers.free_port()
     with embedded(environment, port):
         url = f"http://127.0.0.1:{port}"

@@ -19,7 +19,7 @@ from fluoromap_service.cli.supervisor import program
 @pytest.fixture
 def closed_service(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """Yield the address and the token of a service that asks for one."""
-    environment = environment_of(tmp_path / "data", tmp_path / "numba")
+    environment = environment_of(tmp_path / "data")
     subprocess.run([program(), "db", "upgrade"], env=environment, check=True, capture_output=True)
     command = [program(), "token", "create", "--name", "doctor", "--scope", "read", "--scope", "write"]
     made = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)

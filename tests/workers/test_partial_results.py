@@ -76,7 +76,8 @@ def _send(service: TestClient, study_path: str, folder: Path) -> None:
 
 
 def _job(service: TestClient, study_path: str) -> dict[str, Any]:
-    job: dict[str, Any] = service.get(service.post(f"{study_path}/jobs", json={}).headers["location"]).json()
+    started = service.post(f"{study_path}/jobs", json={"pipeline": {"segmenter": {"name": "catheter-chain"}}})
+    job: dict[str, Any] = service.get(started.headers["location"]).json()
     return job
 
 

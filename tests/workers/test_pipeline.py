@@ -25,7 +25,7 @@ from fluoromap.matching import match_study
 from fluoromap.monoplane.motion_prior import MotionPrior
 from fluoromap.reasons import Reason
 from fluoromap.registry import Kind, Plugin
-from fluoromap.segmenter.learned_chain.plugin import LearnedChain
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.triangulator import study_triangulation
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.site_locator import SiteLocator
@@ -39,6 +39,8 @@ from fluoromap_workers import stage_inputs
 
 SECOND_FRAMES = 12
 """Frames of the second real run: the first one has all 96."""
+QUICK = {"pipeline": {"segmenter": {"name": "catheter-chain"}}}
+"""It finds the same simulated electrodes in a tenth of the time."""
 
 
 def _send(service: TestClient, study_path: str, folder: Path) -> None:
@@ -55,7 +57,7 @@ def _send(service: TestClient, study_path: str, folder: Path) -> None:
     assert answer.json()["unmatched"] == [], answer.text
 
 
-def _job(service: TestClient, study_path: str, **body: Any) -> dict[str, Any]:
+def _job(service: TestClient, study_path: str, body: dict[str, Any] = QUICK) -> dict[str, Any]:
     answer = service.post(f"{study_path}/jobs", json=body)
     assert answer.status_code == 202, answer.text
     job: dict[str, Any] = service.get(answer.headers["location"]).json()
@@ -75,7 +77,7 @@ def sent(service: TestClient, study_path: str, simulated_study: Path) -> str:
 
 
 def test_a_study_becomes_points_map_meshes_and_overlays(service: TestClient, sent: str, simulated_study: Path) -> None:
-    job = _job(service, sent)
+    job = _job(service, sent, body={})
     assert job["state"] == "succeeded", job
     assert job["progress"] == 1.0
     base = f"/v1/jobs/{job['id']}"
@@ -139,7 +141,7 @@ def test_a_new_activation_time_redoes_the_map_alone(service: TestClient, sent: s
 
 
 def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: str) -> None:
-    first = _job(service, sent)
+    first = _job(service, sent, body={})
     tip = next(
         p for p in service.get(f"/v1/jobs/{first['id']}/points").json()["points"]
         if p["catheter"] == "mapping" and p["electrode"] == 1 and p["grade"] != "rejected"
@@ -156,7 +158,7 @@ def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: st
     ]
     kept = [{key: e[key] for key in keys} for e in electrodes if e["catheter"] != "mapping"]
     assert service.put(path, json=corrections + kept).status_code == 200
-    second = _job(service, sent)
+    second = _job(service, sent, body={})
     fresh = _fresh_stages(second)
     assert fresh["segment"] == 1
     assert fresh["monoplane"] <= 1
@@ -259,16 +261,16 @@ def test_doubts_reach_points_tracks_map_overlays_and_report(
 def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
     service: TestClient, sent: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    segment = LearnedChain.segment
+    segment = CatheterChain.segment
     calls: list[int] = []
 
-    def fails_once(self: LearnedChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
+    def fails_once(self: CatheterChain, run: Run, catalogue: Any, corrections: Marks, context: Context) -> Segmentation:
         calls.append(1)
         if len(calls) == 1:
             raise ArithmeticError("the plugin's own words")
         return segment(self, run, catalogue, corrections, context)
 
-    monkeypatch.setattr(LearnedChain, "segment", fails_once)
+    monkeypatch.setattr(CatheterChain, "segment", fails_once)
     job = _job(service, sent)
     assert job["state"] == "succeeded"
     failed = [row for row in job["stages"] if row["state"] == "failed"]
@@ -282,7 +284,7 @@ def test_a_segmenter_that_raises_rejects_its_site_and_the_job_goes_on(
 
 
 REFUSALS = {
-    "segmenter": (LearnedChain, "segment", Reason.MANUAL_NEEDED),
+    "segmenter": (CatheterChain, "segment", Reason.MANUAL_NEEDED),
     "triangulator": (MaximumLikelihood, "triangulate", Reason.TABLE_MOVED),
     "monoplane": (MotionPrior, "track", Reason.DEPTH_UNOBSERVABLE),
     "fuser": (SmoothSurface, "fuse", Reason.TOO_FEW_SITES),
@@ -319,7 +321,7 @@ def test_a_refusal_of_any_stage_reaches_the_user_with_its_reason(
 
 
 RETURNED = {
-    "segmenter": (LearnedChain, "segment", "learned-chain returned NoneType, expected Segmentation"),
+    "segmenter": (CatheterChain, "segment", "catheter-chain returned NoneType, expected Segmentation"),
     "triangulator": (MaximumLikelihood, "triangulate", "maximum-likelihood returned NoneType, expected Triangulation"),
     "monoplane": (MotionPrior, "track", "motion-prior returned NoneType, expected Track"),
     "fuser": (SmoothSurface, "fuse", "smooth-surface returned NoneType, expected ChamberMap"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from fluoromap.contracts import Array
 
@@ -64,6 +63,9 @@ def systole_starts_ms(places: Array, step_ms: float) -> Array:
     low, high = np.percentile(along, [10, 95])
     if high - low <= 0:
         return np.zeros(0)
+    # Its import takes half a second: processes that look for no beats do without it.
+    from scipy.signal import find_peaks
+
     # A resting value is appended, so that a beat at the end of the run has a peak too.
     padded = np.append(along, low)
     peaks, _ = find_peaks(padded, prominence=_PROMINENT * (high - low), distance=max(1.0, SHORTEST_BEAT_MS / step_ms))

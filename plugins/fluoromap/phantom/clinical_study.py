@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
@@ -133,7 +133,7 @@ def _bent(rest_mm: Array, angle_deg: float, rng: np.random.Generator) -> Array:
     steps = np.diff(rest_mm, axis=0)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
     place = rng.uniform(3.0, 12.0)
-    turned = np.radians(angle_deg) * norm.cdf((along[:-1] - place) / _BEND_WIDTH_MM)
+    turned = np.radians(angle_deg) * ndtr((along[:-1] - place) / _BEND_WIDTH_MM)
     tangent = steps[int(np.searchsorted(along, place))]
     axis = np.cross(tangent, rng.normal(size=3))
     axis /= np.linalg.norm(axis)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
-from scipy.stats import norm
 
 from fluoromap.contracts import Array, BoolArray, IntArray, View
 from fluoromap.geometry import Camera
@@ -194,6 +193,12 @@ def _displacements(
     )
 
 
+def _log_normal(x: Array, variance: Array) -> Array:
+    """Return the log density of normal deviations with this variance."""
+    log_density: Array = -0.5 * (x * x / variance + np.log(2.0 * np.pi * variance))
+    return log_density
+
+
 def _dot(first: Array, second: Array) -> Array:
     """Return the products (r,) of vectors (r, 3)."""
     products: Array = (first[:, None] @ second[..., None])[:, 0, 0]
@@ -245,8 +250,8 @@ def _views_apart(moved: _Displacements, params: UncertaintyParams) -> tuple[floa
     variance = 2 * _dot((moved.shared[:, None] @ params.respiration_covariance_mm2())[:, 0], moved.shared)
     from_usual = apart - np.median(apart)
     spread = np.square(_BREATHING_SHARES)[:, None] * variance + 2 * params.beat_sd_mm**2
-    breath = np.log(1 - _JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread))
-    jump = np.log(_JUMP_SHARE) + norm.logpdf(from_usual, 0, np.sqrt(spread + _JUMP_SD_MM**2))
+    breath = np.log(1 - _JUMP_SHARE) + _log_normal(from_usual, spread)
+    jump = np.log(_JUMP_SHARE) + _log_normal(from_usual, spread + _JUMP_SD_MM**2)
     either = np.logaddexp(breath, jump)
     evidence = either.sum(axis=1) + [HeartScale(share, 1.0).log_prior for share in _BREATHING_SHARES]
     weights = np.exp(evidence - logsumexp(evidence))
