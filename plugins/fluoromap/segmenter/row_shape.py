@@ -23,8 +23,8 @@ _STEP_MM = 0.1
 
 
 @functools.lru_cache(maxsize=64)
-def place_covariance_mm2(spacing_mm: tuple[float, ...], curvature_per_mm: float) -> Array:
-    """Return the covariance of one coordinate of the electrodes' places, (electrodes, electrodes).
+def shape_covariance_mm2(spacing_mm: tuple[float, ...], curvature_per_mm: float) -> Array:
+    """Return the covariance of one coordinate of a smooth curve at the electrodes, (electrodes, electrodes).
 
     The first electrode lies at 0. Spacings are those from the tip on. A loop has the curvature of its circle: its direction turns
     by that on the way, whatever side it is seen from.
@@ -39,7 +39,17 @@ def place_covariance_mm2(spacing_mm: tuple[float, ...], curvature_per_mm: float)
     up_to = np.clip((arc[:, None] - steps) / _STEP_MM + 0.5, 0.0, 1.0) * _STEP_MM
     passed = np.tril(np.ones((len(arc), len(arc))), -1)[:, :-1] * np.asarray(spacing_mm)
     covariance = _DIRECTION_VARIANCE * up_to @ alike @ up_to.T + _SPACING_SD**2 * passed @ passed.T
-    return frozen(covariance + _PLACE_SD_MM**2 * np.eye(len(arc)), covariance.shape, "covariance")
+    return frozen(covariance, covariance.shape, "covariance")
+
+
+@functools.lru_cache(maxsize=64)
+def place_covariance_mm2(spacing_mm: tuple[float, ...], curvature_per_mm: float) -> Array:
+    """Return the covariance of one coordinate of the electrodes' places, (electrodes, electrodes).
+
+    They lie about the curve of :func:`shape_covariance_mm2`.
+    """
+    covariance = shape_covariance_mm2(spacing_mm, curvature_per_mm)
+    return frozen(covariance + _PLACE_SD_MM**2 * np.eye(len(covariance)), covariance.shape, "covariance")
 
 
 def row_fit(places: Array, spacing_mm: tuple[float, ...], variance_px2: Array, px_per_mm: float) -> Array:
