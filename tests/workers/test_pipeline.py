@@ -384,7 +384,7 @@ def test_a_real_cine_without_electrodes_is_rejected_and_the_job_succeeds(
         assert patched.json()["missing"] == []
         views.append(run["sop_instance_uid"])
     service.put(f"{study_path}/sites/S01", json={"lat_ms": 12.5, "view_a": views[1], "view_b": views[0]})
-    job = _job(service, study_path)
+    job = _job(service, study_path, body={})
     assert job["state"] == "succeeded"
     points = service.get(f"/v1/jobs/{job['id']}/points").json()["points"]
     assert {point["grade"] for point in points} == {"rejected"}
