@@ -40,7 +40,7 @@ from fluoromap_workers import stage_inputs
 SECOND_FRAMES = 12
 """Frames of the second real run: the first one has all 96."""
 QUICK = {"pipeline": {"segmenter": {"name": "catheter-chain"}}}
-"""It finds the same simulated electrodes in a tenth of the time."""
+"""What jobs do with the results of a segmenter shows with the quick one too."""
 
 
 def _send(service: TestClient, study_path: str, folder: Path) -> None:
@@ -141,6 +141,7 @@ def test_a_new_activation_time_redoes_the_map_alone(service: TestClient, sent: s
 
 
 def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: str) -> None:
+    # With other electrodes, the correction of one site can change what triangulation says of another.
     first = _job(service, sent, body={})
     tip = next(
         p for p in service.get(f"/v1/jobs/{first['id']}/points").json()["points"]
