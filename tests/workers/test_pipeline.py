@@ -141,7 +141,7 @@ def test_a_new_activation_time_redoes_the_map_alone(service: TestClient, sent: s
 
 
 def test_a_correction_redoes_only_what_hangs_on_it(service: TestClient, sent: str) -> None:
-    # With other electrodes, the correction of one site can change what triangulation says of another.
+    # With the electrodes of the quick segmenter, a second site is tracked again.
     first = _job(service, sent, body={})
     tip = next(
         p for p in service.get(f"/v1/jobs/{first['id']}/points").json()["points"]
