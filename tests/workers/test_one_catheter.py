@@ -52,7 +52,7 @@ def _finished_job(service: TestClient, folder: Path) -> str:
     table = (folder / "activation_times.csv").read_bytes()
     answer = service.put(f"{path}/activation-times", content=table, headers={"Content-Type": "text/csv"})
     assert answer.json()["unmatched"] == [], answer.text
-    started = service.post(f"{path}/jobs", json={"view": "both"})
+    started = service.post(f"{path}/jobs", json={"view": "both", "pipeline": {"segmenter": {"name": "catheter-chain"}}})
     assert started.status_code == 202, started.text
     job: dict[str, Any] = service.get(started.headers["location"]).json()
     assert job["state"] == "succeeded", job
