@@ -20,7 +20,7 @@ from fluoromap_service.cli.supervisor import free_port
 pytestmark = pytest.mark.timeout(900)
 
 QUICK = {"pipeline": {"segmenter": {"name": "catheter-chain"}}}
-"""What a killed worker leaves does not hang on the segmenter."""
+"""What a killed worker leaves does not depend on the segmenter."""
 
 
 def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.unlisted import Onwards
 
 KEPT_VELOCITY = 0.6
 """Share of a track's last velocity that is expected to last."""
@@ -56,6 +57,7 @@ class Verdict:
     may_be_hidden: bool = False
     tip_odds: float | None = None
     hidden: tuple[bool, ...] = ()
+    onwards: tuple[tuple[Onwards, ...], ...] = ()
 
 
 TrackJudge = Callable[[Mapping[int, Chain]], Verdict]
@@ -170,10 +172,11 @@ def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     """Return whether a judged track is a catheter beside the run's other tracks.
 
     Noise hides all catheters. Where two others are clear, a long row that is not is none: of so many places, some of other things
-    look like electrodes. A short catheter may be unclear where it points to the X-ray source.
+    look like electrodes. A short catheter may be unclear where it points to the X-ray source. Part of a catheter that the catalogue
+    does not list is none of the catalogue.
     """
     verdict = track.verdict
-    if verdict is None:
+    if verdict is None or _is_part_of_longer(track, tracks):
         return False
     others = [other.verdict for other in tracks if other is not track and other.verdict is not None]
     clear = [other.log_odds for other in others if other.is_catheter]
@@ -183,3 +186,21 @@ def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     is_row = len(track.chain.electrodes) >= MANY_ELECTRODES and len(clear) > 1
     is_clear = as_clear or not is_row or verdict.log_odds >= _CLEAR_ROW
     return (verdict.is_catheter and is_clear) or (verdict.may_be_hidden and as_clear)
+
+
+def _is_part_of_longer(track: Track, tracks: Sequence[Track]) -> bool:
+    """Return whether a track is part of a longer catheter.
+
+    All its pictures show that the electrodes go on, and no other track explains it.
+    """
+    others = [
+        other for other in tracks if other is not track and other.verdict is not None and other.verdict.is_catheter
+    ]
+    pictures = () if track.verdict is None else track.verdict.onwards
+    return bool(pictures) and all(
+        any(
+            end.unexplained_by([other.chains[end.frame] for other in others if end.frame in other.chains])
+            for end in ends
+        )
+        for ends in pictures
+    )

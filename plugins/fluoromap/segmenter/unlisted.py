@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from fluoromap.catheters import Catheter
-from fluoromap.contracts import Array, BoolArray, Chain
+from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.kernels import kernel
 
 SURE = 0.5
@@ -24,6 +25,61 @@ _LONGEST_STEP = 1.25
 _TURNS_ON = 0.75
 """How far a row turns to the next electrodes, as a share of the turn between its halves."""
 _ROW, _ROW_STEP_MM = 4, 10.0
+_LEAST_STEP = 0.75
+"""Distance of a row's next electrode, as a share of the last gap: what is nearer is part of a long tip."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Onwards:
+    """Electrodes in the line of a row, beyond one of its ends in one frame.
+
+    points_uv : (n, 2) pixels, from the row on. as_sure : (n,) whether they are as probable as the row's middle electrode.
+    own_px : how far from the electrode of another chain each is one that the chain does not explain.
+    """
+
+    frame: int
+    points_uv: Array
+    as_sure: BoolArray
+    own_px: float
+
+    def unexplained_by(self, chains: Sequence[Chain]) -> bool:
+        """Return whether other chains leave electrodes unexplained.
+
+        Two have to be left, or the first of them where it is as sure as the row.
+        """
+        left = np.ones(len(self.points_uv), np.bool_)
+        for chain in chains:
+            left &= _apart(self.points_uv, chain.pixels_uv, self.own_px)
+        return bool(np.count_nonzero(left) > 1 or (left[:1] & self.as_sure[:1]).any())
+
+
+def onwards(frame: int, row_uv: Array, points_uv: Array, as_sure: BoolArray, px_per_mm: float) -> Onwards:
+    """Return the points in the line of a row of electrodes beyond its last one.
+
+    They are no farther apart than the row's electrodes are.
+
+    Parameters
+    ----------
+    frame : int
+    row_uv : (electrodes, 2)
+        Pixels.
+    points_uv : (n, 2)
+        Sure electrodes of the image, pixels; those of the row may be among them.
+    as_sure : (n,)
+        Whether they are as probable as the row's middle electrode.
+    px_per_mm : float
+    """
+    own_px = _OWN_MM * px_per_mm
+    gaps = np.sqrt((np.diff(row_uv, axis=0) ** 2).sum(axis=1))
+    apart = _apart(points_uv, row_uv, own_px) & _apart(points_uv, row_uv[-1:], _LEAST_STEP * float(gaps[-1]))
+    free = np.flatnonzero(apart)
+    before = row_uv[-3] if len(row_uv) > 2 else row_uv[-2]
+    lines = (
+        _find_onwards(row_uv[-1], origin, points_uv[free], _LONGEST_STEP * float(gaps.max()))
+        for origin in (before, _before_turn(row_uv))
+    )
+    longest = free[max(lines, key=len)]
+    return Onwards(frame, points_uv[longest], as_sure[longest], own_px)
 
 
 def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> int:
@@ -112,15 +168,22 @@ def shows_row(points_uv: Array, px_per_mm: float) -> bool:
 
 
 def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
-    """Count the points that go on in a line past ``at``.
+    """Count the points that go on in a line past ``at``; see :func:`_find_onwards`."""
+    return len(_find_onwards(at, before, left, reach))
 
-    The line comes from ``before``. Each point is at most ``reach`` from the last.
+
+def _find_onwards(at: Array, before: Array, left: Array, reach: float) -> IntArray:
+    """Return the indices of the points in a line past ``at``.
+
+    They are in their order. The line comes from ``before``. Each point is at most ``reach`` from the last.
     """
-    return int(_count_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach))
+    order = np.empty(len(left), np.int64)
+    count = _find_in_line(at[0], at[1], before[0], before[1], left, np.ones(len(left), np.bool_), reach, order)
+    return order[:count]
 
 
-@kernel("f8, f8, f8, f8, f8[:,::1], b1[::1], f8", fastmath=False)
-def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+@kernel("f8, f8, f8, f8, f8[:,::1], b1[::1], f8, i8[::1]", fastmath=False)
+def _find_in_line(at_u, at_v, before_u, before_v, left, is_left, reach, order):  # type: ignore[no-untyped-def]  # pragma: no cover
     for count in range(left.shape[0]):
         way_u, way_v = at_u - before_u, at_v - before_v
         length = max(math.sqrt(way_u * way_u + way_v * way_v), 1e-9)
@@ -134,6 +197,7 @@ def _count_in_line(at_u, at_v, before_u, before_v, left, is_left, reach):  # typ
         if nearest < 0:
             return count
         is_left[nearest] = False
+        order[count] = nearest
         before_u, before_v, at_u, at_v = at_u, at_v, left[nearest, 0], left[nearest, 1]
     return left.shape[0]
 

@@ -8,6 +8,7 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.tracking import track_chains
 from fluoromap.segmenter.tracks import Verdict
+from fluoromap.segmenter.unlisted import Onwards
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 
@@ -371,6 +372,27 @@ def test_a_long_row_that_is_far_less_clear_than_two_other_catheters_is_none(elec
 
     assert tracked([[*clear, row]] * 10) == [kept] * 10
     assert tracked([[clear[0], row]] * 10) == [2] * 10
+
+
+@pytest.mark.parametrize(("pictures", "explained", "kept"), [(2, False, 0), (1, False, 1), (0, False, 1), (2, True, 2)])
+def test_a_part_of_a_catheter_that_the_catalogue_does_not_list_is_no_other_catheter(pictures, explained, kept):
+    row, pair = chain(POINTS + 100, "map"), chain(np.array([[90.0, 14.0], [110.0, 18.0]]) + 100, "lead")
+    shown = [row, pair] if explained else [row]
+
+    def judge(chains):
+        if len(next(iter(chains.values())).electrodes) == 2:
+            return Verdict(True, 2.0)
+        ends = (
+            tuple(
+                Onwards(frame, pair.pixels_uv if index < pictures else np.zeros((0, 2)), np.ones(2, np.bool_), 4.0)
+                for _ in range(2)
+            )
+            for index, frame in enumerate((2, 6))
+        )
+        return Verdict(True, 2.0, onwards=tuple(ends))
+
+    entries = track_chains(run([shown] * 8), times(8), 2, only_confirmed, judge=judge)
+    assert [len(entry.chains) for entry in entries] == [kept] * 8
 
 
 @pytest.mark.parametrize(("of_frames", "of_judge", "first", "odds"), [

@@ -36,6 +36,7 @@ from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
 from fluoromap.segmenter.shaft_ends import shafts_at_ends
 from fluoromap.segmenter.tracks import Verdict
+from fluoromap.segmenter.unlisted import EVEN_ODDS, Onwards, onwards
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 _AVERAGED = 8
@@ -87,6 +88,8 @@ _CLEAR = 1.0
 """Log-odds of the middle electrode of a track that needs no more frames."""
 _MOST_PROBE_TURN = 2.4
 """Radians. What lies beside a loop, as another wall beside a probe's, is the loop's own other side."""
+_ELECTRODE, _CLEARLY_LESS = 1.0, 0.5
+"""Log-odds of an electrode beyond an end of a row, and how much less than those of the row's electrodes they may be."""
 _MOST_OUTSIDE = 0.5
 """Share of the frames in which an electrode may lie outside the field, where nothing shows, and still count."""
 
@@ -161,7 +164,7 @@ class SectionOdds:
     distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`. shafts : see
     :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`. beyond : see
     :func:`~fluoromap.segmenter.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first and the last
-    electrode.
+    electrode. near_uv, near_odds : (m, 2) places and (m,) log-odds of all electrodes of the picture, in the frame of its places.
     """
 
     log_odds: Array
@@ -171,6 +174,8 @@ class SectionOdds:
     shafts: Array
     beyond: Array
     tips: Array
+    near_uv: Array
+    near_odds: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -217,7 +222,8 @@ class TrackEvidence:
             odds: Array = np.concatenate([section.log_odds for section in sections])[inside]
             return odds
 
-        pictures = [sections_in(picture) for picture in _first_and_last(len(frames))]
+        chosen = _first_and_last(len(frames))
+        pictures = [sections_in(picture) for picture in chosen]
         is_loop = len(usual) >= MANY_ELECTRODES and _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
         odds = np.array([odds_of(sections) for sections in pictures])
         depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
@@ -244,6 +250,13 @@ class TrackEvidence:
             all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
             said.append((float(np.median(all_along)), all_along))
         middle, of_each = max(said, key=lambda one: one[0])
+        ends: tuple[tuple[Onwards, Onwards], ...] = ()
+        if not is_loop:
+            middles = [picture[len(picture) // 2] for picture in chosen]
+            ends = tuple(
+                self._onwards(frames[index], paths[index], sections, odds_of(sections))
+                for index, sections in zip(middles, pictures, strict=True)
+            )
         if is_row:
             # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
             displaced = odds.mean(axis=0).min() < _DISPLACED.at(gaps)
@@ -257,13 +270,32 @@ class TrackEvidence:
                 middle,
                 tip_odds=tip_odds,
                 hidden=tuple(unseen.tolist()) if unseen.any() else (),
+                onwards=ends,
             )
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits, gaps)
         is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said)
         hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
         may_be_hidden = bool(self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst)
-        return Verdict(is_catheter, middle, may_be_hidden, tip_odds)
+        return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends)
+
+    def _onwards(
+        self, frame: int, row_uv: Array, sections: Sequence[SectionOdds], odds: Array
+    ) -> tuple[Onwards, Onwards]:
+        """Return the electrodes in the line of a row in one picture.
+
+        They lie before its first and beyond its last electrode. odds : of the row's own. All look alike, so less probable ones are
+        something else.
+        """
+        least = max(_ELECTRODE, float(odds.min()) - _CLEARLY_LESS)
+        as_sure = max(_ELECTRODE, float(np.median(odds)))
+
+        def beyond(row_uv: Array, section: SectionOdds) -> Onwards:
+            sure = section.near_odds >= least
+            found_odds = section.near_odds[sure]
+            return onwards(frame, row_uv, section.near_uv[sure], found_odds >= as_sure, self.px_per_mm)
+
+        return beyond(row_uv[::-1], sections[0]), beyond(row_uv, sections[-1])
 
     def _is_likely(self, chains: Mapping[int, Chain], names: frozenset[str]) -> bool:
         """Return whether a track is likely one of these catheters."""
@@ -330,7 +362,20 @@ class TrackEvidence:
         ends = shafts_at_ends(chain_uv, shafts)
         beyond = depths_beyond(chain_uv, shafts)
         tips = np.mean([seen.tip_logits_at((middle - first)[[0, -1]]) for seen in answers], axis=0)
-        return SectionOdds(odds, beside, across, depths_along(chain_uv, shafts), ends, beyond, tips)
+        near_uv = answers[0].found.points_uv
+        near_odds = np.mean([log_odds(seen.probability_at(near_uv)) for seen in answers], axis=0)
+        sure = near_odds >= EVEN_ODDS
+        return SectionOdds(
+            odds,
+            beside,
+            across,
+            depths_along(chain_uv, shafts),
+            ends,
+            beyond,
+            tips,
+            near_uv[sure] + first,
+            near_odds[sure],
+        )
 
     def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
         """Return a frame at the network's scale; the latest are kept for the other tracks."""

@@ -59,7 +59,9 @@ def evidence(odds, shafts=(0.0, 0.0), gaps=0.0, beyond=(0.0, 0.0), tips=(0.0, 0.
     beside, across = np.zeros((2, 6, len(odds), 3)), np.zeros((2, 9, len(odds), 3))
     depths = np.zeros((2 * len(odds) - 1, 2))
     depths[::2, 0], depths[1::2, 0] = 1.0, gaps
-    return SectionOdds(odds, beside, across, depths, np.array(shafts), np.array(beyond), np.array(tips))
+    return SectionOdds(
+        odds, beside, across, depths, np.array(shafts), np.array(beyond), np.array(tips), np.zeros((0, 2)), np.zeros(0)
+    )
 
 
 @pytest.mark.parametrize(
@@ -507,3 +509,26 @@ def test_a_short_chain_that_turns_back_is_no_loop(monkeypatch):
     monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: dark)
     turned = np.array([[100.0, 200.0], [110.0, 205.0], [112.0, 213.0], [102.0, 208.0]])
     assert not accepts(judge, chains(np.repeat(turned[None], FRAMES, axis=0)), lambda frame: None)
+
+
+@pytest.mark.parametrize(("odds", "onwards"), [((3.0, 3.0), 2), ((1.8, 3.0), 2), ((0.9, 3.0), 0), ((2.5, 0.9), 1)])
+def test_electrodes_in_the_line_of_a_track_are_those_as_probable_as_its_own(monkeypatch, odds, onwards):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
+    own = np.array([2.0, 2.2, 2.4, 2.2])
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(2 * FRAMES))[:, None, None] * np.array([0.0, 1.0])
+    track = chains(row + beat)
+
+    def along(self, frames, path_uv, log_image):
+        middle = path_uv[len(frames) // 2]
+        pair = middle[-1] + np.array([[20.0, 0.0], [40.0, 0.0]])
+        return replace(evidence(own), near_uv=np.concatenate([middle, pair]), near_odds=np.concatenate([own, odds]))
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    verdict = judge(track, lambda frame: None)
+    assert verdict.is_catheter
+    for before, behind in verdict.onwards:
+        last = track[behind.frame].pixels_uv[-1]
+        assert len(before.points_uv) == 0
+        assert np.allclose(behind.points_uv, last + np.array([[20.0, 0.0], [40.0, 0.0]])[:onwards])
+    assert len(verdict.onwards) == 2
