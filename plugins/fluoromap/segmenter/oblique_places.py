@@ -11,10 +11,13 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.chain_fitting import are_hidden
+from fluoromap.segmenter.cylinder_fit import fit_cylinders
 from fluoromap.segmenter.linking import shape_fit
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, fit_obliquely
+from fluoromap.segmenter.refinement import usual_radius_mm
 
+_OBLIQUE, _LEAST_ELECTRODES = 0.95, 3
+"""Visible over true length below which openings show, and how many electrodes have a line."""
 _MORE_LIKELY = 0.5
 """How much the log-likelihood of an electrode has to rise."""
 _SD_OF_WAY = 0.5
@@ -43,24 +46,21 @@ def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_
 
 def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> Chain:
     catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
-    if chain.manual or len(chain.electrodes) != catheter.electrodes:
-        return chain
     places = chain.pixels_uv
-    stays = (chain.scores <= UNSEEN) | are_hidden(places, others, px_per_mm)
-    bands, cylinders = fit_obliquely(x, places, catheter, px_per_mm, stays)
-    gained = _log_likelihood(cylinders, catheter, px_per_mm) - _log_likelihood(bands, catheter, px_per_mm)
-    if gained <= _MORE_LIKELY * catheter.electrodes or _any_meet(cylinders, catheter, px_per_mm):
+    is_whole = len(places) == catheter.electrodes and len(places) >= _LEAST_ELECTRODES
+    if chain.manual or not is_whole or not _is_oblique(places, catheter, px_per_mm):
         return chain
-    way = cylinders.points_uv[0] - places
+    stays = (chain.scores <= UNSEEN) | are_hidden(places, others, px_per_mm)
+    fit = fit_cylinders(x, places, catheter, px_per_mm, usual_radius_mm(catheter), stays)
+    both = np.stack([places, fit.points_uv])
+    shape = shape_fit(both, np.zeros(both.shape[:2]), catheter, px_per_mm)
+    if fit.log_likelihood + float(shape[1] - shape[0]) <= _MORE_LIKELY * len(places):
+        return chain
+    way = fit.points_uv - places
     more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :]
-    return replace(chain, pixels_uv=cylinders.points_uv[0], covariance_px2=chain.covariance_px2 + more)
+    return replace(chain, pixels_uv=fit.points_uv, covariance_px2=chain.covariance_px2 + more)
 
 
-def _log_likelihood(fit: ElectrodeFit, catheter: Catheter, px_per_mm: float) -> float:
-    no_variance = np.zeros(fit.misfits.shape)
-    return float((fit.log_likelihood + shape_fit(fit.points_uv, no_variance, catheter, px_per_mm))[0])
-
-
-def _any_meet(fit: ElectrodeFit, catheter: Catheter, px_per_mm: float) -> bool:
-    gaps = np.linalg.norm(np.diff(fit.points_uv[0], axis=0), axis=1)
-    return bool((gaps < LEAST_GAP * px_per_mm * np.array(catheter.spacing_mm)).any())
+def _is_oblique(chain_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
+    seen = float(np.sqrt((np.diff(chain_uv, axis=0) ** 2).sum(axis=1)).sum())
+    return catheter.is_circular or seen < _OBLIQUE * px_per_mm * sum(catheter.spacing_mm)

@@ -19,7 +19,6 @@ _STEP_PX = 0.5
 _REACH_PX = 3.5
 _TIP_REACH_PX = 6.0
 _LAST_REACH_PX = 2.0
-_OBLIQUE_REACHES_PX = 3.5, 2.0, 2.0
 LEAST_GAP = 0.15
 """Of the spacing at the isocentre. Nearer than that, two electrodes are fitted to one dark place."""
 _SOFT_PX = 2.0
@@ -121,41 +120,7 @@ def refine(
     later[:, 0] = min(tip_reach, _TIP_REACH_PX)
     last = np.full(reach.shape, _LAST_REACH_PX)
     reaches = (reach, later, last) if tip_reach > _TIP_REACH_PX else (reach, last)
-    flat = np.zeros(len(points_uv), np.bool_)
-    return _fit(image, points_uv, catheter, px_per_mm, noise, hidden, reaches, flat, apart=False)
-
-
-def fit_obliquely(
-    image: Image, chain_uv: Array, catheter: Catheter, px_per_mm: float, stays: BoolArray
-) -> tuple[ElectrodeFit, ElectrodeFit]:
-    """Fit a found chain as bands and as oblique cylinders.
-
-    The openings of a ring, and the rounded end of a tip, show where it is steep: it is longer than its foreshortened
-    length, and single bands fit two near rings too far apart. The cylinders beside one are taken out of its profile.
-
-    Parameters
-    ----------
-    image : (rows, columns) float32
-        Log image.
-    chain_uv : (electrodes, 2)
-        Found places from the tip on, pixels.
-    catheter : Catheter
-    px_per_mm : float
-        At the isocentre.
-    stays : (electrodes,)
-        Electrodes that keep their places.
-
-    Returns
-    -------
-    tuple of two ElectrodeFit
-        Of one chain each: bands at these places, and oblique cylinders where they fit best.
-    """
-    places, oblique = chain_uv[None], np.array([True])
-    hidden = np.zeros((1, len(chain_uv)), np.bool_)
-    reaches = [np.where(stays, 0.0, reach)[None] for reach in _OBLIQUE_REACHES_PX]
-    still = [np.zeros(hidden.shape)] * 2
-    bands = _fit(image, places, catheter, px_per_mm, 0.0, hidden, still, ~oblique, apart=True)
-    return bands, _fit(image, places, catheter, px_per_mm, 0.0, hidden, reaches, oblique, apart=True)
+    return _fit(image, points_uv, catheter, px_per_mm, noise, hidden, reaches)
 
 
 def _fit(
@@ -166,29 +131,27 @@ def _fit(
     noise: float,
     hidden: BoolArray,
     reaches: Sequence[Array],
-    oblique: BoolArray,
-    apart: bool,
 ) -> ElectrodeFit:
     """Fit the bands of several chains in rounds.
 
-    reaches : of each round, (n, electrodes) pixels. oblique : (n,), whether the bands are oblique cylinders. apart : whether the
-    bands beside one are taken out of its profile.
+    reaches : of each round, (n, electrodes) pixels.
     """
     points = np.array(points_uv, dtype=np.float64, order="C")
     arc_mm = catheter.arc_lengths_mm
-    misfits, arc, depths = np.zeros((3, *points.shape[:2]))
-    axes, unit_sd, rests, ends = np.empty((4, *points.shape))
+    misfits, arc = np.zeros((2, *points.shape[:2]))
+    axes, unit_sd, rests = np.empty((3, *points.shape))
+    ends = np.empty(misfits.shape)
     sides = np.empty(misfits.shape, np.int64)
-    radius = 0.5 * _diameter_mm(catheter) * px_per_mm
+    radius = usual_radius_mm(catheter) * px_per_mm
     half = np.full(len(arc_mm), 0.5 * catheter.ring_mm * px_per_mm)
     half[0] = 0.5 * catheter.tip_mm * px_per_mm
     for reach in reaches:
         shifts = (reach / _STEP_PX).astype(np.int64)
-        _measure_chains(points, arc_mm, px_per_mm, half, radius, oblique, arc, axes, ends, sides)
+        _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, ends, sides)
         longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
         scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
-        _fit_bands(image, axes, ends, radius, shifts, sides, scratch, apart, depths, points, unit_sd, misfits, rests)
-    _measure_chains(points, arc_mm, px_per_mm, half, radius, oblique, arc, axes, ends, sides)
+        _fit_bands(image, axes, ends, radius, shifts, sides, scratch, points, unit_sd, misfits, rests)
+    _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, ends, sides)
     sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
     if len(arc_mm) >= 3:
         _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
@@ -218,23 +181,22 @@ def predict_on_curve(points: Array, is_hidden: BoolArray, arc_mm: Array) -> Arra
     return predicted
 
 
-def _diameter_mm(catheter: Catheter) -> float:
-    """Return the diameter: 7F for the longer tips of ablation catheters, else 6F.
+def usual_radius_mm(catheter: Catheter) -> float:
+    """Return the radius of a catheter, millimetres.
 
-    Catalogues give no diameter.
+    It is that of 7F for the longer tips of ablation catheters, else that of 6F. Catalogues give none.
     """
-    return 2.33 if catheter.tip_mm >= _LONG_TIP_MM else 2.0
+    return 1.165 if catheter.tip_mm >= _LONG_TIP_MM else 1.0
 
 
-@kernel("f8[:,:,::1], f8[::1], f8, f8[::1], f8, b1[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1]")
-def _measure_chains(points, arc_mm, px_per_mm, half, radius, oblique, arc, axes, ends, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+@kernel("f8[:,:,::1], f8[::1], f8, f8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], i8[:,::1]")
+def _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, ends, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write arc lengths, axes, band lengths and profile lengths of all electrodes.
 
     arc : visible arc length up to each electrode, pixels.
     axes : unit vector along the catheter.
-    ends : distances from a band's middle to its foreshortened end towards the tip and to the other one. The foreshortening comes
-    from the gaps beside it and from the whole catheter. ``oblique`` : whether the bands of a chain are cylinders whose opening, or
-    rounded end, shows.
+    ends : distance from a band's middle to its foreshortened ends. The foreshortening comes from the gaps beside it and from the
+    whole catheter.
     sides : number of steps to each side over which the profile is compared. The profile ends before the next
     electrode's band, which would push the fit away.
     """
@@ -249,12 +211,7 @@ def _measure_chains(points, arc_mm, px_per_mm, half, radius, oblique, arc, axes,
             after, before = min(k + 1, last), max(k - 1, 0)
             ratio = (arc[row, after] - arc[row, before]) / (px_per_mm * (arc_mm[after] - arc_mm[before]))
             local = min(max(_LOCAL * ratio + (1.0 - _LOCAL) * whole, _LEAST_SHORTENING), LONGEST)
-            end = max(half[k] * local, _LEAST_HALF_PX)
-            ends[row, k, 0] = ends[row, k, 1] = end
-            if oblique[row]:
-                opening = radius * math.sqrt(max(1.0 - local * local, 0.0))
-                ends[row, k, 0] = max(half[k] - radius, 0.0) * local + radius if k == 0 else end + opening
-                ends[row, k, 1] = end + opening
+            ends[row, k] = max(half[k] * local, _LEAST_HALF_PX)
             du = points[row, after, 0] - points[row, before, 0]
             dv = points[row, after, 1] - points[row, before, 1]
             length = max(math.sqrt(du * du + dv * dv), 1e-9)
@@ -263,15 +220,14 @@ def _measure_chains(points, arc_mm, px_per_mm, half, radius, oblique, arc, axes,
             window = _WINDOW_MM * px_per_mm * whole + 2.0
             for beside in range(max(k - 1, 0), min(k + 2, last + 1)):
                 if beside != k:
-                    window = min(window, abs(arc[row, beside] - arc[row, k]) - ends[row, beside, 1] - _CLEAR_PX)
-            sides[row, k] = int(max(window, ends[row, k, 1] + _LEAST_WINDOW_PX) / _STEP_PX)
+                    window = min(window, abs(arc[row, beside] - arc[row, k]) - ends[row, beside] - _CLEAR_PX)
+            sides[row, k] = int(max(window, ends[row, k] + _LEAST_WINDOW_PX) / _STEP_PX)
 
 
 @kernel(
-    "f4[:,::1], f8[:,:,::1], f8[:,:,::1], f8, i8[:,::1], i8[:,::1], f8[:,::1], b1, f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], "
-    "f8[:,:,::1]"
+    "f4[:,::1], f8[:,:,::1], f8[:,::1], f8, i8[:,::1], i8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"
 )
-def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, apart, depths, points, unit_sd, misfits, rests):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, points, unit_sd, misfits, rests):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move the points to the best nearby positions of bands along these axes.
 
     Writes the standard deviations along and across for a pixel noise of 1, the share of the variance along the axis that
@@ -280,13 +236,12 @@ def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, apart, depths, poi
 
     shifts, sides : largest shift and half length of the template, in steps.
     scratch : three lines of work space.
-    apart : whether the bands beside one are taken out of its profile, with their ``depths`` of the round before.
     """
     highest_u, highest_v = x.shape[1] - 1.001, x.shape[0] - 1.001
     template, profile, scores = scratch[0], scratch[1], scratch[2]
     for row in range(points.shape[0]):
         for k in range(points.shape[1]):
-            du, dv, to_tip, to_shaft = axes[row, k, 0], axes[row, k, 1], ends[row, k, 0], ends[row, k, 1]
+            du, dv, end = axes[row, k, 0], axes[row, k, 1], ends[row, k]
             side, shift, wide = sides[row, k], shifts[row, k], 1.5 * radius
             for way in range(2):
                 m = 2 * side + 1
@@ -296,10 +251,10 @@ def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, apart, depths, poi
                     value = 1.0
                     rim = s / radius
                     if way == 0:
-                        # The template rises from 0 to 1 and falls again; a tip's far end, at -to_tip, is round.
-                        inside = to_shaft - s if k == 0 else min(to_shaft - s, to_tip + s)
+                        # The template rises from 0 to 1 and falls again; a tip's far end, at -end, is round.
+                        inside = end - s if k == 0 else min(end - s, end + s)
                         value = min(max(0.5 + inside / _SOFT_PX, 0.0), 1.0)
-                        rim = min(max(1.0 - rim - to_tip / radius, 0.0), 1.0) if k == 0 else 0.0
+                        rim = min(max(1.0 - rim - end / radius, 0.0), 1.0) if k == 0 else 0.0
                     value *= math.sqrt(max(1.0 - rim * rim, 0.0))
                     template[i] = value
                     mean += value
@@ -329,17 +284,6 @@ def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, apart, depths, poi
                         lower = x[c, b] + f * (x[c, d] - x[c, b])
                         total += upper + g * (lower - upper)
                     profile[i] = total / lines
-                if way == 0 and apart:
-                    for beside in range(max(k - 1, 0), min(k + 2, points.shape[1])):
-                        away_u = points[row, beside, 0] - points[row, k, 0]
-                        away_v = points[row, beside, 1] - points[row, k, 1]
-                        if beside == k or abs(away_u * dv - away_v * du) > radius:
-                            continue
-                        at = away_u * du + away_v * dv
-                        for i in range(m + 2 * shift):
-                            s = (i - side - shift) * _STEP_PX - at
-                            inside = min(ends[row, beside, 1] - s, ends[row, beside, 0] + s)
-                            profile[i] += depths[row, beside] * min(max(0.5 + inside / _SOFT_PX, 0.0), 1.0)
                 chosen = 0
                 for place in range(2 * shift + 1):
                     score = 0.0
@@ -358,7 +302,6 @@ def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, apart, depths, poi
                 rest = max(squares - total * total / m - depth * best, 0.0)
                 rests[row, k, way] = math.sqrt(rest * _STEP_PX / (m * max(edges, 1e-9))) / max(depth, 1e-6)
                 if way == 0:
-                    depths[row, k] = depth
                     misfits[row, k] = max(1.0 - depth * best / max(squares - total * total / m, 1e-12), 0.0)
                 # Cramer-Rao bound of a shift in white noise of 1 a pixel, averaged over the band's width.
                 unit_sd[row, k, way] = math.sqrt(_STEP_PX / (wide * max(edges, 1e-9))) / max(depth, 1e-6)
@@ -370,7 +313,7 @@ def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, apart, depths, poi
                 points[row, k, 0] += moved * _STEP_PX * du
                 points[row, k, 1] += moved * _STEP_PX * dv
                 du, dv = -dv, du
-                side, shift, wide = int((radius + 4.0) / _STEP_PX), min(shift, 7), to_tip + to_shaft
+                side, shift, wide = int((radius + 4.0) / _STEP_PX), min(shift, 7), 2.0 * end
 
 
 def _position_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:

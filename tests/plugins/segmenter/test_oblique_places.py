@@ -1,4 +1,4 @@
-"""Final places: thin-walled rings that are seen obliquely, in pairs, push each other away in a fit of single bands."""
+"""Final places: thin-walled rings that are seen obliquely show openings, whose dark ends a fit of bands takes for electrodes."""
 
 from dataclasses import replace
 
@@ -63,6 +63,31 @@ def test_oblique_rings_in_pairs_are_where_they_are(shortening):
     image, places = picture_of(shortening)
     (placed,) = place_obliquely(image, [chain_at(found_in(image, places))], CATALOGUE, PX_PER_MM)
     assert np.linalg.norm(placed.pixels_uv - places, axis=1)[1:].max() < 0.6
+
+
+# At half their length, electrodes of a pair would change places in turn.
+@pytest.mark.parametrize(
+    ("shortening", "shift_mm"),
+    [
+        (0.5, "all"),
+        (0.5, "pairs apart"),
+        *((each, way) for each in (0.65, 0.8) for way in ("all", "pairs apart", "in turn")),
+    ],
+)
+def test_places_on_dark_ends_of_openings_move_to_the_middles_of_the_rings(shortening, shift_mm):
+    image, places = picture_of(shortening)
+    opening_mm = np.sqrt(1.0 - shortening**2)
+    count = np.arange(CATHETER.electrodes)
+    way = {"all": np.ones(len(count)), "in turn": count % 3 - 1.0, "pairs apart": np.where(count % 2, 1.0, -1.0)}[
+        shift_mm
+    ]
+    way[0] = 0.0
+    wrong = places + np.stack([0.9 * opening_mm * way * PX_PER_MM, np.zeros(len(count))], axis=1)
+    (placed,) = place_obliquely(image, [chain_at(wrong)], CATALOGUE, PX_PER_MM)
+    before, after = (
+        np.linalg.norm(found - places, axis=1)[1:].max() / PX_PER_MM for found in (wrong, placed.pixels_uv)
+    )
+    assert after < 0.15 < before
 
 
 def test_bands_that_end_perpendicular_to_the_shaft_stay_where_they_are():

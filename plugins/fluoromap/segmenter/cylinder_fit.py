@@ -1,0 +1,347 @@
+"""Fit of all electrodes of a found chain at once, as pictures of cylinders along its line.
+
+A ring that is seen obliquely is dark at both ends of its openings and bright in its middle, and the openings of a pair meet. So a
+dark place is no electrode's middle, and no electrode can be fitted without its neighbours. Electrodes along a line overlap their
+neighbours at most: the best places of all of them are found by dynamic programming.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from fluoromap.catheters import Catheter
+from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_length_px
+from fluoromap.segmenter.kernels import kernel
+from fluoromap.segmenter.log_image import Image
+
+SAMPLES = 9.0
+"""Independent samples of an electrode's picture: neighbouring pixels deviate from it alike."""
+
+_TUBE, _SOLID = 0.86, 0.0
+"""Inner radius of a ring, as a share of its radius: platinum round the shaft, or so much of it that it is as good as solid."""
+_WIDER = 1.15
+"""How far a picture reaches to each side, over the radius: makers' catheters differ."""
+_MARGIN_PX, _SIDE_PX, _SIDE_COLUMNS, _SMOOTH_PX = 1.5, 4.0, 3, 6.5
+_SHAFT_QUANTILE = 0.2
+_FIRST_SD, _LAST_SD = 0.12, 0.06
+"""Standard deviation of a gap over its true length, in the first search and in the last."""
+_FORESHORTENING = 0.8, 0.9, 1.0, 1.1, 1.2
+"""Tried in the first search, as a share of that of the found places."""
+_LAST_REACH_PX = 2.0
+_PAST_OPENING_PX = 2.0
+_LEAST_COSINE, _MOST_COSINE = 0.12, 1.05
+_BENDS_FROM = 6
+_LEAST_GAP = 0.1
+_ITERATIONS = 3
+_LEAST_SHARE = 0.02
+_DARKEST = 1.2
+"""How much darker than the picture an electrode may seem: what is darker is something else."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CylinderFit:
+    """Places of a chain's electrodes.
+
+    points_uv : (electrodes, 2) pixels. log_likelihood : of the image along the chain, less that at the places before.
+    """
+
+    points_uv: Array
+    log_likelihood: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """The image along a chain's line, straightened.
+
+    places_uv : (samples, 2) of the line, 0.5 px apart. strip : (samples, columns) darkness, log units; the middle column is on the
+    line. at : (electrodes,) index of the sample nearest to each electrode. cosine : (electrodes,) visible over true length of each.
+    gap_cosine : (electrodes - 1,) of the gaps.
+    """
+
+    places_uv: Array
+    strip: Array
+    at: IntArray
+    cosine: Array
+    gap_cosine: Array
+
+    def places_at(self, moved_px: Array) -> Array:
+        """Return where electrodes are that moved so far along the line, (electrodes, 2)."""
+        at, samples = self.at + moved_px / STEP_PX, np.arange(len(self.strip))
+        places: Array = np.stack([np.interp(at, samples, self.places_uv[:, axis]) for axis in range(2)], axis=1)
+        return places
+
+
+def fit_cylinders(
+    image: Image, chain_uv: Array, catheter: Catheter, px_per_mm: float, radius_mm: float, stays: BoolArray
+) -> CylinderFit:
+    """Fit a found chain of three or more electrodes as cylinders.
+
+    Rings are tubes, or solid, as explains the image best. Electrodes move along the chain's line; their gaps are those of the
+    catheter, whose foreshortening changes little from one to the next.
+
+    Parameters
+    ----------
+    image : (rows, columns) float32
+        Log image.
+    chain_uv : (electrodes, 2)
+        Found places from the tip on, pixels.
+    catheter : Catheter
+    px_per_mm : float
+        At the isocentre.
+    radius_mm : float
+        Usual radius of such a catheter.
+    stays : (electrodes,)
+        Electrodes that keep their places, because something else is seen there.
+    """
+    shape = _Shape(catheter, px_per_mm, radius_mm * px_per_mm)
+    reach = int((shape.radius_px + _PAST_OPENING_PX) / STEP_PX)
+    line = _straighten(image, chain_uv, shape, reach)
+    searched = {
+        inner: _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING) for inner in (_TUBE, _SOLID)
+    }
+    inner = min(searched, key=lambda inner: searched[inner][0])
+    before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, (1.0,))
+    nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[inner][1]))
+    reach = int(_LAST_REACH_PX / STEP_PX)
+    line = _straighten(image, nearer, shape, reach)
+    after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, (1.0,))
+    points = np.where(stays[:, None], chain_uv, line.places_at(moved_px))
+    gain = 0.5 * SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
+    return CylinderFit(points, gain)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shape:
+    """Lengths of a catheter in pixels."""
+
+    catheter: Catheter
+    px_per_mm: float
+    radius_px: float
+
+    @property
+    def half_px(self) -> Array:
+        """Half the lengths of the electrodes, (electrodes,)."""
+        half = np.full(self.catheter.electrodes, 0.5 * self.catheter.ring_mm * self.px_per_mm)
+        half[0] = 0.5 * self.catheter.tip_mm * self.px_per_mm
+        return half
+
+    @property
+    def spacing_px(self) -> Array:
+        return np.array(self.catheter.spacing_mm) * self.px_per_mm
+
+    @property
+    def columns(self) -> int:
+        """How far to each side of the line a picture reaches, pixels."""
+        return int(_WIDER * self.radius_px + _MARGIN_PX)
+
+
+def _straighten(image: Image, points_uv: Array, shape: _Shape, reach: int) -> _Line:
+    """Sample the image along a chain, without the anatomy beside it and without the shaft."""
+    steps = np.diff(points_uv, axis=0)
+    arc = np.concatenate([[0.0], np.cumsum(np.sqrt((steps * steps).sum(axis=1)))])
+    axes = np.concatenate([steps[:1], points_uv[2:] - points_uv[:-2], steps[-1:]])
+    axes = axes / np.maximum(np.sqrt((axes * axes).sum(axis=1, keepdims=True)), 1e-9)
+    ends = float(shape.half_px.max()) + shape.columns + _MARGIN_PX + (reach + 1) * STEP_PX
+    along = np.arange(-ends, arc[-1] + ends, STEP_PX)
+    beyond = np.minimum(along, 0.0)[:, None] * axes[0] + np.maximum(along - arc[-1], 0.0)[:, None] * axes[-1]
+    places = np.stack([np.interp(along, arc, points_uv[:, axis]) for axis in range(2)], axis=1) + beyond
+    tangents = np.stack([np.interp(along, arc, axes[:, axis]) for axis in range(2)], axis=1)
+    tangents /= np.maximum(np.sqrt((tangents * tangents).sum(axis=1, keepdims=True)), 1e-9)
+    wide = int(_WIDER * shape.radius_px + _SIDE_PX)
+    strip = np.empty((len(along), 2 * wide + 1))
+    _sample_strip(image, places, tangents, strip)
+    sides = 0.5 * (strip[:, :_SIDE_COLUMNS].mean(axis=1) + strip[:, -_SIDE_COLUMNS:].mean(axis=1))
+    strip -= uniform_filter1d(sides, 2 * int(_SMOOTH_PX / STEP_PX / 2) + 1, mode="nearest")[:, None]
+    strip -= np.quantile(strip, _SHAFT_QUANTILE, axis=0)
+    strip = np.ascontiguousarray(strip[:, wide - shape.columns : wide + shape.columns + 1])
+    at = np.rint((arc + ends) / STEP_PX).astype(np.int64)
+    return _Line(places, strip, at, *_foreshortening(arc, shape))
+
+
+def _foreshortening(arc_px: Array, shape: _Shape) -> tuple[Array, Array]:
+    """Return the visible over the true length at the electrodes, (electrodes,), and of the gaps, (electrodes - 1,).
+
+    It changes smoothly along a catheter, and places that are wrong by an opening hardly change it. Seen obliquely, a loop is an
+    ellipse: the square changes with twice the angle on the loop.
+    """
+    arc_mm = shape.catheter.arc_lengths_mm
+    middles = 0.5 * (arc_mm[1:] + arc_mm[:-1])
+    angles = shape.catheter.angles_on_loop_rad
+    if angles is not None:
+        turn = shape.catheter.curvature_per_mm
+        squares = (np.diff(arc_px) / shape.spacing_px) ** 2
+        design, at = (_twice(turn * where) for where in (middles, arc_mm))
+        answer = np.linalg.lstsq(design, squares, rcond=None)[0]
+        cosine, gaps = (np.sqrt(np.maximum(rows @ answer, 0.0)) for rows in (at, design))
+    else:
+        bend = np.polynomial.Polynomial.fit(
+            arc_mm, arc_px / shape.px_per_mm, 2 if len(arc_mm) >= _BENDS_FROM else 1
+        ).deriv()
+        cosine, gaps = bend(arc_mm), bend(middles)
+    return np.clip(cosine, _LEAST_COSINE, 1.0), np.clip(gaps, _LEAST_COSINE, _MOST_COSINE)
+
+
+def _twice(angles_rad: Array) -> Array:
+    return np.stack([np.ones(len(angles_rad)), np.cos(2.0 * angles_rad), np.sin(2.0 * angles_rad)], axis=1)
+
+
+def _search_along(
+    line: _Line,
+    shape: _Shape,
+    inner: float,
+    stays: BoolArray,
+    reach: int,
+    spacing_sd: float,
+    shares: tuple[float, ...],
+) -> tuple[float, Array]:
+    """Search the electrodes along a line.
+
+    Returns the share of its darkness that they leave unexplained, and how far they move, (electrodes,) pixels.
+
+    inner : see :func:`~fluoromap.segmenter.cylinder_pictures.draw_electrode`.
+    """
+    size = int((half_length_px(shape.half_px, shape.radius_px, line.cosine).max() + _MARGIN_PX) / STEP_PX)
+    moved = np.zeros(len(line.at))
+    share = _search(
+        line.strip, line.at, shape.half_px, line.cosine, line.gap_cosine, shape.spacing_px, shape.radius_px, inner, stays, reach,
+        spacing_sd, np.array(shares), size, moved,
+    )  # fmt: skip
+    return share, moved
+
+
+@kernel("f4[:,::1], f8[:,::1], f8[:,::1], f8[:,::1]")
+def _sample_strip(x, places, tangents, strip):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the darkness beside each place of a line."""
+    last_u, last_v = x.shape[1] - 1.001, x.shape[0] - 1.001
+    wide = strip.shape[1] // 2
+    for row in range(strip.shape[0]):
+        for column in range(strip.shape[1]):
+            w = column - wide
+            u = min(max(places[row, 0] - w * tangents[row, 1], 0.0), last_u)
+            v = min(max(places[row, 1] + w * tangents[row, 0], 0.0), last_v)
+            left, top = int(u), int(v)
+            f, g = u - left, v - top
+            upper = x[top, left] + f * (x[top, left + 1] - x[top, left])
+            lower = x[top + 1, left] + f * (x[top + 1, left + 1] - x[top + 1, left])
+            strip[row, column] = -(upper + g * (lower - upper))
+
+
+@kernel("f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, b1[::1], i8, f8, f8[::1], i8, f8[::1]")
+def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, reach, spacing_sd, shares, size, moved):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write how far electrodes move along a line, pixels.
+
+    Returns the share of its darkness that they leave unexplained.
+
+    With pictures of one depth for all rings and one for the tip, the unexplained darkness is a sum over electrodes and over
+    pairs of neighbours. So is the probability of the gaps. Places and depths are found in turn.
+
+    size : half the number of rows of a picture. Electrodes that stay have no picture.
+    """
+    count, choices, columns = at.size, 2 * reach + 1, strip.shape[1]
+    pictures = np.zeros((count, 2 * size + 1, columns))
+    strength = np.zeros(count)
+    seen = np.zeros((count, choices))
+    both = np.zeros((count, 2 * choices - 1))
+    whole = 0.0
+    for row in range(strip.shape[0]):
+        for column in range(columns):
+            whole += strip[row, column] * strip[row, column]
+    for k in range(count):
+        if stays[k]:
+            continue
+        draw_electrode(pictures[k], half[k], radius, inner, k == 0, cosine[k])
+        for row in range(2 * size + 1):
+            for column in range(columns):
+                strength[k] += pictures[k, row, column] * pictures[k, row, column]
+        for choice in range(choices):
+            first = at[k] + choice - reach - size
+            for row in range(max(-first, 0), min(2 * size + 1, strip.shape[0] - first)):
+                for column in range(columns):
+                    seen[k, choice] += strip[first + row, column] * pictures[k, row, column]
+    for k in range(1, count):
+        for way in range(2 * choices - 1):
+            apart = at[k] - at[k - 1] + way - 2 * reach
+            for row in range(max(-apart, 0), min(2 * size + 1, 2 * size + 1 - apart)):
+                for column in range(columns):
+                    both[k, way] += pictures[k - 1, row + apart, column] * pictures[k, row, column]
+    # A first depth: that of the middle electrode where it is seen best.
+    depth = np.zeros(count)
+    highest = np.zeros(count)
+    rings = 0
+    for k in range(count):
+        if strength[k] > 0.0:
+            highest[rings] = seen[k].max() / strength[k]
+            rings += 1
+    depth[:] = max(np.median(highest[: max(rings, 1)]), 1e-9)
+    samples = strip.size / max((2 * size + 1) * columns, 1)
+    left = 0.5 * whole
+    chosen, before = np.zeros(count, np.int64), np.zeros((count, choices), np.int64)
+    path, total, beside = np.zeros(count, np.int64), np.zeros(choices), np.zeros(choices)
+    for _ in range(_ITERATIONS):
+        weight = 0.5 * SAMPLES * samples / max(left, _LEAST_SHARE * whole)
+        least = np.inf
+        for share in shares:
+            for k in range(count):
+                for choice in range(choices):
+                    best, arg = 0.0, 0
+                    if k > 0:
+                        best = np.inf
+                        for other in range(choices):
+                            gap = (at[k] + choice - at[k - 1] - other) * STEP_PX / spacing[k - 1]
+                            away = (gap - share * gap_cosine[k - 1]) / spacing_sd
+                            cost = total[other] + 0.5 * away * away
+                            cost += weight * 2.0 * depth[k] * depth[k - 1] * both[k, choice - other + 2 * reach]
+                            if gap < _LEAST_GAP:
+                                cost += 1e3
+                            if cost < best:
+                                best, arg = cost, other
+                    own = min(seen[k, choice], _DARKEST * depth[k] * strength[k])
+                    beside[choice] = best + weight * depth[k] * (depth[k] * strength[k] - 2.0 * own)
+                    before[k, choice] = arg
+                total[:] = beside
+            if total.min() < least:
+                least = total.min()
+                path[count - 1] = total.argmin()
+                for k in range(count - 1, 0, -1):
+                    path[k - 1] = before[k, path[k]]
+                chosen[:] = path
+        # The depths of the tip and of the rings that explain most.
+        tip_tip = tip_ring = ring_ring = tip_seen = ring_seen = 0.0
+        for k in range(count):
+            overlap = 0.0 if k == 0 else both[k, chosen[k] - chosen[k - 1] + 2 * reach]
+            if k == 0:
+                tip_tip, tip_seen = strength[0], seen[0, chosen[0]]
+            else:
+                ring_ring += strength[k] + (2.0 * overlap if k > 1 else 0.0)
+                tip_ring += overlap if k == 1 else 0.0
+                ring_seen += seen[k, chosen[k]]
+        determinant = tip_tip * ring_ring - tip_ring * tip_ring
+        if determinant > 1e-9 * tip_tip * ring_ring:
+            tip = (tip_seen * ring_ring - ring_seen * tip_ring) / determinant
+            ring = (ring_seen * tip_tip - tip_seen * tip_ring) / determinant
+        else:
+            tip, ring = tip_seen / max(tip_tip, 1e-9), ring_seen / max(ring_ring, 1e-9)
+        tip, ring = max(tip, 1e-9), max(ring, 1e-9)
+        depth[0], depth[1:] = tip, ring
+        left = whole - 2.0 * (tip * tip_seen + ring * ring_seen)
+        left += tip * tip * tip_tip + 2.0 * tip * ring * tip_ring + ring * ring * ring_ring
+    for k in range(count):
+        moved[k] = (chosen[k] - reach) * STEP_PX
+        if 0 < chosen[k] < choices - 1 and strength[k] > 0.0:
+            near = np.zeros(3)
+            for way in range(3):
+                choice = chosen[k] + way - 1
+                near[way] = seen[k, choice]
+                if k > 0:
+                    near[way] -= depth[k - 1] * both[k, choice - chosen[k - 1] + 2 * reach]
+                if k < count - 1:
+                    near[way] -= depth[k + 1] * both[k + 1, chosen[k + 1] - choice + 2 * reach]
+            curvature = near[0] - 2.0 * near[1] + near[2]
+            if curvature < 0.0:
+                moved[k] += STEP_PX * min(max(0.5 * (near[0] - near[2]) / curvature, -0.5), 0.5)
+    return left / max(whole, 1e-12)
