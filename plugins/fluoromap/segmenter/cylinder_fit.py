@@ -7,6 +7,7 @@ neighbours at most: the best places of all of them are found by dynamic programm
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -157,7 +158,8 @@ def _straighten(image: Image, points_uv: Array, shape: _Shape, reach: int) -> _L
     _sample_strip(image, places, tangents, strip)
     sides = 0.5 * (strip[:, :_SIDE_COLUMNS].mean(axis=1) + strip[:, -_SIDE_COLUMNS:].mean(axis=1))
     strip -= uniform_filter1d(sides, 2 * int(_SMOOTH_PX / STEP_PX / 2) + 1, mode="nearest")[:, None]
-    strip -= np.quantile(strip, _SHAFT_QUANTILE, axis=0)
+    brightest = int(_SHAFT_QUANTILE * len(strip))
+    strip -= np.partition(strip, brightest, axis=0)[brightest]
     strip = np.ascontiguousarray(strip[:, wide - shape.columns : wide + shape.columns + 1])
     at = np.rint((arc + ends) / STEP_PX).astype(np.int64)
     return _Line(places, strip, at, *_foreshortening(arc, shape))
@@ -169,24 +171,35 @@ def _foreshortening(arc_px: Array, shape: _Shape) -> tuple[Array, Array]:
     It changes smoothly along a catheter, and places that are wrong by an opening hardly change it. Seen obliquely, a loop is an
     ellipse: the square changes with twice the angle on the loop.
     """
-    arc_mm = shape.catheter.arc_lengths_mm
-    middles = 0.5 * (arc_mm[1:] + arc_mm[:-1])
-    angles = shape.catheter.angles_on_loop_rad
-    if angles is not None:
-        turn = shape.catheter.curvature_per_mm
-        squares = (np.diff(arc_px) / shape.spacing_px) ** 2
-        design, at = (_twice(turn * where) for where in (middles, arc_mm))
-        answer = np.linalg.lstsq(design, squares, rcond=None)[0]
-        cosine, gaps = (np.sqrt(np.maximum(rows @ answer, 0.0)) for rows in (at, design))
+    smooth = _smoothing(shape.catheter)
+    if shape.catheter.is_circular:
+        cosine = np.sqrt(np.maximum(smooth @ (np.diff(arc_px) / shape.spacing_px) ** 2, 0.0))
     else:
-        bend = np.polynomial.Polynomial.fit(
-            arc_mm, arc_px / shape.px_per_mm, 2 if len(arc_mm) >= _BENDS_FROM else 1
-        ).deriv()
-        cosine, gaps = bend(arc_mm), bend(middles)
-    return np.clip(cosine, _LEAST_COSINE, 1.0), np.clip(gaps, _LEAST_COSINE, _MOST_COSINE)
+        cosine = smooth @ arc_px / shape.px_per_mm
+    count = len(arc_px)
+    return np.clip(cosine[:count], _LEAST_COSINE, 1.0), np.clip(cosine[count:], _LEAST_COSINE, _MOST_COSINE)
 
 
-def _twice(angles_rad: Array) -> Array:
+@functools.lru_cache(maxsize=64)
+def _smoothing(catheter: Catheter) -> Array:
+    """Return the matrix of the smooth foreshortening at electrodes, then gaps.
+
+    Its columns are those of visible arc lengths, or of the squares of a loop's gaps.
+    """
+    arc_mm = catheter.arc_lengths_mm
+    middles = 0.5 * (arc_mm[1:] + arc_mm[:-1])
+    places = np.concatenate([arc_mm, middles])
+    if catheter.is_circular:
+        known, wanted = (_with_twice(catheter.curvature_per_mm * where) for where in (middles, places))
+        squares: Array = wanted @ np.linalg.pinv(known)
+        return squares
+    degree = 2 if len(arc_mm) >= _BENDS_FROM else 1
+    slopes = np.stack([power * places ** max(power - 1, 0) for power in range(degree + 1)], axis=1)
+    matrix: Array = slopes @ np.linalg.pinv(np.vander(arc_mm, degree + 1, increasing=True))
+    return matrix
+
+
+def _with_twice(angles_rad: Array) -> Array:
     return np.stack([np.ones(len(angles_rad)), np.cos(2.0 * angles_rad), np.sin(2.0 * angles_rad)], axis=1)
 
 
