@@ -20,7 +20,7 @@ from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
-SAMPLES = 9.0
+_SAMPLES = 9.0
 """Independent samples of an electrode's picture: neighbouring pixels deviate from it alike."""
 
 _TUBE, _SOLID = 0.86, 0.0
@@ -37,8 +37,11 @@ _LAST_REACH_PX = 2.0
 _PAST_OPENING_PX = 2.0
 _LEAST_COSINE, _MOST_COSINE = 0.12, 1.05
 _BENDS_FROM = 6
-_LEAST_GAP = 0.1
+_LEAST_GAP, _MEETS = 0.1, 1e3
 _ITERATIONS = 3
+_FAR, _NOTHING = 1e300, 1e-12
+_STAYS = 1e-3
+"""Cost of a move by a sample, squared: where the image says nothing, electrodes stay."""
 _LEAST_SHARE = 0.02
 _DARKEST = 1.2
 """How much darker than the picture an electrode may seem: what is darker is something else."""
@@ -112,7 +115,7 @@ def fit_cylinders(
     line = _straighten(image, nearer, shape, reach)
     after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, (1.0,))
     points = np.where(stays[:, None], chain_uv, line.places_at(moved_px))
-    gain = 0.5 * SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
+    gain = 0.5 * _SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
     return CylinderFit(points, gain)
 
 
@@ -290,31 +293,33 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
         if strength[k] > 0.0:
             highest[rings] = seen[k].max() / strength[k]
             rings += 1
-    depth[:] = max(np.median(highest[: max(rings, 1)]), 1e-9)
+    depth[:] = max(np.median(highest[: max(rings, 1)]), _NOTHING)
     samples = strip.size / max((2 * size + 1) * columns, 1)
     left = 0.5 * whole
     chosen, before = np.zeros(count, np.int64), np.zeros((count, choices), np.int64)
     path, total, beside = np.zeros(count, np.int64), np.zeros(choices), np.zeros(choices)
     for _ in range(_ITERATIONS):
-        weight = 0.5 * SAMPLES * samples / max(left, _LEAST_SHARE * whole)
-        least = np.inf
+        weight = 0.5 * _SAMPLES * samples / max(left, _LEAST_SHARE * whole, _NOTHING)
+        least = _FAR
         for share in shares:
             for k in range(count):
                 for choice in range(choices):
                     best, arg = 0.0, 0
                     if k > 0:
-                        best = np.inf
+                        best = _FAR
                         for other in range(choices):
                             gap = (at[k] + choice - at[k - 1] - other) * STEP_PX / spacing[k - 1]
                             away = (gap - share * gap_cosine[k - 1]) / spacing_sd
                             cost = total[other] + 0.5 * away * away
                             cost += weight * 2.0 * depth[k] * depth[k - 1] * both[k, choice - other + 2 * reach]
                             if gap < _LEAST_GAP:
-                                cost += 1e3
+                                cost += _MEETS
                             if cost < best:
                                 best, arg = cost, other
                     own = min(seen[k, choice], _DARKEST * depth[k] * strength[k])
-                    beside[choice] = best + weight * depth[k] * (depth[k] * strength[k] - 2.0 * own)
+                    away = float(choice - reach)
+                    beside[choice] = best + _STAYS * away * away
+                    beside[choice] += weight * depth[k] * (depth[k] * strength[k] - 2.0 * own)
                     before[k, choice] = arg
                 total[:] = beside
             if total.min() < least:
@@ -339,7 +344,7 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
             ring = (ring_seen * tip_tip - tip_seen * tip_ring) / determinant
         else:
             tip, ring = tip_seen / max(tip_tip, 1e-9), ring_seen / max(ring_ring, 1e-9)
-        tip, ring = max(tip, 1e-9), max(ring, 1e-9)
+        tip, ring = max(tip, _NOTHING), max(ring, _NOTHING)
         depth[0], depth[1:] = tip, ring
         left = whole - 2.0 * (tip * tip_seen + ring * ring_seen)
         left += tip * tip * tip_tip + 2.0 * tip * ring * tip_ring + ring * ring * ring_ring
@@ -357,4 +362,4 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
             curvature = near[0] - 2.0 * near[1] + near[2]
             if curvature < 0.0:
                 moved[k] += STEP_PX * min(max(0.5 * (near[0] - near[2]) / curvature, -0.5), 0.5)
-    return left / max(whole, 1e-12)
+    return left / max(whole, _NOTHING)

@@ -47,3 +47,13 @@ def test_rings_on_a_loop_are_found_although_each_is_seen_from_another_side(tilt_
     )
     assert after < 0.6 * before
     assert fit.log_likelihood > 0.0
+
+
+@pytest.mark.parametrize("stays", [False, True])
+def test_an_image_without_anything_moves_no_electrode_for_its_sake(stays):
+    catheter = catheter_type("quadripolar-2-5-2", "rv")
+    places = 60.0 + 0.7 * PX_PER_MM * np.stack([catheter.arc_lengths_mm, np.zeros(4)], axis=1)
+    fit = fit_cylinders(np.ones((120, 160), np.float32), places, catheter, PX_PER_MM, 1.0, np.full(4, stays))
+    assert fit.log_likelihood == pytest.approx(0.0)
+    # Places are searched in steps of half a pixel.
+    assert np.abs(fit.points_uv - places).max() < (1e-9 if stays else 1.5)
