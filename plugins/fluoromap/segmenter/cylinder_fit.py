@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.ndimage import uniform_filter1d
 
 from fluoromap.catheters import Catheter
@@ -247,26 +248,15 @@ def _sample_strip(x, places, tangents, strip):  # type: ignore[no-untyped-def]  
             strip[row, column] = -(upper + g * (lower - upper))
 
 
-@kernel("f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, b1[::1], i8, f8, f8[::1], i8, f8[::1]")
-def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, reach, spacing_sd, shares, size, moved):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write how far electrodes move along a line, pixels.
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _compare(strip, at, half, cosine, radius, inner, stays, reach, size, strength, seen, both):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the scalar products of the electrodes' pictures.
 
-    Returns the share of its darkness that they leave unexplained.
-
-    With pictures of one depth for all rings and one for the tip, the unexplained darkness is a sum over electrodes and over
-    pairs of neighbours. So is the probability of the gaps. Places and depths are found in turn.
-
-    size : half the number of rows of a picture. Electrodes that stay have no picture.
+    strength : (electrodes,) with themselves. seen : (electrodes, choices) with the strip at each place. both : (electrodes,
+    2 choices - 1) with the picture of the electrode before, at each distance.
     """
-    count, choices, columns = at.size, 2 * reach + 1, strip.shape[1]
+    count, choices, columns = at.size, seen.shape[1], strip.shape[1]
     pictures = np.zeros((count, 2 * size + 1, columns))
-    strength = np.zeros(count)
-    seen = np.zeros((count, choices))
-    both = np.zeros((count, 2 * choices - 1))
-    whole = 0.0
-    for row in range(strip.shape[0]):
-        for column in range(columns):
-            whole += strip[row, column] * strip[row, column]
     for k in range(count):
         if stays[k]:
             continue
@@ -285,6 +275,67 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
             for row in range(max(-apart, 0), min(2 * size + 1, 2 * size + 1 - apart)):
                 for column in range(columns):
                     both[k, way] += pictures[k - 1, row + apart, column] * pictures[k, row, column]
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _choose(at, gap_cosine, spacing, spacing_sd, shares, reach, weight, depth, strength, seen, both, chosen):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the place of each electrode that makes the whole chain most likely.
+
+    By dynamic programming along the chain, for each foreshortening. weight : of the squared darkness that is left.
+    """
+    count, choices = seen.shape
+    before, path = np.zeros((count, choices), np.int64), np.zeros(count, np.int64)
+    total, costs = np.zeros(choices), np.zeros(choices)
+    least = _FAR
+    for share in shares:
+        for k in range(count):
+            for choice in range(choices):
+                best, arg = 0.0, 0
+                if k > 0:
+                    best = _FAR
+                    for other in range(choices):
+                        gap = (at[k] + choice - at[k - 1] - other) * STEP_PX / spacing[k - 1]
+                        away = (gap - share * gap_cosine[k - 1]) / spacing_sd
+                        cost = total[other] + 0.5 * away * away
+                        cost += weight * 2.0 * depth[k] * depth[k - 1] * both[k, choice - other + 2 * reach]
+                        if gap < _LEAST_GAP:
+                            cost += _MEETS
+                        if cost < best:
+                            best, arg = cost, other
+                own = min(seen[k, choice], _DARKEST * depth[k] * strength[k])
+                moved = float(choice - reach)
+                costs[choice] = best + _STAYS * moved * moved
+                costs[choice] += weight * depth[k] * (depth[k] * strength[k] - 2.0 * own)
+                before[k, choice] = arg
+            total[:] = costs
+        if total.min() < least:
+            least = total.min()
+            path[count - 1] = total.argmin()
+            for k in range(count - 1, 0, -1):
+                path[k - 1] = before[k, path[k]]
+            chosen[:] = path
+
+
+@kernel("f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, b1[::1], i8, f8, f8[::1], i8, f8[::1]")
+def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, reach, spacing_sd, shares, size, moved):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write how far electrodes move along a line, pixels.
+
+    Returns the share of its darkness that they leave unexplained.
+
+    With pictures of one depth for all rings and one for the tip, the unexplained darkness is a sum over electrodes and over
+    pairs of neighbours. So is the probability of the gaps. Places and depths are found in turn.
+
+    size : half the number of rows of a picture. Electrodes that stay have no picture.
+    """
+    count, choices = at.size, 2 * reach + 1
+    strength = np.zeros(count)
+    seen = np.zeros((count, choices))
+    both = np.zeros((count, 2 * choices - 1))
+    _compare(strip, at, half, cosine, radius, inner, stays, reach, size, strength, seen, both)
+    whole = 0.0
+    for row in range(strip.shape[0]):
+        for column in range(strip.shape[1]):
+            whole += strip[row, column] * strip[row, column]
     # A first depth: that of the middle electrode where it is seen best.
     depth = np.zeros(count)
     highest = np.zeros(count)
@@ -294,40 +345,12 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
             highest[rings] = seen[k].max() / strength[k]
             rings += 1
     depth[:] = max(np.median(highest[: max(rings, 1)]), _NOTHING)
-    samples = strip.size / max((2 * size + 1) * columns, 1)
+    samples = strip.shape[0] / (2 * size + 1)
     left = 0.5 * whole
-    chosen, before = np.zeros(count, np.int64), np.zeros((count, choices), np.int64)
-    path, total, beside = np.zeros(count, np.int64), np.zeros(choices), np.zeros(choices)
+    chosen = np.zeros(count, np.int64)
     for _ in range(_ITERATIONS):
         weight = 0.5 * _SAMPLES * samples / max(left, _LEAST_SHARE * whole, _NOTHING)
-        least = _FAR
-        for share in shares:
-            for k in range(count):
-                for choice in range(choices):
-                    best, arg = 0.0, 0
-                    if k > 0:
-                        best = _FAR
-                        for other in range(choices):
-                            gap = (at[k] + choice - at[k - 1] - other) * STEP_PX / spacing[k - 1]
-                            away = (gap - share * gap_cosine[k - 1]) / spacing_sd
-                            cost = total[other] + 0.5 * away * away
-                            cost += weight * 2.0 * depth[k] * depth[k - 1] * both[k, choice - other + 2 * reach]
-                            if gap < _LEAST_GAP:
-                                cost += _MEETS
-                            if cost < best:
-                                best, arg = cost, other
-                    own = min(seen[k, choice], _DARKEST * depth[k] * strength[k])
-                    away = float(choice - reach)
-                    beside[choice] = best + _STAYS * away * away
-                    beside[choice] += weight * depth[k] * (depth[k] * strength[k] - 2.0 * own)
-                    before[k, choice] = arg
-                total[:] = beside
-            if total.min() < least:
-                least = total.min()
-                path[count - 1] = total.argmin()
-                for k in range(count - 1, 0, -1):
-                    path[k - 1] = before[k, path[k]]
-                chosen[:] = path
+        _choose(at, gap_cosine, spacing, spacing_sd, shares, reach, weight, depth, strength, seen, both, chosen)
         # The depths of the tip and of the rings that explain most.
         tip_tip = tip_ring = ring_ring = tip_seen = ring_seen = 0.0
         for k in range(count):

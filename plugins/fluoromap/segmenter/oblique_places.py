@@ -27,8 +27,8 @@ _SD_OF_WAY = 0.5
 def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> tuple[Chain, ...]:
     """Return a picture's chains, those whose electrodes are oblique cylinders with new places.
 
-    A chain gets them where they are more likely, with the shape of its catheter. It remains as it is if it was set by hand or
-    is not whole. Electrodes that are unseen or behind another chain keep their places.
+    A chain gets them where they are more likely, with the shape of its catheter. It remains as it is if it was set by hand, is
+    not whole, or shows nearly its whole length. Electrodes that are unseen or behind another chain keep their places.
 
     Parameters
     ----------

@@ -73,13 +73,8 @@ def onwards(frame: int, row_uv: Array, points_uv: Array, as_sure: BoolArray, px_
     gaps = np.sqrt((np.diff(row_uv, axis=0) ** 2).sum(axis=1))
     apart = _apart(points_uv, row_uv, own_px) & _apart(points_uv, row_uv[-1:], _LEAST_STEP * float(gaps[-1]))
     free = np.flatnonzero(apart)
-    before = row_uv[-3] if len(row_uv) > 2 else row_uv[-2]
-    lines = (
-        _find_onwards(row_uv[-1], origin, points_uv[free], _LONGEST_STEP * float(gaps.max()))
-        for origin in (before, _before_turn(row_uv))
-    )
-    longest = free[max(lines, key=len)]
-    return Onwards(frame, points_uv[longest], as_sure[longest], own_px)
+    line = free[_line_beyond(row_uv, points_uv[free], _LONGEST_STEP * float(gaps.max()))]
+    return Onwards(frame, points_uv[line], as_sure[line], own_px)
 
 
 def unexplained_between(chain: Chain, points_uv: Array, catheter: Catheter, px_per_mm: float) -> int:
@@ -130,12 +125,17 @@ def continues(
     way = np.diff(chain.pixels_uv, axis=0)
     seen = float(np.sqrt((way * way).sum(axis=1)).sum())
     step = _LONGEST_STEP * max(catheter.spacing_mm) * seen / sum(catheter.spacing_mm)
-    for row in (chain.pixels_uv, chain.pixels_uv[::-1]):
-        before = row[-3] if len(row) > 2 else row[-2]
-        for origin in (before, _before_turn(row)):
-            if _count_onwards(row[-1], origin, free, step) >= least:
-                return True
-    return False
+    return any(len(_line_beyond(row, free, step)) >= least for row in (chain.pixels_uv, chain.pixels_uv[::-1]))
+
+
+def _line_beyond(row_uv: Array, points_uv: Array, reach: float) -> IntArray:
+    """Return the indices of the points in the line beyond the last of a row.
+
+    The line is straight or turns on as the row does, whichever has more points.
+    """
+    before = row_uv[-3] if len(row_uv) > 2 else row_uv[-2]
+    lines = (_find_onwards(row_uv[-1], origin, points_uv, reach) for origin in (before, _before_turn(row_uv)))
+    return max(lines, key=len)
 
 
 def _before_turn(row: Array) -> Array:
@@ -162,14 +162,9 @@ def shows_row(points_uv: Array, px_per_mm: float) -> bool:
             if first == second or np.linalg.norm(way) > reach:
                 continue
             left = np.delete(points_uv, [first, second], axis=0)
-            if 2 + _count_onwards(points_uv[second], points_uv[first], left, reach) >= _ROW:
+            if 2 + len(_find_onwards(points_uv[second], points_uv[first], left, reach)) >= _ROW:
                 return True
     return False
-
-
-def _count_onwards(at: Array, before: Array, left: Array, reach: float) -> int:
-    """Count the points that go on in a line past ``at``; see :func:`_find_onwards`."""
-    return len(_find_onwards(at, before, left, reach))
 
 
 def _find_onwards(at: Array, before: Array, left: Array, reach: float) -> IntArray:
