@@ -22,6 +22,7 @@ from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.shape_agreement import widen_by_shape
+from fluoromap.segmenter.shape_jitter import widen_by_jitter
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
 from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict, chain_distance, overlaps, reverse
@@ -313,6 +314,7 @@ def segment_run(
     if oblique:
         entries = _placed_obliquely(run, catalogue, entries, log_image, recall)
         chains = place_obliquely(mean_x, chains, catalogue, run.px_per_mm)
+    entries, chains = widen_by_jitter(entries, chains, run.px_per_mm)
     entries = widen_by_lag(entries, lag, run.px_per_mm)
     entries = tuple(replace(entry, chains=widen_by_shape(entry.chains, catalogue, run.px_per_mm)) for entry in entries)
     chains = widen_by_shape(chains, catalogue, run.px_per_mm)
