@@ -39,6 +39,7 @@ from fluoromap.segmenter.moved_means import moved_means
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.shared_metal import lies_on_metal
 from fluoromap.segmenter.track_agreement import is_same_shape
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
@@ -79,6 +80,18 @@ class _Linking:
     possible: PossibleChains
     chains: tuple[CandidateChain, ...]
     is_merged: BoolArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Clear:
+    """A chain that is clear enough in the image.
+
+    judged : the fitted chain with its electrodes where the proposer is surest of them.
+    """
+
+    candidates: CandidateChain
+    fitted: FittedChain
+    judged: Chain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -337,7 +350,7 @@ class ChainDetector:
             seen.tip_logits_at, self._is_seen(linking.points_uv),
         )  # fmt: skip
         clear = [
-            (candidates, one)
+            _Clear(candidates, one, self._where_surest(one.chain, linking.points_uv[list(candidates.candidates)], seen))
             for candidates, one in zip(linking.chains, fitted, strict=True)
             if one.clearness >= self.acceptance.least_clearness
         ]
@@ -347,9 +360,22 @@ class ChainDetector:
             result = more if len(more.chains) > len(result.chains) else result
         return result
 
+    def _where_surest(self, chain: Chain, candidates_uv: Array, seen: ImageEvidence) -> Chain:
+        """Return a fitted chain with electrodes at their candidates where these are surer.
+
+        The fit of a band may go astray: thin rings that are seen obliquely are darkest at the ends of their openings.
+        """
+        if not self.acceptance.strict:
+            return chain
+        forth, back = (np.abs(places - chain.pixels_uv).sum() for places in (candidates_uv, candidates_uv[::-1]))
+        places = candidates_uv if forth <= back else candidates_uv[::-1]
+        of_candidates, of_fit = answers_for_each(seen.scores_at, [places, chain.pixels_uv])
+        surer = (of_candidates > of_fit) & self._is_seen(places)
+        return replace(chain, pixels_uv=np.where(surer[:, None], places, chain.pixels_uv))
+
     def _accepted(
         self,
-        clear: Sequence[tuple[CandidateChain, FittedChain]],
+        clear: Sequence[_Clear],
         seen: ImageEvidence,
         proposed: Proposals,
         families: tuple[CatheterFamily, ...],
@@ -360,22 +386,27 @@ class ChainDetector:
         beside : whether the image shows another catheter.
         """
         floor = min(family.floor for family in families)
-        sure = any(one.clearness >= self.acceptance.sure_clearness and one.chain.scores[0] >= floor for _, one in clear)
-        found = [one.chain for _, one in clear]
-        all_scores = answers_for_each(partial(self._scores_in_field, seen), [chain.pixels_uv for chain in found])
-        accepted = []
-        for (candidates, _), chain, scores in zip(clear, found, all_scores, strict=True):
-            others = [other for other in found if other is not chain]
-            if self.acceptance.accepts(scores, chain.scores[0], beside) or self._hides_a_pair(chain, scores, proposed):
+        sure = any(
+            one.fitted.clearness >= self.acceptance.sure_clearness and one.fitted.chain.scores[0] >= floor
+            for one in clear
+        )
+        all_scores = answers_for_each(partial(self._scores_in_field, seen), [one.judged.pixels_uv for one in clear])
+        accepted, judged = [], []
+        for one, scores in zip(clear, all_scores, strict=True):
+            chain = one.fitted.chain
+            others = [other.fitted.chain for other in clear if other is not one]
+            if self.acceptance.accepts(scores, chain.scores[0], beside) or self._hides_a_pair(
+                one.judged, scores, proposed
+            ):
                 covariance = widen_covariance(chain, others, self.px_per_mm)
                 shown = np.where(np.isnan(scores), UNSEEN, scores)
-                accepted.append((candidates, replace(chain, covariance_px2=covariance, scores=shown)))
-        chains = tuple(chain for _, chain in accepted)
-        listed = np.ones(len(chains), np.bool_)
+                accepted.append((one.candidates, replace(chain, covariance_px2=covariance, scores=shown)))
+                judged.append(replace(one.judged, scores=shown))
+        listed = np.ones(len(accepted), np.bool_)
         if self.acceptance.strict:
-            listed = self._are_of_catalogue(chains, seen, proposed)
+            listed = self._are_of_catalogue(tuple(judged), seen, proposed)
         return _FittedSet(
-            tuple(chain for chain, kept in zip(chains, listed, strict=True) if kept),
+            tuple(chain for (_, chain), kept in zip(accepted, listed, strict=True) if kept),
             tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if kept),
             tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if not kept),
             sure,
@@ -447,7 +478,11 @@ class ChainDetector:
             chain, own = chains[index], odds_of_chains[index]
             family = self.family_of(chain)
             is_seen = chain.scores > UNSEEN
-            if family is None or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter):
+            if (
+                family is None
+                or self._lies_on_another(index, chains, listed)
+                or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter)
+            ):
                 listed[index] = False
                 continue
             onwards = EVEN_ODDS
@@ -472,6 +507,20 @@ class ChainDetector:
                 uncrossed = (self._not_crossed(points, chain, seen) for points in unexplained)
                 listed[index] = self._explains(chain, family.catheter, crossings, *uncrossed)
         return listed
+
+    def _lies_on_another(self, index: int, chains: Sequence[Chain], listed: BoolArray) -> bool:
+        """Return whether a chain lies on the metal of another one that is listed."""
+        family = self.family_of(chains[index])
+        others = [
+            (other, self.family_of(other))
+            for other, kept in zip(chains, listed, strict=True)
+            if kept and other is not chains[index]
+        ]
+        return family is not None and any(
+            of_other is not None
+            and lies_on_metal(chains[index], family.catheter, other, of_other.catheter, self.px_per_mm)
+            for other, of_other in others
+        )
 
     def _explains(
         self, chain: Chain, catheter: Catheter, crossings: int, sure: Array, alike: Array, row: Array, pair: Array

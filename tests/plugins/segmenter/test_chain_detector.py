@@ -151,6 +151,16 @@ def test_a_doubted_catheter_is_accepted_beside_a_sure_one_only():
         assert len(detector.search(image).entry(0).chains) == count
 
 
+@pytest.mark.parametrize("astray", [(1,), (1, 3), (2, 3)])
+def test_an_electrode_that_its_fit_leads_astray_is_judged_where_it_was_proposed(astray):
+    catheter = row_of("ablation", (60, 60), 0.3)
+    dark = catheter.copy()
+    dark[list(astray)] += 4.5 * np.array([np.cos(0.3), np.sin(0.3)])
+    found = chains_found(drawn([dark]), catheter, [0.99] * 4, [0.9] * 4)
+    assert len(found) == 1
+    assert np.linalg.norm(found[0].pixels_uv - dark, axis=1).max() < 2.5
+
+
 @pytest.mark.parametrize(("between", "listed"), [([0.8, 0.8], True), ([0.995], True), ([0.995, 0.995], False)])
 def test_a_long_chain_is_unlisted_where_more_than_one_thing_between_is_like_its_electrodes(between, listed):
     catheter = row_of("cs", (60, 60), 0.4)
