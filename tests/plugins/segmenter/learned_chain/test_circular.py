@@ -14,7 +14,7 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 LOOP_TYPES = ["circular-10", "circular-20", "circular-20-2-6-2"]
-FRAMES = 12
+FRAMES = 8
 SPACING = 292.0 / 512
 GANTRY = Gantry(90.0, 0.0, 1000.0, 500.0, (SPACING, SPACING), 512, 512)
 CAMERA = camera_from_gantry(GANTRY)
