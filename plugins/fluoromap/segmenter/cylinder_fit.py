@@ -284,10 +284,11 @@ def _choose(at, gap_cosine, spacing, spacing_sd, shares, reach, weight, depth, s
     By dynamic programming along the chain, for each foreshortening. weight : of the squared darkness that is left.
     """
     count, choices = seen.shape
-    before, path = np.zeros((count, choices), np.int64), np.zeros(count, np.int64)
+    before = np.zeros((count, choices), np.int64)
     total, costs = np.zeros(choices), np.zeros(choices)
     least = _FAR
-    for share in shares:
+    for number in range(shares.size):
+        share = shares[number]
         for k in range(count):
             for choice in range(choices):
                 best, arg = 0.0, 0
@@ -307,13 +308,17 @@ def _choose(at, gap_cosine, spacing, spacing_sd, shares, reach, weight, depth, s
                 costs[choice] = best + _STAYS * moved * moved
                 costs[choice] += weight * depth[k] * (depth[k] * strength[k] - 2.0 * own)
                 before[k, choice] = arg
-            total[:] = costs
-        if total.min() < least:
-            least = total.min()
-            path[count - 1] = total.argmin()
-            for k in range(count - 1, 0, -1):
-                path[k - 1] = before[k, path[k]]
-            chosen[:] = path
+            for choice in range(choices):
+                total[choice] = costs[choice]
+        last = 0
+        for choice in range(1, choices):
+            if total[choice] < total[last]:
+                last = choice
+        if total[last] < least:
+            least = total[last]
+            for k in range(count - 1, -1, -1):
+                chosen[k] = last
+                last = before[k, last]
 
 
 @kernel("f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, b1[::1], i8, f8, f8[::1], i8, f8[::1]")
@@ -337,14 +342,23 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
         for column in range(strip.shape[1]):
             whole += strip[row, column] * strip[row, column]
     # A first depth: that of the middle electrode where it is seen best.
-    depth = np.zeros(count)
     highest = np.zeros(count)
-    rings = 0
+    drawn = 0
     for k in range(count):
         if strength[k] > 0.0:
-            highest[rings] = seen[k].max() / strength[k]
-            rings += 1
-    depth[:] = max(np.median(highest[: max(rings, 1)]), _NOTHING)
+            best = seen[k, 0]
+            for choice in range(1, choices):
+                best = max(best, seen[k, choice])
+            # Sorted: electrodes are few, and a library's median takes seconds to compile.
+            place = drawn
+            while place > 0 and highest[place - 1] > best / strength[k]:
+                highest[place] = highest[place - 1]
+                place -= 1
+            highest[place] = best / strength[k]
+            drawn += 1
+    depth = np.zeros(count)
+    for k in range(count):
+        depth[k] = max(0.5 * (highest[max(drawn - 1, 0) // 2] + highest[drawn // 2]), _NOTHING)
     samples = strip.shape[0] / (2 * size + 1)
     left = 0.5 * whole
     chosen = np.zeros(count, np.int64)
@@ -368,7 +382,8 @@ def _search(strip, at, half, cosine, gap_cosine, spacing, radius, inner, stays, 
         else:
             tip, ring = tip_seen / max(tip_tip, 1e-9), ring_seen / max(ring_ring, 1e-9)
         tip, ring = max(tip, _NOTHING), max(ring, _NOTHING)
-        depth[0], depth[1:] = tip, ring
+        for k in range(count):
+            depth[k] = tip if k == 0 else ring
         left = whole - 2.0 * (tip * tip_seen + ring * ring_seen)
         left += tip * tip * tip_tip + 2.0 * tip * ring * tip_ring + ring * ring * ring_ring
     for k in range(count):
