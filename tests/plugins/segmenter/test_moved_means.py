@@ -59,7 +59,7 @@ def hidden_run(photons=4.5, through_ring=0.7):
     return frames, np.array(truth)
 
 
-@pytest.mark.parametrize("marked", [None, 4, 11])
+@pytest.mark.parametrize("marked", [None, 2, 4, 11])
 def test_a_catheter_that_noise_hides_in_every_frame_is_found(marked):
     frames, truth = hidden_run()
     run = Run(Frames(frames), np.arange(FRAMES) * 1000 / 60, PX_PER_MM, PixelFacts(False, 12, False))
