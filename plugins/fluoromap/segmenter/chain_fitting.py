@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
-from fluoromap.contracts import Array, BoolArray, Chain
+from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES, TURNING_ELECTRODES
+from fluoromap.segmenter.cylinder_fit import compare_catheters
 from fluoromap.segmenter.linking import (
     CandidateChain,
     CatheterFamily,
@@ -19,15 +20,14 @@ from fluoromap.segmenter.linking import (
     shape_fit,
 )
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.proposals import answers_for_each
-from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, predict_on_curve, refine
+from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, predict_on_curve, refine, usual_radius_mm
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 
 _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0
 _TIP_WEIGHT, _SHORT_TIP_WEIGHT, _MOST_TIP = 1.0, 0.5, 4.0
-_LONG_TIP_MM, _MOST_BANDS = 3.0, 1.0
-"""Tips that are longer than rings for certain, and how much the bands of shorter ones say: makers' tips differ."""
+_LONG_TIP_MM, _MOST_OF_SHORT_TIP = 3.0, 4.0
+"""Tips that are longer than rings for certain, and how much the image of shorter ones says: makers' tips differ."""
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 HIDING_MM = 1.2
@@ -59,9 +59,9 @@ def fit_chains(
     tip_logits_at: Callable[[Array], Array] | None = None,
     is_seen: BoolArray | None = None,
 ) -> tuple[FittedChain, ...]:
-    """Fit each chain with every catheter of as many electrodes.
+    """Compare each chain with every catheter of as many electrodes, then fit the most probable one.
 
-    Each catheter is fitted in both orders. The catheter and the order with the highest likelihood win.
+    Each catheter is compared in both orders, as cylinders along the chain's line. The order with the highest likelihood wins.
 
     Parameters
     ----------
@@ -87,64 +87,112 @@ def fit_chains(
     tuple of FittedChain
         In the order of ``linked``.
     """
-    likelihood = np.full((len(linked), len(families)), -np.inf)
     foreign = _candidates_of_others(candidates_uv, linked, families)
-    electrode_fits: dict[tuple[int, int], tuple[ElectrodeFit, int, float]] = {}
-    for column, family in enumerate(families):
-        rows = [row for row, chain in enumerate(linked) if len(chain.candidates) == family.catheter.electrodes]
-        if not rows:
-            continue
-        order = np.array([linked[row].candidates for row in rows])
-        hidden = np.array([[candidate in foreign[row] for candidate in linked[row].candidates] for row in rows])
-        order, hidden = (np.concatenate([forth, forth[:, ::-1]]) for forth in (order, hidden))
-        outside = np.zeros_like(hidden) if is_seen is None else ~is_seen[order]
+    judged: list[_Judged] = []
+    for chain, of_others in zip(linked, foreign, strict=True):
+        order = np.array(chain.candidates)
+        hidden = np.isin(order, list(of_others))
+        outside = np.zeros(len(order), np.bool_) if is_seen is None else ~is_seen[order]
+        judged.append(
+            _judge(x, candidates_uv, order, hidden, outside, shaft_image, families, tip_logits_at or _no_tips)
+        )
+    kinds = kind_probabilities(np.array([one.likelihood for one in judged]).reshape(-1, len(families)), families)
+    chosen = [_most_probable(kinds[row], families, chain) for row, chain in enumerate(linked)]
+    fitted: dict[int, FittedChain] = {}
+    for family in set(chosen):
+        rows = [row for row, other in enumerate(chosen) if other == family]
+        turned = [judged[row].turned(family) for row in rows]
+        catheter = families[family].catheter
+        order, hidden, outside = (np.stack(parts) for parts in zip(*turned, strict=True))
         without_blob = np.zeros_like(hidden) if sure is None else order >= sure
-        electrode_fit = refine(
-            x, candidates_uv[order], family.catheter, shaft_image.px_per_mm, noise, hidden | outside, without_blob
-        )
-        electrode_fit = _apart(electrode_fit, candidates_uv[order], family.catheter, shaft_image.px_per_mm)
-        electrode_fit = _with_places(electrode_fit, candidates_uv[order], outside)
-        no_variance = np.zeros(order.shape)
-        bands = electrode_fit.log_likelihood
-        fit = bands + shape_fit(electrode_fit.points_uv, no_variance, family.catheter, shaft_image.px_per_mm)
-        fit += _SHAFT_WEIGHT * shaft_evidence(electrode_fit.points_uv, family.catheter, shaft_image)
-        directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(electrode_fit.points_uv, family.catheter, shaft_image)
-        if tip_logits_at is not None:
-            first, last = answers_for_each(tip_logits_at, [electrode_fit.points_uv[:, end] for end in (0, -1)])
-            weight = _TIP_WEIGHT if _tip_shows(family.catheter) else _SHORT_TIP_WEIGHT
-            directed += weight * np.clip(first - last, -_MOST_TIP, _MOST_TIP)
+        places = candidates_uv[order]
+        electrodes = refine(x, places, catheter, shaft_image.px_per_mm, noise, hidden | outside, without_blob)
+        electrodes = _with_places(_apart(electrodes, places, catheter, shaft_image.px_per_mm), places, outside)
         for index, row in enumerate(rows):
-            back = index + len(rows)
-            forth_over_back = float(directed[index] - directed[back])
-            if family.catheter.tip_mm < _LONG_TIP_MM:
-                of_bands = float(bands[index] - bands[back])
-                forth_over_back += float(np.clip(of_bands, -_MOST_BANDS, _MOST_BANDS)) - of_bands
-            best = index if forth_over_back >= 0 else index + len(rows)
-            likelihood[row, column] = fit[best]
-            electrode_fits[row, column] = electrode_fit, best, _TIP_SHARE * abs(forth_over_back)
-    probabilities = kind_probabilities(likelihood, families)
-    chains = []
-    for row, chain in enumerate(linked):
-        of_family = [
-            sum(probability for name, probability in probabilities[row] if name in family.names) for family in families
-        ]
-        electrode_fit, best, tip_odds = (
-            electrode_fits.get((row, int(np.argmax(of_family)))) or electrode_fits[row, chain.family]
-        )
-        chains.append(
-            FittedChain(
+            fitted[row] = FittedChain(
                 Chain(
-                    electrodes=tuple(range(1, len(chain.candidates) + 1)),
-                    pixels_uv=electrode_fit.points_uv[best],
-                    covariance_px2=electrode_fit.covariance_px2[best],
-                    scores=np.full(len(chain.candidates), chain.score),
-                    kinds=probabilities[row],
-                    tip_odds=tip_odds,
+                    electrodes=tuple(range(1, catheter.electrodes + 1)),
+                    pixels_uv=electrodes.points_uv[index],
+                    covariance_px2=electrodes.covariance_px2[index],
+                    scores=np.full(catheter.electrodes, linked[row].score),
+                    kinds=kinds[row],
+                    tip_odds=_TIP_SHARE * abs(float(judged[row].forth_over_back[family])),
                 ),
-                float(electrode_fit.clearness[best]),
+                float(electrodes.clearness[index]),
             )
-        )
-    return tuple(chains)
+    return tuple(fitted[row] for row in range(len(linked)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """A chain's names and order.
+
+    order : its candidates. hidden, outside : (electrodes,) which of them are behind another catheter, or outside the field.
+    likelihood : (families,) log-likelihood in the better order; -inf where a family has another number of electrodes.
+    forth_over_back : (families,) how much more likely the chain's order is than the other one, log-likelihood.
+    """
+
+    order: IntArray
+    hidden: BoolArray
+    outside: BoolArray
+    likelihood: Array
+    forth_over_back: Array
+
+    def turned(self, family: int) -> tuple[IntArray, BoolArray, BoolArray]:
+        """Return order, hidden and outside from the tip of a catheter of this family on."""
+        step = 1 if self.forth_over_back[family] >= 0 else -1
+        return self.order[::step], self.hidden[::step], self.outside[::step]
+
+
+def _judge(
+    x: Image,
+    candidates_uv: Array,
+    order: IntArray,
+    hidden: BoolArray,
+    outside: BoolArray,
+    shaft_image: ShaftImage,
+    families: Sequence[CatheterFamily],
+    tip_logits_at: Callable[[Array], Array],
+) -> _Judged:
+    """Compare a chain with every catheter of as many electrodes, in both orders."""
+    alike = [index for index, family in enumerate(families) if family.catheter.electrodes == len(order)]
+    catheters = [families[index].catheter for index in alike]
+    radii_mm = [usual_radius_mm(catheter) for catheter in catheters]
+    compared = compare_catheters(x, candidates_uv[order], catheters, shaft_image.px_per_mm, radii_mm, hidden | outside)
+    ends_uv = compared.points_uv[:, :, [0, -1]]
+    tip_logits = tip_logits_at(ends_uv.reshape(-1, 2)).reshape(ends_uv.shape[:-1])
+    like_tip = np.clip(tip_logits[..., 0] - tip_logits[..., 1], -_MOST_TIP, _MOST_TIP)
+    likelihood, forth_over_back = np.full(len(families), -np.inf), np.zeros(len(families))
+    for row, (index, catheter) in enumerate(zip(alike, catheters, strict=True)):
+        points, in_image = compared.points_uv[row], compared.log_likelihood[row]
+        fit = in_image + shape_fit(points, np.zeros(points.shape[:2]), catheter, shaft_image.px_per_mm)
+        fit += _SHAFT_WEIGHT * shaft_evidence(points, catheter, shaft_image)
+        directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(points, catheter, shaft_image)
+        directed += (_TIP_WEIGHT if _tip_shows(catheter) else _SHORT_TIP_WEIGHT) * like_tip[row]
+        forth = float(directed[0] - directed[1])
+        if catheter.tip_mm < _LONG_TIP_MM:
+            of_image = float(in_image[0] - in_image[1])
+            forth += float(np.clip(of_image, -_MOST_OF_SHORT_TIP, _MOST_OF_SHORT_TIP)) - of_image
+        likelihood[index], forth_over_back[index] = fit[0 if forth >= 0 else 1], forth
+    return _Judged(order, hidden, outside, likelihood, forth_over_back)
+
+
+def _no_tips(points_uv: Array) -> Array:
+    """Return the log-odds of tips where no network says more of them, (n,)."""
+    return np.zeros(len(points_uv))
+
+
+def _most_probable(
+    kinds: Sequence[tuple[str, float]], families: Sequence[CatheterFamily], chain: CandidateChain
+) -> int:
+    """Return the index of the most probable family with as many electrodes as the linked chain."""
+    of_family = [
+        sum(probability for name, probability in kinds if name in family.names)
+        if family.catheter.electrodes == len(chain.candidates)
+        else -1.0
+        for family in families
+    ]
+    return int(np.argmax(of_family))
 
 
 def _apart(fit: ElectrodeFit, candidates_uv: Array, catheter: Catheter, px_per_mm: float) -> ElectrodeFit:

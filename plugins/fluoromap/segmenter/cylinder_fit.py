@@ -1,5 +1,7 @@
 """Fit of all electrodes of a found chain at once, as pictures of cylinders along its line.
 
+So the image says where they are (:func:`fit_cylinders`), and of which catheter and in which order (:func:`compare_catheters`).
+
 A ring that is seen obliquely is dark at both ends of its openings and bright in its middle, and the openings of a pair meet. So a
 dark place is no electrode's middle, and no electrode can be fitted without its neighbours. Electrodes along a line overlap their
 neighbours at most: the best places of all of them are found by dynamic programming.
@@ -9,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +63,18 @@ class CylinderFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CatheterComparison:
+    """What the image along a chain's line says of catheters with as many electrodes, each in both orders.
+
+    points_uv : (catheters, 2, electrodes, 2) best places from the tip on, pixels; the first order is that of the chain.
+    log_likelihood : (catheters, 2), but for a constant.
+    """
+
+    points_uv: Array
+    log_likelihood: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Line:
     """The image along a chain's line, straightened.
 
@@ -104,8 +119,8 @@ def fit_cylinders(
         Electrodes that keep their places, because something else is seen there.
     """
     shape = _Shape(catheter, px_per_mm, radius_mm * px_per_mm)
-    reach = int((shape.radius_px + _PAST_OPENING_PX) / STEP_PX)
-    line = _straighten(image, chain_uv, shape, reach)
+    reach = _first_reach(shape)
+    line = _straighten(image, chain_uv, shape, reach, (shape,))
     searched = {
         inner: _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING) for inner in (_TUBE, _SOLID)
     }
@@ -113,11 +128,56 @@ def fit_cylinders(
     before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, (1.0,))
     nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[inner][1]))
     reach = int(_LAST_REACH_PX / STEP_PX)
-    line = _straighten(image, nearer, shape, reach)
+    line = _straighten(image, nearer, shape, reach, (shape,))
     after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, (1.0,))
     points = np.where(stays[:, None], chain_uv, line.places_at(moved_px))
     gain = 0.5 * _SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
     return CylinderFit(points, gain)
+
+
+def compare_catheters(
+    image: Image,
+    chain_uv: Array,
+    catheters: Sequence[Catheter],
+    px_per_mm: float,
+    radii_mm: Sequence[float],
+    unseen: BoolArray,
+) -> CatheterComparison:
+    """Compare catheters along the line of a chain, from each of its ends.
+
+    Every one is fitted to the same strip of the image, so that what each leaves unexplained can be compared. Rings are tubes here:
+    as solid ones they would look like short tips.
+
+    Parameters
+    ----------
+    image : (rows, columns) float32
+        Log image.
+    chain_uv : (electrodes, 2)
+        Found places, pixels.
+    catheters : sequence of Catheter
+        All have as many electrodes as the chain.
+    px_per_mm : float
+        At the isocentre.
+    radii_mm : sequence of float
+        Usual radius of each catheter.
+    unseen : (electrodes,)
+        Electrodes of which the image says nothing.
+    """
+    shapes = [
+        _Shape(catheter, px_per_mm, radius * px_per_mm) for catheter, radius in zip(catheters, radii_mm, strict=True)
+    ]
+    reach = max(_first_reach(shape) for shape in shapes)
+    points = np.empty((len(shapes), 2, *chain_uv.shape))
+    left = np.empty((len(shapes), 2))
+    for index, shape in enumerate(shapes):
+        for order, step in enumerate((1, -1)):
+            line = _straighten(image, chain_uv[::step], shape, reach, shapes)
+            left[index, order], moved_px = _search_along(
+                line, shape, _TUBE, unseen[::step], reach, _FIRST_SD, _FORESHORTENING
+            )
+            points[index, order] = line.places_at(moved_px)
+    drawn = np.count_nonzero(~unseen)
+    return CatheterComparison(points, -0.5 * _SAMPLES * drawn * np.log(np.maximum(left, _LEAST_SHARE)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,26 +205,36 @@ class _Shape:
         return int(_WIDER * self.radius_px + _MARGIN_PX)
 
 
-def _straighten(image: Image, points_uv: Array, shape: _Shape, reach: int) -> _Line:
-    """Sample the image along a chain, without the anatomy beside it and without the shaft."""
+def _first_reach(shape: _Shape) -> int:
+    """Return how far an electrode may be from its found place, samples: past one of its openings."""
+    return int((shape.radius_px + _PAST_OPENING_PX) / STEP_PX)
+
+
+def _straighten(image: Image, points_uv: Array, shape: _Shape, reach: int, shapes: Sequence[_Shape]) -> _Line:
+    """Sample the image along a chain, without the anatomy beside it and without the shaft.
+
+    ``shapes`` : all for which the strip must be long and wide enough.
+    """
+    columns = max(one.columns for one in shapes)
+    longest = max(float(one.half_px.max()) for one in shapes)
     steps = np.diff(points_uv, axis=0)
     arc = np.concatenate([[0.0], np.cumsum(np.sqrt((steps * steps).sum(axis=1)))])
     axes = np.concatenate([steps[:1], points_uv[2:] - points_uv[:-2], steps[-1:]])
     axes = axes / np.maximum(np.sqrt((axes * axes).sum(axis=1, keepdims=True)), 1e-9)
-    ends = float(shape.half_px.max()) + shape.columns + _MARGIN_PX + (reach + 1) * STEP_PX
+    ends = longest + columns + _MARGIN_PX + (reach + 1) * STEP_PX
     along = np.arange(-ends, arc[-1] + ends, STEP_PX)
     beyond = np.minimum(along, 0.0)[:, None] * axes[0] + np.maximum(along - arc[-1], 0.0)[:, None] * axes[-1]
     places = np.stack([np.interp(along, arc, points_uv[:, axis]) for axis in range(2)], axis=1) + beyond
     tangents = np.stack([np.interp(along, arc, axes[:, axis]) for axis in range(2)], axis=1)
     tangents /= np.maximum(np.sqrt((tangents * tangents).sum(axis=1, keepdims=True)), 1e-9)
-    wide = int(_WIDER * shape.radius_px + _SIDE_PX)
+    wide = int(_WIDER * max(one.radius_px for one in shapes) + _SIDE_PX)
     strip = np.empty((len(along), 2 * wide + 1))
     _sample_strip(image, places, tangents, strip)
     sides = 0.5 * (strip[:, :_SIDE_COLUMNS].mean(axis=1) + strip[:, -_SIDE_COLUMNS:].mean(axis=1))
     strip -= uniform_filter1d(sides, 2 * int(_SMOOTH_PX / STEP_PX / 2) + 1, mode="nearest")[:, None]
     brightest = int(_SHAFT_QUANTILE * len(strip))
     strip -= np.partition(strip, brightest, axis=0)[brightest]
-    strip = np.ascontiguousarray(strip[:, wide - shape.columns : wide + shape.columns + 1])
+    strip = np.ascontiguousarray(strip[:, wide - columns : wide + columns + 1])
     at = np.rint((arc + ends) / STEP_PX).astype(np.int64)
     return _Line(places, strip, at, *_foreshortening(arc, shape))
 

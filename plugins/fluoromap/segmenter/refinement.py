@@ -35,7 +35,6 @@ widens the standard deviation, in this power."""
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
 _SPACING_SD = 0.10
 _LONG_CATHETER = 6
-_PROFILE_SAMPLES = 7.0
 _WINDOW_MM = 2.0
 _LEAST_MISFIT = 0.01
 _CLEAR_PX, _LEAST_WINDOW_PX = 2.0, 2.0
@@ -58,15 +57,6 @@ class ElectrodeFit:
     points_uv: Array
     covariance_px2: Array
     misfits: Array
-
-    @property
-    def log_likelihood(self) -> Array:
-        """Log-likelihood of bands of these lengths in the image, (n,).
-
-        It lacks a constant that is common to all catheters and to both directions of the same candidates.
-        """
-        likelihood: Array = 0.5 * _PROFILE_SAMPLES * self.misfits.shape[1] * self.clearness
-        return likelihood
 
     @functools.cached_property
     def clearness(self) -> Array:
