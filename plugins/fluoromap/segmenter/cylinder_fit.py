@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_length_px
+from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_length_px, reached_rows
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
@@ -43,6 +43,8 @@ _LEAST_COSINE, _MOST_COSINE = 0.12, 1.05
 _BENDS_FROM = 6
 _LEAST_GAP, _MEETS = 0.1, 1e3
 _ITERATIONS = 3
+_COMPARED_PX_PER_MM = 3.5
+"""Scale at which catheters are compared where the frame has a larger one: lengths show well enough, in a quarter of the time."""
 _FAR, _NOTHING = 1e300, 1e-12
 _STAYS = 1e-3
 """Cost of a move by a sample, squared: where the image says nothing, electrodes stay."""
@@ -78,22 +80,31 @@ class CatheterComparison:
 class _Line:
     """The image along a chain's line, straightened.
 
-    places_uv : (samples, 2) of the line, 0.5 px apart. strip : (samples, columns) darkness, log units; the middle column is on the
-    line. at : (electrodes,) index of the sample nearest to each electrode. cosine : (electrodes,) visible over true length of each.
-    gap_cosine : (electrodes - 1,) of the gaps.
+    places_uv : (samples, 2) of the line, half a pixel of the strip apart. strip : (samples, columns) darkness, log units; the
+    middle column is on the line. at : (electrodes,) index of the sample nearest to each electrode. arc_px : (electrodes,) length of
+    the line up to each.
     """
 
     places_uv: Array
     strip: Array
     at: IntArray
-    cosine: Array
-    gap_cosine: Array
+    arc_px: Array
 
     def places_at(self, moved_px: Array) -> Array:
         """Return where electrodes are that moved so far along the line, (electrodes, 2)."""
         at, samples = self.at + moved_px / STEP_PX, np.arange(len(self.strip))
         places: Array = np.stack([np.interp(at, samples, self.places_uv[:, axis]) for axis in range(2)], axis=1)
         return places
+
+    def turned(self) -> _Line:
+        """Return the line from its other end on."""
+        last = len(self.strip) - 1
+        return _Line(
+            self.places_uv[::-1],
+            np.ascontiguousarray(self.strip[::-1]),
+            last - self.at[::-1],
+            self.arc_px[-1] - self.arc_px[::-1],
+        )
 
 
 def fit_cylinders(
@@ -120,7 +131,7 @@ def fit_cylinders(
     """
     shape = _Shape(catheter, px_per_mm, radius_mm * px_per_mm)
     reach = _first_reach(shape)
-    line = _straighten(image, chain_uv, shape, reach, (shape,))
+    line = _straighten(image, chain_uv, (shape,), reach)
     searched = {
         inner: _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING) for inner in (_TUBE, _SOLID)
     }
@@ -128,7 +139,7 @@ def fit_cylinders(
     before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, (1.0,))
     nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[inner][1]))
     reach = int(_LAST_REACH_PX / STEP_PX)
-    line = _straighten(image, nearer, shape, reach, (shape,))
+    line = _straighten(image, nearer, (shape,), reach)
     after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, (1.0,))
     points = np.where(stays[:, None], chain_uv, line.places_at(moved_px))
     gain = 0.5 * _SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
@@ -163,18 +174,17 @@ def compare_catheters(
     unseen : (electrodes,)
         Electrodes of which the image says nothing.
     """
-    shapes = [
-        _Shape(catheter, px_per_mm, radius * px_per_mm) for catheter, radius in zip(catheters, radii_mm, strict=True)
-    ]
+    pitch_px = max(px_per_mm / _COMPARED_PX_PER_MM, 1.0)
+    scale = px_per_mm / pitch_px
+    shapes = [_Shape(catheter, scale, radius * scale) for catheter, radius in zip(catheters, radii_mm, strict=True)]
     reach = max(_first_reach(shape) for shape in shapes)
+    strip = _straighten(image, chain_uv, shapes, reach, pitch_px)
     points = np.empty((len(shapes), 2, *chain_uv.shape))
     left = np.empty((len(shapes), 2))
-    for index, shape in enumerate(shapes):
-        for order, step in enumerate((1, -1)):
-            line = _straighten(image, chain_uv[::step], shape, reach, shapes)
-            left[index, order], moved_px = _search_along(
-                line, shape, _TUBE, unseen[::step], reach, _FIRST_SD, _FORESHORTENING
-            )
+    both_ways = (strip, unseen), (strip.turned(), unseen[::-1].copy())
+    for order, (line, stays) in enumerate(both_ways):
+        for index, shape in enumerate(shapes):
+            left[index, order], moved_px = _search_along(line, shape, _TUBE, stays, reach, _FIRST_SD, _FORESHORTENING)
             points[index, order] = line.places_at(moved_px)
     drawn = np.count_nonzero(~unseen)
     return CatheterComparison(points, -0.5 * _SAMPLES * drawn * np.log(np.maximum(left, _LEAST_SHARE)))
@@ -210,11 +220,13 @@ def _first_reach(shape: _Shape) -> int:
     return int((shape.radius_px + _PAST_OPENING_PX) / STEP_PX)
 
 
-def _straighten(image: Image, points_uv: Array, shape: _Shape, reach: int, shapes: Sequence[_Shape]) -> _Line:
+def _straighten(image: Image, points_uv: Array, shapes: Sequence[_Shape], reach: int, pitch_px: float = 1.0) -> _Line:
     """Sample the image along a chain, without the anatomy beside it and without the shaft.
 
-    ``shapes`` : all for which the strip must be long and wide enough.
+    ``shapes`` : all for which the strip must be long and wide enough. ``pitch_px`` : pixels of the frame in one of the strip, in
+    which all lengths are.
     """
+    points_uv = points_uv / pitch_px
     columns = max(one.columns for one in shapes)
     longest = max(float(one.half_px.max()) for one in shapes)
     steps = np.diff(points_uv, axis=0)
@@ -229,14 +241,14 @@ def _straighten(image: Image, points_uv: Array, shape: _Shape, reach: int, shape
     tangents /= np.maximum(np.sqrt((tangents * tangents).sum(axis=1, keepdims=True)), 1e-9)
     wide = int(_WIDER * max(one.radius_px for one in shapes) + _SIDE_PX)
     strip = np.empty((len(along), 2 * wide + 1))
-    _sample_strip(image, places, tangents, strip)
+    _sample_strip(image, places, tangents, pitch_px, strip)
     sides = 0.5 * (strip[:, :_SIDE_COLUMNS].mean(axis=1) + strip[:, -_SIDE_COLUMNS:].mean(axis=1))
     strip -= uniform_filter1d(sides, 2 * int(_SMOOTH_PX / STEP_PX / 2) + 1, mode="nearest")[:, None]
     brightest = int(_SHAFT_QUANTILE * len(strip))
     strip -= np.partition(strip, brightest, axis=0)[brightest]
     strip = np.ascontiguousarray(strip[:, wide - columns : wide + columns + 1])
     at = np.rint((arc + ends) / STEP_PX).astype(np.int64)
-    return _Line(places, strip, at, *_foreshortening(arc, shape))
+    return _Line(pitch_px * places, strip, at, arc)
 
 
 def _foreshortening(arc_px: Array, shape: _Shape) -> tuple[Array, Array]:
@@ -292,25 +304,26 @@ def _search_along(
 
     inner : see :func:`~fluoromap.segmenter.cylinder_pictures.draw_electrode`.
     """
-    size = int((half_length_px(shape.half_px, shape.radius_px, line.cosine).max() + _MARGIN_PX) / STEP_PX)
+    cosine, gap_cosine = _foreshortening(line.arc_px, shape)
+    size = int((half_length_px(shape.half_px, shape.radius_px, cosine).max() + _MARGIN_PX) / STEP_PX)
     moved = np.zeros(len(line.at))
     share = _search(
-        line.strip, line.at, shape.half_px, line.cosine, line.gap_cosine, shape.spacing_px, shape.radius_px, inner, stays, reach,
+        line.strip, line.at, shape.half_px, cosine, gap_cosine, shape.spacing_px, shape.radius_px, inner, stays, reach,
         spacing_sd, np.array(shares), size, moved,
     )  # fmt: skip
     return share, moved
 
 
-@kernel("f4[:,::1], f8[:,::1], f8[:,::1], f8[:,::1]")
-def _sample_strip(x, places, tangents, strip):  # type: ignore[no-untyped-def]  # pragma: no cover
+@kernel("f4[:,::1], f8[:,::1], f8[:,::1], f8, f8[:,::1]")
+def _sample_strip(x, places, tangents, pitch, strip):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write the darkness beside each place of a line."""
     last_u, last_v = x.shape[1] - 1.001, x.shape[0] - 1.001
     wide = strip.shape[1] // 2
     for row in range(strip.shape[0]):
         for column in range(strip.shape[1]):
             w = column - wide
-            u = min(max(places[row, 0] - w * tangents[row, 1], 0.0), last_u)
-            v = min(max(places[row, 1] + w * tangents[row, 0], 0.0), last_v)
+            u = min(max(pitch * (places[row, 0] - w * tangents[row, 1]), 0.0), last_u)
+            v = min(max(pitch * (places[row, 1] + w * tangents[row, 0]), 0.0), last_v)
             left, top = int(u), int(v)
             f, g = u - left, v - top
             upper = x[top, left] + f * (x[top, left + 1] - x[top, left])
@@ -327,22 +340,31 @@ def _compare(strip, at, half, cosine, radius, inner, stays, reach, size, strengt
     """
     count, choices, columns = at.size, seen.shape[1], strip.shape[1]
     pictures = np.zeros((count, 2 * size + 1, columns))
+    # Rows of a picture before and after its middle that are not empty.
+    rows = np.zeros(count, np.int64)
     for k in range(count):
         if stays[k]:
             continue
         draw_electrode(pictures[k], half[k], radius, inner, k == 0, cosine[k])
-        for row in range(2 * size + 1):
+        rows[k] = min(reached_rows(half[k], radius, cosine[k]), size)
+        for row in range(size - rows[k], size + rows[k] + 1):
             for column in range(columns):
                 strength[k] += pictures[k, row, column] * pictures[k, row, column]
         for choice in range(choices):
             first = at[k] + choice - reach - size
-            for row in range(max(-first, 0), min(2 * size + 1, strip.shape[0] - first)):
+            for row in range(max(-first, size - rows[k]), min(size + rows[k] + 1, strip.shape[0] - first)):
                 for column in range(columns):
                     seen[k, choice] += strip[first + row, column] * pictures[k, row, column]
     for k in range(1, count):
+        if stays[k] or stays[k - 1]:
+            continue
         for way in range(2 * choices - 1):
             apart = at[k] - at[k - 1] + way - 2 * reach
-            for row in range(max(-apart, 0), min(2 * size + 1, 2 * size + 1 - apart)):
+            top, bottom = (
+                max(size - rows[k], size - rows[k - 1] - apart),
+                min(size + rows[k], size + rows[k - 1] - apart),
+            )
+            for row in range(top, bottom + 1):
                 for column in range(columns):
                     both[k, way] += pictures[k - 1, row + apart, column] * pictures[k, row, column]
 

@@ -54,7 +54,7 @@ def draw_electrode(picture, half, radius, inner, is_tip, cosine):  # type: ignor
     Parameters
     ----------
     picture : (2 m + 1, 2 n + 1) float64
-        Length of the rays in metal, pixels. A row goes across the axis; the first rows are nearer to the catheter's tip.
+        Length of the rays in metal, pixels; 0 before. A row goes across the axis; the first rows are nearer to the catheter's tip.
     half, radius : float
         Half the electrode's length, and its radius, pixels.
     inner : float
@@ -67,15 +67,26 @@ def draw_electrode(picture, half, radius, inner, is_tip, cosine):  # type: ignor
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     m, n = picture.shape[0] // 2, picture.shape[1] // 2
     inside = _TIP if is_tip else inner
-    for row in range(picture.shape[0]):
-        for column in range(picture.shape[1]):
+    last = min(m, reached_rows(half, radius, cosine))
+    for row in range(m - last, m + last + 1 if is_tip else m + 1):
+        for column in range(n + 1):
             along, across = (row - m) * STEP_PX, float(column - n)
             total = 0.0
             for way in range(4):
                 u = along + (_ALONG_PX if way & 1 else -_ALONG_PX)
                 v = across + (_ACROSS_PX if way & 2 else -_ACROSS_PX)
                 total += _through_electrode(u, v, half, radius, inside, cosine, sine)
-            picture[row, column] = 0.25 * total
+            # Both sides of an electrode look alike, and both ends of a ring.
+            picture[row, column] = picture[row, 2 * n - column] = 0.25 * total
+            if not is_tip:
+                picture[2 * m - row, column] = picture[2 * m - row, 2 * n - column] = 0.25 * total
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def reached_rows(half, radius, cosine):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return how many rows before and after its middle an electrode's picture reaches, see :func:`draw_electrode`."""
+    opening = radius * math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    return int((max(half * cosine, _LEAST_PX) + max(opening, _LEAST_PX) + _ALONG_PX) / STEP_PX) + 1
 
 
 def half_length_px(half_px: Array, radius_px: float, cosine: Array) -> Array:
