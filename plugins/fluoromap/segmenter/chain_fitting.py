@@ -59,9 +59,10 @@ def fit_chains(
     tip_logits_at: Callable[[Array], Array] | None = None,
     is_seen: BoolArray | None = None,
 ) -> tuple[FittedChain, ...]:
-    """Compare each chain with every catheter of as many electrodes, then fit the most probable one.
+    """Fit each chain as the most probable catheter.
 
-    Each catheter is compared in both orders, as cylinders along the chain's line. The order with the highest likelihood wins.
+    It is compared with every catheter of as many electrodes, in both orders, as cylinders along the chain's line. The order with
+    the highest likelihood wins.
 
     Parameters
     ----------
@@ -139,7 +140,10 @@ class _Judged:
     forth_over_back: Array
 
     def turned(self, family: int) -> tuple[IntArray, BoolArray, BoolArray]:
-        """Return order, hidden and outside from the tip of a catheter of this family on."""
+        """Return order, hidden and outside from the tip on.
+
+        ``family`` : of the catheter.
+        """
         step = 1 if self.forth_over_back[family] >= 0 else -1
         return self.order[::step], self.hidden[::step], self.outside[::step]
 
@@ -185,7 +189,10 @@ def _no_tips(points_uv: Array) -> Array:
 def _most_probable(
     kinds: Sequence[tuple[str, float]], families: Sequence[CatheterFamily], chain: CandidateChain
 ) -> int:
-    """Return the index of the most probable family with as many electrodes as the linked chain."""
+    """Return the index of the most probable family.
+
+    It has as many electrodes as the linked chain.
+    """
     of_family = [
         sum(probability for name, probability in kinds if name in family.names)
         if family.catheter.electrodes == len(chain.candidates)

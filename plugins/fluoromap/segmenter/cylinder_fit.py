@@ -216,7 +216,10 @@ class _Shape:
 
 
 def _first_reach(shape: _Shape) -> int:
-    """Return how far an electrode may be from its found place, samples: past one of its openings."""
+    """Return how many samples an electrode may be from its found place.
+
+    That is past one of its openings.
+    """
     return int((shape.radius_px + _PAST_OPENING_PX) / STEP_PX)
 
 

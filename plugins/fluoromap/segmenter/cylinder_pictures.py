@@ -84,7 +84,10 @@ def draw_electrode(picture, half, radius, inner, is_tip, cosine):  # type: ignor
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def reached_rows(half, radius, cosine):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return how many rows before and after its middle an electrode's picture reaches, see :func:`draw_electrode`."""
+    """Return how many rows an electrode's picture reaches to each side.
+
+    See :func:`draw_electrode`. Other rows are empty.
+    """
     opening = radius * math.sqrt(max(1.0 - cosine * cosine, 0.0))
     return int((max(half * cosine, _LEAST_PX) + max(opening, _LEAST_PX) + _ALONG_PX) / STEP_PX) + 1
 

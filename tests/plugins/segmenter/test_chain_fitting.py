@@ -67,10 +67,10 @@ def test_the_shaft_says_more_of_the_tip_than_the_length_of_short_bands():
 
 
 def metal_picture(catheter, shortening, turned):
-    """Return a log image of metal that is seen obliquely, and the electrodes' middles (electrodes, 2) from the tip on.
+    """Return a log image of oblique metal, and the electrodes' middles.
 
-    Points in the metal are projected. Rings are hollow, and so is a short tip. A long tip is solid and ends in a dome. The tip is
-    at the right if ``turned``.
+    The middles (electrodes, 2) are those from the tip on. Points in the metal are projected. Rings are hollow, and so is a short
+    tip. A long tip is solid and ends in a dome. The tip is at the right if ``turned``.
     """
     random = np.random.default_rng(7)
     solid = catheter.tip_mm > 3.0
