@@ -35,7 +35,7 @@ _MARGIN_PX, _SIDE_PX, _SIDE_COLUMNS, _SMOOTH_PX = 1.5, 4.0, 3, 6.5
 _SHAFT_QUANTILE = 0.2
 _FIRST_SD, _LAST_SD = 0.12, 0.06
 """Standard deviation of a gap over its true length, in the first search and in the last."""
-_FORESHORTENING = 0.8, 0.9, 1.0, 1.1, 1.2
+_FORESHORTENING, _AS_FOUND = np.array([0.8, 0.9, 1.0, 1.1, 1.2]), np.array([1.0])
 """Tried in the first search, as a share of that of the found places."""
 _LAST_REACH_PX = 2.0
 _PAST_OPENING_PX = 2.0
@@ -129,18 +129,18 @@ def fit_cylinders(
     stays : (electrodes,)
         Electrodes that keep their places, because something else is seen there.
     """
-    shape = _Shape(catheter, px_per_mm, radius_mm * px_per_mm)
+    shape = _shape(catheter, px_per_mm, radius_mm * px_per_mm)
     reach = _first_reach(shape)
     line = _straighten(image, chain_uv, (shape,), reach)
     searched = {
         inner: _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING) for inner in (_TUBE, _SOLID)
     }
     inner = min(searched, key=lambda inner: searched[inner][0])
-    before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, (1.0,))
+    before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, _AS_FOUND)
     nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[inner][1]))
     reach = int(_LAST_REACH_PX / STEP_PX)
     line = _straighten(image, nearer, (shape,), reach)
-    after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, (1.0,))
+    after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, _AS_FOUND)
     points = np.where(stays[:, None], chain_uv, line.places_at(moved_px))
     gain = 0.5 * _SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
     return CylinderFit(points, gain)
@@ -176,7 +176,7 @@ def compare_catheters(
     """
     pitch_px = max(px_per_mm / _COMPARED_PX_PER_MM, 1.0)
     scale = px_per_mm / pitch_px
-    shapes = [_Shape(catheter, scale, radius * scale) for catheter, radius in zip(catheters, radii_mm, strict=True)]
+    shapes = [_shape(catheter, scale, radius * scale) for catheter, radius in zip(catheters, radii_mm, strict=True)]
     reach = max(_first_reach(shape) for shape in shapes)
     strip = _straighten(image, chain_uv, shapes, reach, pitch_px)
     points = np.empty((len(shapes), 2, *chain_uv.shape))
@@ -190,7 +190,7 @@ def compare_catheters(
     return CatheterComparison(points, -0.5 * _SAMPLES * drawn * np.log(np.maximum(left, _LEAST_SHARE)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Shape:
     """Lengths of a catheter in pixels."""
 
@@ -198,14 +198,18 @@ class _Shape:
     px_per_mm: float
     radius_px: float
 
-    @property
+    @functools.cached_property
     def half_px(self) -> Array:
         """Half the lengths of the electrodes, (electrodes,)."""
         half = np.full(self.catheter.electrodes, 0.5 * self.catheter.ring_mm * self.px_per_mm)
         half[0] = 0.5 * self.catheter.tip_mm * self.px_per_mm
         return half
 
-    @property
+    @functools.cached_property
+    def longest_half_px(self) -> float:
+        return float(self.half_px.max())
+
+    @functools.cached_property
     def spacing_px(self) -> Array:
         return np.array(self.catheter.spacing_mm) * self.px_per_mm
 
@@ -213,6 +217,11 @@ class _Shape:
     def columns(self) -> int:
         """How far to each side of the line a picture reaches, pixels."""
         return int(_WIDER * self.radius_px + _MARGIN_PX)
+
+
+@functools.lru_cache(maxsize=64)
+def _shape(catheter: Catheter, px_per_mm: float, radius_px: float) -> _Shape:
+    return _Shape(catheter, px_per_mm, radius_px)
 
 
 def _first_reach(shape: _Shape) -> int:
@@ -231,7 +240,7 @@ def _straighten(image: Image, points_uv: Array, shapes: Sequence[_Shape], reach:
     """
     points_uv = points_uv / pitch_px
     columns = max(one.columns for one in shapes)
-    longest = max(float(one.half_px.max()) for one in shapes)
+    longest = max(one.longest_half_px for one in shapes)
     steps = np.diff(points_uv, axis=0)
     arc = np.concatenate([[0.0], np.cumsum(np.sqrt((steps * steps).sum(axis=1)))])
     axes = np.concatenate([steps[:1], points_uv[2:] - points_uv[:-2], steps[-1:]])
@@ -266,7 +275,8 @@ def _foreshortening(arc_px: Array, shape: _Shape) -> tuple[Array, Array]:
     else:
         cosine = smooth @ arc_px / shape.px_per_mm
     count = len(arc_px)
-    return np.clip(cosine[:count], _LEAST_COSINE, 1.0), np.clip(cosine[count:], _LEAST_COSINE, _MOST_COSINE)
+    bounded = np.maximum(cosine, _LEAST_COSINE)
+    return np.minimum(bounded[:count], 1.0), np.minimum(bounded[count:], _MOST_COSINE)
 
 
 @functools.lru_cache(maxsize=64)
@@ -299,7 +309,7 @@ def _search_along(
     stays: BoolArray,
     reach: int,
     spacing_sd: float,
-    shares: tuple[float, ...],
+    shares: Array,
 ) -> tuple[float, Array]:
     """Search the electrodes along a line.
 
@@ -312,7 +322,7 @@ def _search_along(
     moved = np.zeros(len(line.at))
     share = _search(
         line.strip, line.at, shape.half_px, cosine, gap_cosine, shape.spacing_px, shape.radius_px, inner, stays, reach,
-        spacing_sd, np.array(shares), size, moved,
+        spacing_sd, shares, size, moved,
     )  # fmt: skip
     return share, moved
 
