@@ -66,6 +66,7 @@ _NO_ELECTRODE = -1.0
 _EXCHANGED, _PAIR = 2, 2
 _LEAST_PLACES, _TWICE = 4, 3.0
 _SAME_PLACE_MM = 1.0
+_SURE_AT_EDGE = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,18 +168,20 @@ class ChainDetector:
 
         One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
         accepted too. Weaker chains alone come with ``manual_needed``. Where catheters lack, electrodes near the edge of the field
-        may belong to them.
+        may belong to them, and everywhere if two of them are sure.
         """
         seen = self.image_evidence(x)
-        expected = max(2, self._electrodes // 2)
-        proposed = seen.proposals(self.field.candidates, expected)
-        searched = SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
+        proposed = seen.proposals(self.field.with_edge, max(2, self._electrodes // 2))
+        at_edge = ~are_in(self.field.candidates, proposed.points_uv)
+        away = proposed if not at_edge.any() else proposed.where(~at_edge)
+        if len(away) == len(proposed) or (
+            self.acceptance.strict and np.count_nonzero(proposed.probability[at_edge] >= SURE) >= _SURE_AT_EDGE
+        ):
+            return SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
+        searched = SearchedImage(x, seen, away, self._chains_of(x, seen, away))
         if len(searched.found.chains) == len(self.catalogue.catheters):
             return searched
-        with_edge = seen.proposals(self.field.with_edge, expected)
-        if len(with_edge) == len(proposed):
-            return searched
-        other = SearchedImage(x, seen, with_edge, self._chains_of(x, seen, with_edge))
+        other = SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
         return other if other.found.explained > searched.found.explained else searched
 
     def split_pairs(self, searched: SearchedImage) -> SearchedImage:

@@ -21,7 +21,8 @@ _LEAST_FALL = 0.3
 _SHARE = 0.75
 _LEAST_SIDE = 0.2
 _LEAST_RIM = 0.35
-_LEVER_PX = 3.0
+_LEVER_PX, _STEEP_PX = 3.0, 5.0
+"""How far beside an edge its level is measured, and how far a sharp edge is steep."""
 _BEYOND = 0.7
 _MOST_BEYOND = 0.02
 _TRIES = 24
@@ -121,7 +122,7 @@ class _Edges:
         distance = np.hypot(self.u - centre[0], self.v - centre[1])
         if not self._is_edge(centre + radius * rim, rim, distance > radius + _LEVER_PX, _LEAST_RIM * count):
             return None
-        self._claim(np.abs(np.linalg.norm(self.points - centre, axis=1) - radius) < _LEVER_PX)
+        self._claim(np.abs(np.linalg.norm(self.points - centre, axis=1) - radius) < _STEEP_PX)
         within: BoolArray = distance < radius
         return within
 
@@ -160,7 +161,7 @@ class _Edges:
         line = offset * normal + steps[:, None] * along
         if self._is_edge(line, normal, beyond > _LEVER_PX, _LEAST_SIDE * self.size):
             inside &= beyond < 0
-        self._claim((np.abs(self.points @ normal - offset) < _LEVER_PX) & (self.directions @ normal > 0.7) | on_line)
+        self._claim((np.abs(self.points @ normal - offset) < _STEEP_PX) & (self.directions @ normal > 0.7) | on_line)
         return True
 
     def _claim(self, on_edge: BoolArray) -> None:

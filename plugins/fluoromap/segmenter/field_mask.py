@@ -17,7 +17,7 @@ from fluoromap.segmenter.collimator import within_collimator
 from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
-MARGIN_PX, EDGE_PX = 16, 8
+MARGIN_PX, EDGE_PX = 16, 5
 """Candidates closer than this to the edge of the field are ignored, pixels: at first, and where catheters lack."""
 
 _SAMPLES = 15

@@ -42,6 +42,10 @@ class Proposals:
             np.concatenate([self.covariance_px2, other.covariance_px2]),
         )
 
+    def where(self, kept: BoolArray) -> Proposals:
+        """Return the proposals for which ``kept`` (n,) has True."""
+        return Proposals(self.points_uv[kept], self.probability[kept], self.covariance_px2[kept])
+
     @property
     def variance_px2(self) -> Array:
         """Mean variance of a coordinate, (n,) pixels squared."""

@@ -10,7 +10,7 @@ from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.segmenter.acceptance import UNSEEN, ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector, with_whole_places
-from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.field_mask import FieldMask, are_in
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
 from fluoromap.segmenter.linking import PossibleChains, best_chains, catheter_families
 from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds
@@ -118,6 +118,14 @@ def chains_found(image, points, probability, scores, **more):
     return detector.split_pairs(detector.search(image)).entry(0).chains
 
 
+class EvidenceInField(Evidence):
+    """Proposes electrodes where they are allowed only."""
+
+    def proposals(self, allowed, expected):
+        proposed = super().proposals(allowed, expected)
+        return proposed.where(are_in(allowed, proposed.points_uv))
+
+
 def lies_on(chain, row):
     return len(chain.pixels_uv) == len(row) and np.linalg.norm(chain.pixels_uv - row, axis=1).max() < 5.0
 
@@ -129,6 +137,22 @@ def test_a_chain_that_would_be_rejected_does_not_take_a_catheter_s_place():
     found = chains_found(drawn([catheter, vessel]), points, probability, scores)
     assert len(found) == 1
     assert lies_on(found[0], catheter)
+
+
+@pytest.mark.parametrize(("sure", "is_there"), [(4, True), (0, False)])
+def test_nothing_takes_the_place_of_a_catheter_at_the_edge_of_the_field(sure, is_there):
+    """A catheter's electrodes near the edge compete with others at once where two are sure; noise there does not."""
+    at_edge, other = row_of("ablation", (12, 100), np.pi / 2), row_of("ablation", (120, 250), -0.2)
+    image, points = drawn([at_edge, other]), np.concatenate([at_edge, other])
+    probability = [0.97 if sure else 0.45] * 4 + [0.9] * 4
+    evidence = EvidenceInField(image, points, probability, [0.9] * 8)
+    (ablation,) = (catheter for catheter in CATALOGUE.catheters if catheter.name == "ablation")
+    detector = detector_of(evidence, Catalogue((ablation,), None, "ablation"))
+    away = np.zeros(image.shape, np.bool_)
+    away[20:-20, 20:-20] = True
+    detector.field = replace(detector.field, candidates=away)
+    (chain,) = detector.search(image).entry(0).chains
+    assert lies_on(chain, at_edge if is_there else other)
 
 
 def test_a_part_of_a_longer_catheter_gives_its_electrodes_back_to_it():

@@ -49,6 +49,19 @@ def test_a_blade_and_its_penumbra_are_cut(patient):
     assert field.inside[64:192, 48:200].all()
 
 
+@pytest.mark.parametrize("share", [0.2, 0.02, 0.0])
+def test_a_blade_is_cut_where_it_is_at_every_place(anatomies, share):
+    """A sharp edge is steep over several pixels, which may not pass for a second edge."""
+    misplaced = []
+    for blade in range(60, 92):
+        picture = anatomies["a"][1].astype(np.float32)
+        picture[:, :blade] *= share
+        inside = within_collimator(picture)
+        first = np.argmax(inside[128:384], axis=1)
+        misplaced += [blade] if np.abs(first - blade).max() > 6 else []
+    assert misplaced == []
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_levels_below_zero_are_dark(patient):
     patient[:, 190:] = -50.0
