@@ -13,6 +13,7 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
+from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.field_mask import ExposedField, FieldMask, evenly_spaced_frames, exposed_field, field_mask
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.lag import measure_lag, widen_by_lag
@@ -34,12 +35,17 @@ _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
 _LEAST_MOVED = 5
+_CLEAR_ROW = 1.0
+"""Log-odds of the middle electrode of a long row that is clear."""
 
 Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
 """(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
 
 RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], Verdict]
 """(frame -> chain of one track, frame -> log image, recall) -> whether the run shows a catheter there."""
+
+PlaceObliquely = Callable[[int, tuple[Chain, ...]], tuple[Chain, ...]]
+"""(frame, its chains) -> the chains at the places of :func:`~fluoromap.segmenter.oblique_places.place_obliquely`."""
 
 
 class Detector(Protocol):
@@ -271,7 +277,8 @@ def segment_run(
     catheters = len(catalogue.catheters)
     search = _chain_search(detector, log_image, context, recall) if search_again else None
     seed = mean if len(averaged) > 1 else None
-    judge = None if shows_catheter is None else _judge(shows_catheter, log_image, recall)
+    place = _oblique_placing(run, catalogue, log_image, recall) if oblique else None
+    judge = None if shows_catheter is None else _judge(shows_catheter, log_image, recall, place)
 
     def tracked(found: Sequence[FrameChains]) -> tuple[FrameChains, ...]:
         entries = track_chains(found, run.frame_times_ms, catheters, search, seed, judge)
@@ -311,8 +318,8 @@ def segment_run(
             lambda: ExtraCatheter(detector.shows_extra_catheter(mean_x, chains)),
         )
         reason = Reason.EXTRA_CATHETER if extra.is_shown else None
-    if oblique:
-        entries = _placed_obliquely(run, catalogue, entries, log_image, recall)
+    if place is not None:
+        entries = tuple(replace(entry, chains=place(entry.frame, entry.chains)) for entry in entries)
         chains = place_obliquely(mean_x, chains, catalogue, run.px_per_mm)
     entries, chains = widen_by_jitter(entries, chains, run.px_per_mm)
     entries = widen_by_lag(entries, lag, run.px_per_mm)
@@ -330,22 +337,16 @@ def segment_run(
     )
 
 
-def _placed_obliquely(
-    run: Run,
-    catalogue: Catalogue,
-    entries: Sequence[FrameChains],
-    log_image: Callable[[int], Image],
-    recall: Recall[ObliquePlaces],
-) -> tuple[FrameChains, ...]:
-    placed = []
-    for entry in entries:
+def _oblique_placing(
+    run: Run, catalogue: Catalogue, log_image: Callable[[int], Image], recall: Recall[ObliquePlaces]
+) -> PlaceObliquely:
+    def place(frame: int, chains: tuple[Chain, ...]) -> tuple[Chain, ...]:
+        def compute() -> ObliquePlaces:
+            return ObliquePlaces(place_obliquely(log_image(frame), chains, catalogue, run.px_per_mm))
 
-        def place(entry: FrameChains = entry) -> ObliquePlaces:
-            return ObliquePlaces(place_obliquely(log_image(entry.frame), entry.chains, catalogue, run.px_per_mm))
+        return recall(ObliquePlaces, (frame, *chains), compute).chains if chains else ()
 
-        chains = recall(ObliquePlaces, (entry.frame, *entry.chains), place).chains if entry.chains else ()
-        placed.append(replace(entry, chains=chains))
-    return tuple(placed)
+    return place
 
 
 def _with_marks(tracked: Sequence[FrameChains], detections: Sequence[FrameChains], marks: Marks) -> list[FrameChains]:
@@ -414,8 +415,24 @@ def _beside(frame: int, images: Iterable[tuple[int, Image]], frame_times_ms: Arr
     ]
 
 
-def _judge(shows_catheter: RunJudge, log_image: Callable[[int], Image], recall: Recall[Any]) -> TrackJudge:
-    return lambda chains: shows_catheter(chains, log_image, recall)
+def _judge(
+    shows_catheter: RunJudge, log_image: Callable[[int], Image], recall: Recall[Any], place: PlaceObliquely | None
+) -> TrackJudge:
+    """Return the judge of a run's tracks.
+
+    Openings hide the middles of a long row's rings, so that it is judged again at its final places where it is not clear.
+    """
+
+    def judge(chains: Mapping[int, Chain]) -> Verdict:
+        verdict = shows_catheter(chains, log_image, recall)
+        is_row = max(len(chain.electrodes) for chain in chains.values()) >= MANY_ELECTRODES
+        if place is None or not is_row or (verdict.is_catheter and verdict.log_odds >= _CLEAR_ROW):
+            return verdict
+        placed = {frame: place(frame, (chain,))[0] for frame, chain in chains.items()}
+        again = shows_catheter(placed, log_image, recall)
+        return max(verdict, again, key=lambda one: (one.is_catheter, one.log_odds))
+
+    return judge
 
 
 def _chain_search(

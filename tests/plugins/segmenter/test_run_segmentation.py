@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
+from fluoromap.segmenter import run_segmentation
 from fluoromap.segmenter.run_segmentation import segment_run
 from fluoromap.segmenter.tracks import Verdict, reverse
 
@@ -127,6 +129,43 @@ def test_frames_in_which_a_catheter_lies_elsewhere_are_not_averaged():
     (alone,) = segmented(7.0).diastole_frames
     (diastolic,) = segmented(7.0).diastole.chains
     assert np.array_equal(diastolic.pixels_uv, PLACES + np.array([0.0, 7.0 * alone]))
+
+
+class Row(Detector):
+    """Finds a decapolar catheter in each frame, and nothing in the mean."""
+
+    def find_chains(self, x, frame, beside=()):
+        self.searched += 1
+        if self.searched > self.count:
+            return FrameChains(frame, ())
+        return FrameChains(frame, (row(30.0),))
+
+
+def row(down):
+    places = np.stack([np.linspace(20.0, 100.0, 10), np.full(10, down)], axis=1)
+    covariance = np.tile(np.eye(2), (10, 1, 1))
+    return Chain(tuple(range(1, 11)), places, covariance, np.ones(10), (("cs", 1.0),))
+
+
+@pytest.mark.parametrize(("log_odds", "judged_again"), [(0.2, True), (3.0, False)])
+def test_a_long_row_that_is_not_clear_is_judged_where_its_rings_are_fitted(monkeypatch, log_odds, judged_again):
+    catalogue = Catalogue((catheter_type("decapolar-2-5-2", "cs"),), None, "cs")
+    run = Run(Frames(6), np.arange(6) * 66.7, 2.0, PixelFacts(False, 12, False))
+    fitted, judged = row(32.0), []
+
+    def place(x, chains, catalogue, px_per_mm):
+        return tuple(replace(one, pixels_uv=fitted.pixels_uv) for one in chains)
+
+    def judge(chains, log_image, recall):
+        there = all(np.array_equal(one.pixels_uv, fitted.pixels_uv) for one in chains.values())
+        judged.append(there)
+        return Verdict(log_odds >= 1.0 or there, max(log_odds, 1.5 * there))
+
+    monkeypatch.setattr(run_segmentation, "place_obliquely", place)
+    detector = Row(6)
+    found = segment_run(run, catalogue, {}, Silent(), lambda field: detector, True, False, judge, oblique=True)
+    assert [len(entry.chains) for entry in found.frames] == [1] * 6
+    assert any(judged) == judged_again
 
 
 class HiddenInSomeFrames(Detector):
