@@ -17,6 +17,7 @@ from fluoromap.segmenter.learned_chain.carried_network import Motion
 from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.tracks import reverse
 
 SHARED_MS = 21.0
 """Time between frames up to which the network's answer for one frame says where electrodes are in the next."""
@@ -270,9 +271,13 @@ def _mean(x: Image, beside: Sequence[Image]) -> Image:
 
 
 def _nearest(chain: Chain, entry: FrameChains) -> Chain | None:
-    """Return the nearest chain of another frame with as many electrodes."""
+    """Return the nearest chain of another frame with as many electrodes.
+
+    It is in the order in which it is nearest: frames may disagree about which end is the tip, and nothing has moved then.
+    """
     alike = [other for other in entry.chains if other.electrodes == chain.electrodes]
-    return min(alike, key=lambda other: float(_farthest(chain, other)), default=None)
+    both_ways = [order for other in alike for order in (other, reverse(other))]
+    return min(both_ways, key=lambda other: _farthest(chain, other), default=None)
 
 
 def _farthest(chain: Chain, other: Chain) -> float:

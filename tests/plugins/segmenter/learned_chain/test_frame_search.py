@@ -13,6 +13,7 @@ from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestN
 from fluoromap.segmenter.learned_chain.frame_search import FrameSearch
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.proposals import Likeness, Proposals
+from fluoromap.segmenter.tracks import reverse
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 X = np.zeros((32, 32), np.float32)
@@ -46,7 +47,7 @@ class Detector:
         self.likeness = lambda x: 10.0
         self.searched, self.split, self.found_again = [], [], []
         self.of_pairs, self.doubtful = (), False
-        self.frame, self.chain_at = 0, lambda frame: 0.0
+        self.frame, self.chain_at, self.turned_in = 0, lambda frame: 0.0, ()
         self.family = None
         self.field, self.px_per_mm = SimpleNamespace(inside=np.ones(X.shape, np.bool_)), 5.0
 
@@ -56,9 +57,9 @@ class Detector:
     def search(self, x):
         self.network(x)
         self.searched.append(float(x.mean()))
-        return Searched(
-            x, self.image_evidence(x), (chain(self.chain_at(self.frame)),) if np.isclose(x.mean(), self.level) else ()
-        )
+        found = chain(self.chain_at(self.frame))
+        found = reverse(found) if self.frame in self.turned_in else found
+        return Searched(x, self.image_evidence(x), (found,) if np.isclose(x.mean(), self.level) else ())
 
     def has_doubtful_places(self, searched):
         return self.doubtful
@@ -224,6 +225,18 @@ def test_a_catheter_that_moves_otherwise_is_not_followed_at_once(monkeypatch):
     follow_by(monkeypatch, tuple)
     # In the third frame it is not where it would be; from the fourth on it moves as before.
     assert searched_of(frames, detector, [0.0, 0, 20, 40, 60, 80, 100])[0] == [0, 1, 2, 3]
+
+
+def test_a_catheter_whose_tip_seems_to_be_at_its_other_end_has_not_moved():
+    frames, detector, asked = search(1.0, shares=False, near_px=4.0)
+    detector.turned_in = (1, 4, 5, 7)
+    motions = []
+    detector.forget_image = lambda: motions.append(frames.network.motion)
+    assert asked_in(frames, detector, asked, [2.0 * frame for frame in range(9)]) == [0, 1]
+    # The answer of frame 1 is moved with the catheter, electrode by electrode.
+    assert all(
+        np.allclose(motion.shifts_at(POINTS + 2.0 * (k + 2)), 2.0 * (k + 1)) for k, motion in enumerate(motions[2:])
+    )
 
 
 def test_after_a_sudden_motion_the_next_frame_asks_the_network_at_once():
