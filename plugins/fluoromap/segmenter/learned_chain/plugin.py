@@ -16,7 +16,7 @@ from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
-from fluoromap.segmenter.learned_chain.explanation import better_scales, is_inverted
+from fluoromap.segmenter.learned_chain.explanation import is_inverted, promising_scales
 from fluoromap.segmenter.learned_chain.frame_answers import StoredAnswers
 from fluoromap.segmenter.learned_chain.other_scales import ChosenScale, choose_scale
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
@@ -67,7 +67,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "36"
+    version: ClassVar[str] = "37"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -93,7 +93,7 @@ class LearnedChain:
 
         def choose() -> ChosenScale:
             def promising(scales_px_per_mm: Sequence[float]) -> Sequence[float]:
-                return better_scales(run, catalogue, scales_px_per_mm, trained)
+                return promising_scales(run, catalogue, scales_px_per_mm, trained)
 
             return choose_scale(run.px_per_mm, catalogue, automatic, promising)
 

@@ -10,7 +10,7 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.learned_chain import explanation
-from fluoromap.segmenter.learned_chain.explanation import Explanation, better_scales, find_scale, is_inverted
+from fluoromap.segmenter.learned_chain.explanation import Explanation, find_scale, is_inverted, promising_scales
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 
@@ -111,15 +111,17 @@ def test_noise_has_no_scale(level):
     assert find_scale(run_of(noise), DEFAULT_CATALOGUE) is None
 
 
-@pytest.mark.parametrize(("own_is_sure", "better"), [(False, (2.5,)), (True, (2.5, 4.0))])
-def test_another_scale_needs_clear_chains_where_the_own_one_shows_none(own_is_sure, better, monkeypatch):
+@pytest.mark.parametrize(("own_is_sure", "promising"), [(False, (2.5, 3.8)), (True, (2.5, 4.0, 3.8))])
+def test_another_scale_needs_clear_chains_where_the_own_one_shows_none(own_is_sure, promising, monkeypatch):
     """Contrast medium may explain a few electrodes at any scale, and a whole segmentation takes long."""
     explained = [
         Explanation(3.0, False, 2.0, own_is_sure),
         Explanation(2.5, False, 3.0, True),
         Explanation(4.0, False, 5.0, False),
         Explanation(3.5, False, 1.0, True),
+        # Nearly as much in a few frames: the whole run may show a catheter more.
+        Explanation(3.8, False, 1.7, True),
     ]
     monkeypatch.setattr(explanation, "_explanations", lambda *_: explained)
     run = run_of([np.zeros((8, 8), np.uint16)])
-    assert better_scales(run, DEFAULT_CATALOGUE, (2.5, 4.0, 3.5)) == better
+    assert promising_scales(run, DEFAULT_CATALOGUE, (2.5, 4.0, 3.5, 3.8)) == promising

@@ -84,6 +84,19 @@ def test_eight_bits_at_half_the_scale(simulated):
     assert points >= 0.8 * 12 * 12
 
 
+@pytest.mark.parametrize(("beside_mm", "least"), [(2.3, 0.97), (1.2, 0.9)])
+def test_a_catheter_close_to_a_collimator_blade_is_found(simulated, beside_mm, least):
+    """The blade lies so far from the outermost electrode where that comes nearest."""
+    places = np.concatenate(list(simulated.truth.pixels_uv.values()), axis=1)[:12]
+    blade = int(places[..., 0].min() - beside_mm * PX_PER_MM)
+    frames = [simulated.frames[k].copy() for k in range(12)]
+    for frame in frames:
+        frame[:, :blade] //= 60
+    recall, false = electrodes_right(segmented(frames), simulated.truth)
+    assert recall >= least
+    assert false == 0
+
+
 @pytest.mark.parametrize("wrong", [0.6, 1.4])
 def test_a_scale_that_is_off_by_forty_per_cent_invents_nothing(simulated, wrong):
     found = segmented([simulated.frames[k] for k in range(4)], px_per_mm=wrong * PX_PER_MM)
