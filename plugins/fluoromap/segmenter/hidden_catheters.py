@@ -33,8 +33,8 @@ def add_hidden_catheters(
 ) -> tuple[FrameChains, ...]:
     """Return the tracked chains with those of catheters that lacked a track.
 
-    A longer catheter replaces a track on some of its electrodes, but no track with a mark. Nothing changes where none of these
-    catheters, or no more electrodes, are tracked then.
+    A longer catheter replaces a track on some of its electrodes, but no track with a mark. Nothing changes where no more electrodes
+    are tracked then, of these catheters or of others that another start shows.
 
     Parameters
     ----------
@@ -70,11 +70,8 @@ def add_hidden_catheters(
         if added:
             left = [_without(entry, known, wrong) for entry, known in zip(found, tracked, strict=True)]
             again = follow(left, FrameChains(frame, (*chains, *added)))
-            followed = any(
-                _share_electrodes(chain, other, px_per_mm) for chain in added for other in again[frame].chains
-            )
             # Another start also gives anatomy another chance to pass for a catheter.
-            if followed and _electrodes(again) > _electrodes(tracked):
+            if _electrodes(again) > _electrodes(tracked):
                 found, tracked = left, again
     return tracked
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from fluoromap.contracts import Array
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.track_names import surplus
 from fluoromap.segmenter.tracks import (
     KEPT_VELOCITY,
     ChainSearch,
@@ -45,7 +46,8 @@ def completed(
         Accepted tracks.
     rare : sequence of Track
         Tracks that too few frames show. A long one may replace tracks of its parts that have fewer electrodes together: anatomy
-        rarely has so long a row. It is judged again with the frames that the search adds.
+        rarely has so long a row. A short one needs a judge who believes it, and another catheter beside it. Both are judged again
+        with the frames that the search adds.
     least : float
         In how many frames a track is seen.
     frame_times_ms : (n,)
@@ -64,16 +66,18 @@ def completed(
                 track.verdict = judge(track.chains)
                 wrong += [] if is_believed(track, kept) else [track]
     tracks = [track for track in tracks if track not in wrong]
-    for track in sorted(filter(_is_long, rare), key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
-        parts = [other for other in tracks if _is_part(other, track)]
-        if sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes):
-            others = [other for other in tracks if other not in parts]
-            _complete(track, others, frame_times_ms, catheters, search)
-            if len(track.chains) < least:
-                continue
-            track.verdict = judge(track.chains)
-            if is_believed(track, others):
-                tracks = [*others, track]
+    for track in sorted(rare, key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
+        parts = [other for other in tracks if _is_part(other, track)] if _is_long(track) else []
+        explains_more = sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes)
+        if not (explains_more if _is_long(track) else _is_another(track, tracks)):
+            continue
+        others = [other for other in tracks if other not in parts]
+        _complete(track, others, frame_times_ms, catheters, search)
+        if len(track.chains) < least:
+            continue
+        track.verdict = judge(track.chains)
+        if is_believed(track, others):
+            tracks = [*others, track]
     return tracks
 
 
@@ -113,6 +117,17 @@ def _complete(
 def _is_part(track: Track, other: Track) -> bool:
     """Return whether a track lies on electrodes of a track with more electrodes."""
     return not track.manual and len(track.chain.electrodes) < len(other.chain.electrodes) and meet(track, other)
+
+
+def _is_another(track: Track, tracks: Sequence[Track]) -> bool:
+    """Return whether a track is one more catheter beside these.
+
+    The judge believes it, it does not meet them, and the study has a name left for it.
+    """
+    believed = track.verdict is not None and track.verdict.is_catheter
+    return (
+        bool(tracks) and believed and not any(meet(track, other) for other in tracks) and not surplus([*tracks, track])
+    )
 
 
 def _is_long(track: Track) -> bool:

@@ -129,3 +129,11 @@ def test_a_search_after_which_fewer_electrodes_are_tracked_changes_nothing():
         known, known, CATALOGUE, 3.5, lambda frame: [chain(10, 0.0)], lambda found, start: entries()
     )
     assert tracked is known
+
+
+def test_a_start_that_shows_another_catheter_helps_too():
+    known, more = entries(chain(4, 400.0, 0)), entries(chain(4, 400.0, 0), chain(10, 0.0, 1))
+    tracked = add_hidden_catheters(
+        known, known, CATALOGUE, 3.5, lambda frame: [chain(10, 150.0)], lambda found, start: more
+    )
+    assert tracked is more

@@ -340,6 +340,21 @@ def test_a_short_catheter_that_few_frames_show_may_be_anatomy():
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "believed", "kept"), [("map", True, True), ("map", False, False), ("reference", True, False)]
+)
+def test_a_short_catheter_that_few_frames_show_is_believed_beside_another_one(name, believed, kept):
+    """Not where the judge doubts it, nor where the study has no catheter left for it."""
+    other, rare = chain(POINTS + 100), chain(POINTS + 250, name)
+    found = run([[other, rare] if frame in (3, 4, 5, 6) else [other] for frame in range(16)])
+
+    def accepts(chains):
+        return believed or chains[min(chains)].pixels_uv[0, 0] < 200
+
+    entries = track_chains(found, times(16), 2, only_confirmed, None, says(accepts))
+    assert [len(entry.chains) for entry in entries] == [1 + kept] * 16
+
+
 def test_a_faint_catheter_is_accepted_only_beside_a_clear_one():
     clear, faint = chain(POINTS + 100, "map"), chain(POINTS + 250, "rv")
 
