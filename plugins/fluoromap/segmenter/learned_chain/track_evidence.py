@@ -116,15 +116,16 @@ class _Least:
     Clutter rarely looks like the same catheter in every frame, and it rarely moves as the heart does.
 
     track : of any track. followed : of one that was found in nearly all frames. still : of one that does not move.
-    waiting : of one that does not move, but was found in nearly all frames of a run shorter than a beat. hidden, hidden_still : of
-    one that was found in nearly all frames and that noise may hide, as it may hide the other catheters; a long row has no such
-    excuse.
+    waiting : of one that does not move, but was found in nearly all frames of a run shorter than a beat. moment : the same in a run
+    so short that nothing need move. hidden, hidden_still : of one that was found in nearly all frames and that noise may hide, as
+    it may hide the other catheters; a long row has no such excuse.
     """
 
     track: float
     followed: _ByGaps
     still: float
     waiting: _ByGaps
+    moment: _ByGaps
     hidden: _ByGaps = _ByGaps(math.inf, math.inf)
     hidden_still: float = math.inf
 
@@ -140,16 +141,18 @@ _LEAST = _Least(
     _ByGaps(-0.4, 0.35),
     still=1.2,
     waiting=_ByGaps(0.3, 1.2),
+    moment=_ByGaps(-0.4, 1.2),
     hidden=_ByGaps(-2.1, 0.45),
     hidden_still=0.6,
 )
-_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8, waiting=_ByGaps(0.3, 0.8))
+_LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8, waiting=_ByGaps(0.3, 0.8), moment=_ByGaps(-2.6, 0.8))
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
 _LEAST_PAIR = _Least(
     1.2,
     _ByGaps(0.8, 0.8),
     still=1.6,
     waiting=_ByGaps(1.6, 1.6),
+    moment=_ByGaps(0.8, 1.6),
     hidden=_ByGaps(0.8, 0.8),
     hidden_still=1.6,
 )
@@ -309,7 +312,9 @@ class TrackEvidence:
         """
         if self._is_still(path_uv):
             return least.waiting.at(gaps) if self._is_waiting(path_uv) else least.still
-        return least.followed.at(gaps) if self._is_followed_long(path_uv) else least.track
+        if not self._is_followed_long(path_uv):
+            return least.track
+        return (least.moment if self._is_at_rest(path_uv) else least.followed).at(gaps)
 
     def _is_waiting(self, path_uv: Array) -> bool:
         """Return whether a followed track may just not have moved yet.
@@ -320,9 +325,13 @@ class TrackEvidence:
 
     def _is_still(self, path_uv: Array) -> bool:
         """Return whether places (frames, electrodes, 2) hardly move, although the run is long enough."""
-        motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
         is_moment = self._is_followed(path_uv) and np.ptp(self.frame_times_ms) < _MOMENT_MS
-        return bool(motion_px < _STILL_MM * self.px_per_mm) and not is_moment
+        return self._is_at_rest(path_uv) and not is_moment
+
+    def _is_at_rest(self, path_uv: Array) -> bool:
+        """Return whether places (frames, electrodes, 2) hardly move."""
+        motion_px = np.ptp(path_uv.mean(axis=1), axis=0).max()
+        return bool(motion_px < _STILL_MM * self.px_per_mm)
 
     def _is_followed(self, path_uv: Array) -> bool:
         """Return whether nearly all frames of the run show a track."""

@@ -276,13 +276,19 @@ def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(
     assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
 
 
-def test_a_moment_is_too_short_to_see_a_catheter_move(monkeypatch):
+@pytest.mark.parametrize(
+    ("odds", "gaps", "step_px", "accepted"),
+    [(-0.2, 0.2, 0.0, True), (1.0, 0.6, 0.0, False), (1.3, 0.6, 0.0, True), (1.0, 0.6, 1.0, True)],
+)
+def test_a_moment_is_too_short_to_see_separate_spots_move(monkeypatch, odds, gaps, step_px, accepted):
+    """Parts of a dark line at rest need as much as in a longer run."""
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
     monkeypatch.setattr(
-        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, -0.2))
+        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, odds), gaps=gaps)
     )
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
-    assert accepts(judge, chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None)
+    moved = step_px * np.arange(2 * FRAMES)[:, None, None] * np.array([0.0, 1.0])
+    assert accepts(judge, chains(row + moved), lambda frame: None) == accepted
 
 
 @pytest.mark.parametrize(
