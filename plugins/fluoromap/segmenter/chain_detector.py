@@ -168,16 +168,15 @@ class ChainDetector:
 
         One chain must exceed its family's floor and clearly look like electrodes. Then weaker chains beside it are
         accepted too. Weaker chains alone come with ``manual_needed``. Where catheters lack, electrodes near the edge of the field
-        may belong to them, and everywhere if two of them are sure.
+        may belong to them. In an image where two of these are sure, all compete at once.
         """
         seen = self.image_evidence(x)
         proposed = seen.proposals(self.field.with_edge, max(2, self._electrodes // 2))
         at_edge = ~are_in(self.field.candidates, proposed.points_uv)
-        away = proposed if not at_edge.any() else proposed.where(~at_edge)
-        if len(away) == len(proposed) or (
-            self.acceptance.strict and np.count_nonzero(proposed.probability[at_edge] >= SURE) >= _SURE_AT_EDGE
-        ):
+        sure_at_edge = np.count_nonzero(proposed.probability[at_edge] >= SURE)
+        if not at_edge.any() or (self.acceptance.strict and sure_at_edge >= _SURE_AT_EDGE):
             return SearchedImage(x, seen, proposed, self._chains_of(x, seen, proposed))
+        away = proposed.where(~at_edge)
         searched = SearchedImage(x, seen, away, self._chains_of(x, seen, away))
         if len(searched.found.chains) == len(self.catalogue.catheters):
             return searched

@@ -18,7 +18,7 @@ from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.log_image import Image
 
 MARGIN_PX, EDGE_PX = 16, 5
-"""Candidates closer than this to the edge of the field are ignored, pixels: at first, and where catheters lack."""
+"""Candidates closer than this to the edge of the field are ignored, pixels: at first, and where catheters lack or two are sure."""
 
 _SAMPLES = 15
 _DARK = 0.06

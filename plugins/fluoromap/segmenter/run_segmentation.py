@@ -35,8 +35,8 @@ _SAME_TRACK_PX = 12.0
 _EDGE_PX = 12
 _SAME_MOMENT_MS = 40.0
 _LEAST_MOVED = 5
-_CLEAR_ROW = 1.0
-"""Log-odds of the middle electrode of a long row that is clear."""
+_SURE_ROW = 1.0
+"""Log-odds of the middle electrode of a long row that is not judged again."""
 
 Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
 """(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
@@ -426,7 +426,7 @@ def _judge(
     def judge(chains: Mapping[int, Chain]) -> Verdict:
         verdict = shows_catheter(chains, log_image, recall)
         is_row = max(len(chain.electrodes) for chain in chains.values()) >= MANY_ELECTRODES
-        if place is None or not is_row or (verdict.is_catheter and verdict.log_odds >= _CLEAR_ROW):
+        if place is None or not is_row or (verdict.is_catheter and verdict.log_odds >= _SURE_ROW):
             return verdict
         placed = {frame: place(frame, (chain,))[0] for frame, chain in chains.items()}
         again = shows_catheter(placed, log_image, recall)

@@ -69,7 +69,7 @@ def completed(
     for track in sorted(rare, key=lambda track: -len(track.chains) * len(track.chain.electrodes)):
         parts = [other for other in tracks if _is_part(other, track)] if _is_long(track) else []
         explains_more = sum(len(other.chain.electrodes) for other in parts) < len(track.chain.electrodes)
-        if not (explains_more if _is_long(track) else _is_another(track, tracks)):
+        if not explains_more or not (_is_long(track) or _is_another(track, tracks)):
             continue
         others = [other for other in tracks if other not in parts]
         _complete(track, others, frame_times_ms, catheters, search)

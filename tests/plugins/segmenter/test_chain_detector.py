@@ -139,12 +139,12 @@ def test_a_chain_that_would_be_rejected_does_not_take_a_catheter_s_place():
     assert lies_on(found[0], catheter)
 
 
-@pytest.mark.parametrize(("sure", "is_there"), [(4, True), (0, False)])
-def test_nothing_takes_the_place_of_a_catheter_at_the_edge_of_the_field(sure, is_there):
+@pytest.mark.parametrize(("likely", "is_there"), [(0.97, True), (0.45, False)])
+def test_nothing_takes_the_place_of_a_catheter_at_the_edge_of_the_field(likely, is_there):
     """A catheter's electrodes near the edge compete with others at once where two are sure; noise there does not."""
     at_edge, other = row_of("ablation", (12, 100), np.pi / 2), row_of("ablation", (120, 250), -0.2)
     image, points = drawn([at_edge, other]), np.concatenate([at_edge, other])
-    probability = [0.97 if sure else 0.45] * 4 + [0.9] * 4
+    probability = [likely] * 4 + [0.9] * 4
     evidence = EvidenceInField(image, points, probability, [0.9] * 8)
     (ablation,) = (catheter for catheter in CATALOGUE.catheters if catheter.name == "ablation")
     detector = detector_of(evidence, Catalogue((ablation,), None, "ablation"))

@@ -233,6 +233,7 @@ def test_a_catheter_whose_tip_seems_to_be_at_its_other_end_has_not_moved():
     motions = []
     detector.forget_image = lambda: motions.append(frames.network.motion)
     assert asked_in(frames, detector, asked, [2.0 * frame for frame in range(9)]) == [0, 1]
+    assert len(motions) == 9
     # The answer of frame 1 is moved with the catheter, electrode by electrode.
     assert all(
         np.allclose(motion.shifts_at(POINTS + 2.0 * (k + 2)), 2.0 * (k + 1)) for k, motion in enumerate(motions[2:])
