@@ -84,6 +84,9 @@ of the darker electrodes' depth. The mean of all frames may blur what lies there
 _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
+_TIP, _TIP_OVER_END = 0.4, 1.0
+"""Logit of a tip that is sure, and how much more that is than at the other end. The network learned tips from electrodes alone, so that
+clutter rarely has one."""
 _CLEAR = 1.0
 """Log-odds of the middle electrode of a track that needs no more frames."""
 _MOST_PROBE_TURN = 2.4
@@ -147,6 +150,9 @@ _LEAST = _Least(
 )
 _LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8, waiting=_ByGaps(0.3, 0.8), moment=_ByGaps(-2.6, 0.8))
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
+_WITH_TIP, _WITH_TIP_ON_LINE = (-0.6, -1.8), (0.0, -1.5)
+"""Least log-odds of the middle and the worst electrode of a catheter that moves and has a sure long tip; in a dark line, as which a
+long tip and the rings near it may show."""
 _LEAST_PAIR = _Least(
     1.2,
     _ByGaps(0.8, 0.8),
@@ -231,7 +237,8 @@ class TrackEvidence:
         odds = np.array([odds_of(sections) for sections in pictures])
         depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
         on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES) or ends_on_coil(depths, odds.mean(axis=0))
-        if not is_loop and (_is_probe(pictures) or on_line):
+        has_tip = self._is_likely(chains, self.long_tips) and not self._is_at_rest(paths) and _has_sure_tip(pictures)
+        if not is_loop and (_is_probe(pictures) or (on_line and not has_tip)):
             return Verdict(False)
         beyond = np.mean([(sections[0].beyond[0], sections[-1].beyond[1]) for sections in pictures], axis=0)
         if not self._is_likely(chains, self.circular) and goes_on(depths, beyond):
@@ -277,7 +284,12 @@ class TrackEvidence:
             )
         limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
         least = self._least(paths, limits, gaps)
-        is_catheter = any(middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said)
+        is_catheter = not on_line and any(
+            middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said
+        )
+        if has_tip and not is_catheter:
+            least, least_worst = _WITH_TIP_ON_LINE if on_line else _WITH_TIP
+            is_catheter = any(middle >= least and of_each.min() >= least_worst for middle, of_each in said)
         hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
         may_be_hidden = bool(self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst)
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends)
@@ -414,6 +426,12 @@ def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:
     behind = np.mean([sections[-1].shafts[1] - sections[0].shafts[0] for sections in pictures])
     tips = np.mean([sections[0].tips[0] - sections[-1].tips[1] for sections in pictures])
     return _OF_SHAFT * float(behind) + _OF_TIPS * float(np.clip(tips, -_MOST_TIPS, _MOST_TIPS))
+
+
+def _has_sure_tip(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
+    """Return whether the network calls the first electrode of a track a tip, and the last one less so."""
+    first, last = np.mean([(sections[0].tips[0], sections[-1].tips[1]) for sections in pictures], axis=0)
+    return bool(first >= _TIP and first - last >= _TIP_OVER_END)
 
 
 def _turn(path_uv: Array) -> float:
