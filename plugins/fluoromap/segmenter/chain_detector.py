@@ -438,7 +438,8 @@ class ChainDetector:
         for index, (family, rows, chain_scores) in enumerate(
             zip(families, linking.possible.rows, linking.possible.scores, strict=True)
         ):
-            good = (chain_scores >= family.floor + _GOOD_ALONE) & self.acceptance.accepts(scores[rows], chain_scores)
+            good = chain_scores >= family.floor + _GOOD_ALONE
+            good &= self.acceptance.accepts(scores[rows], chain_scores, beside=bool(result.candidates))
             unlisted = [one.candidates for one in result.unlisted if len(one.candidates) >= rows.shape[1]]
             good &= ~np.isin(rows, [candidate for candidates in unlisted for candidate in candidates]).any(axis=1)
             for chain in linking.chains:

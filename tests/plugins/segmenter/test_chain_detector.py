@@ -175,6 +175,19 @@ def test_a_doubted_catheter_is_accepted_beside_a_sure_one_only():
         assert len(detector.search(image).entry(0).chains) == count
 
 
+def test_what_takes_the_place_of_a_doubted_catheter_beside_a_sure_one_gives_it_back():
+    ablation, vessel, cs = (
+        row_of("ablation", (60, 250), -0.2),
+        row_of("ablation", (200, 300), 0.1),
+        row_of("cs", (60, 60), 0.3),
+    )
+    acceptance = replace(IN_A_RUN, scores_beside=ScoreLimits(0.3, seen=0.1, least_seen=0.7))
+    image, points = drawn([ablation, vessel, cs]), np.concatenate([ablation, vessel, cs])
+    probability, scores = [0.9] * 4 + [0.99] * 14, [0.35] * 4 + [0.05] * 4 + [0.9] * 10
+    found = detector_of(Evidence(image, points, probability, scores), acceptance=acceptance).search(image)
+    assert any(lies_on(chain, ablation) for chain in found.entry(0).chains)
+
+
 @pytest.mark.parametrize("astray", [(1,), (1, 3), (2, 3)])
 def test_an_electrode_that_its_fit_leads_astray_is_judged_where_it_was_proposed(astray):
     catheter = row_of("ablation", (60, 60), 0.3)

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
+from fluoromap.contracts import Array, FrameChains, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 
 OTHER_SCALES = 1.18, 0.85
 """Over the stated one."""
 
-_LEAST_SEEN = 0.85
-"""Length seen over length in space of the catheters that a larger scale adds: shorter ones fit the stated scale as well."""
 _BESIDE_MM = 1.5
 _CONFIRMED = 2
 _LEAST_KEPT = 0.8
@@ -70,8 +68,7 @@ def choose_scale(
             continue
         if _share_kept(found, other, _BESIDE_MM * scale) < _LEAST_KEPT:
             continue
-        if scale < best or _median_length_seen(other, found, catalogue, scale) >= _LEAST_SEEN:
-            best, found = scale, other
+        best, found = scale, other
     return ChosenScale(best)
 
 
@@ -98,27 +95,6 @@ def _share_kept(found: Segmentation, other: Segmentation, reach_px: float) -> fl
     return float(np.mean(away <= reach_px)) if len(away) else 1.0
 
 
-def _median_length_seen(other: Segmentation, found: Segmentation, catalogue: Catalogue, px_per_mm: float) -> float:
-    """Return the median length of the chains that only the other segmentation has.
-
-    It is the length seen over that in space, of the longest whole chain of each frame; 0 where there is none.
-    """
-    longest = []
-    for entry, before in zip(other.frames, found.frames, strict=True):
-        taken = _places(before)
-        new = [chain for chain in entry.chains if _lies_elsewhere(chain, taken, _BESIDE_MM * px_per_mm)]
-        seen = [_length_seen(chain, catalogue, px_per_mm) for chain in new]
-        if seen:
-            longest.append(max(seen))
-    return float(np.median(longest)) if longest else 0.0
-
-
-def _lies_elsewhere(chain: Chain, taken_uv: Array, reach_px: float) -> bool:
-    """Return whether half of a chain's electrodes lie beside all these places."""
-    away = _away(chain.pixels_uv, taken_uv)
-    return bool(2 * np.count_nonzero(away > reach_px) >= len(chain.electrodes))
-
-
 def _places(entry: FrameChains) -> Array:
     return np.concatenate([np.zeros((0, 2)), *(chain.pixels_uv for chain in entry.chains)])
 
@@ -127,15 +103,3 @@ def _away(points_uv: Array, from_uv: Array) -> Array:
     """Return the distance of each point to the nearest of others, (n,), infinite without others."""
     nearest: Array = np.linalg.norm(points_uv[:, None] - from_uv, axis=2).min(axis=1, initial=np.inf)
     return nearest
-
-
-def _length_seen(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> float:
-    """Return a chain's length in the image over its catheter's.
-
-    It is 0 for a part of a catheter.
-    """
-    catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
-    if len(chain.electrodes) < catheter.electrodes:
-        return 0.0
-    seen = np.linalg.norm(np.diff(chain.pixels_uv, axis=0), axis=1).sum()
-    return float(seen / (sum(catheter.spacing_mm) * px_per_mm))

@@ -85,8 +85,8 @@ _LOW_QUANTILE = 0.1
 _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 """Mean log-odds of all electrodes, each within these bounds, that excuses the worst one: the network may miss one of four."""
 _TIP, _TIP_OVER_END = 0.4, 1.0
-"""Logit of a tip that is sure, and how much more that is than at the other end. The network learned tips from electrodes alone, so that
-clutter rarely has one."""
+"""Logit of a tip that is sure, and how much more that is than at the other end. The network learned tips from electrodes alone, so
+that clutter rarely has one."""
 _CLEAR = 1.0
 """Log-odds of the middle electrode of a track that needs no more frames."""
 _MOST_PROBE_TURN = 2.4

@@ -1,4 +1,4 @@
-"""The scale of a run in which catheters lack: another one counts where it shows more, and not what the stated one could."""
+"""The scale of a run in which catheters lack: another one counts where it shows more."""
 
 import numpy as np
 import pytest
@@ -50,17 +50,12 @@ def test_six_more_electrodes_are_enough_where_the_stated_scale_shows_an_unlisted
     assert chosen({3.0: stated, 3.54: stated, 2.55: showing(chain("a", 10.0, 3.0), chain("c", 90.0, 2.55))}) == 2.55
 
 
-def test_a_larger_scale_counts_where_a_catheter_is_too_long_for_the_stated_one():
-    few, nothing_more = showing(chain("a", 10.0, 3.0)), showing()
-    long = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.54, 0.95))
-    short = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.54, 0.6))
-    assert chosen({3.0: few, 3.54: long, 2.55: nothing_more}) == 3.54
-    assert chosen({3.0: few, 3.54: short, 2.55: nothing_more}) == 3.0
-
-
-def test_a_smaller_scale_counts_where_it_shows_more():
-    few, more = showing(chain("a", 10.0, 3.0)), showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55, 0.5))
-    assert chosen({3.0: few, 3.54: few, 2.55: more}) == 2.55
+@pytest.mark.parametrize("scale", [3.54, 2.55])
+@pytest.mark.parametrize("seen", [0.95, 0.5])
+def test_another_scale_counts_where_it_shows_more(scale, seen):
+    """Some of the labelled real frames, mirrored or with more noise, show the third catheter only at a larger scale."""
+    few, more = showing(chain("a", 10.0, 3.0)), showing(chain("a", 10.0, 3.0), chain("b", 90.0, scale, seen))
+    assert chosen({3.0: few, 3.54: few, 2.55: few} | {scale: more}) == scale
 
 
 def test_a_scale_that_loses_what_the_stated_one_shows_does_not_count():

@@ -277,6 +277,31 @@ def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(
 
 
 @pytest.mark.parametrize(
+    ("odds", "tips", "gaps", "moves", "name", "accepted"),
+    [
+        ([-0.5] * 4, (0.5, -1.0), 0.0, True, "ablation", True),
+        ([-0.5] * 4, (0.5, -1.0), 0.0, True, "cs", False),
+        ([-0.5] * 4, (0.5, -1.0), 0.0, False, "ablation", False),
+        ([-0.5] * 4, (0.3, -1.0), 0.0, True, "ablation", False),
+        ([-0.5] * 4, (0.5, -0.4), 0.0, True, "ablation", False),
+        ([-0.7] * 4, (0.5, -1.0), 0.0, True, "ablation", False),
+        ([-0.3, -0.3, -0.3, -1.9], (0.5, -1.0), 0.5, True, "ablation", False),
+        ([0.1] * 4, (0.5, -1.0), 0.7, True, "ablation", True),
+        ([-0.1] * 4, (0.5, -1.0), 0.7, True, "ablation", False),
+    ],
+)
+def test_a_sure_long_tip_is_rarely_clutter_that_moves(monkeypatch, odds, tips, gaps, moves, name, accepted):
+    """A long tip and the rings near it merge to a dark bar, in which the network doubts each."""
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7, frozenset({"ablation"}))
+    seen = evidence(np.array(odds), gaps=gaps, tips=tips)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: seen)
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, float(moves)])
+    track = {frame: replace(chain, kinds=((name, 1.0),)) for frame, chain in chains(row + beat).items()}
+    assert accepts(judge, track, lambda frame: None) == accepted
+
+
+@pytest.mark.parametrize(
     ("odds", "gaps", "step_px", "accepted"),
     [(-0.2, 0.2, 0.0, True), (1.0, 0.6, 0.0, False), (1.3, 0.6, 0.0, True), (1.0, 0.6, 1.0, True)],
 )
