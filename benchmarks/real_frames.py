@@ -37,6 +37,7 @@ from fluoromap_service.dicom import open_frames, read_instance
 Array = NDArray[np.float64]
 
 NEAR_PX = 5.0
+_AS_PROBABLE = 0.9
 _PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 _COLOURS = (255, 70, 70), (70, 255, 70), (90, 160, 255), (255, 80, 255), (255, 180, 40), (80, 255, 255)
 
@@ -169,23 +170,24 @@ def score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDA
     """Count found, missed, false, named and numbered electrodes of one frame."""
     there = [(name, number, uv) for name, electrodes in labels.items() for number, uv in electrodes.items()]
     seen = [
-        (max(chain.kinds, key=lambda kind: kind[1])[0], number, uv)
+        (_names(chain), number, uv)
         for chain in chains
         for number, uv in zip(chain.electrodes, chain.pixels_uv, strict=True)
     ]
     if not there or not seen:
         return np.array([0, len(there), len(seen), 0, 0])
-    alike = {tuple(sorted(name for name, _ in chain.kinds)) for chain in chains}
     away = np.array([[np.linalg.norm(mine[2] - theirs[2]) for theirs in there] for mine in seen])
     rows, columns = linear_sum_assignment(np.minimum(away, 4 * NEAR_PX))
     pairs = [(seen[r], there[c]) for r, c in zip(rows, columns, strict=True) if away[r, c] <= NEAR_PX]
-    named = [
-        (mine, theirs)
-        for mine, theirs in pairs
-        if mine[0] == theirs[0] or any(mine[0] in names and theirs[0] in names for names in alike)
-    ]
+    named = [(mine, theirs) for mine, theirs in pairs if theirs[0] in mine[0]]
     numbered = sum(mine[1] == theirs[1] for mine, theirs in named)
     return np.array([len(pairs), len(there) - len(pairs), len(seen) - len(pairs), len(named), numbered])
+
+
+def _names(chain: Chain) -> set[str]:
+    """Return the most probable name of a chain; look-alikes, which only a study tells apart, are as probable."""
+    most = max(probability for _, probability in chain.kinds)
+    return {name for name, probability in chain.kinds if probability >= _AS_PROBABLE * most}
 
 
 def drawn(pixels: NDArray[np.generic], chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> Image.Image:

@@ -10,6 +10,8 @@ import numpy as np
 import real_frames
 from PIL import Image
 
+from fluoromap.contracts import Chain
+
 LABELS = "file,catheter,electrode,u_px,v_px\n"
 
 
@@ -41,3 +43,16 @@ def test_labels_without_rows_are_of_pictures_without_electrodes(tmp_path: Path) 
     assert len(empty.run.frames) == 3
     assert empty.labels == [{}, {}, {}]
     assert len(other.run.frames) == 1
+
+
+def test_a_name_counts_where_it_is_the_most_probable_or_as_probable() -> None:
+    places = np.array([[10.0, 20.0], [20.0, 20.0]])
+
+    def named(kinds: dict[str, float]) -> int:
+        chain = Chain((1, 2), places, np.tile(np.eye(2), (2, 1, 1)), np.ones(2), tuple(kinds.items()))
+        labels = {"his": {1: places[0], 2: places[1]}}
+        return int(real_frames.score((chain,), labels)[3])
+
+    assert named({"his": 0.9, "rv": 0.1}) == 2
+    assert named({"his": 0.5, "rv": 0.5}) == 2
+    assert named({"his": 0.1, "rv": 0.9}) == 0
