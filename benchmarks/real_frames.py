@@ -17,10 +17,12 @@ import argparse
 import csv
 import json
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from changed_copies import changed_copy
 from memory_frames import MemoryFrames
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
@@ -44,18 +46,24 @@ _COLOURS = (255, 70, 70), (70, 255, 70), (90, 160, 255), (255, 80, 255), (255, 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledRun:
-    """One run and its truth. labels : of each frame, catheter -> {electrode: (2,) pixels}; none where nothing is there."""
+    """One run and its truth.
+
+    labels : of each frame, catheter -> {electrode: (2,) pixels}; none where nothing is there. near_px : how far an electrode that
+    was found may lie from its label.
+    """
 
     name: str
     run: Run
     catalogue: Catalogue
     labels: list[dict[str, dict[int, Array]]]
+    near_px: float = NEAR_PX
 
 
 def main() -> None:
     """Measure the segmenters on all runs of a folder."""
     given = _arguments()
-    runs = [*_labelled_runs(given), *_empty_runs(given)]
+    labelled = _labelled_runs(given)
+    runs = [*labelled, *_copies(labelled, given.copies), *_empty_runs(given)]
     print(f"{'':44}{'found':>12}{'missed':>8}{'false':>7}{'named':>7}{'numbered':>10}{'ms':>7}  frames   lag")
     for name in given.segmenter:
         for one in runs:
@@ -72,6 +80,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--catheter", action="append", default=[], metavar="NAME=TYPE", help=", ".join(CATHETER_TYPES))
     parser.add_argument("--frames", type=int, default=1000, help="at most so many of each run")
+    parser.add_argument("--copies", type=int, default=0, help="so many changed copies of each labelled run too")
     parser.add_argument("--single", action="store_true", help="every frame on its own, as stills are")
     parser.add_argument("--draw", type=Path, metavar="FOLDER", help="draw the chains, with crosses for labels")
     return parser.parse_args()
@@ -104,6 +113,18 @@ def _labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
         pixels = PixelFacts(bool(facts.get("logarithmic", False)), 8, False)
         runs.append(LabelledRun(path.stem, Run(MemoryFrames(frames), times, px_per_mm, pixels), catalogue, labels))
     return runs
+
+
+def _copies(runs: Sequence[LabelledRun], count: int) -> list[LabelledRun]:
+    """Return changed copies of runs; the seed of each is its number."""
+    copies = []
+    for one in runs:
+        frames = [one.run.frames[index] for index in range(len(one.run.frames))]
+        for seed in range(count):
+            changed, labels, size = changed_copy(np.random.default_rng(seed), frames, one.labels)
+            run = replace(one.run, frames=MemoryFrames(changed), px_per_mm=size * one.run.px_per_mm)
+            copies.append(LabelledRun(f"{one.name} copy {seed}", run, one.catalogue, labels, size * NEAR_PX))
+    return copies
 
 
 def _empty_runs(given: argparse.Namespace) -> list[LabelledRun]:
@@ -141,7 +162,7 @@ def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:
     spent = 1000 * (time.process_time() - started) / len(entries)
     sums = np.zeros(5, np.int64)
     for entry, labels in zip(entries, one.labels, strict=True):
-        sums += score(entry.chains, labels)
+        sums += score(entry.chains, labels, one.near_px)
     found, missed, false, named, numbered = sums.tolist()
     inside = find_field(one.run.frames, one.run.pixels).inside
     lag = measure_lag(one.run.frames, inside, one.run.pixels)
@@ -153,7 +174,7 @@ def _measure(name: str, one: LabelledRun, given: argparse.Namespace) -> None:
         given.draw.mkdir(parents=True, exist_ok=True)
         for index in range(0, len(entries), max(1, len(entries) // 4)):
             picture = drawn(one.run.frames[index], entries[index].chains, one.labels[index])
-            picture.save(given.draw / f"{name}_{one.name}_{index}.png")
+            picture.save(given.draw / f"{name}_{one.name.replace(' ', '_')}_{index}.png")
 
 
 def _segment(segmenter: Segmenter, one: LabelledRun, single: bool) -> list[FrameChains]:
@@ -166,7 +187,9 @@ def _segment(segmenter: Segmenter, one: LabelledRun, single: bool) -> list[Frame
     return entries
 
 
-def score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDArray[np.int64]:
+def score(
+    chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]], near_px: float = NEAR_PX
+) -> NDArray[np.int64]:
     """Count found, missed, false, named and numbered electrodes of one frame."""
     there = [(name, number, uv) for name, electrodes in labels.items() for number, uv in electrodes.items()]
     seen = [
@@ -177,15 +200,18 @@ def score(chains: tuple[Chain, ...], labels: dict[str, dict[int, Array]]) -> NDA
     if not there or not seen:
         return np.array([0, len(there), len(seen), 0, 0])
     away = np.array([[np.linalg.norm(mine[2] - theirs[2]) for theirs in there] for mine in seen])
-    rows, columns = linear_sum_assignment(np.minimum(away, 4 * NEAR_PX))
-    pairs = [(seen[r], there[c]) for r, c in zip(rows, columns, strict=True) if away[r, c] <= NEAR_PX]
+    rows, columns = linear_sum_assignment(np.minimum(away, 4 * near_px))
+    pairs = [(seen[r], there[c]) for r, c in zip(rows, columns, strict=True) if away[r, c] <= near_px]
     named = [(mine, theirs) for mine, theirs in pairs if theirs[0] in mine[0]]
     numbered = sum(mine[1] == theirs[1] for mine, theirs in named)
     return np.array([len(pairs), len(there) - len(pairs), len(seen) - len(pairs), len(named), numbered])
 
 
 def _names(chain: Chain) -> set[str]:
-    """Return the most probable name of a chain; look-alikes, which only a study tells apart, are as probable."""
+    """Return the most probable name of a chain, and those of look-alikes.
+
+    Look-alikes are as probable.
+    """
     most = max(probability for _, probability in chain.kinds)
     return {name for name, probability in chain.kinds if probability >= _AS_PROBABLE * most}
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import real_frames
+from changed_copies import changed_copy
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from fluoromap.contracts import Chain
 
@@ -56,3 +58,19 @@ def test_a_name_counts_where_it_is_the_most_probable_or_as_probable() -> None:
     assert named({"his": 0.9, "rv": 0.1}) == 2
     assert named({"his": 0.5, "rv": 0.5}) == 2
     assert named({"his": 0.1, "rv": 0.9}) == 0
+
+
+def test_the_labels_of_a_changed_copy_lie_where_its_electrodes_are() -> None:
+    """A dark spot stays under its label; a copy is as the seed says."""
+    frame = np.full((60, 80), 200, np.uint8)
+    frame[18:23, 48:53] = 20
+    for seed in range(8):
+        copies = [
+            changed_copy(np.random.default_rng(seed), [frame], [{"cs": {1: np.array([50.0, 20.0])}}]) for _ in range(2)
+        ]
+        (copied, labels, size), (again, _, _) = copies
+        place = labels[0]["cs"][1]
+        blurred = gaussian_filter(copied[0].astype(np.float64), 2.0 * size)
+        v, u = np.unravel_index(np.argmin(blurred), blurred.shape)
+        assert np.hypot(u - place[0], v - place[1]) <= 2.0
+        assert np.array_equal(copied[0], again[0])

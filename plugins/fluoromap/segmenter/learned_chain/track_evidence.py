@@ -150,7 +150,7 @@ _LEAST = _Least(
 )
 _LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8, waiting=_ByGaps(0.3, 0.8), moment=_ByGaps(-2.6, 0.8))
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
-_WITH_TIP, _WITH_TIP_ON_LINE = (-0.6, -1.8), (0.0, -1.5)
+_WITH_TIP, _WITH_TIP_ON_LINE = (-0.6, -2.5), (0.0, -1.5)
 """Least log-odds of the middle and the worst electrode of a catheter that moves and has a sure long tip; in a dark line, as which a
 long tip and the rings near it may show."""
 _LEAST_PAIR = _Least(
@@ -429,7 +429,10 @@ def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:
 
 
 def _has_sure_tip(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
-    """Return whether the network calls the first electrode of a track a tip, and the last one less so."""
+    """Return whether the network calls a track's first electrode a tip.
+
+    The last one must be clearly less of a tip.
+    """
     first, last = np.mean([(sections[0].tips[0], sections[-1].tips[1]) for sections in pictures], axis=0)
     return bool(first >= _TIP and first - last >= _TIP_OVER_END)
 
