@@ -151,7 +151,7 @@ _LEAST = _Least(
 _LEAST_LONG = _Least(0.0, _ByGaps(-2.6, 0.0), still=0.8, waiting=_ByGaps(0.3, 0.8), moment=_ByGaps(-2.6, 0.8))
 """Of six or more electrodes. Clutter often hides some of them: the worst electrodes do not count."""
 _WITH_TIP, _WITH_TIP_ON_LINE = (-0.6, -2.5), (0.0, -1.5)
-"""Least log-odds of the middle and the worst electrode of a catheter that moves and has a sure long tip; in a dark line, as which a
+"""Least log-odds of the middle and the worst electrode of a catheter that moves and has a sure long tip; on a dark line, as which a
 long tip and the rings near it may show."""
 _LEAST_PAIR = _Least(
     1.2,
@@ -233,11 +233,15 @@ class TrackEvidence:
 
         chosen = _first_and_last(len(frames))
         pictures = [sections_in(picture) for picture in chosen]
-        is_loop = len(usual) >= MANY_ELECTRODES and _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
+        is_row = len(usual) >= MANY_ELECTRODES
+        is_loop = is_row and _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
         odds = np.array([odds_of(sections) for sections in pictures])
         depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
         on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES) or ends_on_coil(depths, odds.mean(axis=0))
-        has_tip = self._is_likely(chains, self.long_tips) and not self._is_at_rest(paths) and _has_sure_tip(pictures)
+        # Two dark spots are little, and a row has limits of its own.
+        is_short = LEAST_VISIBLE <= len(usual) < MANY_ELECTRODES
+        moves = is_short and not self._is_at_rest(paths)
+        has_tip = moves and self._is_likely(chains, self.long_tips) and _has_sure_tip(pictures)
         if not is_loop and (_is_probe(pictures) or (on_line and not has_tip)):
             return Verdict(False)
         beyond = np.mean([(sections[0].beyond[0], sections[-1].beyond[1]) for sections in pictures], axis=0)
@@ -248,7 +252,7 @@ class TrackEvidence:
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
         # Of a long tip single frames show which end it is.
         tip_odds = None if is_loop or self._is_likely(chains, self.long_tips) else _tip_odds(pictures)
-        is_row, still = len(usual) >= MANY_ELECTRODES, self._is_still(paths)
+        still = self._is_still(paths)
         waits = still and self._is_waiting(paths)
         worst_still = None
         if still:
@@ -291,7 +295,9 @@ class TrackEvidence:
             least, least_worst = _WITH_TIP_ON_LINE if on_line else _WITH_TIP
             is_catheter = any(middle >= least and of_each.min() >= least_worst for middle, of_each in said)
         hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
-        may_be_hidden = bool(self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst)
+        may_be_hidden = bool(
+            not on_line and self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst
+        )
         return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends)
 
     def _onwards(

@@ -292,13 +292,31 @@ def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(
 )
 def test_a_sure_long_tip_is_rarely_clutter_that_moves(monkeypatch, odds, tips, gaps, moves, name, accepted):
     """A long tip and the rings near it merge to a dark bar, in which the network doubts each."""
+    assert judged_with_tip(monkeypatch, odds, tips, gaps, moves, name).is_catheter == accepted
+
+
+def judged_with_tip(monkeypatch, odds, tips, gaps, moves=True, name="ablation"):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7, frozenset({"ablation"}))
-    seen = evidence(np.array(odds), gaps=gaps, tips=tips)
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: seen)
-    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+
+    def along(self, frames, path_uv, log_image):
+        return evidence(np.resize(odds, path_uv.shape[1]), gaps=gaps, tips=tips)
+
+    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, float(moves)])
     track = {frame: replace(chain, kinds=((name, 1.0),)) for frame, chain in chains(row + beat).items()}
-    assert accepts(judge, track, lambda frame: None) == accepted
+    return judge(track, lambda frame: None)
+
+
+@pytest.mark.parametrize(("electrodes", "gaps"), [(2, 0.0), (10, 0.7)])
+def test_a_tip_speaks_for_no_pair_and_no_row(monkeypatch, electrodes, gaps):
+    assert not judged_with_tip(monkeypatch, [0.4] * electrodes, (0.5, -1.0), gaps).is_catheter
+
+
+def test_noise_hides_no_catheter_with_a_tip_on_a_dark_line(monkeypatch):
+    odds = [0.48, 0.48, 0.48, -1.6]
+    assert not judged_with_tip(monkeypatch, odds, (0.5, -1.0), 0.7).may_be_hidden
+    assert judged_with_tip(monkeypatch, odds, (0.5, -1.0), 0.0).may_be_hidden
 
 
 @pytest.mark.parametrize(
