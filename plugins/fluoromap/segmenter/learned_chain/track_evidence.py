@@ -245,7 +245,7 @@ class TrackEvidence:
         if not is_loop and (_is_probe(pictures) or (on_line and not has_tip)):
             return Verdict(False)
         beyond = np.mean([(sections[0].beyond[0], sections[-1].beyond[1]) for sections in pictures], axis=0)
-        if not self._is_likely(chains, self.circular) and goes_on(depths, beyond):
+        if not self._is_likely(chains, self.circular) and not _ends_in_tip(pictures) and goes_on(depths, beyond):
             return Verdict(False)
         if _count_blank(depths, odds.mean(axis=0), inside) > max(_MOST_BLANK, len(usual) // _FOR_ONE_BLANK):
             return Verdict(False)
@@ -439,8 +439,23 @@ def _has_sure_tip(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
 
     The last one must be clearly less of a tip.
     """
-    first, last = np.mean([(sections[0].tips[0], sections[-1].tips[1]) for sections in pictures], axis=0)
+    first, last = _tips(pictures)
     return bool(first >= _TIP and first - last >= _TIP_OVER_END)
+
+
+def _ends_in_tip(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
+    """Return whether the network calls one end of a track a tip.
+
+    It must be one rather than not, and the other end clearly less.
+    """
+    tips = _tips(pictures)
+    return bool(tips.max() >= EVEN_ODDS and np.ptp(tips) >= _TIP_OVER_END)
+
+
+def _tips(pictures: Sequence[Sequence[SectionOdds]]) -> Array:
+    """Return the mean logits of a tip at the first and the last electrode, (2,)."""
+    tips: Array = np.mean([(sections[0].tips[0], sections[-1].tips[1]) for sections in pictures], axis=0)
+    return tips
 
 
 def _turn(path_uv: Array) -> float:

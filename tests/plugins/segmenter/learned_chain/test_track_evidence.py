@@ -517,11 +517,21 @@ def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, be
     assert accepts(judge, chains(np.repeat(loop[None], FRAMES, axis=0)), lambda frame: None)
 
 
-@pytest.mark.parametrize(("beyond", "accepted"), [((0.6, 0.6), False), ((0.1, 0.6), True), ((0.6, 0.1), True)])
-def test_a_track_on_a_line_that_goes_on_beyond_both_ends_is_no_catheter_but_a_circular_one(
-    monkeypatch, beyond, accepted
+@pytest.mark.parametrize(
+    ("beyond", "tips", "accepted"),
+    [
+        ((0.6, 0.6), (-2.0, -4.0), False),
+        ((0.6, 0.6), (0.5, 0.5), False),
+        ((0.1, 0.6), (-2.0, -4.0), True),
+        ((0.6, 0.1), (-2.0, -4.0), True),
+        ((0.6, 0.6), (0.3, -2.0), True),
+        ((0.6, 0.6), (-2.0, 0.3), True),
+    ],
+)
+def test_a_track_on_a_line_that_goes_on_beyond_both_ends_is_no_catheter_unless_it_is_circular_or_has_a_tip(
+    monkeypatch, beyond, tips, accepted
 ):
-    seen = evidence(np.full(5, 3.0), beyond=beyond)
+    seen = evidence(np.full(5, 3.0), beyond=beyond, tips=tips)
     monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: seen)
     weights, none = read_weights(Path(SHIPPED)), frozenset()
     row = np.stack([100.0 + 20.0 * np.arange(5), np.full(5, 200.0)], axis=1)
