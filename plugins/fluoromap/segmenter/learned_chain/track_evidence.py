@@ -430,8 +430,8 @@ def _tip_odds(pictures: Sequence[Sequence[SectionOdds]]) -> float:
     A shaft shows behind a catheter and not before it. The network knows tips: most are darker and longer than rings.
     """
     behind = np.mean([sections[-1].shafts[1] - sections[0].shafts[0] for sections in pictures])
-    tips = np.mean([sections[0].tips[0] - sections[-1].tips[1] for sections in pictures])
-    return _OF_SHAFT * float(behind) + _OF_TIPS * float(np.clip(tips, -_MOST_TIPS, _MOST_TIPS))
+    first, last = _tips(pictures)
+    return _OF_SHAFT * float(behind) + _OF_TIPS * float(np.clip(first - last, -_MOST_TIPS, _MOST_TIPS))
 
 
 def _has_sure_tip(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
