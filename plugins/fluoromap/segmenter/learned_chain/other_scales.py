@@ -7,42 +7,44 @@ electrodes that lie close together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Array, FrameChains, Segmentation
+from fluoromap.contracts import Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 
 OTHER_SCALES = 1.18, 0.85
 """Over the stated one."""
 
-_BESIDE_MM = 1.5
 _CONFIRMED = 2
-_LEAST_KEPT = 0.8
+_AS_STATED = 1.05
+"""How much more probable than with the stated scale all catheters have to be with another one."""
 
 
 @dataclass(frozen=True, slots=True)
-class ChosenScale:
-    """The scale at which a run is segmented, pixels per mm at the isocentre."""
+class UsefulScales:
+    """The scales whose catheters count, pixels per mm at the isocentre: each adds some to those before it."""
 
-    px_per_mm: float
+    px_per_mm: tuple[float, ...]
 
 
-def choose_scale(
+def useful_scales(
     stated: float,
     catalogue: Catalogue,
     segment: Callable[[float], Segmentation],
     promising: Callable[[Sequence[float]], Sequence[float]],
-) -> ChosenScale:
-    """Return the scale that explains most electrodes of a run.
+) -> UsefulScales:
+    """Return the scales that together show most of a run's catheters.
 
-    It is the stated one where that shows all catheters. Where it shows none, another one has to show two: contrast medium may lie
-    like one catheter at some scale. Else another one has to keep those that it shows. Where it shows one that is not listed,
-    another scale has to show three, or six more electrodes: four of an unlisted catheter may lie like a listed one of another size.
+    It is the stated one alone where that shows all or others add nothing. Else the catheters are most probable in this order, see
+    :func:`~fluoromap.segmenter.learned_chain.added_catheters.add_catheters`. Where the stated scale shows none, two have to be
+    there: contrast medium may lie like one catheter at some scale. Where it shows one that is not listed, there have to be three,
+    or six more electrodes: four of an unlisted catheter may lie like a listed one of another size.
 
     Parameters
     ----------
@@ -54,22 +56,37 @@ def choose_scale(
     promising : callable
         Returns those of some scales that are worth a segmentation.
     """
-    best, found = stated, segment(stated)
+    found = segment(stated)
     if _usual_catheters(found) >= len(catalogue.catheters):
-        return ChosenScale(stated)
-    least = 1 if _count_electrodes(found) else _CONFIRMED
-    has_unlisted = _shows_unlisted(found)
-    for scale in promising([factor * stated for factor in OTHER_SCALES]):
-        other = segment(scale)
-        more = _count_electrodes(other) - _count_electrodes(found)
-        if more <= 0 or _usual_catheters(other) < least:
-            continue
-        if has_unlisted and _usual_catheters(other) <= _CONFIRMED and more < MANY_ELECTRODES * len(found.frames):
-            continue
-        if _share_kept(found, other, _BESIDE_MM * scale) < _LEAST_KEPT:
-            continue
-        best, found = scale, other
-    return ChosenScale(best)
+        return UsefulScales((stated,))
+    tried = {stated: found} | {scale: segment(scale) for scale in promising([by * stated for by in OTHER_SCALES])}
+
+    def shows_more(together: Segmentation) -> bool:
+        more, catheters = _count_electrodes(together) - _count_electrodes(found), _usual_catheters(together)
+        if _shows_unlisted(found) and catheters <= _CONFIRMED and more < MANY_ELECTRODES * len(found.frames):
+            return False
+        return more > 0 and catheters >= (1 if _count_electrodes(found) else _CONFIRMED)
+
+    useful, most = UsefulScales((stated,)), 0.0
+    for first in (scale for scale, other in tried.items() if _count_electrodes(other)):
+        scales, together = _together(first, tried, catalogue)
+        probable = (_AS_STATED if first == stated else 1.0) * _expected_electrodes(together)
+        if probable > most and shows_more(together):
+            useful, most = UsefulScales(scales), probable
+    return useful
+
+
+def _together(
+    first: float, tried: Mapping[float, Segmentation], catalogue: Catalogue
+) -> tuple[tuple[float, ...], Segmentation]:
+    """Return the scales that add catheters to the first one, and all catheters."""
+    scales, found = [first], tried[first]
+    for scale, other in tried.items():
+        more = add_catheters(found, other, catalogue, scale)
+        if more is not found:
+            scales.append(scale)
+        found = more
+    return tuple(scales), found
 
 
 def _usual_catheters(found: Segmentation) -> float:
@@ -85,21 +102,5 @@ def _count_electrodes(found: Segmentation) -> int:
     return sum(len(chain.electrodes) for entry in found.frames for chain in entry.chains)
 
 
-def _share_kept(found: Segmentation, other: Segmentation, reach_px: float) -> float:
-    """Return the share of the found electrodes that the other segmentation has.
-
-    It is 1 where none is found.
-    """
-    frames = zip(found.frames, other.frames, strict=True)
-    away = np.concatenate([_away(_places(entry), _places(after)) for entry, after in frames])
-    return float(np.mean(away <= reach_px)) if len(away) else 1.0
-
-
-def _places(entry: FrameChains) -> Array:
-    return np.concatenate([np.zeros((0, 2)), *(chain.pixels_uv for chain in entry.chains)])
-
-
-def _away(points_uv: Array, from_uv: Array) -> Array:
-    """Return the distance of each point to the nearest of others, (n,), infinite without others."""
-    nearest: Array = np.linalg.norm(points_uv[:, None] - from_uv, axis=2).min(axis=1, initial=np.inf)
-    return nearest
+def _expected_electrodes(found: Segmentation) -> float:
+    return sum(float(chain.scores.sum()) for entry in found.frames for chain in entry.chains)

@@ -15,10 +15,11 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import is_inverted, promising_scales
 from fluoromap.segmenter.learned_chain.frame_answers import StoredAnswers
-from fluoromap.segmenter.learned_chain.other_scales import ChosenScale, choose_scale
+from fluoromap.segmenter.learned_chain.other_scales import UsefulScales, useful_scales
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, recall_for, segment_run
@@ -67,7 +68,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "39"
+    version: ClassVar[str] = "40"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
@@ -91,16 +92,18 @@ class LearnedChain:
                 tried[px_per_mm] = self._segment(shown, catalogue, {}, watched, trained)
             return tried[px_per_mm]
 
-        def choose() -> ChosenScale:
+        def choose() -> UsefulScales:
             def promising(scales_px_per_mm: Sequence[float]) -> Sequence[float]:
                 return promising_scales(run, catalogue, scales_px_per_mm, trained)
 
-            return choose_scale(run.px_per_mm, catalogue, automatic, promising)
+            return useful_scales(run.px_per_mm, catalogue, automatic, promising)
 
-        # Marks must not change the scale, else they would change the automatic chains beside them.
-        chosen = recall_for(run, catalogue, context)(ChosenScale, (), choose).px_per_mm
-        shown = replace(run, px_per_mm=chosen)
-        found = self._segment(shown, catalogue, marks, context, trained) if marks else automatic(chosen)
+        # Marks must not change the scales, else they would change the automatic chains beside them.
+        first, *others = recall_for(run, catalogue, context)(UsefulScales, (), choose).px_per_mm
+        shown = replace(run, px_per_mm=first)
+        found = self._segment(shown, catalogue, marks, context, trained) if marks else automatic(first)
+        for scale in others:
+            found = add_catheters(found, automatic(scale), catalogue, scale)
         if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
             of_inverted = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)
