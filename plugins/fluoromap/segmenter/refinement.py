@@ -23,13 +23,16 @@ LEAST_GAP = 0.15
 """Of the spacing at the isocentre. Nearer than that, two electrodes are fitted to one dark place."""
 _SOFT_PX = 2.0
 _APART_PX = 6.0
-_GAIN, _TIP_GAIN = (4.6, 5.3), (6.15, 6.35)
+_GAIN, _TIP_GAIN = (4.6, 4.8), (6.15, 5.7)
+_FITTED_PX_PER_MM, _OF_SCALE = 5.75, 0.25
+"""The scale at which the gains were fitted, and the power of the scale with which the standard deviation grows: noise that goes
+together in neighbouring pixels averages out less, the more pixels an electrode has."""
 _TIP_REACH = 0.8
 """How far a long tip's middle is searched, over half its length: the first guess may lie near one of its ends."""
-_FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.027, 0.038), (0.072, 0.045), (0.124, 0.045)
+_FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.027, 0.034), (0.072, 0.04), (0.124, 0.04)
 _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
-_USUAL_REST, _OF_REST, _TINY = np.array([1.2, 1.1]), np.array([0.63, 1.33]), 1e-12
+_USUAL_REST, _OF_REST, _TINY = np.array([1.0, 0.9]), np.array([0.8, 1.33]), 1e-12
 """The unexplained rest of a profile, along and across, as a multiple of that of the chain's middle electrode: from here on it
 widens the standard deviation, in this power."""
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
@@ -146,7 +149,7 @@ def _fit(
     if len(arc_mm) >= 3:
         _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
     # Not before: spacings of a bent catheter are no better than a disturbed fit.
-    sd = np.minimum(sd * _disturbance(rests), _APART_PX)
+    sd = np.minimum(sd * _disturbance(rests) * (px_per_mm / _FITTED_PX_PER_MM) ** _OF_SCALE, _APART_PX)
     fit = ElectrodeFit(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
     covariance = fit.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):

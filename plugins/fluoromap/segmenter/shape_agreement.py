@@ -9,16 +9,18 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.chain_axes import axes_of_chain
 from fluoromap.segmenter.row_shape import shape_covariance_mm2
 
 _FEWEST = 3
 _PLACE_SD_MM = 0.05
 """How far an electrode's middle lies off its catheter's smooth curve."""
-_AGREES, _LOOP_AGREES = 0.3, 1.0
+_AGREES, _LOOP_AGREES = 0.4, 1.0
 """The square of an electrode's distance from its prediction, over the square that is expected, up to which the chain agrees; the
 ends of a loop are predicted less well. On the phantom, where little but noise displaces electrodes, nine in ten lie below 0.2."""
-_OF_DISTANCE = 0.5
-"""Standard deviation that is added, as a share of the distance from the prediction."""
+_ACROSS = 0.6
+"""Standard deviation that is added across the catheter, as a share of the distance across. Along it the whole distance from the
+prediction is added: openings of rings and neighbours displace electrodes along their catheter."""
 
 
 def widen_by_shape(chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> tuple[Chain, ...]:
@@ -44,20 +46,24 @@ def widen_by_shape(chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: flo
 def _widened(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> Chain:
     catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
     rows = np.array(chain.electrodes) - 1
-    distance, relative = _off_the_curve(
+    off, relative = _off_the_curve(
         chain, shape_covariance_mm2(catheter.spacing_mm, catheter.curvature_per_mm)[np.ix_(rows, rows)] * px_per_mm**2,
         _PLACE_SD_MM * px_per_mm,
     )  # fmt: skip
     agrees = _LOOP_AGREES if catheter.is_circular else _AGREES
     weight = 1.0 - agrees / np.maximum(relative, agrees)
-    more = weight * (_OF_DISTANCE * distance) ** 2
-    return replace(chain, covariance_px2=chain.covariance_px2 + more[:, None, None] * np.eye(2))
+    axes = axes_of_chain(chain.pixels_uv)
+    across = np.einsum("na,na->n", off, axes[:, 1])
+    added_sd = np.stack([np.linalg.norm(off, axis=1), _ACROSS * across], axis=1)
+    more = np.einsum("n,na,nai,naj->nij", weight, added_sd**2, axes, axes)
+    return replace(chain, covariance_px2=chain.covariance_px2 + more)
 
 
 def _off_the_curve(chain: Chain, shape_px2: Array, place_sd_px: float) -> tuple[Array, Array]:
-    """Return how far each electrode lies from where the others predict it.
+    """Return how each electrode lies off the place that the others predict.
 
-    Both results are (electrodes,): pixels, and their square over what is expected of two coordinates.
+    The results are the way from there, (electrodes, 2) pixels, and the square of its length over what is expected of two
+    coordinates, (electrodes,).
 
     The inverse of the covariance of all coordinates has, in its blocks, the precision of each place given the others.
     """
@@ -72,4 +78,4 @@ def _off_the_curve(chain: Chain, shape_px2: Array, place_sd_px: float) -> tuple[
     places = chain.pixels_uv - chain.pixels_uv.mean(axis=0)
     pull = np.einsum("iajb,jb->ia", precision, places)
     off = np.linalg.solve(precision[each, :, each, :], pull[..., None])[..., 0]
-    return np.linalg.norm(off, axis=1), np.einsum("ia,ia->i", off, pull)
+    return off, np.einsum("ia,ia->i", off, pull)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fluoromap.contracts import Array, Chain, FrameChains
+from fluoromap.segmenter.chain_axes import axes_of_chain
 
 _FEWEST, _LEAST_TRIPLES = 3, 3
 _MEDIAN_CHI2 = 0.4549
@@ -86,7 +87,7 @@ def _over_expected(places_uv: Array, jitter: Array, covariance: Array) -> Array:
     Along the catheter, and across it. Displacement, turning and a change of foreshortening are no jitter: they are linear in
     the arc.
     """
-    axes = _axes(places_uv)
+    axes = axes_of_chain(places_uv)
     expected = np.einsum("nai,nij,naj->na", axes, covariance, axes)
     weight = 1.0 / np.sqrt(expected.sum(axis=1))
     steps = np.linalg.norm(np.diff(places_uv, axis=0), axis=1)
@@ -100,19 +101,10 @@ def _over_expected(places_uv: Array, jitter: Array, covariance: Array) -> Array:
     return squares
 
 
-def _axes(places_uv: Array) -> Array:
-    """Return the directions along the catheter and across it at each electrode, (electrodes, 2, 2)."""
-    along = np.gradient(places_uv, axis=0)
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    along = np.where(length > _TINY, along / np.maximum(length, _TINY), [1.0, 0.0])
-    axes: Array = np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
-    return axes
-
-
 def _widened(chain: Chain, factors: Array) -> Chain:
     if len(chain.electrodes) < 2 or not (factors > 1.0).any():
         return chain
-    axes = _axes(chain.pixels_uv)
+    axes = axes_of_chain(chain.pixels_uv)
     scale = np.einsum("nai,a,naj->nij", axes, factors, axes)
     covariance = scale @ chain.covariance_px2 @ scale
     return replace(chain, covariance_px2=0.5 * (covariance + covariance.transpose(0, 2, 1)))

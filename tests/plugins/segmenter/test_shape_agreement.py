@@ -54,6 +54,20 @@ def test_the_ellipse_of_a_displaced_electrode_holds_its_place(index, direction):
     assert np.count_nonzero(sd > 0.11) <= 4
 
 
+def test_an_ellipse_grows_most_along_the_catheter():
+    straight = bent("decapolar-2-5-2", radius_mm=1e6)
+    sd = []
+    for direction in ([3.0, 0.0], [0.0, 3.0]):
+        displaced = straight.copy()
+        displaced[4] += direction
+        (wider,) = widen_by_shape([chain_of("decapolar-2-5-2", displaced)], CATALOGUE, PX_PER_MM)
+        sd.append(np.sqrt(np.diag(wider.covariance_px2[4])))
+    # What displaced it along the catheter leaves it as sure across.
+    assert sd[0][0] > 2.0
+    assert sd[0][1] < 0.11
+    assert 1.2 < sd[1][1] < sd[1][0]
+
+
 def test_what_is_known_to_be_unsure_gets_no_wider():
     places = bent("decapolar-2-5-2")
     places[4] += [0.0, 4.0]
