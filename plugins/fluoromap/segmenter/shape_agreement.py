@@ -17,7 +17,7 @@ _PLACE_SD_MM = 0.05
 """How far an electrode's middle lies off its catheter's smooth curve."""
 _AGREES, _LOOP_AGREES = 0.4, 1.0
 """The square of an electrode's distance from its prediction, over the square that is expected, up to which the chain agrees; the
-ends of a loop are predicted less well. On the phantom, where little but noise displaces electrodes, nine in ten lie below 0.2."""
+ends of a loop are predicted less well."""
 _ACROSS = 0.6
 """Standard deviation that is added across the catheter, as a share of the distance across. Along it the whole distance from the
 prediction is added: openings of rings and neighbours displace electrodes along their catheter."""
