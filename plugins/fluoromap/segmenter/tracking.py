@@ -25,6 +25,7 @@ from fluoromap.segmenter.tracks import (
     count_shared,
     farthest_px,
     is_believed,
+    is_clear,
     kind_overlap,
     mean_shift,
     meet,
@@ -231,6 +232,7 @@ def _accepted(
     """Return the tracks without wrong ones.
 
     A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
+    In the end one has to be clear: where all are faint, other things may lie like catheters.
     """
     judged = _judged_frames(found)
     confirmed: list[Track] = []
@@ -262,7 +264,8 @@ def _accepted(
         if all(len(other.chain.electrodes) < len(track.chain.electrodes) for other in tracks if meet(track, other)):
             tracks.append(track)
     left_over = surplus(_lasting(tracks, len(found)))
-    return [track for track in tracks if track not in left_over]
+    tracks = [track for track in tracks if track not in left_over]
+    return tracks if any(is_clear(track) for track in tracks) else []
 
 
 def _lasting(tracks: Sequence[Track], frames: int) -> list[Track]:

@@ -49,7 +49,8 @@ class Verdict:
     is_catheter : whether the run shows a catheter there. log_odds : of the middle electrode. may_be_hidden : whether it is a
     catheter if noise hides the run's other catheters nearly as much. tip_odds : log-odds by the shaft that the track's first
     electrode is the tip; None where single frames know better. hidden : for each of the track's places whether the run clearly
-    shows no electrode there; empty where none is hidden.
+    shows no electrode there; empty where none is hidden. is_clear : whether it is one although the run shows no clear catheter
+    beside it.
     """
 
     is_catheter: bool
@@ -58,6 +59,7 @@ class Verdict:
     tip_odds: float | None = None
     hidden: tuple[bool, ...] = ()
     onwards: tuple[tuple[Onwards, ...], ...] = ()
+    is_clear: bool = True
 
 
 TrackJudge = Callable[[Mapping[int, Chain]], Verdict]
@@ -186,6 +188,11 @@ def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     is_row = len(track.chain.electrodes) >= MANY_ELECTRODES and len(clear) > 1
     is_clear = as_clear or not is_row or verdict.log_odds >= _CLEAR_ROW
     return (verdict.is_catheter and is_clear) or (verdict.may_be_hidden and as_clear)
+
+
+def is_clear(track: Track) -> bool:
+    """Return whether a believed track needs no other one beside it."""
+    return track.manual or (track.verdict is not None and track.verdict.is_catheter and track.verdict.is_clear)
 
 
 def _is_part_of_longer(track: Track, tracks: Sequence[Track]) -> bool:

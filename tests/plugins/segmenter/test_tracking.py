@@ -374,6 +374,23 @@ def test_a_faint_catheter_is_accepted_only_beside_a_clear_one():
     assert tracked([[clear, faint]] * 4 + [[faint]] * 6) == [0] * 10
 
 
+def test_an_unclear_catheter_is_accepted_only_beside_a_clear_one():
+    """A contrast-filled coronary tree looked like two unclear catheters in each frame."""
+    clear, unclear = chain(POINTS + 100, "map"), chain(POINTS + 250, "rv")
+
+    def judge(chains):
+        return Verdict(True, 0.5, is_clear=chains[min(chains)].pixels_uv[0, 0] < 200)
+
+    def tracked(chains):
+        entries = track_chains(run([chains] * 10), times(10), 2, only_confirmed, judge=judge)
+        return [(len(entry.chains), entry.manual_needed) for entry in entries]
+
+    assert tracked([clear, unclear]) == [(2, None)] * 10
+    assert tracked([unclear, chain(POINTS + np.array([400, 250]), "cs")]) == [(0, Reason.MANUAL_NEEDED)] * 10
+    # A chain that was set by hand is clear.
+    assert tracked([unclear, chain(POINTS + 100, "map", manual=True)]) == [(2, None)] * 10
+
+
 @pytest.mark.parametrize(("electrodes", "odds", "kept"), [(6, 0.5, 2), (6, 0.7, 3), (6, 1.5, 3), (4, 0.0, 3)])
 def test_a_long_row_that_is_far_less_clear_than_two_other_catheters_is_none(electrodes, odds, kept):
     row = chain(np.stack([np.arange(electrodes) * 12.0, np.arange(electrodes) * 3.0], axis=1) + 250, "cs")

@@ -88,7 +88,7 @@ _TIP, _TIP_OVER_END = 0.4, 1.0
 """Logit of a tip that is sure, and how much more that is than at the other end. The network learned tips from electrodes alone, so
 that clutter rarely has one."""
 _CLEAR = 1.0
-"""Log-odds of the middle electrode of a track that needs no more frames."""
+"""Log-odds of the middle electrode of a track that needs no more frames; a short one needs no other track beside it either."""
 _MOST_PROBE_TURN = 2.4
 """Radians. What lies beside a loop, as another wall beside a probe's, is the loop's own other side."""
 _ELECTRODE, _CLEARLY_LESS = 1.0, 0.5
@@ -298,7 +298,7 @@ class TrackEvidence:
         may_be_hidden = bool(
             not on_line and self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst
         )
-        return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends)
+        return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends, is_clear=middle >= _CLEAR)
 
     def _onwards(
         self, frame: int, row_uv: Array, sections: Sequence[SectionOdds], odds: Array
