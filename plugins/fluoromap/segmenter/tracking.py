@@ -25,10 +25,10 @@ from fluoromap.segmenter.tracks import (
     count_shared,
     farthest_px,
     is_believed,
-    is_clear,
     kind_overlap,
     mean_shift,
     meet,
+    needs_no_other,
     overlaps,
     reverse,
 )
@@ -265,7 +265,7 @@ def _accepted(
             tracks.append(track)
     left_over = surplus(_lasting(tracks, len(found)))
     tracks = [track for track in tracks if track not in left_over]
-    return tracks if any(is_clear(track) for track in tracks) else []
+    return tracks if any(needs_no_other(track) for track in tracks) else []
 
 
 def _lasting(tracks: Sequence[Track], frames: int) -> list[Track]:

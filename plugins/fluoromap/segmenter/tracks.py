@@ -190,7 +190,7 @@ def is_believed(track: Track, tracks: Sequence[Track]) -> bool:
     return (verdict.is_catheter and is_clear) or (verdict.may_be_hidden and as_clear)
 
 
-def is_clear(track: Track) -> bool:
+def needs_no_other(track: Track) -> bool:
     """Return whether a believed track needs no other one beside it."""
     return track.manual or (track.verdict is not None and track.verdict.is_catheter and track.verdict.is_clear)
 
