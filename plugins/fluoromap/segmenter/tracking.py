@@ -132,6 +132,9 @@ def track_chains(
     if judge is not None and search is not None:
         rare = [track for track in tracks if track not in tracks_kept and len(track.chains) >= _judged_frames(found)]
         tracks_kept = completed(tracks_kept, rare, least, frame_times_ms, catheters, search, judge)
+    if judge is not None and not any(needs_no_other(track) for track in tracks_kept):
+        # Where none is clear, other things may lie like catheters.
+        tracks_kept = []
     for track in tracks_kept:
         if not track.manual:
             track.chains = _from_tip(track)
@@ -232,7 +235,6 @@ def _accepted(
     """Return the tracks without wrong ones.
 
     A wrong track may have taken a catheter's place: the run is followed again without its chains, from the accepted tracks on.
-    In the end one has to be clear: where all are faint, other things may lie like catheters.
     """
     judged = _judged_frames(found)
     confirmed: list[Track] = []
@@ -264,8 +266,7 @@ def _accepted(
         if all(len(other.chain.electrodes) < len(track.chain.electrodes) for other in tracks if meet(track, other)):
             tracks.append(track)
     left_over = surplus(_lasting(tracks, len(found)))
-    tracks = [track for track in tracks if track not in left_over]
-    return tracks if any(needs_no_other(track) for track in tracks) else []
+    return [track for track in tracks if track not in left_over]
 
 
 def _lasting(tracks: Sequence[Track], frames: int) -> list[Track]:

@@ -381,14 +381,18 @@ def test_an_unclear_catheter_is_accepted_only_beside_a_clear_one():
     def judge(chains):
         return Verdict(True, 0.5, is_clear=chains[min(chains)].pixels_uv[0, 0] < 200)
 
-    def tracked(chains):
-        entries = track_chains(run([chains] * 10), times(10), 2, only_confirmed, judge=judge)
+    def tracked(found, search=only_confirmed):
+        entries = track_chains(run(found), times(10), 2, search, judge=judge)
         return [(len(entry.chains), entry.manual_needed) for entry in entries]
 
-    assert tracked([clear, unclear]) == [(2, None)] * 10
-    assert tracked([unclear, chain(POINTS + np.array([400, 250]), "cs")]) == [(0, Reason.MANUAL_NEEDED)] * 10
+    assert tracked([[clear, unclear]] * 10) == [(2, None)] * 10
+    assert tracked([[unclear, chain(POINTS + np.array([400, 250]), "cs")]] * 10) == [(0, Reason.MANUAL_NEEDED)] * 10
     # A chain that was set by hand is clear.
-    assert tracked([unclear, chain(POINTS + 100, "map", manual=True)]) == [(2, None)] * 10
+    assert tracked([[unclear, chain(POINTS + 100, "map", manual=True)]] * 10) == [(2, None)] * 10
+    # One that is there for a moment is none, unless the search finds it again in the other frames.
+    for_a_moment = [[clear, unclear]] * 4 + [[unclear]] * 6
+    assert tracked(for_a_moment, search=None) == [(0, Reason.MANUAL_NEEDED)] * 10
+    assert tracked(for_a_moment) == [(2, None)] * 10
 
 
 @pytest.mark.parametrize(("electrodes", "odds", "kept"), [(6, 0.5, 2), (6, 0.7, 3), (6, 1.5, 3), (4, 0.0, 3)])
