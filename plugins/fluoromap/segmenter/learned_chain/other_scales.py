@@ -18,7 +18,7 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 
-OTHER_SCALES = 1.18, 0.85
+OTHER_SCALES = 1.18, 1.39, 0.85
 """Over the stated one."""
 
 _CONFIRMED = 2
@@ -44,7 +44,8 @@ def useful_scales(
     It is the stated one alone where that shows all or others add nothing. Else the catheters are most probable in this order, see
     :func:`~fluoromap.segmenter.learned_chain.added_catheters.add_catheters`. Where the stated scale shows none, two have to be
     there: contrast medium may lie like one catheter at some scale. Where it shows one that is not listed, there have to be three,
-    or six more electrodes: four of an unlisted catheter may lie like a listed one of another size.
+    or six more electrodes: four of an unlisted catheter may lie like a listed one of another size. Where it shows all and one that
+    is not listed, the others have to show all without that one, and to make them more probable.
 
     Parameters
     ----------
@@ -57,12 +58,16 @@ def useful_scales(
         Returns those of some scales that are worth a segmentation.
     """
     found = segment(stated)
-    if _usual_catheters(found) >= len(catalogue.catheters):
+    are_all = _usual_catheters(found) >= len(catalogue.catheters)
+    if are_all and not _shows_unlisted(found):
         return UsefulScales((stated,))
     tried = {stated: found} | {scale: segment(scale) for scale in promising([by * stated for by in OTHER_SCALES])}
 
     def shows_more(together: Segmentation) -> bool:
         more, catheters = _count_electrodes(together) - _count_electrodes(found), _usual_catheters(together)
+        if are_all:
+            is_more_probable = _expected_electrodes(together) > _AS_STATED * _expected_electrodes(found)
+            return is_more_probable and catheters >= len(catalogue.catheters) and not _shows_unlisted(together)
         if _shows_unlisted(found) and catheters <= _CONFIRMED and more < MANY_ELECTRODES * len(found.frames):
             return False
         return more > 0 and catheters >= (1 if _count_electrodes(found) else _CONFIRMED)

@@ -1,5 +1,7 @@
 """Other scales of a run in which catheters lack: one counts where it shows others."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from fluoromap.segmenter.learned_chain.other_scales import useful_scales
 
 TYPES = {"a": "quadripolar-2-5-2", "b": "quadripolar-5-5-5", "c": "hexapolar-2-5-2"}
 CATALOGUE = Catalogue(tuple(catheter_type(type_, name) for name, type_ in TYPES.items()), "a", "b")
+EXTRA = Reason.EXTRA_CATHETER
 
 
 def chain(name: str, v: float, px_per_mm: float, seen: float = 1.0, probable: float = 0.8) -> Chain:
@@ -30,15 +33,27 @@ def useful(by_scale: dict[float, Segmentation]) -> list[float]:
     def segment(px_per_mm: float) -> Segmentation:
         return by_scale[round(px_per_mm, 2)]
 
-    return [round(scale, 2) for scale in useful_scales(3.0, CATALOGUE, segment, lambda scales: scales).px_per_mm]
+    def promising(scales: Sequence[float]) -> Sequence[float]:
+        return [scale for scale in scales if round(scale, 2) in by_scale]
+
+    return [round(scale, 2) for scale in useful_scales(3.0, CATALOGUE, segment, promising).px_per_mm]
 
 
 def test_no_other_scale_is_tried_where_the_stated_one_shows_all():
     assert useful({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0), chain("c", 150.0, 3.0))}) == [3.0]
 
 
+@pytest.mark.parametrize(("probable", "reason", "scales"), [(0.99, None, [3.54]), (0.82, None, [3.0]), (0.99, EXTRA, [3.0])])
+def test_another_scale_explains_what_the_stated_one_calls_an_unlisted_catheter(probable, reason, scales):
+    """At 0.8 of the scale some electrodes were displaced and three catheters had wrong names."""
+    places = {"a": 10.0, "b": 90.0, "c": 150.0}
+    stated = showing(*(chain(name, v, 3.0) for name, v in places.items()), reason=EXTRA)
+    other = showing(*(chain(name, v, 3.54, probable=probable) for name, v in places.items()), reason=reason)
+    assert useful({3.0: stated, 3.54: other}) == scales
+
+
 def test_two_catheters_are_not_enough_where_the_stated_scale_shows_an_unlisted_one():
-    stated = showing(chain("a", 10.0, 3.0), reason=Reason.EXTRA_CATHETER)
+    stated = showing(chain("a", 10.0, 3.0), reason=EXTRA)
     two = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55))
     three = showing(chain("a", 10.0, 3.0), chain("b", 90.0, 2.55), chain("c", 150.0, 2.55))
     assert useful({3.0: stated, 3.54: stated, 2.55: two}) == [3.0]
@@ -47,12 +62,12 @@ def test_two_catheters_are_not_enough_where_the_stated_scale_shows_an_unlisted_o
 
 def test_six_more_electrodes_are_enough_where_the_stated_scale_shows_an_unlisted_catheter():
     """A hexapolar catheter that does not fit the stated scale is reported as unlisted there."""
-    stated = showing(chain("a", 10.0, 3.0), reason=Reason.EXTRA_CATHETER)
+    stated = showing(chain("a", 10.0, 3.0), reason=EXTRA)
     six_more = showing(chain("a", 10.0, 3.0), chain("c", 90.0, 2.55))
     assert useful({3.0: stated, 3.54: stated, 2.55: six_more}) == [3.0, 2.55]
 
 
-@pytest.mark.parametrize("scale", [3.54, 2.55])
+@pytest.mark.parametrize("scale", [3.54, 4.17, 2.55])
 @pytest.mark.parametrize("seen", [0.95, 0.5])
 def test_another_scale_counts_where_it_shows_more(scale, seen):
     """Some of the labelled real frames, mirrored or with more noise, show the third catheter only at a larger scale."""
