@@ -32,11 +32,11 @@ def add_catheters(found: Segmentation, other: Segmentation, catalogue: Catalogue
     px_per_mm : float
         At the isocentre.
     """
-    kept = _tracks_of(found)
+    kept = tracks_of(found)
     if not kept:
         return other
     added: dict[int, int] = {}
-    for number, track in sorted(_tracks_of(other).items(), key=lambda one: -len(one[1].chain.electrodes)):
+    for number, track in sorted(tracks_of(other).items(), key=lambda one: -len(one[1].chain.electrodes)):
         is_lasting = 2 * len(track.chains) >= len(found.frames)
         has_room = len(kept) < len(catalogue.catheters) and not surplus([*kept.values(), track])
         if is_lasting and has_room and not any(_lies_on(track, of, _BESIDE_MM * px_per_mm) for of in kept.values()):
@@ -48,7 +48,7 @@ def add_catheters(found: Segmentation, other: Segmentation, catalogue: Catalogue
     return replace(found, frames=frames, diastole=_diastole(found, other, added))
 
 
-def _tracks_of(found: Segmentation) -> dict[int, Track]:
+def tracks_of(found: Segmentation) -> dict[int, Track]:
     """Return the tracks of a segmentation by their numbers."""
     chains: dict[int, dict[int, Chain]] = {}
     for entry in found.frames:

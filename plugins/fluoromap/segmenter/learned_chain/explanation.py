@@ -91,6 +91,18 @@ def promising_scales(
     )
 
 
+def expected_electrodes(run: Run, catalogue: Catalogue, frame: int, trained: Trained | None = None) -> float:
+    """Return how many of a catalogue's electrodes a frame of a run shows, the sum of their probabilities.
+
+    ``trained`` : the shipped network by default.
+    """
+    field = find_field(run.frames, run.pixels)
+    image = field.fill(LogTransform.of_run(run.pixels, field.mean_level)(run.frames[frame]))
+    network = read_weights(SHIPPED) if trained is None else trained
+    alone = len(run.frames) == 1
+    return _explained([image], field, run.pixels, catalogue, run.px_per_mm, network, alone).electrodes
+
+
 def _inverted(pixels: PixelFacts) -> PixelFacts:
     return replace(pixels, monochrome1=not pixels.monochrome1)
 
@@ -120,13 +132,20 @@ def _explanations(
     frames = list(evenly_spaced_frames(len(run.frames)))
     images = [field.fill(transform(run.frames[frame])) for frame in frames[:: max(1, len(frames) // _FRAMES)][:_FRAMES]]
     network = read_weights(SHIPPED) if trained is None else trained
-    return [_explained(images, field, pixels, catalogue, scale, network) for scale in scales_px_per_mm]
+    alone = len(images) == 1
+    return [_explained(images, field, pixels, catalogue, scale, network, alone) for scale in scales_px_per_mm]
 
 
 def _explained(
-    images: Sequence[Image], field: FieldMask, pixels: PixelFacts, catalogue: Catalogue, px_per_mm: float, trained: Trained
-) -> Explanation:  # fmt: skip
-    detector = electrode_chains(catalogue, field, pixels, px_per_mm, trained, alone=len(images) == 1)
+    images: Sequence[Image],
+    field: FieldMask,
+    pixels: PixelFacts,
+    catalogue: Catalogue,
+    px_per_mm: float,
+    trained: Trained,
+    alone: bool,
+) -> Explanation:
+    detector = electrode_chains(catalogue, field, pixels, px_per_mm, trained, alone)
     entries = [detector.find_chains(x, number) for number, x in enumerate(images)]
     return Explanation(
         px_per_mm,

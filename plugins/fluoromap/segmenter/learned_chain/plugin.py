@@ -17,10 +17,17 @@ from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
-from fluoromap.segmenter.learned_chain.explanation import is_inverted, promising_scales
+from fluoromap.segmenter.learned_chain.explanation import expected_electrodes, is_inverted, promising_scales
 from fluoromap.segmenter.learned_chain.frame_answers import StoredAnswers
 from fluoromap.segmenter.learned_chain.other_scales import UsefulScales, useful_scales
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
+from fluoromap.segmenter.learned_chain.unlisted_catheters import (
+    ShowsUnlisted,
+    frame_shows_more,
+    listed_alone,
+    run_shows_more,
+    with_usual_types,
+)
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.run_segmentation import Detector, recall_for, segment_run
 from fluoromap.segmenter.visible_part import visible_part
@@ -82,15 +89,15 @@ class LearnedChain:
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation:
         """Segment a run; see :class:`~fluoromap.contracts.Segmenter`."""
         trained = read_weights(SHIPPED if self.params.weights is None else Path(self.params.weights))
-        tried: dict[float, Segmentation] = {}
+        tried: dict[tuple[float, Catalogue], Segmentation] = {}
 
-        def automatic(px_per_mm: float) -> Segmentation:
-            if px_per_mm not in tried:
+        def automatic(px_per_mm: float, sought: Catalogue = catalogue) -> Segmentation:
+            if (px_per_mm, sought) not in tried:
                 shown = replace(run, px_per_mm=px_per_mm)
                 # Progress must not begin again.
                 watched = _WithoutProgress(context) if tried else context
-                tried[px_per_mm] = self._segment(shown, catalogue, {}, watched, trained)
-            return tried[px_per_mm]
+                tried[px_per_mm, sought] = self._segment(shown, sought, {}, watched, trained)
+            return tried[px_per_mm, sought]
 
         def choose() -> UsefulScales:
             def promising(scales_px_per_mm: Sequence[float]) -> Sequence[float]:
@@ -99,11 +106,29 @@ class LearnedChain:
             return useful_scales(run.px_per_mm, catalogue, automatic, promising)
 
         # Marks must not change the scales, else they would change the automatic chains beside them.
-        first, *others = recall_for(run, catalogue, context)(UsefulScales, (), choose).px_per_mm
+        recall = recall_for(run, catalogue, context)
+        first, *others = recall(UsefulScales, (), choose).px_per_mm
         shown = replace(run, px_per_mm=first)
-        found = self._segment(shown, catalogue, marks, context, trained) if marks else automatic(first)
-        for scale in others:
-            found = add_catheters(found, automatic(scale), catalogue, scale)
+
+        def with_other_scales(found: Segmentation) -> Segmentation:
+            for scale in others:
+                found = add_catheters(found, automatic(scale), catalogue, scale)
+            return found
+
+        more = with_usual_types(catalogue)
+        repeated = _WithoutProgress(context)
+
+        def search_unlisted() -> ShowsUnlisted:
+            found, frame = with_other_scales(automatic(first)), len(run.frames) // 2
+            if not frame_shows_more(expected_electrodes(shown, more, frame, trained), found, frame):
+                return ShowsUnlisted(False)
+            return ShowsUnlisted(run_shows_more(self._segment(shown, more, {}, repeated, trained), found))
+
+        if recall(ShowsUnlisted, (), search_unlisted).is_shown:
+            return listed_alone(self._segment(shown, more, marks, repeated, trained), catalogue)
+        found = with_other_scales(
+            self._segment(shown, catalogue, marks, context, trained) if marks else automatic(first)
+        )
         if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
             of_inverted = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)

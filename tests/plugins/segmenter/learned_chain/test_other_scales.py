@@ -43,7 +43,9 @@ def test_no_other_scale_is_tried_where_the_stated_one_shows_all():
     assert useful({3.0: showing(chain("a", 10.0, 3.0), chain("b", 90.0, 3.0), chain("c", 150.0, 3.0))}) == [3.0]
 
 
-@pytest.mark.parametrize(("probable", "reason", "scales"), [(0.99, None, [3.54]), (0.82, None, [3.0]), (0.99, EXTRA, [3.0])])
+@pytest.mark.parametrize(
+    ("probable", "reason", "scales"), [(0.99, None, [3.54]), (0.82, None, [3.0]), (0.99, EXTRA, [3.0])]
+)
 def test_another_scale_explains_what_the_stated_one_calls_an_unlisted_catheter(probable, reason, scales):
     """At 0.8 of the scale some electrodes were displaced and three catheters had wrong names."""
     places = {"a": 10.0, "b": 90.0, "c": 150.0}
