@@ -75,7 +75,7 @@ class LearnedChain:
     """
 
     name: ClassVar[str] = "learned-chain"
-    version: ClassVar[str] = "43"
+    version: ClassVar[str] = "44"
     Params: ClassVar[type[BaseModel]] = LearnedChainParams
 
     def __init__(self, params: LearnedChainParams | None = None) -> None:
