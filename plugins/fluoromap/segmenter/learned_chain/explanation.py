@@ -77,18 +77,16 @@ def is_inverted(run: Run, catalogue: Catalogue, trained: Trained | None = None) 
 
 
 def promising_scales(
-    run: Run, catalogue: Catalogue, scales_px_per_mm: Sequence[float], trained: Trained | None = None
+    run: Run, catalogue: Catalogue, scales_px_per_mm: Sequence[float], least: float, trained: Trained | None = None
 ) -> tuple[float, ...]:
-    """Return those scales that explain nearly as much as the run's own.
+    """Return those scales that explain at least ``least`` times as much as the run's own.
 
     A few frames of the run are searched: too few to know at which scale the whole run shows more. Where its own scale does not
     show a clear chain in each of them, another one has to.
     ``trained`` : the shipped network by default.
     """
     own, *others = _explanations(run, run.pixels, catalogue, (run.px_per_mm, *scales_px_per_mm), trained)
-    return tuple(
-        one.px_per_mm for one in others if one.electrodes >= _NEARLY_ALL * own.electrodes and (own.sure or one.sure)
-    )
+    return tuple(one.px_per_mm for one in others if one.electrodes >= least * own.electrodes and (own.sure or one.sure))
 
 
 def expected_electrodes(run: Run, catalogue: Catalogue, frame: int, trained: Trained | None = None) -> float:

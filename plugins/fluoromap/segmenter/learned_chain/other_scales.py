@@ -22,6 +22,8 @@ OTHER_SCALES = 1.18, 1.39, 0.85
 """Over the stated one."""
 
 _CONFIRMED = 2
+_NEARLY_AS_MUCH = 0.75
+"""How much of what the stated scale explains in a few frames another one has to explain to be tried where catheters lack."""
 _AS_STATED = 1.05
 """How much more probable than with the stated scale all catheters have to be with another one."""
 
@@ -37,7 +39,7 @@ def useful_scales(
     stated: float,
     catalogue: Catalogue,
     segment: Callable[[float], Segmentation],
-    promising: Callable[[Sequence[float]], Sequence[float]],
+    promising: Callable[[Sequence[float], float], Sequence[float]],
 ) -> UsefulScales:
     """Return the scales that together show most of a run's catheters.
 
@@ -55,13 +57,15 @@ def useful_scales(
     segment : callable
         Segments the run at a scale.
     promising : callable
-        Returns those of some scales that are worth a segmentation.
+        Returns those of some scales that are worth a segmentation: what they explain of a few frames is at least so many times what
+        the stated one does.
     """
     found = segment(stated)
     are_all = _usual_catheters(found) >= len(catalogue.catheters)
     if are_all and not _shows_unlisted(found):
         return UsefulScales((stated,))
-    tried = {stated: found} | {scale: segment(scale) for scale in promising([by * stated for by in OTHER_SCALES])}
+    others = promising([by * stated for by in OTHER_SCALES], _AS_STATED if are_all else _NEARLY_AS_MUCH)
+    tried = {stated: found} | {scale: segment(scale) for scale in others}
 
     def shows_more(together: Segmentation) -> bool:
         more, catheters = _count_electrodes(together) - _count_electrodes(found), _usual_catheters(together)

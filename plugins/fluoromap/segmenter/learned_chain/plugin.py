@@ -100,8 +100,8 @@ class LearnedChain:
             return tried[px_per_mm, sought]
 
         def choose() -> UsefulScales:
-            def promising(scales_px_per_mm: Sequence[float]) -> Sequence[float]:
-                return promising_scales(run, catalogue, scales_px_per_mm, trained)
+            def promising(scales_px_per_mm: Sequence[float], least: float) -> Sequence[float]:
+                return promising_scales(run, catalogue, scales_px_per_mm, least, trained)
 
             return useful_scales(run.px_per_mm, catalogue, automatic, promising)
 

@@ -124,4 +124,4 @@ def test_another_scale_needs_clear_chains_where_the_own_one_shows_none(own_is_su
     ]
     monkeypatch.setattr(explanation, "_explanations", lambda *_: explained)
     run = run_of([np.zeros((8, 8), np.uint16)])
-    assert promising_scales(run, DEFAULT_CATALOGUE, (2.5, 4.0, 3.5, 3.8)) == promising
+    assert promising_scales(run, DEFAULT_CATALOGUE, (2.5, 4.0, 3.5, 3.8), 0.75) == promising

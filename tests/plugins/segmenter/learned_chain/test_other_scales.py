@@ -29,11 +29,14 @@ def showing(*chains: Chain, reason: Reason | None = None) -> Segmentation:
     return Segmentation(frames, FrameChains(0, numbered, reason), (0,), np.zeros(3), np.arange(3.0), ())
 
 
-def useful(by_scale: dict[float, Segmentation]) -> list[float]:
+def useful(by_scale: dict[float, Segmentation], asked: list[float] | None = None) -> list[float]:
+    asked = [] if asked is None else asked
+
     def segment(px_per_mm: float) -> Segmentation:
         return by_scale[round(px_per_mm, 2)]
 
-    def promising(scales: Sequence[float]) -> Sequence[float]:
+    def promising(scales: Sequence[float], least: float) -> Sequence[float]:
+        asked.append(least)
         return [scale for scale in scales if round(scale, 2) in by_scale]
 
     return [round(scale, 2) for scale in useful_scales(3.0, CATALOGUE, segment, promising).px_per_mm]
@@ -51,7 +54,10 @@ def test_another_scale_explains_what_the_stated_one_calls_an_unlisted_catheter(p
     places = {"a": 10.0, "b": 90.0, "c": 150.0}
     stated = showing(*(chain(name, v, 3.0) for name, v in places.items()), reason=EXTRA)
     other = showing(*(chain(name, v, 3.54, probable=probable) for name, v in places.items()), reason=reason)
-    assert useful({3.0: stated, 3.54: other}) == scales
+    asked: list[float] = []
+    assert useful({3.0: stated, 3.54: other}, asked) == scales
+    # All are there, so a scale is tried only if a few frames show that it explains more.
+    assert asked == [1.05]
 
 
 def test_two_catheters_are_not_enough_where_the_stated_scale_shows_an_unlisted_one():
