@@ -23,6 +23,7 @@ from fluoromap.segmenter.learned_chain.other_scales import UsefulScales, useful_
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.unlisted_catheters import (
     ShowsUnlisted,
+    asked_frames,
     frame_shows_more,
     listed_alone,
     run_shows_more,

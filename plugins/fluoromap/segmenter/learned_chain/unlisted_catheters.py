@@ -44,6 +44,11 @@ def with_usual_types(catalogue: Catalogue) -> Catalogue:
     return Catalogue((*catalogue.catheters, *more), catalogue.reference or more[0].name, catalogue.mapping)
 
 
+def asked_frames(count: int) -> tuple[int, ...]:
+    """Return the frames of a run of ``count`` that are asked for one more catheter, the middle one first."""
+    return tuple(dict.fromkeys((count // 2, count // 4, 3 * count // 4)))
+
+
 def frame_shows_more(expected: float, found: Segmentation, frame: int) -> bool:
     """Return whether a frame has more electrodes with the usual types, ``expected`` of them, than a segmentation shows."""
     return expected >= _expected_electrodes(found.frames[frame]) + _MORE_IN_FRAME

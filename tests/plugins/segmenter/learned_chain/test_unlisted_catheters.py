@@ -9,6 +9,7 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.segmenter.learned_chain.unlisted_catheters import (
+    asked_frames,
     frame_shows_more,
     listed_alone,
     run_shows_more,
@@ -96,6 +97,11 @@ def test_where_only_an_unlisted_catheter_is_seen_nothing_is():
     assert all(
         entry.chains == () and entry.manual_needed is Reason.MANUAL_NEEDED for entry in (*alone.frames, alone.diastole)
     )
+
+
+@pytest.mark.parametrize(("count", "frames"), [(1, (0,)), (2, (1, 0)), (60, (30, 15, 45))])
+def test_three_frames_are_asked_where_there_are_as_many(count, frames):
+    assert asked_frames(count) == frames
 
 
 def test_one_more_catheter_is_more_in_the_frame_and_in_the_run():
