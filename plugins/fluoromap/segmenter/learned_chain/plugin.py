@@ -111,25 +111,28 @@ class LearnedChain:
         first, *others = recall(UsefulScales, (), choose).px_per_mm
         shown = replace(run, px_per_mm=first)
 
-        def with_other_scales(found: Segmentation) -> Segmentation:
+        def in_all_scales(found: Segmentation) -> Segmentation:
             for scale in others:
                 found = add_catheters(found, automatic(scale), catalogue, scale)
             return found
 
-        more = with_usual_types(catalogue)
-        repeated = _WithoutProgress(context)
+        with_unlisted = with_usual_types(catalogue)
 
         def search_unlisted() -> ShowsUnlisted:
-            found, frame = with_other_scales(automatic(first)), len(run.frames) // 2
-            if not frame_shows_more(expected_electrodes(shown, more, frame, trained), found, frame):
-                return ShowsUnlisted(False)
-            return ShowsUnlisted(run_shows_more(self._segment(shown, more, {}, repeated, trained), found))
+            found = in_all_scales(automatic(first))
+            # A whole segmentation takes long: chance shows one more catheter in one frame, but rarely in three.
+            in_frames = all(
+                frame_shows_more(expected_electrodes(shown, with_unlisted, frame, trained), found, frame)
+                for frame in asked_frames(len(run.frames))
+            )
+            return ShowsUnlisted(in_frames and run_shows_more(automatic(first, with_unlisted), found))
+
+        def segmented(sought: Catalogue) -> Segmentation:
+            return self._segment(shown, sought, marks, context, trained) if marks else automatic(first, sought)
 
         if recall(ShowsUnlisted, (), search_unlisted).is_shown:
-            return listed_alone(self._segment(shown, more, marks, repeated, trained), catalogue)
-        found = with_other_scales(
-            self._segment(shown, catalogue, marks, context, trained) if marks else automatic(first)
-        )
+            return listed_alone(segmented(with_unlisted), catalogue)
+        found = in_all_scales(segmented(catalogue))
         if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
             of_inverted = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)
