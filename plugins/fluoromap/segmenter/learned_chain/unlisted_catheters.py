@@ -46,7 +46,7 @@ def with_usual_types(catalogue: Catalogue) -> Catalogue:
 
 def asked_frames(count: int) -> tuple[int, ...]:
     """Return the frames of a run of ``count`` that are asked for one more catheter, the middle one first."""
-    return tuple(dict.fromkeys((count // 2, count // 4, 3 * count // 4)))
+    return tuple(dict.fromkeys((count // 2, count // 4)))
 
 
 def frame_shows_more(expected: float, found: Segmentation, frame: int) -> bool:
