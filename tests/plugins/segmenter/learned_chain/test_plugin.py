@@ -244,9 +244,8 @@ def test_a_catheter_that_only_another_scale_shows_is_added(monkeypatch, by_hand)
         return Segmentation(frames, FrameChains(0, chains), (0, 1), np.zeros(2), run.frame_times_ms)
 
     monkeypatch.setattr(LearnedChain, "_segment", segment)
-    monkeypatch.setattr(
-        "fluoromap.segmenter.learned_chain.plugin.promising_scales", lambda run, catalogue, scales, trained: scales
-    )
+    plugin = "fluoromap.segmenter.learned_chain.plugin"
+    monkeypatch.setattr(f"{plugin}.promising_scales", lambda run, catalogue, scales, least, trained: scales)
     found = segmented([np.zeros((8, 8), np.uint16)] * 2, marks=marks)
     for entry in (*found.frames, found.diastole):
         assert [(chain.kinds[0][0], chain.manual) for chain in entry.chains] == [
