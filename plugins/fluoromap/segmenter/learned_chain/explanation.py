@@ -79,20 +79,19 @@ def is_inverted(run: Run, catalogue: Catalogue, trained: Trained | None = None) 
 def promising_scales(
     run: Run, catalogue: Catalogue, scales_px_per_mm: Sequence[float], least: float, trained: Trained | None = None
 ) -> tuple[float, ...]:
-    """Return those scales that explain at least ``least`` times as much as the run's own.
+    """Return those scales that explain enough of a run.
 
-    A few frames of the run are searched: too few to know at which scale the whole run shows more. Where its own scale does not
-    show a clear chain in each of them, another one has to.
-    ``trained`` : the shipped network by default.
+    It is at least ``least`` times what the run's own scale explains. A few frames of the run are searched: too few to know at which scale the whole run shows more. Where its own scale does not
+    show a clear chain in each of them, another one has to. ``trained`` : the shipped network by default.
     """
     own, *others = _explanations(run, run.pixels, catalogue, (run.px_per_mm, *scales_px_per_mm), trained)
     return tuple(one.px_per_mm for one in others if one.electrodes >= least * own.electrodes and (own.sure or one.sure))
 
 
 def expected_electrodes(run: Run, catalogue: Catalogue, frame: int, trained: Trained | None = None) -> float:
-    """Return how many of a catalogue's electrodes a frame of a run shows, the sum of their probabilities.
+    """Return how many electrodes of a catalogue a frame shows.
 
-    ``trained`` : the shipped network by default.
+    It is the sum of their probabilities. ``trained`` : the shipped network by default.
     """
     field = find_field(run.frames, run.pixels)
     image = field.fill(LogTransform.of_run(run.pixels, field.mean_level)(run.frames[frame]))

@@ -121,7 +121,7 @@ class LearnedChain:
         def search_unlisted() -> ShowsUnlisted:
             found = in_all_scales(automatic(first))
             # A whole segmentation takes long: chance shows one more catheter in one frame, but rarely in two.
-            in_frames = all(
+            in_frames = any(entry.chains for entry in found.frames) and all(
                 frame_shows_more(expected_electrodes(shown, with_unlisted, frame, trained), found, frame)
                 for frame in asked_frames(len(run.frames))
             )

@@ -34,7 +34,10 @@ class ShowsUnlisted:
 
 
 def with_usual_types(catalogue: Catalogue) -> Catalogue:
-    """Return a catalogue with one more catheter of each usual type, under names that the study does not use."""
+    """Return a catalogue with one more catheter of each usual type.
+
+    Their names are none of the study's.
+    """
     more: list[Catheter] = []
     for type_name in USUAL_TYPES:
         name = f"unlisted {type_name}"
@@ -45,12 +48,15 @@ def with_usual_types(catalogue: Catalogue) -> Catalogue:
 
 
 def asked_frames(count: int) -> tuple[int, ...]:
-    """Return the frames of a run of ``count`` that are asked for one more catheter, the middle one first."""
+    """Return which frames of ``count`` are searched for one more catheter."""
     return tuple(dict.fromkeys((count // 2, count // 4)))
 
 
 def frame_shows_more(expected: float, found: Segmentation, frame: int) -> bool:
-    """Return whether a frame has more electrodes with the usual types, ``expected`` of them, than a segmentation shows."""
+    """Return whether a frame shows more electrodes than were found.
+
+    ``expected`` : with the usual types, the sum of their probabilities.
+    """
     return expected >= _expected_electrodes(found.frames[frame]) + _MORE_IN_FRAME
 
 
@@ -63,8 +69,8 @@ def run_shows_more(more: Segmentation, found: Segmentation) -> bool:
 def listed_alone(found: Segmentation, catalogue: Catalogue) -> Segmentation:
     """Return a segmentation with the usual types without the catheters that the study does not list.
 
-    Each track gets a name of its own, so that together they are most probable. Of catheters that look alike the one that is seen
-    best is the listed one; that it may be the other is left of its probability.
+    Each track gets a name of its own, so that together they are most probable. Of two catheters that look alike the clearer one gets
+    the listed name, with half of the probability.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ def segmented(*chains: Chain, lacking: int | None = None) -> Segmentation:
 
 
 def shown(found: Segmentation) -> list[tuple[int, dict[str, float]]]:
-    """Return track and kinds of each chain, the same in all frames and at diastole."""
+    """Return track and kinds of each chain of every frame."""
     (one,) = {tuple((chain.track, chain.kinds) for chain in entry.chains) for entry in (*found.frames, found.diastole)}
     return [(track, dict(kinds)) for track, kinds in one]
 
