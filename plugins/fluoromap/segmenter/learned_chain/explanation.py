@@ -81,8 +81,9 @@ def promising_scales(
 ) -> tuple[float, ...]:
     """Return those scales that explain enough of a run.
 
-    It is at least ``least`` times what the run's own scale explains. A few frames of the run are searched: too few to know at which scale the whole run shows more. Where its own scale does not
-    show a clear chain in each of them, another one has to. ``trained`` : the shipped network by default.
+    It is at least ``least`` times what the run's own scale explains. A few frames of the run are searched: too few to know
+    at which scale the whole run shows more. Where its own scale does not show a clear chain in each of them, another one has to.
+    ``trained`` : the shipped network by default.
     """
     own, *others = _explanations(run, run.pixels, catalogue, (run.px_per_mm, *scales_px_per_mm), trained)
     return tuple(one.px_per_mm for one in others if one.electrodes >= least * own.electrodes and (own.sure or one.sure))

@@ -69,8 +69,8 @@ def run_shows_more(more: Segmentation, found: Segmentation) -> bool:
 def listed_alone(found: Segmentation, catalogue: Catalogue) -> Segmentation:
     """Return a segmentation with the usual types without the catheters that the study does not list.
 
-    Each track gets a name of its own, so that together they are most probable. Of two catheters that look alike the clearer one gets
-    the listed name, with half of the probability.
+    Each track gets a name of its own, so that together they are most probable. Of two catheters that look alike the clearer one
+    gets the listed name, with half of the probability.
 
     Parameters
     ----------
