@@ -23,7 +23,7 @@ USUAL_TYPES = "quadripolar-2-5-2", "decapolar-2-5-2"
 _MORE_IN_FRAME, _MORE_IN_RUN = 2.0, 3.0
 """How many more electrodes a frame has to show with these types: in one frame, and in the mean of a run's frames."""
 _IMPOSSIBLE = 1e-3
-_PREFER_LISTED = 0.01
+_PREFER_LISTED, _SET_BY_HAND = 0.01, 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def listed_alone(found: Segmentation, catalogue: Catalogue) -> Segmentation:
     """Return a segmentation with the usual types without the catheters that the study does not list.
 
     Each track gets a name of its own, so that together they are most probable. Of two catheters that look alike the clearer one
-    gets the listed name, with half of the probability.
+    gets the listed name, with half of the probability. What was set by hand keeps its name.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def listed_alone(found: Segmentation, catalogue: Catalogue) -> Segmentation:
     """
     tracks = tracks_of(found)
     names = _names_of_tracks(tracks, catalogue, len(found.frames))
-    kept = {number for number, name in names.items() if name in catalogue.names}
+    kept = {number for number, track in tracks.items() if track.manual or names.get(number) in catalogue.names}
     # A usual type that no track shows is no other name for those that are there.
     absent = {name for track in tracks.values() for name, _ in track.chain.kinds} - set(names.values())
     absent -= set(catalogue.names)
@@ -117,6 +117,8 @@ def _names_of_tracks(tracks: Mapping[int, Track], catalogue: Catalogue, frames: 
 
 
 def _cost(track: Track, name: str, catalogue: Catalogue, frames: int) -> float:
+    if any(chain.manual and chain.probability(name) > 0.0 for chain in track.chains.values()):
+        return -_SET_BY_HAND
     seen = sum(float(chain.scores.mean()) for chain in track.chains.values()) / frames
     likely = float(np.log(max(track.chain.probability(name), _IMPOSSIBLE)))
     return -likely - (_PREFER_LISTED * (1.0 + seen) if name in catalogue.names else 0.0)

@@ -1,5 +1,7 @@
 """Catheters that a study does not list: sought as usual types, and none of them gets a listed name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,11 +25,11 @@ STUDY = Catalogue(
 QUADRIPOLAR, DECAPOLAR = (one.name for one in with_usual_types(STUDY).catheters[2:])
 
 
-def chain(kinds: dict[str, float], v: float, seen: float = 0.9, electrodes: int = 4) -> Chain:
+def chain(kinds: dict[str, float], v: float, seen: float = 0.9, electrodes: int = 4, manual: bool = False) -> Chain:
     points = np.stack([10.0 * np.arange(electrodes), np.full(electrodes, v)], axis=1)
     covariance = np.tile(np.eye(2), (electrodes, 1, 1))
     numbers = tuple(range(1, electrodes + 1))
-    return Chain(numbers, points, covariance, np.full(electrodes, seen), tuple(kinds.items()), track=int(v))
+    return Chain(numbers, points, covariance, np.full(electrodes, seen), tuple(kinds.items()), int(v), manual)
 
 
 def segmented(*chains: Chain, lacking: int | None = None) -> Segmentation:
@@ -76,6 +78,25 @@ def test_of_two_that_look_alike_the_clearer_one_is_listed_with_half_of_the_proba
     alone = listed_alone(found, STUDY)
     assert shown(alone) == [(1, {"map": 1.0}), (3, {"rv": pytest.approx(0.5)})]
     assert alone.diastole.manual_needed is Reason.EXTRA_CATHETER
+
+
+def test_what_was_set_by_hand_keeps_its_name_and_the_clearer_one_is_left_out():
+    """One frame has a mark; in the others the catheter is as likely the unlisted one."""
+    alike = {"rv": 0.5, QUADRIPOLAR: 0.5}
+    automatic, marked = chain(alike, 2, seen=0.9), chain({"rv": 1.0}, 3, manual=True)
+    found = segmented(automatic, chain(alike, 3, seen=0.5))
+    frames = (*found.frames[:2], FrameChains(2, (automatic, marked)), found.frames[3])
+    alone = listed_alone(replace(found, frames=frames), STUDY)
+    assert [[one.track for one in entry.chains] for entry in alone.frames] == [[3]] * FRAMES
+    (kept,) = alone.frames[2].chains
+    assert kept.manual
+    assert kept.kinds == (("rv", 1.0),)
+
+
+def test_nothing_that_was_set_by_hand_is_left_out():
+    marked = [chain({"rv": 1.0}, 2, manual=True), chain({"rv": 1.0}, 3, manual=True)]
+    alone = listed_alone(segmented(*marked, chain({QUADRIPOLAR: 0.9, "map": 0.1}, 4)), STUDY)
+    assert {2, 3} <= {track for track, _ in shown(alone)}
 
 
 def test_the_names_are_most_probable_together():
