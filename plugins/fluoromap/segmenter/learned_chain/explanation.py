@@ -89,7 +89,7 @@ def promising_scales(
     return tuple(one.px_per_mm for one in others if one.electrodes >= least * own.electrodes and (own.sure or one.sure))
 
 
-def expected_electrodes(run: Run, catalogue: Catalogue, frame: int, trained: Trained | None = None) -> float:
+def frame_electrodes(run: Run, catalogue: Catalogue, frame: int, trained: Trained | None = None) -> float:
     """Return how many electrodes of a catalogue a frame shows.
 
     It is the sum of their probabilities. ``trained`` : the shipped network by default.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Segmentation
+from fluoromap.contracts import FrameChains, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
@@ -70,7 +70,7 @@ def useful_scales(
     def shows_more(together: Segmentation) -> bool:
         more, catheters = _count_electrodes(together) - _count_electrodes(found), _usual_catheters(together)
         if are_all:
-            is_more_probable = _expected_electrodes(together) > _AS_STATED * _expected_electrodes(found)
+            is_more_probable = expected_electrodes(together.frames) > _AS_STATED * expected_electrodes(found.frames)
             return is_more_probable and catheters >= len(catalogue.catheters) and not _shows_unlisted(together)
         if _shows_unlisted(found) and catheters <= _CONFIRMED and more < MANY_ELECTRODES * len(found.frames):
             return False
@@ -79,7 +79,7 @@ def useful_scales(
     useful, most = UsefulScales((stated,)), 0.0
     for first in (scale for scale, other in tried.items() if _count_electrodes(other)):
         scales, together = _together(first, tried, catalogue)
-        probable = (_AS_STATED if first == stated else 1.0) * _expected_electrodes(together)
+        probable = (_AS_STATED if first == stated else 1.0) * expected_electrodes(together.frames)
         if probable > most and shows_more(together):
             useful, most = UsefulScales(scales), probable
     return useful
@@ -111,5 +111,6 @@ def _count_electrodes(found: Segmentation) -> int:
     return sum(len(chain.electrodes) for entry in found.frames for chain in entry.chains)
 
 
-def _expected_electrodes(found: Segmentation) -> float:
-    return sum(float(chain.scores.sum()) for entry in found.frames for chain in entry.chains)
+def expected_electrodes(frames: Sequence[FrameChains]) -> float:
+    """Return the sum of the probabilities of all electrodes."""
+    return sum(float(chain.scores.sum()) for entry in frames for chain in entry.chains)

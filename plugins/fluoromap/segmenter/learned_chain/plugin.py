@@ -17,7 +17,7 @@ from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
-from fluoromap.segmenter.learned_chain.explanation import expected_electrodes, is_inverted, promising_scales
+from fluoromap.segmenter.learned_chain.explanation import frame_electrodes, is_inverted, promising_scales
 from fluoromap.segmenter.learned_chain.frame_answers import StoredAnswers
 from fluoromap.segmenter.learned_chain.other_scales import UsefulScales, useful_scales
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
@@ -122,7 +122,7 @@ class LearnedChain:
             found = in_all_scales(automatic(first))
             # A whole segmentation takes long: chance shows one more catheter in one frame, but rarely in two.
             in_frames = any(entry.chains for entry in found.frames) and all(
-                frame_shows_more(expected_electrodes(shown, with_unlisted, frame, trained), found, frame)
+                frame_shows_more(frame_electrodes(shown, with_unlisted, frame, trained), found, frame)
                 for frame in asked_frames(len(run.frames))
             )
             return ShowsUnlisted(in_frames and run_shows_more(automatic(first, with_unlisted), found))

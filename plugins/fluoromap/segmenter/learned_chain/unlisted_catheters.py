@@ -16,6 +16,7 @@ from fluoromap.catheters import Catalogue, Catheter, catheter_type
 from fluoromap.contracts import Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
+from fluoromap.segmenter.learned_chain.other_scales import expected_electrodes
 from fluoromap.segmenter.tracks import Track
 
 USUAL_TYPES = "quadripolar-2-5-2", "decapolar-2-5-2"
@@ -57,12 +58,12 @@ def frame_shows_more(expected: float, found: Segmentation, frame: int) -> bool:
 
     ``expected`` : with the usual types, the sum of their probabilities.
     """
-    return expected >= _expected_electrodes(found.frames[frame]) + _MORE_IN_FRAME
+    return expected >= expected_electrodes([found.frames[frame]]) + _MORE_IN_FRAME
 
 
 def run_shows_more(more: Segmentation, found: Segmentation) -> bool:
     """Return whether a segmentation with the usual types shows one more catheter than another."""
-    gain = sum(map(_expected_electrodes, more.frames)) - sum(map(_expected_electrodes, found.frames))
+    gain = expected_electrodes(more.frames) - expected_electrodes(found.frames)
     return gain >= _MORE_IN_RUN * len(found.frames)
 
 
@@ -132,7 +133,3 @@ def _with_listed_names(chain: Chain, catalogue: Catalogue, absent: set[str]) -> 
         if name in catalogue.names
     )
     return replace(chain, kinds=kinds)
-
-
-def _expected_electrodes(entry: FrameChains) -> float:
-    return sum(float(chain.scores.sum()) for chain in entry.chains)
