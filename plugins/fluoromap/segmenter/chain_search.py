@@ -25,7 +25,8 @@ MANY_ELECTRODES = 6
 TURNING_ELECTRODES = 8
 """From here on a row is known even where it turns through the viewing direction and a part of its electrodes merge."""
 
-_END_SLACK = 0.55, 1.1
+_END_SLACK, _RING_MM = (0.55, 1.1), 0.7
+"""Of a single gap: shares of the limits, and how much longer makers' rings may make it than the catalogue's rings do."""
 _SPREAD, _SPREAD_A_GAP, _MOST_SPREAD = 0.6, 0.06, 0.9
 """How far the ratios of two gaps may differ: of neighbours, more for each gap between, at most. Long catheters turn in depth."""
 _LEAST_COSINE, _MOST_TURNED = 0.55, 0.6
@@ -71,7 +72,7 @@ def find_paths(
     for step in range(len(spacing_px)):
         most = min(len(kept) * len(points), _GROWN)
         longer, more = np.empty((most, kept.shape[1]), np.int64), np.empty((most, ratios.shape[1]))
-        count = _grow(points, spacing_px, step, cosines[step], kept, ratios, longer, more)
+        count = _grow(points, spacing_px, step, cosines[step], _RING_MM * px_per_mm, kept, ratios, longer, more)
         kept, ratios = longer[:count], more[:count]
         if count > _PARTIAL:
             values = weights[kept[:, : step + 2]].sum(axis=1)
@@ -114,8 +115,8 @@ def _least_cosines(spacing_mm: Array) -> Array:
     return least
 
 
-@kernel("f8[:,::1], f8[::1], i8, f8, i8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1]")
-def _grow(points, spacing_px, step, least_cosine, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
+@kernel("f8[:,::1], f8[::1], i8, f8, f8, i8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1]")
+def _grow(points, spacing_px, step, least_cosine, ring_px, kept, ratios, longer, more):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Write all paths with one more electrode; return their number.
 
     Their spacing ratios are written too.
@@ -123,7 +124,7 @@ def _grow(points, spacing_px, step, least_cosine, kept, ratios, longer, more):  
     count = 0
     spacing = spacing_px[step]
     shortest = SHORTEST * _END_SLACK[0] * spacing
-    longest = LONGEST * _END_SLACK[1] * spacing
+    longest = LONGEST * max(_END_SLACK[1] * spacing, spacing + ring_px)
     for row in range(kept.shape[0]):
         last = kept[row, step]
         bu = bv = before = 0.0

@@ -20,8 +20,9 @@ _OBLIQUE, _LEAST_ELECTRODES = 0.95, 3
 """Visible over true length below which openings show, and how many electrodes have a line."""
 _MORE_LIKELY = 0.5
 """How much the log-likelihood of an electrode has to rise."""
-_SD_OF_WAY = 0.5
-"""Standard deviation that is added, as a share of the way that an electrode moves: the two fits differ by that way."""
+_SD_OF_WAY, _SD_BESIDE = 0.4, 0.15
+"""Standard deviation that is added, as a share of the way that an electrode moves: along the way, by which the two fits differ, and
+in all directions, because the line that it moves along bends."""
 
 
 def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> tuple[Chain, ...]:
@@ -57,7 +58,10 @@ def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogu
     if fit.log_likelihood + float(shape[1] - shape[0]) <= _MORE_LIKELY * len(places):
         return chain
     way = fit.points_uv - places
-    more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :]
+    way_squared = (way * way).sum(axis=1)
+    more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :] + _SD_BESIDE**2 * way_squared[
+        :, None, None
+    ] * np.eye(2)
     return replace(chain, pixels_uv=fit.points_uv, covariance_px2=chain.covariance_px2 + more)
 
 

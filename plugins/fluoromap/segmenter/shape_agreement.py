@@ -15,12 +15,12 @@ from fluoromap.segmenter.row_shape import shape_covariance_mm2
 _FEWEST = 3
 _PLACE_SD_MM = 0.05
 """How far an electrode's middle lies off its catheter's smooth curve."""
-_AGREES, _LOOP_AGREES = 0.4, 1.0
-"""The square of an electrode's distance from its prediction, over the square that is expected, up to which the chain agrees; the
-ends of a loop are predicted less well."""
-_ACROSS = 0.6
-"""Standard deviation that is added across the catheter, as a share of the distance across. Along it the whole distance from the
-prediction is added: openings of rings and neighbours displace electrodes along their catheter."""
+_AGREES, _LOOP_AGREES = np.array([0.4, 0.1]), 1.0
+"""The square of an electrode's distance from its prediction, along the catheter and across, over its expectation, up to which the
+chain agrees where the places themselves are sure. Catheters mostly bend less than they can, and where they lie across the rays they
+are as long as they can be. The ends of a loop are predicted less well."""
+_NOISE_AGREES = 2.0
+"""The same where the expected distance is all due to the ellipses: what they say already is no reason to widen them."""
 
 
 def widen_by_shape(chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> tuple[Chain, ...]:
@@ -46,24 +46,26 @@ def widen_by_shape(chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: flo
 def _widened(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> Chain:
     catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
     rows = np.array(chain.electrodes) - 1
-    off, relative = _off_the_curve(
-        chain, shape_covariance_mm2(catheter.spacing_mm, catheter.curvature_per_mm)[np.ix_(rows, rows)] * px_per_mm**2,
-        _PLACE_SD_MM * px_per_mm,
-    )  # fmt: skip
-    agrees = _LOOP_AGREES if catheter.is_circular else _AGREES
-    weight = 1.0 - agrees / np.maximum(relative, agrees)
     axes = axes_of_chain(chain.pixels_uv)
-    across = np.einsum("na,na->n", off, axes[:, 1])
-    added_sd = np.stack([np.linalg.norm(off, axis=1), _ACROSS * across], axis=1)
-    more = np.einsum("n,na,nai,naj->nij", weight, added_sd**2, axes, axes)
-    return replace(chain, covariance_px2=chain.covariance_px2 + more)
+    off, expected, noise = _off_the_curve(
+        chain,
+        shape_covariance_mm2(catheter.spacing_mm, catheter.curvature_per_mm)[np.ix_(rows, rows)] * px_per_mm**2,
+        _PLACE_SD_MM * px_per_mm,
+        axes,
+    )
+    of_shape = _LOOP_AGREES if catheter.is_circular else _AGREES
+    agrees = of_shape + noise / expected * (_NOISE_AGREES - of_shape)
+    added = off**2 * (1.0 - agrees / np.maximum(off**2 / expected, agrees))
+    # What displaces an electrode across its catheter may displace it along as well.
+    added[:, 0] += added[:, 1]
+    return replace(chain, covariance_px2=chain.covariance_px2 + np.einsum("na,nai,naj->nij", added, axes, axes))
 
 
-def _off_the_curve(chain: Chain, shape_px2: Array, place_sd_px: float) -> tuple[Array, Array]:
+def _off_the_curve(chain: Chain, shape_px2: Array, place_sd_px: float, axes: Array) -> tuple[Array, Array, Array]:
     """Return how each electrode lies off the place that the others predict.
 
-    The results are the way from there, (electrodes, 2) pixels, and the square of its length over what is expected of two
-    coordinates, (electrodes,).
+    The results, along the catheter and across, are the distance from there, pixels, the expected square of this distance, and the part of the expected square that
+    is due to the ellipses; (electrodes, 2) each.
 
     The inverse of the covariance of all coordinates has, in its blocks, the precision of each place given the others.
     """
@@ -75,7 +77,10 @@ def _off_the_curve(chain: Chain, shape_px2: Array, place_sd_px: float) -> tuple[
     each = np.arange(count)
     whole[each, :, each, :] += chain.covariance_px2
     precision = np.linalg.inv(whole.reshape(2 * count, 2 * count)).reshape(count, 2, count, 2)
-    places = chain.pixels_uv - chain.pixels_uv.mean(axis=0)
-    pull = np.einsum("iajb,jb->ia", precision, places)
-    off = np.linalg.solve(precision[each, :, each, :], pull[..., None])[..., 0]
-    return off, np.einsum("ia,ia->i", off, pull)
+    given_others = np.linalg.inv(precision[each, :, each, :])
+    # The distances are this linear function of the places.
+    distance = np.einsum("nai,nij,njmk->namk", axes, given_others, precision)
+    off = np.einsum("namk,mk->na", distance, chain.pixels_uv - chain.pixels_uv.mean(axis=0))
+    expected = np.einsum("nai,nij,naj->na", axes, given_others, axes)
+    noise = np.einsum("nami,mij,namj->na", distance, chain.covariance_px2, distance)
+    return off, expected, noise

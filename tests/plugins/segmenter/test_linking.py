@@ -160,6 +160,16 @@ def bent(catheter, tip, turn_deg, at):
     return np.concatenate([[tip], tip + np.cumsum(steps, axis=0)])
 
 
+def test_pairs_of_rings_that_are_longer_than_the_catalogue_says_are_found():
+    # Edge gaps of 2 and 8 mm between rings of 2 mm, not of 1 mm, seen from the side at the last pair only.
+    listed = catheter_type("decapolar-2-8-2", "cs")
+    gaps = np.array([4.0 if index % 2 == 0 else 10.0 for index in range(9)])
+    seen = PX * np.linspace(0.7, 1.0, 9) * gaps
+    points = np.stack([20.0 + np.concatenate([[0.0], np.cumsum(seen)]), np.full(10, 50.0)], axis=1)
+    paths = find_paths(points, np.ones(len(points)), np.array(listed.spacing_mm) * PX, PX)
+    assert list(range(10)) in paths.tolist()
+
+
 @pytest.mark.parametrize(
     ("name", "is_found"), [("decapolar-2-5-2", True), ("quadripolar-2-5-2", False), ("quadripolar-5-5-5", True)]
 )
