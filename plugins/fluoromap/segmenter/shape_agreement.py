@@ -64,8 +64,8 @@ def _widened(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> Chain:
 def _off_the_curve(chain: Chain, shape_px2: Array, place_sd_px: float, axes: Array) -> tuple[Array, Array, Array]:
     """Return how each electrode lies off the place that the others predict.
 
-    The results, along the catheter and across, are the distance from there, pixels, the expected square of this distance, and the part of the expected square that
-    is due to the ellipses; (electrodes, 2) each.
+    The results, along the catheter and across, (electrodes, 2) each, are the distance from there, pixels, the expected square of
+    this distance, and the part of the expected square that is due to the ellipses.
 
     The inverse of the covariance of all coordinates has, in its blocks, the precision of each place given the others.
     """
