@@ -24,7 +24,7 @@ LEAST_GAP = 0.15
 _SOFT_PX = 2.0
 _APART_PX = 6.0
 _GAIN, _TIP_GAIN = (4.6, 4.8), (6.15, 5.7)
-_FITTED_PX_PER_MM, _OF_SCALE = 5.75, 0.4
+_FITTED_PX_PER_MM, _OF_SCALE = 5.75, 0.25
 """The scale at which the gains were fitted, and the power of the scale with which the standard deviation grows: noise that goes
 together in neighbouring pixels averages out less, the more pixels an electrode has."""
 _TIP_REACH = 0.8
@@ -32,7 +32,7 @@ _TIP_REACH = 0.8
 _FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.027, 0.034), (0.072, 0.04), (0.124, 0.04)
 _LONG_TIP_MM = 3.0
 _BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
-_USUAL_REST, _OF_REST, _TINY = np.array([1.0, 0.9]), np.array([0.8, 1.7]), 1e-12
+_USUAL_REST, _OF_REST, _TINY = np.array([1.0, 0.9]), np.array([0.8, 1.33]), 1e-12
 """The unexplained rest of a profile, along and across, as a multiple of that of the chain's middle electrode: from here on it
 widens the standard deviation, in this power."""
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7

@@ -21,12 +21,13 @@ from fluoromap.segmenter.log_image import Image, LogTransform
 from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
+from fluoromap.segmenter.scale_of_ellipses import at_scale
 from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.shape_agreement import widen_by_shape
 from fluoromap.segmenter.shape_jitter import widen_by_jitter
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict, chain_distance, overlaps, reverse
+from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict, chain_distance, kind_overlap, overlaps, reverse
 
 T = TypeVar("T")
 
@@ -318,6 +319,8 @@ def segment_run(
             lambda: ExtraCatheter(detector.shows_extra_catheter(mean_x, chains)),
         )
         reason = Reason.EXTRA_CATHETER if extra.is_shown else None
+    entries = tuple(replace(entry, chains=at_scale(entry.chains, run.px_per_mm)) for entry in entries)
+    chains = at_scale(chains, run.px_per_mm)
     if place is not None:
         entries = tuple(replace(entry, chains=place(entry.frame, entry.chains)) for entry in entries)
         chains = place_obliquely(mean_x, chains, catalogue, run.px_per_mm)
@@ -643,7 +646,8 @@ def _assign_tracks(
 ) -> tuple[Chain, ...]:
     """Give each diastolic chain the track number of the averaged frames.
 
-    The number is that of the chains at the same place, where most of the averaged frames that show the track show it there.
+    The number is that of the chains at the same place, where most of the averaged frames that show the track show it there. Chains
+    that cannot be the same catheter do not count, unless a user set one of them.
     """
     taken: set[int] = {chain.track for chain in chains if chain.track >= 0}
     fresh = 1 + max((chain.track for entry in entries for chain in entry.chains), default=-1)
@@ -655,7 +659,7 @@ def _assign_tracks(
                 near = [
                     (sum(chain_distance(chain, other)), other.track)
                     for other in entries[frame].chains
-                    if other.track not in taken
+                    if other.track not in taken and (chain.manual or other.manual or kind_overlap(chain, other) > 0)
                 ]
                 if near and min(near)[0] <= _SAME_TRACK_PX:
                     votes[min(near)[1]] = votes.get(min(near)[1], 0) + 1

@@ -12,6 +12,7 @@ from fluoromap.segmenter.run_segmentation import segment_run
 from fluoromap.segmenter.tracks import Verdict, reverse
 
 CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "reference"),), None, "reference")
+LONG = Catalogue((catheter_type("decapolar-2-5-2", "cs"), catheter_type("hexapolar-2-5-2", "his")), "cs", "his")
 PLACES = np.array([[40.0, 40], [50, 44], [68, 50], [78, 55]])
 
 
@@ -101,6 +102,30 @@ def test_a_chain_of_the_mean_belongs_to_a_track_where_most_of_its_frames_show_it
     (usual,) = found.diastole.chains
     assert np.array_equal(usual.pixels_uv, PLACES)
     assert {each.track for entry in found.frames for each in entry.chains} == {usual.track}
+
+
+class ShorterInMean(Detector):
+    """Finds a decapolar catheter in the frames, and six of its electrodes as a hexapolar one in the mean."""
+
+    def find_chains(self, x, frame, beside=()):
+        self.searched += 1
+        catheter = LONG["cs" if self.searched <= self.count else "his"]
+        places = np.stack([10.0 + 2.0 * catheter.arc_lengths_mm, 40.0 + 0.5 * catheter.arc_lengths_mm], axis=1)
+        numbers = tuple(range(1, catheter.electrodes + 1))
+        covariance = np.tile(np.eye(2), (len(numbers), 1, 1))
+        found = Chain(numbers, places, covariance, np.ones(len(numbers)), ((catheter.name, 1.0),), tip_odds=1.0)
+        return FrameChains(frame, (found,))
+
+
+def test_a_chain_of_the_mean_belongs_to_no_track_of_a_catheter_with_other_electrodes():
+    run = Run(Frames(12), np.arange(12) * 33.0, 2.0, PixelFacts(False, 12, False))
+    detector = ShorterInMean(12)
+    found = segment_run(run, LONG, {}, Silent(), lambda field: detector, True, True, lambda *_: Verdict(True))
+    for entry in (*found.frames, found.diastole):
+        for each in entry.chains:
+            assert {name for name, _ in each.kinds} == {"cs" if len(each.electrodes) == 10 else "his"}
+    (diastolic,) = found.diastole.chains
+    assert len(diastolic.electrodes) == 10
 
 
 class Moving(Detector):
