@@ -58,10 +58,8 @@ def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogu
     if fit.log_likelihood + float(shape[1] - shape[0]) <= _MORE_LIKELY * len(places):
         return chain
     way = fit.points_uv - places
-    way_squared = (way * way).sum(axis=1)
-    more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :] + _SD_BESIDE**2 * way_squared[
-        :, None, None
-    ] * np.eye(2)
+    beside = _SD_BESIDE**2 * (way * way).sum(axis=1)
+    more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :] + beside[:, None, None] * np.eye(2)
     return replace(chain, pixels_uv=fit.points_uv, covariance_px2=chain.covariance_px2 + more)
 
 
