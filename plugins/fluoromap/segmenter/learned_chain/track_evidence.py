@@ -72,6 +72,9 @@ _DARK_LINES = DarkLineLimits(thinnest=0.6, sure=0.5, sure_long=2.0)
 _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
 """How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.dark_lines.gap_share`. Gaps of a loop are
 not measured: seen on edge, both of its sides are one line."""
+_LINE_GAPS, _MOST_OF_SHAFT = 0.8, 1
+"""How dark gaps on one line are, as a share of the electrodes' depth, and how many places on it may be improbable. Two electrodes
+of a lead and two places of its shaft look like a catheter else."""
 _MOST_DENIED = 1
 """Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
 _LEAST_BESIDE_HIDDEN = 8
@@ -250,6 +253,8 @@ class TrackEvidence:
         if _count_blank(depths, odds.mean(axis=0), inside) > max(_MOST_BLANK, len(usual) // _FOR_ONE_BLANK):
             return Verdict(False)
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
+        if is_short and not has_tip and gaps >= _LINE_GAPS and _count_improbable(odds.mean(axis=0)) > _MOST_OF_SHAFT:
+            return Verdict(False)
         # Of a long tip single frames show which end it is.
         tip_odds = None if is_loop or self._is_likely(chains, self.long_tips) else _tip_odds(pictures)
         still = self._is_still(paths)
@@ -489,6 +494,11 @@ def _count_blank(depths: Sequence[Array], odds: Array, inside: BoolArray) -> int
     depth = np.concatenate([section[::2, 0] for section in depths])[inside]
     dark = np.median(np.sort(depth)[len(depth) // 2 :])
     return int(np.count_nonzero((depth < _BLANK_DEPTH * dark) & (odds < _NOTHING)))
+
+
+def _count_improbable(odds: Array) -> int:
+    """Return how many log-odds (n,) speak against an electrode."""
+    return int(np.count_nonzero(odds < EVEN_ODDS))
 
 
 def _are_of_long_catheter(odds: Array, middle: float) -> bool:

@@ -502,6 +502,18 @@ def test_the_ends_of_a_lead_and_places_on_its_coil_are_no_catheter(monkeypatch, 
     assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
 
 
+@pytest.mark.parametrize(
+    ("odds", "gaps", "accepted"),
+    [((2.1, 1.9, -0.8, -0.4), 1.0, False), ((2.1, 1.9, -0.8, -0.4), 0.6, True), ((2.1, 1.9, -0.8, 0.4), 1.0, True)],
+)
+def test_two_electrodes_of_a_lead_and_two_places_of_its_shaft_are_no_catheter(monkeypatch, odds, gaps, accepted):
+    judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
+    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: evidence(np.array(odds), gaps=gaps))
+    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
+    beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
+    assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
+
+
 @pytest.mark.parametrize(("between", "odds", "accepted"), [(0.5, 1.9, True), (0.7, 1.9, False), (0.7, 2.1, True)])
 def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, between, odds, accepted):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
