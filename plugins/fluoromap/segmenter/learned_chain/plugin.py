@@ -15,6 +15,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
+from fluoromap.segmenter.learned_chain.absent_catheters import without_absent
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import frame_electrodes, is_inverted, promising_scales
@@ -114,7 +115,8 @@ class LearnedChain:
         def in_all_scales(found: Segmentation) -> Segmentation:
             for scale in others:
                 found = add_catheters(found, automatic(scale), catalogue, scale)
-            return found
+            shown = without_absent(found, catalogue)
+            return found if shown is None else add_catheters(found, automatic(first, shown), catalogue, first)
 
         with_unlisted = with_usual_types(catalogue)
 
