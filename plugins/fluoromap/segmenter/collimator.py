@@ -23,6 +23,8 @@ _LEAST_SIDE = 0.2
 _LEAST_RIM = 0.35
 _LEVER_PX, _STEEP_PX = 3.0, 5.0
 """How far beside an edge its level is measured, and how far a sharp edge is steep."""
+_BEHIND_PX, _MOST_BEHIND = 9.0, 0.5
+"""How far beyond an edge the penumbra has ended, and the most that its level may be there, as a share of the level inside."""
 _BEYOND = 0.7
 _MOST_BEYOND = 0.02
 _TRIES = 24
@@ -39,9 +41,10 @@ def within_collimator(picture: Image) -> BoolArray:
 
     - The level falls by 30 % along three quarters of the edge's bright inner side.
     - The edge covers a fifth of the image (a circle: a third of its rim).
-    - Hardly any pixel beyond it is as bright as the pixels inside.
+    - Hardly any pixel beyond it is as bright as the pixels inside, and behind the penumbra most have less than half of their level.
 
-    An edge of anatomy is gentler, shorter, or has bright pixels behind it.
+    An edge of anatomy is gentler, shorter, or has bright pixels behind it. The spine's is as steep and as long, but the spine is less
+    dark than a collimator's blade.
 
     Parameters
     ----------
@@ -179,8 +182,12 @@ class _Edges:
         bright = in_picture & (inner > 0.5 * level)
         if np.count_nonzero(falls & bright) < max(_SHARE * np.count_nonzero(bright), 0.75 * least):
             return False
-        behind = self.small[beyond]
-        return behind.size == 0 or float(np.mean(behind > _BEYOND * level)) < _MOST_BEYOND
+        behind, in_picture = self._levels(edge + _BEHIND_PX * normals)
+        behind = behind[in_picture & inner_in_picture]
+        if behind.size and float(np.median(behind)) > _MOST_BEHIND * level:
+            return False
+        pixels = self.small[beyond]
+        return pixels.size == 0 or float(np.mean(pixels > _BEYOND * level)) < _MOST_BEYOND
 
     def _levels(self, places: Array) -> tuple[NDArray[np.float32], BoolArray]:
         u, v = (places + self.centre).T

@@ -42,6 +42,15 @@ def test_a_dark_half_of_the_patient_stays(patient):
     assert find_field(Still(patient), FACTS).inside.all()
 
 
+@pytest.mark.parametrize("share", [0.55, 0.65])
+def test_a_spine_with_a_straight_steep_edge_stays(share):
+    """In a frontal view of high contrast it is as long and as steep as a collimator's edge, and nothing bright lies behind it."""
+    u = np.arange(256)[None].repeat(256, axis=0)
+    level = 1000 * (1 - (1 - share) / (1 + np.exp(u - 90.0)))
+    field = find_field(Still(np.random.default_rng(1).poisson(level).astype(float)), FACTS)
+    assert field.inside.all()
+
+
 def test_a_blade_and_its_penumbra_are_cut(patient):
     patient[:, :30] *= 0.2
     field = find_field(Still(patient), FACTS)
