@@ -43,8 +43,8 @@ def within_collimator(picture: Image) -> BoolArray:
     - The edge covers a fifth of the image (a circle: a third of its rim).
     - Hardly any pixel beyond it is as bright as the pixels inside, and behind the penumbra most have less than half of their level.
 
-    An edge of anatomy is gentler, shorter, or has bright pixels behind it. The spine's is as steep and as long, but the spine is less
-    dark than a collimator's blade.
+    An edge of anatomy is gentler, shorter, or has bright pixels behind it. The spine's is as steep and as long, but the
+    spine is less dark than a collimator's blade.
 
     Parameters
     ----------
