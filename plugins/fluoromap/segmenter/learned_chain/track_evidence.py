@@ -73,8 +73,8 @@ _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
 """How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.dark_lines.gap_share`. Gaps of a loop are
 not measured: seen on edge, both of its sides are one line."""
 _LINE_GAPS, _MOST_OF_SHAFT = 0.8, 1
-"""How dark gaps on one line are, as a share of the electrodes' depth, and how many places on it may be improbable. Two electrodes
-of a lead and two places of its shaft look like a catheter else."""
+"""How dark gaps on one line are, as a share of the electrodes' depth, and how many places on it may be improbable. Else two
+electrodes of a lead and two places of its shaft look like a catheter, and so does a row that is crammed between fewer electrodes."""
 _MOST_DENIED = 1
 """Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
 _LEAST_BESIDE_HIDDEN = 8
@@ -253,7 +253,7 @@ class TrackEvidence:
         if _count_blank(depths, odds.mean(axis=0), inside) > max(_MOST_BLANK, len(usual) // _FOR_ONE_BLANK):
             return Verdict(False)
         gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
-        if is_short and not has_tip and gaps >= _LINE_GAPS and _count_improbable(odds.mean(axis=0)) > _MOST_OF_SHAFT:
+        if not has_tip and gaps >= _LINE_GAPS and _count_improbable(odds.mean(axis=0)) > _MOST_OF_SHAFT:
             return Verdict(False)
         # Of a long tip single frames show which end it is.
         tip_odds = None if is_loop or self._is_likely(chains, self.long_tips) else _tip_odds(pictures)

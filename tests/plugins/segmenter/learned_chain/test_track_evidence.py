@@ -507,11 +507,15 @@ def test_the_ends_of_a_lead_and_places_on_its_coil_are_no_catheter(monkeypatch, 
     [((2.1, 1.9, -0.8, -0.4), 1.0, False), ((2.1, 1.9, -0.8, -0.4), 0.6, True), ((2.1, 1.9, -0.8, 0.4), 1.0, True)],
 )
 def test_two_electrodes_of_a_lead_and_two_places_of_its_shaft_are_no_catheter(monkeypatch, odds, gaps, accepted):
+    """Nor is a long row between other electrodes."""
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: evidence(np.array(odds), gaps=gaps))
-    row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
-    assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
+    for sections in (1, 2):
+        shown = (*odds[:2], *(4 * sections - 4) * (2.5,), *odds[2:])
+        row = np.stack([100.0 + 20.0 * np.arange(len(shown)), np.full(len(shown), 200.0)], axis=1)
+        of_section = (evidence(part, gaps=gaps) for part in 3 * np.array_split(np.array(shown), sections))
+        monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_, of=of_section: next(of))
+        assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
 
 
 @pytest.mark.parametrize(("between", "odds", "accepted"), [(0.5, 1.9, True), (0.7, 1.9, False), (0.7, 2.1, True)])
