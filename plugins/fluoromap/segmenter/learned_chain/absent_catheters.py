@@ -14,9 +14,9 @@ from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
 
 
 def without_absent(found: Segmentation, catalogue: Catalogue) -> Catalogue | None:
-    """Return a study's catalogue without the long catheters that no track of a run is likely to be.
+    """Return a catalogue without its long catheters that do not show.
 
-    It is None where nothing was found, where all long catheters were, or where all others were.
+    No track of the run is likely to be one of them. The result is None where nothing was found, where all long catheters were, or where all others were.
     """
     tracks = tracks_of(found).values()
     shown = {max(track.chain.kinds, key=lambda kind: kind[1])[0] for track in tracks}

@@ -74,7 +74,7 @@ _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
 not measured: seen on edge, both of its sides are one line."""
 _LINE_GAPS, _MOST_OF_SHAFT = 0.8, 1
 """How dark gaps on one line are, as a share of the electrodes' depth, and how many places on it may be improbable. Else two
-electrodes of a lead and two places of its shaft look like a catheter, and so does a row that is crammed between fewer electrodes."""
+electrodes of a lead and two places of its shaft look like a catheter, and so does a row between fewer electrodes."""
 _MOST_DENIED = 1
 """Places of a long row that may be denied: two are beside the catheter, or on a shorter one."""
 _LEAST_BESIDE_HIDDEN = 8

@@ -12,7 +12,7 @@ CATALOGUE = Catalogue(tuple(catheter_type(type_, name) for name, type_ in TYPES.
 
 
 def segmented(*names: str) -> Segmentation:
-    """Return a run of one frame whose tracks have these names, and a little of another one."""
+    """Return a run of one frame whose tracks have these names."""
     chains = []
     for track, name in enumerate(names):
         count = CATALOGUE[name].electrodes
