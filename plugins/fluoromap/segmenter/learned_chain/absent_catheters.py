@@ -16,7 +16,8 @@ from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
 def without_absent(found: Segmentation, catalogue: Catalogue) -> Catalogue | None:
     """Return a catalogue without its long catheters that do not show.
 
-    No track of the run is likely to be one of them. The result is None where nothing was found, where all long catheters were, or where all others were.
+    No track of the run is likely to be one of them. The result is None where nothing was found, where all long catheters were, or
+    where all others were.
     """
     tracks = tracks_of(found).values()
     shown = {max(track.chain.kinds, key=lambda kind: kind[1])[0] for track in tracks}
