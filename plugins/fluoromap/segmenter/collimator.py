@@ -182,8 +182,8 @@ class _Edges:
         bright = in_picture & (inner > 0.5 * level)
         if np.count_nonzero(falls & bright) < max(_SHARE * np.count_nonzero(bright), 0.75 * least):
             return False
-        behind, in_picture = self._levels(edge + _BEHIND_PX * normals)
-        behind = behind[in_picture & inner_in_picture]
+        behind, behind_in_picture = self._levels(edge + _BEHIND_PX * normals)
+        behind = behind[behind_in_picture & inner_in_picture]
         if behind.size and float(np.median(behind)) > _MOST_BEHIND * level:
             return False
         pixels = self.small[beyond]

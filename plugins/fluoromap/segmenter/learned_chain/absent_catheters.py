@@ -7,23 +7,42 @@ others.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import dataclass
+
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Segmentation
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
 
 
-def without_absent(found: Segmentation, catalogue: Catalogue) -> Catalogue | None:
-    """Return a catalogue without its long catheters that do not show.
+@dataclass(frozen=True, slots=True)
+class AbsentCatheters:
+    """Names of the long catheters without which a run is searched once more."""
 
-    No track of the run is likely to be one of them. The result is None where nothing was found, where all long catheters were, or
-    where all others were.
+    names: tuple[str, ...]
+
+
+def absent_catheters(found: Segmentation, catalogue: Catalogue) -> AbsentCatheters:
+    """Return the long catheters of a study that do not show.
+
+    No track of the run is likely to be one of them. There are none where nothing was found, or all others were.
     """
     tracks = tracks_of(found).values()
     shown = {max(track.chain.kinds, key=lambda kind: kind[1])[0] for track in tracks}
-    kept = tuple(one for one in catalogue.catheters if one.electrodes < MANY_ELECTRODES or one.name in shown)
-    if not shown or len(kept) == len(catalogue.catheters) or len(tracks) >= len(kept):
-        return None
+    absent = tuple(
+        one.name for one in catalogue.catheters if one.electrodes >= MANY_ELECTRODES and one.name not in shown
+    )
+    others_lack = len(tracks) < len(catalogue.catheters) - len(absent)
+    return AbsentCatheters(absent if shown and others_lack else ())
+
+
+def without_absent(catalogue: Catalogue, absent: Collection[str]) -> Catalogue:
+    """Return a catalogue without some of its catheters.
+
+    Another one gets a role that has none left.
+    """
+    kept = tuple(one for one in catalogue.catheters if one.name not in absent)
     names = [one.name for one in kept]
     mapping = catalogue.mapping if catalogue.mapping in names else names[-1]
     others = [name for name in names if name != mapping]

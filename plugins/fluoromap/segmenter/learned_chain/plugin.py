@@ -15,7 +15,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.field_mask import FieldMask
-from fluoromap.segmenter.learned_chain.absent_catheters import without_absent
+from fluoromap.segmenter.learned_chain.absent_catheters import AbsentCatheters, absent_catheters, without_absent
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.explanation import frame_electrodes, is_inverted, promising_scales
@@ -107,7 +107,7 @@ class LearnedChain:
 
             return useful_scales(run.px_per_mm, catalogue, automatic, promising)
 
-        # Marks must not change the scales, else they would change the automatic chains beside them.
+        # Marks must not change the scales and what is sought, else they would change the automatic chains beside them.
         recall = recall_for(run, catalogue, context)
         first, *others = recall(UsefulScales, (), choose).px_per_mm
         shown = replace(run, px_per_mm=first)
@@ -115,13 +115,23 @@ class LearnedChain:
         def in_all_scales(found: Segmentation) -> Segmentation:
             for scale in others:
                 found = add_catheters(found, automatic(scale), catalogue, scale)
-            shown = without_absent(found, catalogue)
-            return found if shown is None else add_catheters(found, automatic(first, shown), catalogue, first)
+            return found
+
+        def search_absent() -> AbsentCatheters:
+            return absent_catheters(in_all_scales(automatic(first)), catalogue)
+
+        absent = recall(AbsentCatheters, (), search_absent).names
+
+        def completed(found: Segmentation) -> Segmentation:
+            found = in_all_scales(found)
+            if not absent:
+                return found
+            return add_catheters(found, automatic(first, without_absent(catalogue, absent)), catalogue, first)
 
         with_unlisted = with_usual_types(catalogue)
 
         def search_unlisted() -> ShowsUnlisted:
-            found = in_all_scales(automatic(first))
+            found = completed(automatic(first))
             # A whole segmentation takes long: chance shows one more catheter in one frame, but rarely in two.
             in_frames = any(entry.chains for entry in found.frames) and all(
                 frame_shows_more(frame_electrodes(shown, with_unlisted, frame, trained), found, frame)
@@ -134,7 +144,7 @@ class LearnedChain:
 
         if recall(ShowsUnlisted, (), search_unlisted).is_shown:
             return listed_alone(segmented(with_unlisted), catalogue)
-        found = in_all_scales(segmented(catalogue))
+        found = completed(segmented(catalogue))
         if not any(entry.chains for entry in found.frames) and is_inverted(run, catalogue, trained):
             inverted = replace(run.pixels, monochrome1=not run.pixels.monochrome1)
             of_inverted = self._segment(replace(run, pixels=inverted), catalogue, marks, context, trained)

@@ -254,24 +254,27 @@ def test_a_catheter_that_only_another_scale_shows_is_added(monkeypatch, by_hand)
         ]
 
 
-def test_a_catheter_whose_places_a_loop_took_is_found_without_the_loop(monkeypatch):
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_a_catheter_whose_places_a_loop_took_is_found_without_the_loop(monkeypatch, by_hand):
+    """It also stays where the loop is set by hand afterwards."""
     types = {"loop": "circular-10", "his": "quadripolar-2-5-2", "ablation": "ablation-4"}
     catalogue = Catalogue(tuple(catheter_type(of, name) for name, of in types.items()), "loop", "ablation")
     shown = {
         name: Chain((1, 2), [[10.0, v], [20.0, v]], np.tile(np.eye(2), (2, 1, 1)), np.ones(2), ((name, 1.0),), track)
-        for track, (name, v) in enumerate({"his": 10.0, "ablation": 90.0}.items())
+        for track, (name, v) in enumerate({"his": 10.0, "ablation": 90.0, "loop": 170.0}.items())
     }
+    loop = (replace(shown.pop("loop"), manual=True),)
 
     def segment(self, run, catalogue, marks, context, trained):
-        chains = (shown["his"],) if "loop" in catalogue.names else tuple(shown.values())
+        chains = (*marks.get(0, ()), shown["his"]) if "loop" in catalogue.names else tuple(shown.values())
         frames = tuple(FrameChains(frame, chains) for frame in range(2))
         return Segmentation(frames, FrameChains(0, chains), (0, 1), np.zeros(2), run.frame_times_ms)
 
     monkeypatch.setattr(LearnedChain, "_segment", segment)
     monkeypatch.setattr("fluoromap.segmenter.learned_chain.plugin.promising_scales", lambda *_: ())
-    found = segmented([np.zeros((8, 8), np.uint16)] * 2, catalogue=catalogue)
+    found = segmented([np.zeros((8, 8), np.uint16)] * 2, catalogue=catalogue, marks={0: loop} if by_hand else {})
     for entry in (*found.frames, found.diastole):
-        assert [chain.kinds[0][0] for chain in entry.chains] == ["his", "ablation"]
+        assert [chain.kinds[0][0] for chain in entry.chains] == [*(["loop"] if by_hand else []), "his", "ablation"]
 
 
 def test_nothing_is_said_of_bright_electrodes_where_the_inverted_picture_shows_none(monkeypatch, caplog):
