@@ -1,13 +1,11 @@
 """Catheters found by the network and the chain search: the phantom, pictures without catheters, wrong descriptions."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
-from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Segmentation, Segmenter, Silent
+from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
 from fluoromap.phantom import APPEARANCES, FRONTAL, LATERAL, StudySpec, simulate_study
 from fluoromap.phantom.fluoroscopy import detect, expected_photons
 from fluoromap.phantom.torso import torso
@@ -223,58 +221,6 @@ def test_frames_in_which_the_catheters_are_gone_stay_empty(simulated):
     found = segmented([*frames, gone, gone])
     assert [len(entry.chains) for entry in found.frames[11:]] == [0, 0]
     assert sum(len(entry.chains) for entry in found.frames[:11]) >= 28
-
-
-@pytest.mark.parametrize("by_hand", [False, True])
-def test_a_catheter_that_only_another_scale_shows_is_added(monkeypatch, by_hand):
-    """Marks are followed at the stated scale; the other scale's catheter stays beside them."""
-    one, other = (
-        Chain((1, 2), [[10.0, v], [20.0, v]], np.tile(np.eye(2), (2, 1, 1)), np.ones(2), ((name, 1.0),))
-        for name, v in zip(DEFAULT_CATALOGUE.names, (10.0, 90.0), strict=False)
-    )
-    marks = {0: (replace(one, manual=True),)} if by_hand else {}
-
-    def segment(self, run, catalogue, marks, context, trained):
-        if run.px_per_mm == PX_PER_MM:
-            chains = tuple(chain.on_track(0) for chain in marks.get(0, (one,)))
-        else:
-            assert not marks
-            chains = (other.on_track(0),)
-        frames = tuple(FrameChains(frame, chains) for frame in range(2))
-        return Segmentation(frames, FrameChains(0, chains), (0, 1), np.zeros(2), run.frame_times_ms)
-
-    monkeypatch.setattr(LearnedChain, "_segment", segment)
-    plugin = "fluoromap.segmenter.learned_chain.plugin"
-    monkeypatch.setattr(f"{plugin}.promising_scales", lambda run, catalogue, scales, least, trained: scales)
-    found = segmented([np.zeros((8, 8), np.uint16)] * 2, marks=marks)
-    for entry in (*found.frames, found.diastole):
-        assert [(chain.kinds[0][0], chain.manual) for chain in entry.chains] == [
-            (DEFAULT_CATALOGUE.names[0], by_hand),
-            (DEFAULT_CATALOGUE.names[1], False),
-        ]
-
-
-@pytest.mark.parametrize("by_hand", [False, True])
-def test_a_catheter_whose_places_a_loop_took_is_found_without_the_loop(monkeypatch, by_hand):
-    """It also stays where the loop is set by hand afterwards."""
-    types = {"loop": "circular-10", "his": "quadripolar-2-5-2", "ablation": "ablation-4"}
-    catalogue = Catalogue(tuple(catheter_type(of, name) for name, of in types.items()), "loop", "ablation")
-    shown = {
-        name: Chain((1, 2), [[10.0, v], [20.0, v]], np.tile(np.eye(2), (2, 1, 1)), np.ones(2), ((name, 1.0),), track)
-        for track, (name, v) in enumerate({"his": 10.0, "ablation": 90.0, "loop": 170.0}.items())
-    }
-    loop = (replace(shown.pop("loop"), manual=True),)
-
-    def segment(self, run, catalogue, marks, context, trained):
-        chains = (*marks.get(0, ()), shown["his"]) if "loop" in catalogue.names else tuple(shown.values())
-        frames = tuple(FrameChains(frame, chains) for frame in range(2))
-        return Segmentation(frames, FrameChains(0, chains), (0, 1), np.zeros(2), run.frame_times_ms)
-
-    monkeypatch.setattr(LearnedChain, "_segment", segment)
-    monkeypatch.setattr("fluoromap.segmenter.learned_chain.plugin.promising_scales", lambda *_: ())
-    found = segmented([np.zeros((8, 8), np.uint16)] * 2, catalogue=catalogue, marks={0: loop} if by_hand else {})
-    for entry in (*found.frames, found.diastole):
-        assert [chain.kinds[0][0] for chain in entry.chains] == [*(["loop"] if by_hand else []), "his", "ablation"]
 
 
 def test_nothing_is_said_of_bright_electrodes_where_the_inverted_picture_shows_none(monkeypatch, caplog):
