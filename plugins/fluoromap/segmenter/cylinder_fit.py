@@ -24,9 +24,13 @@ from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.log_image import Image
 
+_Degrees = tuple[tuple[int, int], ...]
+
 _SAMPLES = 9.0
 """Independent samples of an electrode's picture: neighbouring pixels deviate from it alike."""
 
+_SCALES = 1.0, 1.1
+"""Sizes that are tried, over the usual one: makers' diameters differ, and a heart may lie nearer to the X-ray source."""
 _TUBE, _SOLID = 0.86, 0.0
 """Inner radius of a ring, as a share of its radius: platinum round the shaft, or so much of it that it is as good as solid."""
 _WIDER = 1.15
@@ -40,7 +44,9 @@ _FORESHORTENING, _AS_FOUND = np.array([0.8, 0.9, 1.0, 1.1, 1.2]), np.array([1.0]
 _LAST_REACH_PX = 2.0
 _PAST_OPENING_PX = 2.0
 _LEAST_COSINE, _MOST_COSINE = 0.12, 1.05
-_BENDS_FROM = 6
+_FITTED, _COMPARED = ((8, 3), (4, 2), (0, 1)), ((6, 2), (0, 1))
+"""Least number of electrodes, and the degree of the polynomial of the arc length that they show. Catheters that are compared may
+bend less, else a wrong one would bend until it fits."""
 _LEAST_GAP, _MEETS = 0.1, 1e3
 _ITERATIONS = 3
 _COMPARED_PX_PER_MM = 3.5
@@ -112,8 +118,8 @@ def fit_cylinders(
 ) -> CylinderFit:
     """Fit a found chain of three or more electrodes as cylinders.
 
-    Rings are tubes, or solid, as explains the image best. Electrodes move along the chain's line; their gaps are those of the
-    catheter, whose foreshortening changes little from one to the next.
+    Rings are tubes or solid, and of the usual size or larger, as explains the image best. Electrodes move along the chain's line;
+    their gaps are those of the catheter, whose foreshortening changes little from one to the next.
 
     Parameters
     ----------
@@ -129,15 +135,18 @@ def fit_cylinders(
     stays : (electrodes,)
         Electrodes that keep their places, because something else is seen there.
     """
-    shape = _shape(catheter, px_per_mm, radius_mm * px_per_mm)
-    reach = _first_reach(shape)
-    line = _straighten(image, chain_uv, (shape,), reach)
+    scales = [by * px_per_mm for by in _SCALES]
+    shapes = [_shape(catheter, scale, radius_mm * scale) for scale in scales]
+    reach = max(_first_reach(shape) for shape in shapes)
+    line = _straighten(image, chain_uv, shapes, reach)
     searched = {
-        inner: _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING) for inner in (_TUBE, _SOLID)
+        (shape, inner): _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING)
+        for shape in shapes
+        for inner in (_TUBE, _SOLID)
     }
-    inner = min(searched, key=lambda inner: searched[inner][0])
-    before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, _AS_FOUND)
-    nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[inner][1]))
+    shape, inner = min(searched, key=lambda kind: searched[kind][0])
+    before = min(_search_along(line, one, inner, stays, 0, _FIRST_SD, _AS_FOUND)[0] for one in shapes)
+    nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[shape, inner][1]))
     reach = int(_LAST_REACH_PX / STEP_PX)
     line = _straighten(image, nearer, (shape,), reach)
     after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, _AS_FOUND)
@@ -184,7 +193,9 @@ def compare_catheters(
     both_ways = (strip, unseen), (strip.turned(), unseen[::-1].copy())
     for order, (line, stays) in enumerate(both_ways):
         for index, shape in enumerate(shapes):
-            left[index, order], moved_px = _search_along(line, shape, _TUBE, stays, reach, _FIRST_SD, _FORESHORTENING)
+            left[index, order], moved_px = _search_along(
+                line, shape, _TUBE, stays, reach, _FIRST_SD, _FORESHORTENING, _COMPARED
+            )
             points[index, order] = line.places_at(moved_px)
     drawn = np.count_nonzero(~unseen)
     return CatheterComparison(points, -0.5 * _SAMPLES * drawn * np.log(np.maximum(left, _LEAST_SHARE)))
@@ -263,13 +274,13 @@ def _straighten(image: Image, points_uv: Array, shapes: Sequence[_Shape], reach:
     return _Line(pitch_px * places, strip, at, arc)
 
 
-def _foreshortening(arc_px: Array, shape: _Shape) -> tuple[Array, Array]:
+def _foreshortening(arc_px: Array, shape: _Shape, degrees: _Degrees) -> tuple[Array, Array]:
     """Return the visible over the true length at the electrodes, (electrodes,), and of the gaps, (electrodes - 1,).
 
     It changes smoothly along a catheter, and places that are wrong by an opening hardly change it. Seen obliquely, a loop is an
     ellipse: the square changes with twice the angle on the loop.
     """
-    smooth = _smoothing(shape.catheter)
+    smooth = _smoothing(shape.catheter, degrees)
     if shape.catheter.is_circular:
         cosine = np.sqrt(np.maximum(smooth @ (np.diff(arc_px) / shape.spacing_px) ** 2, 0.0))
     else:
@@ -280,7 +291,7 @@ def _foreshortening(arc_px: Array, shape: _Shape) -> tuple[Array, Array]:
 
 
 @functools.lru_cache(maxsize=64)
-def _smoothing(catheter: Catheter) -> Array:
+def _smoothing(catheter: Catheter, degrees: _Degrees) -> Array:
     """Return the matrix of the smooth foreshortening at electrodes, then gaps.
 
     Its columns are those of visible arc lengths, or of the squares of a loop's gaps.
@@ -292,7 +303,7 @@ def _smoothing(catheter: Catheter) -> Array:
         known, wanted = (_with_twice(catheter.curvature_per_mm * where) for where in (middles, places))
         squares: Array = wanted @ np.linalg.pinv(known)
         return squares
-    degree = 2 if len(arc_mm) >= _BENDS_FROM else 1
+    degree = next(degree for least, degree in degrees if len(arc_mm) >= least)
     slopes = np.stack([power * places ** max(power - 1, 0) for power in range(degree + 1)], axis=1)
     matrix: Array = slopes @ np.linalg.pinv(np.vander(arc_mm, degree + 1, increasing=True))
     return matrix
@@ -310,6 +321,7 @@ def _search_along(
     reach: int,
     spacing_sd: float,
     shares: Array,
+    degrees: _Degrees = _FITTED,
 ) -> tuple[float, Array]:
     """Search the electrodes along a line.
 
@@ -317,7 +329,7 @@ def _search_along(
 
     inner : see :func:`~fluoromap.segmenter.cylinder_pictures.draw_electrode`.
     """
-    cosine, gap_cosine = _foreshortening(line.arc_px, shape)
+    cosine, gap_cosine = _foreshortening(line.arc_px, shape, degrees)
     size = int((half_length_px(shape.half_px, shape.radius_px, cosine).max() + _MARGIN_PX) / STEP_PX)
     moved = np.zeros(len(line.at))
     share = _search(

@@ -16,8 +16,8 @@ from fluoromap.segmenter.linking import shape_fit
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.refinement import usual_radius_mm
 
-_OBLIQUE, _LEAST_ELECTRODES = 0.95, 3
-"""Visible over true length below which openings show, and how many electrodes have a line."""
+_OBLIQUE, _LEAST_ELECTRODES = 0.9, 3
+"""Visible over true length of a gap below which openings show, and how many electrodes have a line."""
 _MORE_LIKELY = 0.5
 """How much the log-likelihood of an electrode has to rise."""
 _SD_OF_WAY, _SD_BESIDE = 0.4, 0.15
@@ -29,7 +29,7 @@ def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_
     """Return a picture's chains, those whose electrodes are oblique cylinders with new places.
 
     A chain gets them where they are more likely, with the shape of its catheter. It remains as it is if it was set by hand, is
-    not whole, or shows nearly its whole length. Electrodes that are unseen or behind another chain keep their places.
+    not whole, or shows nearly the whole length of each gap. Electrodes that are unseen or behind another chain keep their places.
 
     Parameters
     ----------
@@ -64,5 +64,5 @@ def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogu
 
 
 def _is_oblique(chain_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
-    seen = float(np.sqrt((np.diff(chain_uv, axis=0) ** 2).sum(axis=1)).sum())
-    return catheter.is_circular or seen < _OBLIQUE * px_per_mm * sum(catheter.spacing_mm)
+    seen_px = np.sqrt((np.diff(chain_uv, axis=0) ** 2).sum(axis=1))
+    return catheter.is_circular or bool((seen_px < _OBLIQUE * px_per_mm * np.array(catheter.spacing_mm)).any())

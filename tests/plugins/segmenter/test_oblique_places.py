@@ -18,13 +18,18 @@ CATALOGUE = Catalogue((CATHETER, catheter_type("quadripolar-2-5-2", "rv")), "cs"
 NOTHING = np.zeros(CATHETER.electrodes, np.bool_)
 
 
-def picture_of(shortening: float, noise: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+def picture_of(
+    shortening: float | np.ndarray, noise: float = 0.01, px_per_mm: float = PX_PER_MM
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a log image of rings along a line, and their middles (electrodes, 2).
 
-    Points on the walls of the rings are projected: each lies at an angle round the axis and at a depth.
+    Points on the walls of the rings are projected: each lies at an angle round the axis and at a depth. ``shortening`` : visible
+    over true length, of all electrodes or of each.
     """
     random = np.random.default_rng(5)
-    along = CATHETER.arc_lengths_mm * shortening * PX_PER_MM
+    each = np.broadcast_to(shortening, CATHETER.electrodes)
+    gaps_mm = np.diff(CATHETER.arc_lengths_mm) * 0.5 * (each[1:] + each[:-1])
+    along = np.concatenate([[0.0], np.cumsum(gaps_mm)]) * px_per_mm
     places = np.stack([40.0 + along, np.full(len(along), 40.0)], axis=1)
     shape = 80, int(places[-1, 0]) + 40
     image = np.zeros(shape)
@@ -32,11 +37,11 @@ def picture_of(shortening: float, noise: float = 0.01) -> tuple[np.ndarray, np.n
         half_mm = 0.5 * (CATHETER.tip_mm if index == 0 else CATHETER.ring_mm)
         axial, angle = random.uniform(-half_mm, half_mm, 60_000), random.uniform(0.0, 2 * np.pi, 60_000)
         radius = random.uniform(0.9, 1.0, 60_000)
-        right = axial * shortening + radius * np.cos(angle) * np.sqrt(1.0 - shortening**2)
+        right = axial * each[index] + radius * np.cos(angle) * np.sqrt(1.0 - each[index] ** 2)
         down = radius * np.sin(angle)
         seen, _, _ = np.histogram2d(
-            v + down * PX_PER_MM,
-            u + right * PX_PER_MM,
+            v + down * px_per_mm,
+            u + right * px_per_mm,
             bins=[np.arange(shape[0] + 1) - 0.5, np.arange(shape[1] + 1) - 0.5],
         )
         image -= seen * half_mm
@@ -88,6 +93,17 @@ def test_places_on_dark_ends_of_openings_move_to_the_middles_of_the_rings(shorte
         np.linalg.norm(found - places, axis=1)[1:].max() / PX_PER_MM for found in (wrong, placed.pixels_uv)
     )
     assert after < 0.15 < before
+
+
+@pytest.mark.parametrize(("first", "last"), [(1.0, 0.65), (0.7, 1.0)])
+def test_a_part_of_a_catheter_may_be_oblique_and_larger_than_described(first, last):
+    """The catheter as a whole is as long as its description: it lies nearer to the X-ray source, and turns."""
+    shortening = np.linspace(first, last, CATHETER.electrodes)
+    image, places = picture_of(shortening, px_per_mm=1.15 * PX_PER_MM)
+    way = np.where(np.arange(CATHETER.electrodes) % 2, 1.0, -1.0) * (np.arange(CATHETER.electrodes) > 0)
+    wrong = places + np.stack([0.9 * np.sqrt(1.0 - shortening**2) * way * PX_PER_MM, 0.0 * way], axis=1)
+    (placed,) = place_obliquely(image, [chain_at(wrong)], CATALOGUE, PX_PER_MM)
+    assert largest_error(placed.pixels_uv, places) < 0.15 * PX_PER_MM < largest_error(wrong, places)
 
 
 def test_bands_that_end_perpendicular_to_the_shaft_stay_where_they_are():

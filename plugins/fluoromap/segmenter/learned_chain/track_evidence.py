@@ -90,8 +90,9 @@ _LEAST_MEAN, _COUNTED = 0.5, (-4.0, 2.5)
 _TIP, _TIP_OVER_END = 0.4, 1.0
 """Logit of a tip that is sure, and how much more that is than at the other end. The network learned tips from electrodes alone, so
 that clutter rarely has one."""
-_CLEAR = 1.0
-"""Log-odds of the middle electrode of a track that needs no more frames; a short one needs no other track beside it either."""
+_CLEAR, _CLEAR_WITH_TIP = 1.0, 0.5
+"""Log-odds of the middle electrode of a track that needs no more frames; a short one needs no other track beside it either. Clutter
+rarely has a long tip."""
 _MOST_PROBE_TURN = 2.4
 """Radians. What lies beside a loop, as another wall beside a probe's, is the loop's own other side."""
 _ELECTRODE, _CLEARLY_LESS = 1.0, 0.5
@@ -303,7 +304,8 @@ class TrackEvidence:
         may_be_hidden = bool(
             not on_line and self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst
         )
-        return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends, is_clear=middle >= _CLEAR)
+        is_clear = middle >= (_CLEAR_WITH_TIP if has_tip and not on_line else _CLEAR)
+        return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends, is_clear=is_clear)
 
     def _onwards(
         self, frame: int, row_uv: Array, sections: Sequence[SectionOdds], odds: Array

@@ -308,6 +308,22 @@ def judged_with_tip(monkeypatch, odds, tips, gaps, moves=True, name="ablation"):
     return judge(track, lambda frame: None)
 
 
+@pytest.mark.parametrize(
+    ("odds", "tips", "name", "is_clear"),
+    [
+        (0.6, (0.5, -1.0), "ablation", True),
+        (0.6, (0.5, -0.4), "ablation", False),
+        (0.6, (0.5, -1.0), "cs", False),
+        (0.1, (0.5, -1.0), "ablation", False),
+        (1.1, (0.0, 0.0), "cs", True),
+    ],
+)
+def test_a_catheter_with_a_sure_long_tip_is_clear_enough_alone(monkeypatch, odds, tips, name, is_clear):
+    """Clutter rarely has a tip: such a catheter may be all that a run shows clearly. One that needs its tip is not clear."""
+    verdict = judged_with_tip(monkeypatch, [odds] * 4, tips, 0.0, name=name)
+    assert (verdict.is_catheter, verdict.is_clear) == (odds > 0.0, is_clear)
+
+
 @pytest.mark.parametrize(("electrodes", "gaps"), [(2, 0.0), (10, 0.7)])
 def test_a_tip_speaks_for_no_pair_and_no_row(monkeypatch, electrodes, gaps):
     assert not judged_with_tip(monkeypatch, [0.4] * electrodes, (0.5, -1.0), gaps).is_catheter
