@@ -135,18 +135,20 @@ def fit_cylinders(
     stays : (electrodes,)
         Electrodes that keep their places, because something else is seen there.
     """
-    scales = [by * px_per_mm for by in _SCALES]
-    shapes = [_shape(catheter, scale, radius_mm * scale) for scale in scales]
+    shapes = [_shape(catheter, by * px_per_mm, by * radius_mm * px_per_mm) for by in _SCALES]
     reach = max(_first_reach(shape) for shape in shapes)
     line = _straighten(image, chain_uv, shapes, reach)
-    searched = {
-        (shape, inner): _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING)
-        for shape in shapes
-        for inner in (_TUBE, _SOLID)
-    }
-    shape, inner = min(searched, key=lambda kind: searched[kind][0])
-    before = min(_search_along(line, one, inner, stays, 0, _FIRST_SD, _AS_FOUND)[0] for one in shapes)
-    nearer = np.where(stays[:, None], chain_uv, line.places_at(searched[shape, inner][1]))
+
+    def search(shape: _Shape, inner: float) -> tuple[float, Array]:
+        return _search_along(line, shape, inner, stays, reach, _FIRST_SD, _FORESHORTENING)
+
+    usual, *larger = shapes
+    tried = {(usual, inner): search(usual, inner) for inner in (_TUBE, _SOLID)}
+    _, inner = min(tried, key=lambda kind: tried[kind][0])
+    tried |= {(shape, inner): search(shape, inner) for shape in larger}
+    shape, inner = min(tried, key=lambda kind: tried[kind][0])
+    before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, _AS_FOUND)
+    nearer = np.where(stays[:, None], chain_uv, line.places_at(tried[shape, inner][1]))
     reach = int(_LAST_REACH_PX / STEP_PX)
     line = _straighten(image, nearer, (shape,), reach)
     after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, _AS_FOUND)

@@ -18,7 +18,7 @@ from fluoromap.segmenter.refinement import usual_radius_mm
 
 _OBLIQUE, _LEAST_ELECTRODES = 0.9, 3
 """Visible over true length of a gap below which openings show, and how many electrodes have a line."""
-_MORE_LIKELY = 0.5
+_MORE_LIKELY = 0.75
 """How much the log-likelihood of an electrode has to rise."""
 _SD_OF_WAY, _SD_BESIDE = 0.4, 0.15
 """Standard deviation that is added, as a share of the way that an electrode moves: along the way, by which the two fits differ, and
