@@ -33,6 +33,8 @@ _SCALES = 1.0, 1.1
 """Sizes that are tried, over the usual one: makers' diameters differ, and a heart may lie nearer to the X-ray source."""
 _TUBE, _SOLID = 0.86, 0.0
 """Inner radius of a ring, as a share of its radius: platinum round the shaft, or so much of it that it is as good as solid."""
+_CLEARLY = 1.3
+"""How many times as much darkness tubes leave unexplained where rings are clearly solid."""
 _WIDER = 1.15
 """How far a picture reaches to each side, over the radius: makers' catheters differ."""
 _MARGIN_PX, _SIDE_PX, _SIDE_COLUMNS, _SMOOTH_PX = 1.5, 4.0, 3, 6.5
@@ -63,11 +65,13 @@ _DARKEST = 1.2
 class CylinderFit:
     """Places of a chain's electrodes.
 
-    points_uv : (electrodes, 2) pixels. log_likelihood : of the image along the chain, less that at the places before.
+    points_uv : (electrodes, 2) pixels. log_likelihood : of the image along the chain, less that at the places before. is_solid :
+    whether the rings are clearly solid, without openings.
     """
 
     points_uv: Array
     log_likelihood: float
+    is_solid: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,6 +149,7 @@ def fit_cylinders(
     usual, *larger = shapes
     tried = {(usual, inner): search(usual, inner) for inner in (_TUBE, _SOLID)}
     _, inner = min(tried, key=lambda kind: tried[kind][0])
+    is_solid = tried[usual, _TUBE][0] > _CLEARLY * tried[usual, _SOLID][0]
     tried |= {(shape, inner): search(shape, inner) for shape in larger}
     shape, inner = min(tried, key=lambda kind: tried[kind][0])
     before, _ = _search_along(line, shape, inner, stays, 0, _FIRST_SD, _AS_FOUND)
@@ -154,7 +159,7 @@ def fit_cylinders(
     after, moved_px = _search_along(line, shape, inner, stays, reach, _LAST_SD, _AS_FOUND)
     points = np.where(stays[:, None], chain_uv, line.places_at(moved_px))
     gain = 0.5 * _SAMPLES * len(points) * math.log(max(before, _LEAST_SHARE) / max(after, _LEAST_SHARE))
-    return CylinderFit(points, gain)
+    return CylinderFit(points, gain, is_solid)
 
 
 def compare_catheters(

@@ -18,8 +18,8 @@ from fluoromap.segmenter.refinement import usual_radius_mm
 
 _OBLIQUE, _LEAST_ELECTRODES = 0.9, 3
 """Visible over true length of a gap below which openings show, and how many electrodes have a line."""
-_MORE_LIKELY = 0.75
-"""How much the log-likelihood of an electrode has to rise."""
+_MORE_LIKELY, _MORE_LIKELY_SOLID = 0.75, 1.75
+"""How much the log-likelihood of an electrode has to rise. Clearly solid rings have no openings that lead bands astray."""
 _SD_OF_WAY, _SD_BESIDE = 0.4, 0.15
 """Standard deviation that is added, as a share of the way that an electrode moves: along the way, by which the two fits differ, and
 in all directions, because the line that it moves along bends."""
@@ -55,7 +55,8 @@ def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogu
     fit = fit_cylinders(x, places, catheter, px_per_mm, usual_radius_mm(catheter), stays)
     both = np.stack([places, fit.points_uv])
     shape = shape_fit(both, np.zeros(both.shape[:2]), catheter, px_per_mm)
-    if fit.log_likelihood + float(shape[1] - shape[0]) <= _MORE_LIKELY * len(places):
+    least = _MORE_LIKELY_SOLID if fit.is_solid else _MORE_LIKELY
+    if fit.log_likelihood + float(shape[1] - shape[0]) <= least * len(places):
         return chain
     way = fit.points_uv - places
     beside = _SD_BESIDE**2 * (way * way).sum(axis=1)

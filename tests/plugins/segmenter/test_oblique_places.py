@@ -9,8 +9,9 @@ from scipy.ndimage import gaussian_filter
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
 from fluoromap.segmenter.acceptance import UNSEEN
+from fluoromap.segmenter.cylinder_fit import fit_cylinders
 from fluoromap.segmenter.oblique_places import place_obliquely
-from fluoromap.segmenter.refinement import refine
+from fluoromap.segmenter.refinement import refine, usual_radius_mm
 
 PX_PER_MM = 4.0
 CATHETER = catheter_type("decapolar-2-8-2", "cs")
@@ -19,12 +20,12 @@ NOTHING = np.zeros(CATHETER.electrodes, np.bool_)
 
 
 def picture_of(
-    shortening: float | np.ndarray, noise: float = 0.01, px_per_mm: float = PX_PER_MM
+    shortening: float | np.ndarray, noise: float = 0.01, px_per_mm: float = PX_PER_MM, inner: float = 0.9
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a log image of rings along a line, and their middles (electrodes, 2).
 
     Points on the walls of the rings are projected: each lies at an angle round the axis and at a depth. ``shortening`` : visible
-    over true length, of all electrodes or of each.
+    over true length, of all electrodes or of each. ``inner`` : the least distance from the axis, as a share of the radius.
     """
     random = np.random.default_rng(5)
     each = np.broadcast_to(shortening, CATHETER.electrodes)
@@ -36,7 +37,7 @@ def picture_of(
     for index, (u, v) in enumerate(places):
         half_mm = 0.5 * (CATHETER.tip_mm if index == 0 else CATHETER.ring_mm)
         axial, angle = random.uniform(-half_mm, half_mm, 60_000), random.uniform(0.0, 2 * np.pi, 60_000)
-        radius = random.uniform(0.9, 1.0, 60_000)
+        radius = random.uniform(inner, 1.0, 60_000)
         right = axial * each[index] + radius * np.cos(angle) * np.sqrt(1.0 - each[index] ** 2)
         down = radius * np.sin(angle)
         seen, _, _ = np.histogram2d(
@@ -104,6 +105,14 @@ def test_a_part_of_a_catheter_may_be_oblique_and_larger_than_described(first, la
     wrong = places + np.stack([0.9 * np.sqrt(1.0 - shortening**2) * way * PX_PER_MM, 0.0 * way], axis=1)
     (placed,) = place_obliquely(image, [chain_at(wrong)], CATALOGUE, PX_PER_MM)
     assert largest_error(placed.pixels_uv, places) < 0.15 * PX_PER_MM < largest_error(wrong, places)
+
+
+@pytest.mark.parametrize(("inner", "is_solid"), [(0.9, False), (0.0, True)])
+def test_rings_without_openings_are_known(inner, is_solid):
+    """Bands fit them well, so more has to speak for other places."""
+    image, places = picture_of(0.5, inner=inner)
+    fit = fit_cylinders(image, places, CATHETER, PX_PER_MM, usual_radius_mm(CATHETER), NOTHING)
+    assert fit.is_solid == is_solid
 
 
 def test_bands_that_end_perpendicular_to_the_shaft_stay_where_they_are():
