@@ -108,7 +108,9 @@ class RunSearch:
         in_frames = any(entry.chains for entry in found.frames) and all(
             map(shows_more, asked_frames(len(self._run.frames)))
         )
-        return ShowsUnlisted(in_frames and run_shows_more(self._automatic(first, self._with_unlisted), found))
+        if not in_frames:
+            return ShowsUnlisted(False)
+        return ShowsUnlisted(run_shows_more(self._automatic(first, self._with_unlisted), found, self._catalogue))
 
     def _completed(self, found: Segmentation) -> Segmentation:
         """Add what the other scales show, and what shows without the absent catheters."""

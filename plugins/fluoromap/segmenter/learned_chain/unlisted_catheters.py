@@ -17,7 +17,7 @@ from fluoromap.contracts import Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
 from fluoromap.segmenter.learned_chain.other_scales import expected_electrodes
-from fluoromap.segmenter.tracks import Track
+from fluoromap.segmenter.tracks import Track, overlaps
 
 USUAL_TYPES = "quadripolar-2-5-2", "decapolar-2-5-2"
 
@@ -61,10 +61,41 @@ def frame_shows_more(expected: float, found: Segmentation, frame: int) -> bool:
     return expected >= expected_electrodes([found.frames[frame]]) + _MORE_IN_FRAME
 
 
-def run_shows_more(more: Segmentation, found: Segmentation) -> bool:
-    """Return whether a segmentation with the usual types shows one more catheter than another."""
+def run_shows_more(more: Segmentation, found: Segmentation, catalogue: Catalogue) -> bool:
+    """Return whether a segmentation with the usual types shows one more catheter than another.
+
+    It has to show each listed catheter that the other one shows, or an unlisted one in its place.
+    """
     gain = expected_electrodes(more.frames) - expected_electrodes(found.frames)
-    return gain >= _MORE_IN_RUN * len(found.frames)
+    return gain >= _MORE_IN_RUN * len(found.frames) and not _loses_listed(more, found, catalogue)
+
+
+def _loses_listed(more: Segmentation, found: Segmentation, catalogue: Catalogue) -> bool:
+    """Return whether a listed catheter of ``found`` is lost in ``more``.
+
+    Neither does it have a track there, nor does an unlisted catheter lie in its place.
+    """
+    frames = len(found.frames)
+    listed, others = tracks_of(found), tracks_of(more)
+    names = _names_of_tracks(others, catalogue, frames)
+    unlisted = [track for number, track in others.items() if names.get(number) not in catalogue.names]
+    lost = [
+        listed[number]
+        for number, name in _names_of_tracks(listed, catalogue, frames).items()
+        if name not in names.values()
+    ]
+    return any(not any(_is_at_place(other, track) for other in unlisted) for track in lost)
+
+
+def _is_at_place(track: Track, of: Track) -> bool:
+    """Return whether a track lies on electrodes of another one.
+
+    It has to in more than half of the other one's frames.
+    """
+    together = sum(
+        overlaps(chain, [track.chains[frame]]) for frame, chain in of.chains.items() if frame in track.chains
+    )
+    return 2 * together > len(of.chains)
 
 
 def listed_alone(found: Segmentation, catalogue: Catalogue) -> Segmentation:

@@ -129,10 +129,24 @@ def test_one_more_catheter_is_more_in_the_frame_and_in_the_run():
     one, both = (
         segmented(*chains) for chains in ((chain({"rv": 1.0}, 1),), (chain({"rv": 1.0}, 1), chain({"map": 1.0}, 2)))
     )
-    assert run_shows_more(both, one)
-    assert not run_shows_more(both, both)
+    assert run_shows_more(both, one, STUDY)
+    assert not run_shows_more(both, both, STUDY)
     assert frame_shows_more(7.2, one, 0)
     assert not frame_shows_more(7.2, both, 0)
+
+
+def test_usual_types_may_not_cost_a_listed_catheter_its_place():
+    """A longer unlisted row drove a listed catheter to the place of the mapping catheter, which was found no more."""
+    found = segmented(chain({"rv": 1.0}, 50), chain({"map": 1.0}, 90))
+    more = segmented(chain({DECAPOLAR: 1.0}, 50, electrodes=10), chain({"rv": 1.0}, 90))
+    assert not run_shows_more(more, found, STUDY)
+
+
+def test_an_unlisted_catheter_may_take_the_place_that_had_a_listed_name():
+    """The study lists a mapping catheter that is not there; four electrodes of a longer one had its name."""
+    found = segmented(chain({"rv": 1.0}, 50), chain({"map": 1.0}, 90))
+    more = segmented(chain({"rv": 1.0}, 50), chain({DECAPOLAR: 1.0}, 90, electrodes=10))
+    assert run_shows_more(more, found, STUDY)
 
 
 def test_an_unlisted_catheter_does_not_take_the_name_of_the_mapping_catheter():
