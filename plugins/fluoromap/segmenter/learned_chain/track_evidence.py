@@ -1,58 +1,38 @@
-"""Whether a run shows a catheter along a track: the network judges pictures that are averaged along it.
-
-Quantum noise makes the network doubt a catheter in single frames. The average of frames that are moved onto each other has little
-noise: a catheter becomes clear in it, while beads of contrast medium stay as improbable as they are.
-"""
+"""Whether a run shows a catheter along a track: rules about the network's answers in the means along it."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
-from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, follows_bars, has_other_wall, products_beside
+from fluoromap.segmenter.bars import follows_bars, has_other_wall
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.dark_lines import (
-    DarkLineLimits,
-    depths_along,
-    depths_beyond,
-    ends_on_coil,
-    gap_share,
-    goes_on,
-    is_dark_line,
+from fluoromap.segmenter.dark_lines import DarkLineLimits, ends_on_coil, gap_share, goes_on, is_dark_line
+from fluoromap.segmenter.learned_chain.track_means import (
+    SectionOdds,
+    TrackMeans,
+    all_along,
+    first_and_last,
+    in_sections,
 )
-from fluoromap.segmenter.gaussian_blur import gaussian
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
-from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
-from fluoromap.segmenter.linking import ShaftImage
 from fluoromap.segmenter.log_image import Image
-from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
-from fluoromap.segmenter.shaft_ends import shafts_at_ends
 from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.unlisted import EVEN_ODDS, Onwards, onwards
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
-_AVERAGED = 8
-_ORIENTATIONS = 2
-_SCALES = 1.0, 0.87
-"""Over that of the network. What it says at one scale and denies at the other is luck."""
-_PICTURES = 2
-_MARGIN_PX = 40.0
-_SECTION = 5
-_KEPT_FRAMES = _PICTURES * _AVERAGED
-_SMOOTH_PX = 1.0
-_SHAFT, _OF_SHAFT = 0.03, 2.3
-"""Depth of a clear shaft, log units, and the log-odds of a tip where one end only has such a shaft.
+_Said = tuple[float, Array]
+"""Log-odds of the middle electrode of a track, and of each one (n,), in some means."""
 
-By logistic regression on simulated catheters.
-"""
+_OF_SHAFT = 2.3
+"""Log-odds of a tip where one end only has a clear shaft, by logistic regression on simulated catheters."""
 _OF_TIPS, _MOST_TIPS = 0.5, 4.0
 """Log-odds of a tip for one by which the ends' logits differ, and how much they differ at most.
 
@@ -169,26 +149,77 @@ _LEAST_PAIR = _Least(
 """Of two electrodes, which is little: any two dark spots are a pair."""
 
 
-@dataclass(frozen=True, eq=False)
-class SectionOdds:
-    """The evidence for a part of a track, in the mean of some frames.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What the means along a track show.
 
-    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
-    distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`. shafts : see
-    :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`. beyond : see
-    :func:`~fluoromap.segmenter.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first and the last
-    electrode. near_uv, near_odds : (m, 2) places and (m,) log-odds of all electrodes of the picture, in the frame of its places.
+    frames : those that show most of its electrodes. paths_uv : (frames, electrodes, 2) places in them. inside : (electrodes,)
+    whether they lie in the field. middles, pictures : of each mean, the frame in its middle, as an index, and the evidence of its
+    sections. odds : (pictures, electrodes inside). depths : of each section, see
+    :func:`~fluoromap.segmenter.dark_lines.depths_along`. has_long_tip, is_likely_loop : whether it is likely a catheter with a
+    long tip, or a circular one. moves : whether it does, in the run.
     """
 
-    log_odds: Array
-    beside: Array
-    across: Array
-    depths: Array
-    shafts: Array
-    beyond: Array
-    tips: Array
-    near_uv: Array
-    near_odds: Array
+    frames: Sequence[int]
+    paths_uv: Array
+    inside: BoolArray
+    middles: Sequence[int]
+    pictures: Sequence[Sequence[SectionOdds]]
+    odds: Array
+    depths: Sequence[Array]
+    has_long_tip: bool
+    is_likely_loop: bool
+    moves: bool
+
+    @property
+    def electrodes(self) -> int:
+        """How many the track has."""
+        return int(self.paths_uv.shape[1])
+
+    @property
+    def is_row(self) -> bool:
+        """Whether the catheter is a long one, which has limits of its own."""
+        return self.electrodes >= MANY_ELECTRODES
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether the catheter turns back to itself."""
+        return self.is_row and _turn(self.paths_uv[len(self.frames) // 2]) >= _MOST_PROBE_TURN
+
+    @property
+    def on_line(self) -> bool:
+        """Whether the electrodes are parts of a dark line."""
+        odds = self.odds.mean(axis=0)
+        return is_dark_line(self.depths, odds, _DARK_LINES) or ends_on_coil(self.depths, odds)
+
+    @property
+    def has_tip(self) -> bool:
+        """Whether it is a short catheter that moves and has a sure long tip. Two dark spots are little."""
+        is_short = LEAST_VISIBLE <= self.electrodes < MANY_ELECTRODES
+        return is_short and self.moves and self.has_long_tip and _has_sure_tip(self.pictures)
+
+    @property
+    def gaps(self) -> float:
+        """How dark the gaps are, see :func:`~fluoromap.segmenter.dark_lines.gap_share`."""
+        return 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if self.is_loop else gap_share(self.depths)
+
+    @property
+    def is_something_else(self) -> bool:
+        """Whether it is a probe, a line, a part of a longer thing, or has places where nothing shows."""
+        odds = self.odds.mean(axis=0)
+        if not self.is_loop and (_is_probe(self.pictures) or (self.on_line and not self.has_tip)):
+            return True
+        beyond = np.mean([(sections[0].beyond[0], sections[-1].beyond[1]) for sections in self.pictures], axis=0)
+        if not self.is_likely_loop and not _ends_in_tip(self.pictures) and goes_on(self.depths, beyond):
+            return True
+        if _count_blank(self.depths, odds, self.inside) > max(_MOST_BLANK, self.electrodes // _FOR_ONE_BLANK):
+            return True
+        return not self.has_tip and self.gaps >= _LINE_GAPS and _count_improbable(odds) > _MOST_OF_SHAFT
+
+    @property
+    def tip_odds(self) -> float | None:
+        """Log-odds that the track begins at its tip; None where single frames show it, as of a long tip."""
+        return None if self.is_loop or self.has_long_tip else _tip_odds(self.pictures)
 
 
 @dataclass(slots=True, eq=False)
@@ -199,12 +230,15 @@ class TrackEvidence:
     circular : names of the circular ones.
     """
 
-    trained: Trained
+    trained: InitVar[Trained]
     px_per_mm: float
     frame_times_ms: Array
     long_tips: frozenset[str] = frozenset()
     circular: frozenset[str] = frozenset()
-    _reduced: OrderedDict[int, Image] = field(default_factory=OrderedDict, init=False)
+    _means: TrackMeans = field(init=False)
+
+    def __post_init__(self, trained: Trained) -> None:
+        self._means = TrackMeans(trained, self.px_per_mm)
 
     def __call__(
         self,
@@ -215,7 +249,7 @@ class TrackEvidence:
         """Return whether the run shows a catheter where a track's chains (frame -> chain) are."""
         usual, _ = Counter(chain.electrodes for chain in chains.values()).most_common(1)[0]
         frames = [frame for frame, chain in sorted(chains.items()) if chain.electrodes == usual]
-        paths = np.array([chains[frame].pixels_uv for frame in frames])
+        paths_uv = np.array([chains[frame].pixels_uv for frame in frames])
         inside = np.array([chains[frame].scores > UNSEEN for frame in frames]).mean(axis=0) >= 1.0 - _MOST_OUTSIDE
         if np.count_nonzero(inside) < min(LEAST_VISIBLE, len(usual)):
             return Verdict(False)
@@ -225,87 +259,106 @@ class TrackEvidence:
 
             def section_along(path_uv: Array) -> SectionOdds:
                 def compute() -> SectionOdds:
-                    return self.evidence_along(averaged, path_uv, log_image)
+                    return self._means.evidence_along(averaged, path_uv, log_image)
 
                 return recall(SectionOdds, (tuple(averaged), path_uv), compute)
 
-            return [section_along(part) for part in _sections(paths[picture])]
+            return [section_along(part) for part in in_sections(paths_uv[picture])]
 
-        def odds_of(sections: Sequence[SectionOdds]) -> Array:
-            odds: Array = np.concatenate([section.log_odds for section in sections])[inside]
-            return odds
-
-        chosen = _first_and_last(len(frames))
+        chosen = first_and_last(len(frames))
         pictures = [sections_in(picture) for picture in chosen]
-        is_row = len(usual) >= MANY_ELECTRODES
-        is_loop = is_row and _turn(paths[len(paths) // 2]) >= _MOST_PROBE_TURN
-        odds = np.array([odds_of(sections) for sections in pictures])
-        depths = [np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)]
-        on_line = is_dark_line(depths, odds.mean(axis=0), _DARK_LINES) or ends_on_coil(depths, odds.mean(axis=0))
-        # Two dark spots are little, and a row has limits of its own.
-        is_short = LEAST_VISIBLE <= len(usual) < MANY_ELECTRODES
-        moves = is_short and not self._is_at_rest(paths)
-        has_tip = moves and self._is_likely(chains, self.long_tips) and _has_sure_tip(pictures)
-        if not is_loop and (_is_probe(pictures) or (on_line and not has_tip)):
+        seen = _Seen(
+            frames,
+            paths_uv,
+            inside,
+            middles=[picture[len(picture) // 2] for picture in chosen],
+            pictures=pictures,
+            odds=np.array([_odds_of(sections, inside) for sections in pictures]),
+            depths=[np.mean([one.depths for one in same], axis=0) for same in zip(*pictures, strict=True)],
+            has_long_tip=self._is_likely(chains, self.long_tips),
+            is_likely_loop=self._is_likely(chains, self.circular),
+            moves=not self._is_at_rest(paths_uv),
+        )
+        if seen.is_something_else:
             return Verdict(False)
-        beyond = np.mean([(sections[0].beyond[0], sections[-1].beyond[1]) for sections in pictures], axis=0)
-        if not self._is_likely(chains, self.circular) and not _ends_in_tip(pictures) and goes_on(depths, beyond):
-            return Verdict(False)
-        if _count_blank(depths, odds.mean(axis=0), inside) > max(_MOST_BLANK, len(usual) // _FOR_ONE_BLANK):
-            return Verdict(False)
-        gaps = 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if is_loop else gap_share(depths)
-        if not has_tip and gaps >= _LINE_GAPS and _count_improbable(odds.mean(axis=0)) > _MOST_OF_SHAFT:
-            return Verdict(False)
-        # Of a long tip single frames show which end it is.
-        tip_odds = None if is_loop or self._is_likely(chains, self.long_tips) else _tip_odds(pictures)
-        still = self._is_still(paths)
-        waits = still and self._is_waiting(paths)
-        worst_still = None
-        if still:
-            worst_still = _LEAST_LOW_WAITING.at(gaps) if waits else _LEAST_LOW_STILL
-        said = [(float(np.median(odds, axis=1).mean()), odds.mean(axis=0))]
-        settled = said[0][1].min() >= _NOTHING if is_row else _are_electrodes(said[0][1], worst_still, waits)
-        if said[0][0] < _CLEAR or not settled:
+        said: list[_Said] = [(float(np.median(seen.odds, axis=1).mean()), seen.odds.mean(axis=0))]
+        if said[0][0] < _CLEAR or not self._is_settled(seen):
             # Twice as many frames have less noise. A run that is too short for two pictures has been judged by all its frames.
-            all_along = odds_of(sections_in(_all_along(len(frames)))) if len(pictures) > 1 else odds[0]
-            said.append((float(np.median(all_along)), all_along))
+            more = _odds_of(sections_in(all_along(len(frames))), inside) if len(pictures) > 1 else seen.odds[0]
+            said.append((float(np.median(more)), more))
+        return self._verdict_of_row(seen, said) if seen.is_row else self._verdict_of_few(seen, said)
+
+    def _verdict_of_row(self, seen: _Seen, said: Sequence[_Said]) -> Verdict:
+        """Return the verdict on a long catheter.
+
+        Clutter may hide some of its electrodes.
+        """
+        middle = max(of_middle for of_middle, _ in said)
+        # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
+        displaced = seen.odds.mean(axis=0).min() < _DISPLACED.at(seen.gaps)
+        least = _LEAST_LONG.track if displaced else self._least(seen.paths_uv, _LEAST_LONG, seen.gaps)
+        best = np.max([of_each for _, of_each in said], axis=0)
+        # Noise may hide electrodes of a catheter that is not clear itself.
+        unseen = np.zeros(seen.electrodes, np.bool_)
+        unseen[seen.inside] = (best < _DENIED) & (middle >= _CLEAR)
+        return Verdict(
+            middle >= least and _are_of_long_catheter(best, middle),
+            middle,
+            tip_odds=seen.tip_odds,
+            hidden=tuple(unseen.tolist()) if unseen.any() else (),
+            onwards=self._onwards_of_pictures(seen),
+        )
+
+    def _verdict_of_few(self, seen: _Seen, said: Sequence[_Said]) -> Verdict:
+        """Return the verdict on a catheter of few electrodes."""
         middle, of_each = max(said, key=lambda one: one[0])
-        ends: tuple[tuple[Onwards, Onwards], ...] = ()
-        if not is_loop:
-            middles = [picture[len(picture) // 2] for picture in chosen]
-            ends = tuple(
-                self._onwards(frames[index], paths[index], sections, odds_of(sections))
-                for index, sections in zip(middles, pictures, strict=True)
-            )
-        if is_row:
-            # A chain that is displaced along its catheter has clear electrodes, and places that are clearly none.
-            displaced = odds.mean(axis=0).min() < _DISPLACED.at(gaps)
-            least = _LEAST_LONG.track if displaced else self._least(paths, _LEAST_LONG, gaps)
-            best = np.max([of_each for _, of_each in said], axis=0)
-            # Noise may hide electrodes of a catheter that is not clear itself.
-            unseen = np.zeros(len(usual), np.bool_)
-            unseen[inside] = (best < _DENIED) & (middle >= _CLEAR)
-            return Verdict(
-                middle >= least and _are_of_long_catheter(best, middle),
-                middle,
-                tip_odds=tip_odds,
-                hidden=tuple(unseen.tolist()) if unseen.any() else (),
-                onwards=ends,
-            )
-        limits = _LEAST if len(usual) >= LEAST_VISIBLE else _LEAST_PAIR
-        least = self._least(paths, limits, gaps)
-        is_catheter = not on_line and any(
-            middle >= least and _are_electrodes(of_each, worst_still, waits) for middle, of_each in said
+        limits = _LEAST if seen.electrodes >= LEAST_VISIBLE else _LEAST_PAIR
+        least = self._least(seen.paths_uv, limits, seen.gaps)
+        is_catheter = not seen.on_line and any(
+            of_middle >= least and self._are_electrodes(seen, odds) for of_middle, odds in said
         )
-        if has_tip and not is_catheter:
-            least, least_worst = _WITH_TIP_ON_LINE if on_line else _WITH_TIP
-            is_catheter = any(middle >= least and of_each.min() >= least_worst for middle, of_each in said)
-        hidden, worst = (limits.hidden.at(gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
+        if seen.has_tip and not is_catheter:
+            least, least_worst = _WITH_TIP_ON_LINE if seen.on_line else _WITH_TIP
+            is_catheter = any(of_middle >= least and odds.min() >= least_worst for of_middle, odds in said)
+        worst_still = self._worst_at_rest(seen)
+        hidden, worst = (
+            (limits.hidden.at(seen.gaps), _DENIED) if worst_still is None else (limits.hidden_still, worst_still)
+        )
         may_be_hidden = bool(
-            not on_line and self._is_followed_long(paths) and middle >= hidden and of_each.min() >= worst
+            not seen.on_line and self._is_followed_long(seen.paths_uv) and middle >= hidden and of_each.min() >= worst
         )
-        is_clear = middle >= (_CLEAR_WITH_TIP if has_tip and not on_line else _CLEAR)
-        return Verdict(is_catheter, middle, may_be_hidden, tip_odds, onwards=ends, is_clear=is_clear)
+        is_clear = middle >= (_CLEAR_WITH_TIP if seen.has_tip and not seen.on_line else _CLEAR)
+        ends = self._onwards_of_pictures(seen)
+        return Verdict(is_catheter, middle, may_be_hidden, seen.tip_odds, onwards=ends, is_clear=is_clear)
+
+    def _is_settled(self, seen: _Seen) -> bool:
+        """Return whether the first and the last frames already show electrodes everywhere."""
+        odds = seen.odds.mean(axis=0)
+        return bool(odds.min() >= _NOTHING) if seen.is_row else self._are_electrodes(seen, odds)
+
+    def _are_electrodes(self, seen: _Seen, odds: Array) -> bool:
+        return _are_electrodes(odds, self._worst_at_rest(seen), self._is_waiting(seen.paths_uv))
+
+    def _worst_at_rest(self, seen: _Seen) -> float | None:
+        """Return the least log-odds of a resting track's worst electrode.
+
+        None for a track that moves.
+        """
+        if not self._is_still(seen.paths_uv):
+            return None
+        return _LEAST_LOW_WAITING.at(seen.gaps) if self._is_waiting(seen.paths_uv) else _LEAST_LOW_STILL
+
+    def _onwards_of_pictures(self, seen: _Seen) -> tuple[tuple[Onwards, Onwards], ...]:
+        """Return what lies in the line of a row in each picture.
+
+        A loop has no line.
+        """
+        if seen.is_loop:
+            return ()
+        return tuple(
+            self._onwards(seen.frames[index], seen.paths_uv[index], sections, _odds_of(sections, seen.inside))
+            for index, sections in zip(seen.middles, seen.pictures, strict=True)
+        )
 
     def _onwards(
         self, frame: int, row_uv: Array, sections: Sequence[SectionOdds], odds: Array
@@ -369,56 +422,11 @@ class TrackEvidence:
         """
         return self._is_followed(path_uv) and len(self.frame_times_ms) >= _FOLLOWED_FRAMES
 
-    def evidence_along(self, frames: Sequence[int], path_uv: Array, log_image: Callable[[int], Image]) -> SectionOdds:
-        """Return the evidence for electrodes in the mean of these frames.
 
-        The frames are moved along ``path_uv`` (frames, electrodes, 2).
-        """
-        scale = network_scale(self.px_per_mm)
-        middle = path_uv[len(frames) // 2]
-        first = np.floor(middle.min(axis=0) - _MARGIN_PX / scale)
-        columns, rows = np.ceil((middle.max(axis=0) - first) * scale + _MARGIN_PX).astype(np.int64)
-        total = np.zeros((rows, columns), np.float32)
-        for frame, points in zip(frames, path_uv, strict=True):
-            turn, shift = _similarity(middle, points)
-            offset = (turn @ first + shift + 0.5) * scale - 0.5
-            small = self._small(frame, log_image, scale)
-            add_moved(small, turn, offset, total)
-        total /= len(frames)
-        answers = [
-            NetworkResponse.of_reduced(resampled(total, less), self.trained, scale * less, _ORIENTATIONS)
-            for less in _SCALES
-        ]
-        odds = np.mean([log_odds(seen.shares_at(middle - first)) for seen in answers], axis=0)
-        shafts = ShaftImage(gaussian(total, _SMOOTH_PX), 1, _SHAFT, self.px_per_mm * scale)
-        chain_uv = (middle - first + 0.5) * scale - 0.5
-        beside, across = (products_beside(chain_uv, shafts, distances) for distances in (BESIDE_MM, ACROSS_MM))
-        ends = shafts_at_ends(chain_uv, shafts)
-        beyond = depths_beyond(chain_uv, shafts)
-        tips = np.mean([seen.tip_logits_at((middle - first)[[0, -1]]) for seen in answers], axis=0)
-        near_uv = answers[0].found.points_uv
-        near_odds = np.mean([log_odds(seen.probability_at(near_uv)) for seen in answers], axis=0)
-        sure = near_odds >= EVEN_ODDS
-        return SectionOdds(
-            odds,
-            beside,
-            across,
-            depths_along(chain_uv, shafts),
-            ends,
-            beyond,
-            tips,
-            near_uv[sure] + first,
-            near_odds[sure],
-        )
-
-    def _small(self, frame: int, log_image: Callable[[int], Image], scale: float) -> Image:
-        """Return a frame at the network's scale; the latest are kept for the other tracks."""
-        small = self._reduced.get(frame)
-        if small is None:
-            small = self._reduced[frame] = resampled(log_image(frame), scale)
-            if len(self._reduced) > _KEPT_FRAMES:
-                self._reduced.popitem(last=False)
-        return small
+def _odds_of(sections: Sequence[SectionOdds], inside: BoolArray) -> Array:
+    """Return the log-odds of the electrodes of a picture that lie in the field."""
+    odds: Array = np.concatenate([section.log_odds for section in sections])[inside]
+    return odds
 
 
 def _is_probe(pictures: Sequence[Sequence[SectionOdds]]) -> bool:
@@ -515,38 +523,3 @@ def _are_of_long_catheter(odds: Array, middle: float) -> bool:
     denied = np.flatnonzero(odds < _DENIED_LONG)
     hides_pair = len(denied) == 2 and np.ptp(denied) == 1 and middle >= _CLEAR and there >= _LEAST_BESIDE_HIDDEN
     return bool(len(denied) <= _MOST_DENIED or hides_pair)
-
-
-def _first_and_last(frames: int) -> list[IntArray]:
-    """Return the first and the last eight of a track's frames."""
-    size = min(_AVERAGED, frames)
-    count = min(_PICTURES, -(-frames // size))
-    return [start + np.arange(size) for start in np.linspace(0, frames - size, count).astype(np.int64).tolist()]
-
-
-def _all_along(frames: int) -> IntArray:
-    """Return sixteen frames of a track, evenly over it.
-
-    Motion between them blurs the anatomy, which hides a catheter at rest.
-    """
-    return np.linspace(0, frames - 1, min(frames, _PICTURES * _AVERAGED)).astype(np.int64)
-
-
-def _sections(path_uv: Array) -> list[Array]:
-    """Split a path into sections of about five electrodes.
-
-    A path has the shape (frames, electrodes, 2). Long catheters bend as they move.
-    """
-    return np.array_split(path_uv, -(-path_uv.shape[1] // _SECTION), axis=1)
-
-
-def _similarity(points: Array, moved: Array) -> tuple[Array, Array]:
-    """Return the matrix and the shift that move points best.
-
-    The matrix (2, 2) turns and scales. Both sets of points have the shape (n, 2).
-    """
-    middle, to = points.mean(axis=0), moved.mean(axis=0)
-    flat, other = ((side @ np.array([1.0, 1.0j])) for side in (points - middle, moved - to))
-    factor = np.vdot(flat, other) / max(float(np.vdot(flat, flat).real), 1e-9)
-    turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-    return turn, to - turn @ middle

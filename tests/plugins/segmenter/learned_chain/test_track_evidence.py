@@ -11,10 +11,10 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.learned_chain.track_evidence import SectionOdds, TrackEvidence
+from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
+from fluoromap.segmenter.learned_chain.track_means import SectionOdds, TrackMeans
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.log_image import LogTransform
-from fluoromap.segmenter.proposals import log_odds
 
 FRAMES = 8
 PX_PER_MM = 512 / 178 * 2
@@ -80,7 +80,7 @@ def evidence(odds, shafts=(0.0, 0.0), gaps=0.0, beyond=(0.0, 0.0), tips=(0.0, 0.
 def test_shaft_and_network_in_the_means_say_which_end_of_a_track_is_the_tip(monkeypatch, shafts, tips, says):
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     track = chains(np.repeat(row[None], FRAMES, axis=0))
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: evidence(np.full(4, 2.0), shafts, tips=tips))
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda *_: evidence(np.full(4, 2.0), shafts, tips=tips))
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     assert np.sign(judge(track, lambda frame: None).tip_odds) == says
     # Single frames show a long tip itself.
@@ -94,30 +94,13 @@ def test_a_catheter_in_noise_is_clear_in_the_mean_along_its_track(noisy, images)
     alone = [NetworkResponse.of_image(image, trained, PX_PER_MM) for image in images]
     for path_uv in noisy.truth.pixels_uv.values():
         assert accepts(judge, chains(path_uv), lambda frame: images[frame])
-        odds = judge.evidence_along(list(range(FRAMES)), path_uv, lambda frame: images[frame]).log_odds
+        odds = (
+            TrackMeans(trained, PX_PER_MM)
+            .evidence_along(list(range(FRAMES)), path_uv, lambda frame: images[frame])
+            .log_odds
+        )
         single = [np.median(seen.probability_at(points)) for seen, points in zip(alone, path_uv, strict=True)]
         assert 1.0 / (1.0 + np.exp(-np.median(odds))) > np.median(single)
-
-
-def test_the_network_is_asked_at_two_scales(monkeypatch, noisy, images):
-    trained = read_weights(Path(SHIPPED))
-    judge = TrackEvidence(trained, PX_PER_MM, TIMES_MS[:FRAMES])
-    path_uv = noisy.truth.pixels_uv["reference"]
-    ask, said = NetworkResponse.of_reduced, {}
-
-    def record(small, trained, scale, orientations):
-        seen = ask(small, trained, scale, orientations)
-        said[scale] = seen
-        return seen
-
-    monkeypatch.setattr(NetworkResponse, "of_reduced", record)
-    odds = judge.evidence_along([0], path_uv[:1], lambda frame: images[frame]).log_odds
-    assert len(said) == 2
-    largest, smaller = sorted(said, reverse=True)
-    assert smaller < 0.9 * largest
-    corner = np.floor(path_uv[0].min(axis=0) - 40.0 / largest)
-    each = [log_odds(seen.shares_at(path_uv[0] - corner)) for seen in said.values()]
-    np.testing.assert_allclose(odds, np.mean(each, axis=0))
 
 
 def test_a_track_beside_the_catheters_is_rejected(noisy, images):
@@ -163,7 +146,7 @@ def test_some_electrodes_of_a_long_catheter_and_one_of_a_clear_short_one_may_be_
     def along(self, frames, path_uv, log_image):
         return evidence(np.where(path_uv[0, :, 0] > 100.0 + 20.0 * hidden - 1.0, odds, -2.5))
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     assert accepts(judge, chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
 
@@ -174,7 +157,7 @@ def test_a_place_that_is_clearly_no_electrode_has_no_excuse_in_a_short_catheter(
     track = chains(np.repeat(row[None], FRAMES, axis=0))
     for worst, accepted in ((-2.9, True), (-3.1, False)):
         odds = np.array([3.0, 3.0, 3.0, worst])
-        monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_, odds=odds: evidence(odds))
+        monkeypatch.setattr(TrackMeans, "evidence_along", lambda *_, odds=odds: evidence(odds))
         assert accepts(judge, track, lambda frame: None) == accepted
 
 
@@ -183,7 +166,7 @@ def test_a_lead_with_two_electrodes_can_be_accepted(monkeypatch):
     row = np.array([[100.0, 200.0], [150.0, 200.0]])
     track = chains(np.repeat(row[None], FRAMES, axis=0))
     for odds, accepted in ((0.9, True), (0.7, False)):
-        monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_, odds=odds: evidence(np.full(2, odds)))
+        monkeypatch.setattr(TrackMeans, "evidence_along", lambda *_, odds=odds: evidence(np.full(2, odds)))
         assert accepts(judge, track, lambda frame: None) == accepted
 
 
@@ -198,7 +181,7 @@ def test_what_lies_beside_a_loop_is_its_other_side(monkeypatch):
         wall = np.broadcast_to(np.array([0.6, 1.0, 1.0]), (2, 9, count, 3))
         return replace(evidence(np.full(count, 3.0)), across=wall)
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     assert accepts(judge, chains(np.repeat(loop[None], FRAMES, axis=0)), lambda frame: None)
     assert not accepts(judge, chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None)
 
@@ -211,7 +194,7 @@ def test_electrodes_outside_the_field_do_not_count(monkeypatch):
     def along(self, frames, path_uv, log_image):
         return evidence(np.where(path_uv[0, :, 0] > 0, 1, -9))
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     for outside, accepted in ((1, True), (2, False)):
         scores = np.where(np.arange(4) < outside, UNSEEN, 0.3)
         track = {frame: replace(chain, scores=scores) for frame, chain in known.items()}
@@ -229,7 +212,7 @@ def test_a_catheter_at_rest_over_anatomy_or_in_noise_is_judged_by_frames_all_alo
     def along(self, frames, path_uv, log_image):
         return evidence(np.full(path_uv.shape[1], all_along if np.ptp(frames) > FRAMES else -2.8))
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(electrodes), np.full(electrodes, 200.0)], axis=1)
     assert accepts(judge, chains(np.repeat(row[None], 2 * FRAMES, axis=0)), lambda frame: None) == accepted
 
@@ -242,9 +225,9 @@ def test_a_track_along_the_bars_of_a_probe_is_no_catheter(monkeypatch, lines):
     nothing = evidence(np.full(4, 3.0))
     bars = np.zeros(getattr(nothing, lines).shape)
     bars[0] = 0.6, 1.0, 1.0
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: replace(nothing, **{lines: bars}))
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda *_: replace(nothing, **{lines: bars}))
     assert not accepts(judge, known, lambda frame: None)
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_: nothing)
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda *_: nothing)
     assert accepts(judge, known, lambda frame: None)
 
 
@@ -267,7 +250,7 @@ def test_clutter_is_rarely_the_same_catheter_in_every_frame_and_rarely_moves(
 ):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
     monkeypatch.setattr(
-        TrackEvidence,
+        TrackMeans,
         "evidence_along",
         lambda self, frames, path_uv, log_image: evidence(np.full(path_uv.shape[1], odds)),
     )
@@ -301,7 +284,7 @@ def judged_with_tip(monkeypatch, odds, tips, gaps, moves=True, name="ablation"):
     def along(self, frames, path_uv, log_image):
         return evidence(np.resize(odds, path_uv.shape[1]), gaps=gaps, tips=tips)
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, float(moves)])
     track = {frame: replace(chain, kinds=((name, 1.0),)) for frame, chain in chains(row + beat).items()}
@@ -343,7 +326,7 @@ def test_a_moment_is_too_short_to_see_separate_spots_move(monkeypatch, odds, gap
     """Parts of a dark line at rest need as much as in a longer run."""
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[: 2 * FRAMES])
     monkeypatch.setattr(
-        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, odds), gaps=gaps)
+        TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.full(4, odds), gaps=gaps)
     )
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     moved = step_px * np.arange(2 * FRAMES)[:, None, None] * np.array([0.0, 1.0])
@@ -374,7 +357,7 @@ def test_in_less_than_a_beat_separate_spots_may_not_have_moved_yet(monkeypatch, 
     def along(self, frames, path_uv, log_image):
         return evidence(np.array(odds)[: path_uv.shape[1]], gaps=gaps)
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
     assert accepts(judge, chains(np.repeat(row[None], 6, axis=0)), lambda frame: None) == accepted
 
@@ -388,7 +371,7 @@ def test_a_chain_that_is_displaced_along_its_catheter_has_places_that_are_clearl
         place = np.rint((path_uv[0, :, 0] - 100.0) / 20.0).astype(int)
         return evidence(np.array([odds.get(index, -0.5) for index in place.tolist()]))
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     assert accepts(judge, chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None) == accepted
 
@@ -398,7 +381,7 @@ def test_a_short_track_that_does_not_move_needs_every_electrode(monkeypatch, ste
     frames = 6
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, 66.7 * np.arange(frames))
     odds = np.array([2.0, 2.0, 2.0, -1.6])
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(odds))
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: evidence(odds))
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     places = row + np.array([0.0, step_px]) * np.arange(frames)[:, None, None]
     assert accepts(judge, chains(places), lambda frame: None) == accepted
@@ -419,9 +402,7 @@ def test_a_short_track_that_does_not_move_needs_every_electrode(monkeypatch, ste
 )
 def test_noise_is_an_excuse_in_a_run_that_shows_another_catheter(monkeypatch, odds, found, moves, shown):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
-    monkeypatch.setattr(
-        TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.array(odds))
-    )
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: evidence(np.array(odds)))
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(found))[:, None, None] * np.array([0.0, float(moves)])
     assert judge(chains(row + beat), lambda frame: None).may_be_hidden == shown
@@ -450,7 +431,7 @@ def test_a_row_with_places_of_nothing_may_lie_on_a_shorter_catheter(monkeypatch,
         place = np.rint((path_uv[0, :, 0] - 100.0) / 20.0).astype(int)
         return evidence(np.array(odds)[place])
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(len(odds)), np.full(len(odds), 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).is_catheter == is_catheter
 
@@ -462,7 +443,7 @@ def test_the_places_that_something_hides_are_known(monkeypatch):
     def along(self, frames, path_uv, log_image):
         return evidence(odds[np.rint((path_uv[0, :, 0] - 100.0) / 20.0).astype(int)])
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     assert judge(chains(np.repeat(row[None], FRAMES, axis=0)), lambda frame: None).hidden == (False,) * 9 + (True,)
     for unhidden in (2.5, [0.9] * 9 + [-3.1]):
@@ -489,7 +470,7 @@ def test_a_row_of_separate_spots_is_a_catheter_in_more_noise_than_parts_of_a_lin
 ):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
     monkeypatch.setattr(
-        TrackEvidence,
+        TrackMeans,
         "evidence_along",
         lambda self, frames, path_uv, log_image: evidence(np.full(path_uv.shape[1], odds), gaps=gaps),
     )
@@ -501,7 +482,7 @@ def test_a_row_of_separate_spots_is_a_catheter_in_more_noise_than_parts_of_a_lin
 def test_what_is_not_dark_is_no_row_of_spots(monkeypatch):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
     flat = replace(evidence(np.full(5, -0.5)), depths=np.zeros((9, 2)))
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: flat)
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: flat)
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
     assert not accepts(judge, chains(row + beat), lambda frame: None)
@@ -512,7 +493,7 @@ def test_the_ends_of_a_lead_and_places_on_its_coil_are_no_catheter(monkeypatch, 
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, np.arange(24) * 66.7)
     lead = evidence(np.array([doubted, doubted, 2.5, 2.5]))
     lead.depths[1::2, 0] = 1.5, 0.5, 0.3
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: lead)
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: lead)
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(24))[:, None, None] * np.array([0.0, 1.0])
     assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
@@ -530,7 +511,7 @@ def test_two_electrodes_of_a_lead_and_two_places_of_its_shaft_are_no_catheter(mo
         shown = (*odds[:2], *(4 * sections - 4) * (2.5,), *odds[2:])
         row = np.stack([100.0 + 20.0 * np.arange(len(shown)), np.full(len(shown), 200.0)], axis=1)
         of_section = (evidence(part, gaps=gaps) for part in 3 * np.array_split(np.array(shown), sections))
-        monkeypatch.setattr(TrackEvidence, "evidence_along", lambda *_, of=of_section: next(of))
+        monkeypatch.setattr(TrackMeans, "evidence_along", lambda *_, of=of_section: next(of))
         assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
 
 
@@ -541,7 +522,7 @@ def test_a_track_on_a_dark_line_is_no_catheter_but_a_loop_may_be(monkeypatch, be
     def along(self, frames, path_uv, log_image):
         return evidence(np.full(path_uv.shape[1], odds), gaps=between)
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     angles = np.linspace(0.0, 5.5, 10)
     loop = 200.0 + 40.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     row = np.stack([100.0 + 20.0 * np.arange(10), np.full(10, 200.0)], axis=1)
@@ -564,7 +545,7 @@ def test_a_track_on_a_line_that_goes_on_beyond_both_ends_is_no_catheter_unless_i
     monkeypatch, beyond, tips, accepted
 ):
     seen = evidence(np.full(5, 3.0), beyond=beyond, tips=tips)
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: seen)
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: seen)
     weights, none = read_weights(Path(SHIPPED)), frozenset()
     row = np.stack([100.0 + 20.0 * np.arange(5), np.full(5, 200.0)], axis=1)
     track = chains(np.repeat(row[None], FRAMES, axis=0))
@@ -588,7 +569,7 @@ def test_two_places_where_nothing_shows_are_no_electrodes_whatever_the_mean_of_a
         seen.depths[2 * np.array(blank, np.int64), 0] = 0.1
         return seen
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     row = np.stack([100.0 + 20.0 * np.arange(4), np.full(4, 200.0)], axis=1)
     beat = 10.0 * np.sin(np.arange(2 * FRAMES))[:, None, None] * np.array([0.0, 1.0])
     assert accepts(judge, chains(row + beat), lambda frame: None) == accepted
@@ -597,7 +578,7 @@ def test_two_places_where_nothing_shows_are_no_electrodes_whatever_the_mean_of_a
 def test_a_short_chain_that_turns_back_is_no_loop(monkeypatch):
     judge = TrackEvidence(read_weights(Path(SHIPPED)), PX_PER_MM, TIMES_MS[:FRAMES])
     dark = evidence(np.full(4, 0.4), gaps=0.9)
-    monkeypatch.setattr(TrackEvidence, "evidence_along", lambda self, frames, path_uv, log_image: dark)
+    monkeypatch.setattr(TrackMeans, "evidence_along", lambda self, frames, path_uv, log_image: dark)
     turned = np.array([[100.0, 200.0], [110.0, 205.0], [112.0, 213.0], [102.0, 208.0]])
     assert not accepts(judge, chains(np.repeat(turned[None], FRAMES, axis=0)), lambda frame: None)
 
@@ -615,7 +596,7 @@ def test_electrodes_in_the_line_of_a_track_are_those_as_probable_as_its_own(monk
         pair = middle[-1] + np.array([[20.0, 0.0], [40.0, 0.0]])
         return replace(evidence(own), near_uv=np.concatenate([middle, pair]), near_odds=np.concatenate([own, odds]))
 
-    monkeypatch.setattr(TrackEvidence, "evidence_along", along)
+    monkeypatch.setattr(TrackMeans, "evidence_along", along)
     verdict = judge(track, lambda frame: None)
     assert verdict.is_catheter
     for before, behind in verdict.onwards:
