@@ -161,6 +161,48 @@ def _fit(
     return fit
 
 
+def unexplained_sd(
+    image: Image, chain_uv: Array, catheter: Catheter, electrodes: Sequence[int], px_per_mm: float
+) -> tuple[Array, Array]:
+    """Return how far unexplained rests would displace electrodes.
+
+    What the template leaves of an electrode's profile counts as if it were noise.
+
+    Parameters
+    ----------
+    image : (rows, columns) float32
+        Log image.
+    chain_uv : (n, 2)
+        Places of two or more electrodes, pixels.
+    catheter : Catheter
+    electrodes : sequence of int
+        Their numbers, from 1 at the tip on.
+    px_per_mm : float
+        At the isocentre.
+
+    Returns
+    -------
+    axes : (n, 2, 2)
+        Unit vectors along the catheter and across, of each electrode.
+    sd : (n, 2)
+        Standard deviation along and across, pixels. It is large without bound where no band shows.
+    """
+    rows = np.array(electrodes) - 1
+    arc_mm = catheter.arc_lengths_mm[rows]
+    count = len(rows)
+    points = np.array(chain_uv[None], dtype=np.float64, order="C")
+    misfits, arc, ends = np.zeros((3, 1, count))
+    axes, unit_sd, rests = np.empty((3, *points.shape))
+    sides, still = np.empty((1, count), np.int64), np.zeros((1, count), np.int64)
+    radius = usual_radius_mm(catheter) * px_per_mm
+    half = np.where(rows == 0, 0.5 * catheter.tip_mm, 0.5 * catheter.ring_mm) * px_per_mm
+    _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, ends, sides)
+    longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
+    _fit_bands(image, axes, ends, radius, still, sides, np.empty((3, 2 * longest + 1)), points, unit_sd, misfits, rests)
+    along = axes[0]
+    return np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1), rests[0]
+
+
 def predict_on_curve(points: Array, is_hidden: BoolArray, arc_mm: Array) -> Array:
     """Return the positions of the hidden electrodes on a curve through the others.
 

@@ -14,6 +14,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
 from fluoromap.segmenter.field_mask import ExposedField, FieldMask, evenly_spaced_frames, exposed_field, field_mask
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.lag import measure_lag, widen_by_lag
@@ -324,6 +325,14 @@ def segment_run(
     if place is not None:
         entries = tuple(replace(entry, chains=place(entry.frame, entry.chains)) for entry in entries)
         chains = place_obliquely(mean_x, chains, catalogue, run.px_per_mm)
+    gain = rest_gain(frames, field.inside, run.pixels.bits_stored)
+
+    def widened(x: Image, chains: tuple[Chain, ...]) -> tuple[Chain, ...]:
+        return widen_by_rest(x, chains, catalogue, run.px_per_mm, gain)
+
+    if gain:
+        entries = tuple(replace(entry, chains=widened(log_image(entry.frame), entry.chains)) for entry in entries)
+        chains = widened(mean_x, chains)
     entries, chains = widen_by_jitter(entries, chains, run.px_per_mm)
     entries = widen_by_lag(entries, lag, run.px_per_mm)
     entries = tuple(replace(entry, chains=widen_by_shape(entry.chains, catalogue, run.px_per_mm)) for entry in entries)

@@ -1,0 +1,103 @@
+"""Ellipses where video coding has removed the noise: the unexplained rest of each profile says how sure a place is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from frame_sources import Frames
+from scipy.ndimage import gaussian_filter
+
+from fluoromap.catheters import DEFAULT_CATALOGUE
+from fluoromap.contracts import Chain
+from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
+from fluoromap.segmenter.refinement import refine, unexplained_sd
+
+PX_PER_MM = 4.0
+CATHETER = DEFAULT_CATALOGUE["reference"]
+INSIDE = np.ones((96, 160), np.bool_)
+
+
+def noisy(sd: float, level: float = 120.0) -> Frames:
+    random = np.random.default_rng(1)
+    return Frames(np.round(level + sd * random.standard_normal((3, *INSIDE.shape))).astype(np.uint8))
+
+
+def picture(artefact: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return a log image of the catheter and its places.
+
+    Smooth artefacts of this size lie over it.
+    """
+    along = 30.0 + PX_PER_MM * CATHETER.arc_lengths_mm
+    places = np.stack([along, np.full(len(along), 48.0)], axis=1)
+    half = np.where(np.arange(len(along)) == 0, CATHETER.tip_mm, CATHETER.ring_mm) * PX_PER_MM / 2.0
+    v, u = np.mgrid[:96, :160].astype(float)
+    bands = np.zeros(u.shape)
+    for (at_u, at_v), end in zip(places, half, strict=True):
+        chord = np.sqrt(np.clip(1.0 - ((v - at_v) / PX_PER_MM) ** 2, 0.0, None))
+        bands += chord * np.clip(0.5 + (end - np.abs(u - at_u)) / 2.0, 0.0, 1.0)
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(u.shape), 0.7)
+    return (-bands + artefact * noise / noise.std()).astype(np.float32), places
+
+
+def chain(places: np.ndarray, sd: float = 0.01) -> Chain:
+    count = len(places)
+    numbers = tuple(range(1, count + 1))
+    return Chain(numbers, places, np.tile(sd**2 * np.eye(2), (count, 1, 1)), np.ones(count), (("reference", 1.0),))
+
+
+def test_noise_of_some_grey_levels_speaks_for_itself():
+    assert rest_gain(noisy(4.0), INSIDE, 8) == 0.0
+    assert rest_gain(noisy(0.1), INSIDE, 12) == 0.0
+    assert rest_gain(noisy(0.1), ~INSIDE, 8) == 0.0
+
+
+def test_the_less_noise_is_left_the_more_the_rest_counts():
+    without, little, some = (rest_gain(noisy(sd), INSIDE, 8) for sd in (0.2, 0.8, 2.0))
+    assert without > little > some > 0.0
+
+
+def test_a_profile_that_is_explained_has_no_rest_and_one_with_artefacts_has():
+    rests = []
+    for artefact in (0.0, 0.05, 0.2):
+        x, places = picture(artefact)
+        axes, sd = unexplained_sd(x, places, CATHETER, chain(places).electrodes, PX_PER_MM)
+        np.testing.assert_allclose(axes[:, 0], np.tile([1.0, 0.0], (len(places), 1)), atol=1e-9)
+        np.testing.assert_allclose(axes[:, 1], np.tile([0.0, 1.0], (len(places), 1)), atol=1e-9)
+        rests.append(float(np.median(sd)))
+    assert rests[0] < rests[1] < rests[2]
+
+
+def test_ellipses_hold_what_artefacts_displace():
+    """The truth is where the rings were drawn; the places are those that fit best. The tips have no dome here."""
+    held = []
+    for seed in range(40):
+        x, truth = picture(0.1, seed)
+        nothing = np.zeros((1, len(truth)), np.bool_)
+        fit = refine(x, truth[None], CATHETER, PX_PER_MM, 1e-4, nothing, nothing)
+        found = replace(chain(fit.points_uv[0]), covariance_px2=fit.covariance_px2[0])
+        (widened,) = widen_by_rest(x, (found,), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
+        for one in (found, widened):
+            off = one.pixels_uv - truth
+            held.append((np.einsum("ni,nij,nj->n", off, np.linalg.inv(one.covariance_px2), off) < 5.99)[1:])
+    before, after = np.mean(held[::2]), np.mean(held[1::2])
+    assert before < 0.5
+    assert after > 0.8
+
+
+@pytest.mark.parametrize("what", ["manual", "no gain", "large", "one electrode"])
+def test_other_ellipses_stay(what):
+    x, places = picture(0.1)
+    gain = 0.0 if what == "no gain" else 1.5
+    one = replace(chain(places, 5.0 if what == "large" else 0.01), manual=what == "manual")
+    if what == "one electrode":
+        one = Chain((1,), places[:1], one.covariance_px2[:1], one.scores[:1], one.kinds)
+    (kept,) = widen_by_rest(x, (one,), DEFAULT_CATALOGUE, PX_PER_MM, gain)
+    np.testing.assert_array_equal(kept.covariance_px2, one.covariance_px2)
+
+
+def test_where_no_band_shows_a_fifth_of_a_millimetre_is_enough():
+    _, places = picture(0.0)
+    empty = np.random.default_rng(2).standard_normal(INSIDE.shape).astype(np.float32)
+    (widened,) = widen_by_rest(empty, (chain(places),), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
+    largest = np.sqrt(np.linalg.eigvalsh(widened.covariance_px2).max())
+    assert largest == pytest.approx(0.2 * PX_PER_MM)
