@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource, PixelFacts
+from fluoromap.segmenter.coded_frames import usual_step
 from fluoromap.segmenter.gaussian_blur import reduce_by
 from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.tracks import mean_shift
@@ -17,10 +18,12 @@ _TRIPLES, _BLOCK_PX = 3, 16
 _STILL_SHARE = 0.6
 _LEAST_LAG, _MOST_LAG = 0.05, 0.9
 _TINY = 1e-9
-_SAMPLED, _LEAST_SAMPLED, _REDUCED = 12, 4, 2
+_FEWEST_FRAMES, _SAMPLED, _REDUCED = 4, 12, 2
 _EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 50
 """Quantile over time that shows what lies behind moving things, quantile over the picture that is the darkest of these, how dark a
 pixel is to count, as a share of that and over the noise, and how many such pixels there are at least."""
+_LATER = 0.08
+"""How much more darkness has to be left than was there before, for noise to be believed."""
 _LEFT, _LEFT_TOO, _SAME, _MOST_LEFT = 0.05, 0.15, 0.12, 0.65
 """Quantiles of the share of darkness that is left, how near they are where things have moved away from enough pixels, and the
 largest share that is lag: contrast medium flows away more slowly than that."""
@@ -32,9 +35,11 @@ apart from its electrode displaces it no more."""
 def measure_lag(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:
     """Return the share of the frame before in each frame, 0 to 0.9.
 
-    It is the larger of two measures. A filter y(t) = lag y(t - 1) + (1 - lag) x(t) leaves noise that is correlated in time.
-    Quantisation and compression add noise of their own, so that measure is a lower bound. The filter also leaves a shadow where a
-    dark thing was in the frame before, and that share of its darkness is the lag itself; it needs things that move by their width.
+    A filter y(t) = lag y(t - 1) + (1 - lag) x(t) leaves noise that is correlated in time. It also leaves a shadow where a dark
+    thing was in the frame before, with that share of its darkness. The larger of both measures counts. But noise is not believed
+    where moving things keep less, nor where neighbouring pixels are mostly alike: video coding repeats the noise of the frame
+    before, and some filters spare what moves. Where nothing moves by its width, noise alone says what the lag is. Quantisation and
+    compression add noise of their own, so that this is a lower bound. Less than four frames say too little: their lag is 0.
 
     Parameters
     ----------
@@ -44,7 +49,15 @@ def measure_lag(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> f
     pixels : PixelFacts
         They say which values are dark.
     """
-    lag = max(_lag_of_noise(frames, inside), _lag_of_shadows(frames, inside, pixels))
+    if len(frames) < _FEWEST_FRAMES:
+        return 0.0
+    is_coded = usual_step(frames, inside, pixels.bits_stored) == 0.0
+    of_noise = 0.0 if is_coded else _lag_of_noise(frames, inside)
+    left, arrived = _shares_of_darkness(frames, inside, pixels)
+    if min(len(left), len(arrived)) < _LEAST_PIXELS:
+        lag = of_noise
+    else:
+        lag = max(_lag_of_shadows(left, arrived), _believed(of_noise, left, arrived))
     return min(lag, _MOST_LAG) if lag >= _LEAST_LAG else 0.0
 
 
@@ -55,7 +68,7 @@ def _lag_of_noise(frames: FrameSource, inside: BoolArray) -> float:
     count.
     """
     whole = _block_means(inside.astype(np.float64)) == 1.0
-    if len(frames) < 3 or not whole.any():
+    if not whole.any():
         return 0.0
     middles = np.unique(np.linspace(1, len(frames) - 2, _TRIPLES).round().astype(np.int64))
     one_apart, two_apart = [], []
@@ -68,14 +81,11 @@ def _lag_of_noise(frames: FrameSource, inside: BoolArray) -> float:
     return float(np.median(two[still] / one[still])) - 1.0 if still.any() else 0.0
 
 
-def _lag_of_shadows(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:
-    """Return the least share of darkness that pixels keep.
+def _shares_of_darkness(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> tuple[Array, Array]:
+    """Return the shares of darkness beside each frame.
 
-    From one frame to the next it is the lag wherever something dark has moved away. The edges of what moves slowly keep a share
-    too, and they show it backwards in time as well: lag does not. 0 where too few pixels agree or both directions do.
+    Those that dark pixels keep in the next frame, and those that they had in the frame before.
     """
-    if len(frames) < _LEAST_SAMPLED:
-        return 0.0
     sign = -1.0 if pixels.monochrome1 else 1.0
 
     def reduced(frame: int) -> Image:
@@ -95,11 +105,30 @@ def _lag_of_shadows(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) 
     darkness = [(empty - before, empty - after) for before, after in pairs]
     left = np.concatenate([shared(before, after) for before, after in darkness])
     arrived = np.concatenate([shared(after, before) for before, after in darkness])
-    if min(len(left), len(arrived)) < _LEAST_PIXELS:
-        return 0.0
+    return left, arrived
+
+
+def _lag_of_shadows(left: Array, arrived: Array) -> float:
+    """Return the least share of darkness that pixels keep.
+
+    From one frame to the next it is the lag wherever something dark has moved away. The edges of what moves slowly keep a share
+    too, and they show it backwards in time as well: lag does not. 0 where too few pixels agree or both directions do.
+    """
     least, also = np.quantile(left, (_LEFT, _LEFT_TOO))
     is_lag = also - least < _SAME and np.quantile(arrived, _LEFT_TOO) < least < _MOST_LEFT
     return float(least) if is_lag else 0.0
+
+
+def _believed(of_noise: float, left: Array, arrived: Array) -> float:
+    """Return as much of the lag of noise as moving things allow.
+
+    They allow it where all of them keep that share of their darkness, as what moves slowly does. Else they allow what they keep, if
+    that is more than they show backwards in time.
+    """
+    if np.quantile(left, _LEFT) >= of_noise:
+        return of_noise
+    least, before = np.quantile(left, _LEFT_TOO), np.quantile(arrived, _LEFT_TOO)
+    return min(of_noise, float(least)) if least - before >= _LATER else 0.0
 
 
 def widen_by_lag(entries: Sequence[FrameChains], lag: float, px_per_mm: float) -> tuple[FrameChains, ...]:
