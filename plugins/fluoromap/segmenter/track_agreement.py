@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fluoromap.contracts import Array, Chain
 
-_LONG_TRACK, _COMPARED = 5, 60
+_FEWEST_FRAMES, _COMPARED = 3, 60
 _SAME_PX, _DISPLACED_PX = 1.5, 4.0
 _JUMP_PX = 2.5
 _SHARED_AT_LEAST = 0.5
@@ -52,7 +52,7 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
     search : ShapeSearch
         Called for those frames.
     """
-    if len(chains) < _LONG_TRACK:
+    if len(chains) < _FEWEST_FRAMES:
         return dict(chains)
     frames = np.array(sorted(chains))
     places = _places([chains[frame] for frame in frames.tolist()])

@@ -50,6 +50,15 @@ def test_displaced_electrodes_are_searched_where_most_frames_show_them():
     assert all(agreed[frame] is chains[frame] for frame in range(FRAMES) if frame % 3 != 1)
 
 
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_of_three_frames_two_that_agree_show_the_shape(wrong):
+    chains = {frame: chain(displaced(beating(frame)) if frame == wrong else beating(frame)) for frame in range(3)}
+    search, asked = search_of(beating)
+    agreed = with_common_shape(chains, search)
+    assert asked == [wrong]
+    np.testing.assert_allclose(agreed[wrong].pixels_uv, beating(wrong))
+
+
 def test_a_catheter_that_bends_is_not_searched_again():
     chains = {frame: chain(beating(frame)) for frame in range(2 * FRAMES)}
     search, asked = search_of(beating)
@@ -84,7 +93,7 @@ def test_chains_remain_where_the_search_finds_nothing_or_another_shape():
 def test_marks_and_short_tracks_keep_their_shape():
     search, asked = search_of(lambda frame: ROW)
     by_hand = {frame: chain(displaced(ROW), manual=True) if frame == 4 else chain(ROW) for frame in range(FRAMES)}
-    short = {frame: chain(displaced(ROW) if frame == 1 else ROW) for frame in range(4)}
+    short = {frame: chain(displaced(ROW) if frame == 1 else ROW) for frame in range(2)}
     for chains in (by_hand, short):
         assert with_common_shape(chains, search) == chains
     assert not asked
