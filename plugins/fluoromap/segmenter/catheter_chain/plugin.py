@@ -31,7 +31,7 @@ class CatheterChain:
     """
 
     name: ClassVar[str] = "catheter-chain"
-    version: ClassVar[str] = "31"
+    version: ClassVar[str] = "32"
     Params: ClassVar[type[BaseModel]] = NoParams
 
     def __init__(self, params: BaseModel | None = None) -> None:

@@ -20,7 +20,7 @@ class FourStep:
     """
 
     name: ClassVar[str] = "four-step"
-    version: ClassVar[str] = "23"
+    version: ClassVar[str] = "24"
     Params: ClassVar[type[BaseModel]] = FourStepParams
 
     def __init__(self, params: FourStepParams | None = None) -> None:
