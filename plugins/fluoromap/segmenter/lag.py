@@ -16,14 +16,17 @@ from fluoromap.segmenter.tracks import mean_shift
 
 _TRIPLES, _BLOCK_PX = 3, 16
 _STILL_SHARE = 0.6
+_ALIKE = 0.5
+"""Grey levels by which neighbouring pixels differ where most are alike."""
 _LEAST_LAG, _MOST_LAG = 0.05, 0.9
 _TINY = 1e-9
 _FEWEST_FRAMES, _SAMPLED, _REDUCED = 4, 12, 2
 _EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 50
 """Quantile over time that shows what lies behind moving things, quantile over the picture that is the darkest of these, how dark a
 pixel is to count, as a share of that and over the noise, and how many such pixels there are at least."""
-_LATER = 0.08
-"""How much more darkness has to be left than was there before, for noise to be believed."""
+_NEARLY, _LATER = 0.8, 0.08
+"""How much of the lag of noise has to be left of all darkness, or else how much more has to be left than was there before, for
+noise to be believed."""
 _LEFT, _LEFT_TOO, _SAME, _MOST_LEFT = 0.05, 0.15, 0.12, 0.65
 """Quantiles of the share of darkness that is left, how near they are where things have moved away from enough pixels, and the
 largest share that is lag: contrast medium flows away more slowly than that."""
@@ -51,7 +54,7 @@ def measure_lag(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> f
     """
     if len(frames) < _FEWEST_FRAMES:
         return 0.0
-    is_coded = usual_step(frames, inside, pixels.bits_stored) == 0.0
+    is_coded = usual_step(frames, inside, pixels.bits_stored) <= _ALIKE
     of_noise = 0.0 if is_coded else _lag_of_noise(frames, inside)
     left, arrived = _shares_of_darkness(frames, inside, pixels)
     if min(len(left), len(arrived)) < _LEAST_PIXELS:
@@ -125,7 +128,7 @@ def _believed(of_noise: float, left: Array, arrived: Array) -> float:
     They allow it where all of them keep that share of their darkness, as what moves slowly does. Else they allow what they keep, if
     that is more than they show backwards in time.
     """
-    if np.quantile(left, _LEFT) >= of_noise:
+    if np.quantile(left, _LEFT) >= _NEARLY * of_noise:
         return of_noise
     least, before = np.quantile(left, _LEFT_TOO), np.quantile(arrived, _LEFT_TOO)
     return min(of_noise, float(least)) if least - before >= _LATER else 0.0

@@ -36,6 +36,8 @@ _USUAL_REST, _OF_REST, _TINY = np.array([1.0, 0.9]), np.array([0.8, 1.33]), 1e-1
 """The unexplained rest of a profile, along and across, as a multiple of that of the chain's middle electrode: from here on it
 widens the standard deviation, in this power."""
 _STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
+_NO_BAND_SD = 1e4
+"""Standard deviation of a place for a pixel noise of 1, where a profile is not dark in its middle."""
 _SPACING_SD = 0.10
 _LONG_CATHETER = 6
 _WINDOW_MM = 2.0
@@ -176,7 +178,7 @@ def unexplained_sd(
         Places of two or more electrodes, pixels.
     catheter : Catheter
     electrodes : sequence of int
-        Their numbers, from 1 at the tip on.
+        Their numbers, from 1 at the tip on. The first has a tip's round end.
     px_per_mm : float
         At the isocentre.
 
@@ -185,7 +187,7 @@ def unexplained_sd(
     axes : (n, 2, 2)
         Unit vectors along the catheter and across, of each electrode.
     sd : (n, 2)
-        Standard deviation along and across, pixels. It is large without bound where no band shows.
+        Standard deviation along and across, pixels. It is infinite where no band shows.
     """
     rows = np.array(electrodes) - 1
     arc_mm = catheter.arc_lengths_mm[rows]
@@ -200,7 +202,8 @@ def unexplained_sd(
     longest = max(int(sides.max()), int((radius + 4.0) / _STEP_PX))
     _fit_bands(image, axes, ends, radius, still, sides, np.empty((3, 2 * longest + 1)), points, unit_sd, misfits, rests)
     along = axes[0]
-    return np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1), rests[0]
+    sd = np.where(unit_sd[0] > _NO_BAND_SD, np.inf, rests[0])
+    return np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1), sd
 
 
 def predict_on_curve(points: Array, is_hidden: BoolArray, arc_mm: Array) -> Array:

@@ -331,7 +331,10 @@ def segment_run(
         return widen_by_rest(x, chains, catalogue, run.px_per_mm, gain)
 
     if gain:
-        entries = tuple(replace(entry, chains=widened(log_image(entry.frame), entry.chains)) for entry in entries)
+        entries = tuple(
+            replace(entry, chains=widened(log_image(entry.frame), entry.chains)) if entry.chains else entry
+            for entry in entries
+        )
         chains = widened(mean_x, chains)
     entries, chains = widen_by_jitter(entries, chains, run.px_per_mm)
     entries = widen_by_lag(entries, lag, run.px_per_mm)

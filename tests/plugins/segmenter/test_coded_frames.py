@@ -7,9 +7,12 @@ import pytest
 from frame_sources import Frames
 from scipy.ndimage import gaussian_filter
 
-from fluoromap.catheters import DEFAULT_CATALOGUE
-from fluoromap.contracts import Chain
+from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, catheter_type
+from fluoromap.contracts import Chain, PixelFacts, Run, Silent
+from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
 from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
+from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.segmenter.refinement import refine, unexplained_sd
 
 PX_PER_MM = 4.0
@@ -56,6 +59,15 @@ def test_the_less_noise_is_left_the_more_the_rest_counts():
     assert without > little > some > 0.0
 
 
+def test_neither_clipped_pixels_nor_a_blank_frame_look_coded():
+    noise = 120.0 + 4.0 * np.random.default_rng(1).standard_normal((5, *INSIDE.shape))
+    clipped = noise.copy()
+    clipped[:, :, 40:] = 255.0
+    assert rest_gain(Frames(np.round(clipped).astype(np.uint8)), INSIDE, 8) == 0.0
+    noise[2] = 0.0
+    assert rest_gain(Frames(np.round(noise).astype(np.uint8)), INSIDE, 8) == 0.0
+
+
 def test_a_profile_that_is_explained_has_no_rest_and_one_with_artefacts_has():
     rests = []
     for artefact in (0.0, 0.05, 0.2):
@@ -93,6 +105,45 @@ def test_other_ellipses_stay(what):
         one = Chain((1,), places[:1], one.covariance_px2[:1], one.scores[:1], one.kinds)
     (kept,) = widen_by_rest(x, (one,), DEFAULT_CATALOGUE, PX_PER_MM, gain)
     np.testing.assert_array_equal(kept.covariance_px2, one.covariance_px2)
+
+
+def test_the_profile_is_that_of_the_likely_catheter_and_its_tip():
+    x, places = picture(0.0)
+    longer = catheter_type("ablation-4", "mapping")
+    numbers = chain(places).electrodes
+    _, right = unexplained_sd(x, places, CATHETER, numbers, PX_PER_MM)
+    _, wrong = unexplained_sd(x, places, longer, numbers, PX_PER_MM)
+    assert wrong[0, 0] > 1.5 * right[0, 0]
+    study = Catalogue((CATHETER, longer), "reference", "mapping")
+    likely = replace(chain(places), kinds=(("mapping", 0.1), ("reference", 0.9)))
+    (widened,) = widen_by_rest(x, (likely,), study, PX_PER_MM, 1.5)
+    assert np.sqrt(widened.covariance_px2[0, 0, 0]) == pytest.approx(1.5 * right[0, 0])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.01])
+def test_coding_that_removes_an_electrode_leaves_a_large_ellipse(slope):
+    _, places = picture(0.0)
+    flat = np.broadcast_to(slope * np.arange(INSIDE.shape[1], dtype=np.float32), INSIDE.shape).copy()
+    (widened,) = widen_by_rest(flat, (chain(places),), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
+    np.testing.assert_allclose(np.sqrt(widened.covariance_px2[:, 1, 1]), 0.2 * PX_PER_MM)
+
+
+@pytest.mark.parametrize("segmenter", [CatheterChain, LearnedChain])
+def test_electrodes_of_smooth_pictures_have_larger_ellipses(monkeypatch, segmenter):
+    spec = StudySpec(315, sites=1, frames=2, frame_rate_hz=60.0, heart="dog", contrast=("LAT", "PA"))
+    lateral = simulate_study(spec).sites[0].runs[0]
+    smooth = [gaussian_filter(frame.astype(float), 1.5) for frame in lateral.frames]
+    highest = max(float(frame.max()) for frame in smooth)
+    coded = Frames(np.array([np.round(200.0 * frame / highest) for frame in smooth]).astype(np.uint8))
+    run = Run(coded, lateral.frame_times_ms, 512 / 178 * 2, PixelFacts(False, 8, False))
+    found = segmenter().segment(run, DEFAULT_CATALOGUE, {}, Silent())
+    monkeypatch.setattr("fluoromap.segmenter.run_segmentation.rest_gain", lambda *_: 0.0)
+    without = segmenter().segment(run, DEFAULT_CATALOGUE, {}, Silent())
+
+    def sizes(entries):
+        return np.array([np.linalg.det(one.covariance_px2) for entry in entries for one in entry.chains])
+
+    assert np.median(sizes((*found.frames, found.diastole)) / sizes((*without.frames, without.diastole))) > 1.2
 
 
 def test_where_no_band_shows_a_fifth_of_a_millimetre_is_enough():

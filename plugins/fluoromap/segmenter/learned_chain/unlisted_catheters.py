@@ -23,7 +23,7 @@ USUAL_TYPES = "quadripolar-2-5-2", "decapolar-2-5-2"
 
 _MORE_IN_FRAME, _MORE_IN_RUN = 2.0, 3.0
 """How many more electrodes a frame has to show with these types: in one frame, and in the mean of a run's frames."""
-_IMPOSSIBLE = 1e-3
+_IMPOSSIBLE, _POSSIBLE = 1e-3, 0.01
 _PREFER_LISTED, _SET_BY_HAND = 0.01, 10.0
 
 
@@ -73,18 +73,23 @@ def run_shows_more(more: Segmentation, found: Segmentation, catalogue: Catalogue
 def _loses_listed(more: Segmentation, found: Segmentation, catalogue: Catalogue) -> bool:
     """Return whether a listed catheter of ``found`` is lost in ``more``.
 
-    Neither does it have a track there, nor does an unlisted catheter lie in its place.
+    Neither has a track its name, nor lies one in its place that is unlisted or may have that name.
     """
     frames = len(found.frames)
     listed, others = tracks_of(found), tracks_of(more)
     names = _names_of_tracks(others, catalogue, frames)
     unlisted = [track for number, track in others.items() if names.get(number) not in catalogue.names]
     lost = [
-        listed[number]
+        (listed[number], name)
         for number, name in _names_of_tracks(listed, catalogue, frames).items()
         if name not in names.values()
     ]
-    return any(not any(_is_at_place(other, track) for other in unlisted) for track in lost)
+
+    def is_there(track: Track, name: str) -> bool:
+        likely = [other for other in others.values() if other.chain.probability(name) >= _POSSIBLE]
+        return any(_is_at_place(other, track) for other in (*unlisted, *likely))
+
+    return not all(is_there(track, name) for track, name in lost)
 
 
 def _is_at_place(track: Track, of: Track) -> bool:

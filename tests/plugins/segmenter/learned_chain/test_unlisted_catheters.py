@@ -142,6 +142,12 @@ def test_usual_types_may_not_cost_a_listed_catheter_its_place():
     assert not run_shows_more(more, found, STUDY)
 
 
+def test_a_listed_catheter_in_its_place_is_not_lost_if_another_name_is_more_likely():
+    found = segmented(chain({"rv": 0.6, "map": 0.4}, 50))
+    more = segmented(chain({"rv": 0.4, "map": 0.6}, 50), chain({DECAPOLAR: 1.0}, 200, electrodes=10))
+    assert run_shows_more(more, found, STUDY)
+
+
 def test_an_unlisted_catheter_may_take_the_place_that_had_a_listed_name():
     """The study lists a mapping catheter that is not there; four electrodes of a longer one had its name."""
     found = segmented(chain({"rv": 1.0}, 50), chain({"map": 1.0}, 90))
