@@ -314,6 +314,11 @@ class Chain:
             tip_odds=None if self.tip_odds is None else -self.tip_odds,
         )
 
+    @property
+    def likely_name(self) -> str:
+        """Name of the catheter that this most likely is."""
+        return max(self.kinds, key=lambda kind: kind[1])[0]
+
     def probability(self, catheter: str) -> float:
         """Return the probability that this is ``catheter``."""
         return dict(self.kinds).get(catheter, 0.0)

@@ -103,7 +103,7 @@ def widen_by_rest(
 
 
 def _widened(x: Image, chain: Chain, catalogue: Catalogue, px_per_mm: float, gain: float) -> Chain:
-    catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
+    catheter = catalogue[chain.likely_name]
     axes, rest = unexplained_sd(x, chain.pixels_uv, catheter, chain.electrodes, px_per_mm)
     least = np.minimum(gain * rest, _MOST_MM * px_per_mm) ** 2
     stated = np.einsum("nai,nij,naj->na", axes, chain.covariance_px2, axes)

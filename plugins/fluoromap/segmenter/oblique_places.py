@@ -46,7 +46,7 @@ def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_
 
 
 def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> Chain:
-    catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
+    catheter = catalogue[chain.likely_name]
     places = chain.pixels_uv
     is_whole = len(places) == catheter.electrodes and len(places) >= _LEAST_ELECTRODES
     if chain.manual or not is_whole or not _is_oblique(places, catheter, px_per_mm):

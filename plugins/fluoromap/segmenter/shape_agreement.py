@@ -44,7 +44,7 @@ def widen_by_shape(chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: flo
 
 
 def _widened(chain: Chain, catalogue: Catalogue, px_per_mm: float) -> Chain:
-    catheter = catalogue[max(chain.kinds, key=lambda kind: kind[1])[0]]
+    catheter = catalogue[chain.likely_name]
     rows = np.array(chain.electrodes) - 1
     axes = axes_of_chain(chain.pixels_uv)
     off, expected, noise = _off_the_curve(

@@ -34,6 +34,21 @@ def filtered(lag: float, count: int = 8, quantised: bool = False) -> Frames:
     return Frames(frames[20:])
 
 
+def repeated(noise_sd: float, step: int) -> FrameList:
+    """Return pictures of eight bits with noise that repeats.
+
+    A dark bar moves by ``step`` a frame.
+    """
+    random = np.random.default_rng(5)
+    noise, frames = random.standard_normal((128, 128)), []
+    for frame in range(12):
+        noise = 0.8 * noise + 0.6 * random.standard_normal((128, 128))
+        exposure = np.full((128, 128), 150.0)
+        exposure[40:80, 20 + step * frame : 28 + step * frame] *= 0.5
+        frames.append(np.round(gaussian_filter(exposure, 1.0) + noise_sd * noise).astype(np.uint8))
+    return FrameList(frames)
+
+
 @pytest.mark.parametrize("lag", [0.0, 0.2, 0.5, 0.7])
 def test_lag_is_measured_beside_what_moves(lag):
     assert lag - 0.1 < measure_lag(filtered(lag), EVERYWHERE, PIXELS) <= lag + 0.03
@@ -50,23 +65,8 @@ def test_noise_that_video_coding_repeats_is_no_lag(step):
     assert measure_lag(repeated(3.0, step), EVERYWHERE, PixelFacts(False, 8, False)) == 0.0
 
 
-def repeated(noise_sd: float, step: int) -> FrameList:
-    """Return pictures of eight bits with noise that repeats.
-
-    A dark bar moves by ``step`` a frame.
-    """
-    random = np.random.default_rng(5)
-    noise, frames = random.standard_normal((128, 128)), []
-    for frame in range(12):
-        noise = 0.8 * noise + 0.6 * random.standard_normal((128, 128))
-        exposure = np.full((128, 128), 150.0)
-        exposure[40:80, 20 + step * frame : 28 + step * frame] *= 0.5
-        frames.append(np.round(gaussian_filter(exposure, 1.0) + noise_sd * noise).astype(np.uint8))
-    return FrameList(frames)
-
-
 def test_noise_of_pictures_whose_neighbours_are_alike_says_nothing():
-    """The bar is too slow to say anything."""
+    """Nothing moves that could say more."""
     eight = PixelFacts(False, 8, False)
     assert measure_lag(repeated(0.4, 0), EVERYWHERE, eight) == 0.0
     assert measure_lag(repeated(3.0, 0), EVERYWHERE, eight) > 0.5

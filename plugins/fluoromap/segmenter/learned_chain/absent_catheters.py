@@ -29,7 +29,7 @@ def absent_catheters(found: Segmentation, catalogue: Catalogue) -> AbsentCathete
     No track of the run is likely to be one of them. There are none where nothing was found, or all others were.
     """
     tracks = tracks_of(found).values()
-    shown = {max(track.chain.kinds, key=lambda kind: kind[1])[0] for track in tracks}
+    shown = {track.chain.likely_name for track in tracks}
     absent = tuple(
         one.name for one in catalogue.catheters if one.electrodes >= MANY_ELECTRODES and one.name not in shown
     )
