@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-import fluoromap.contracts
+import fluoromap.registry
 
 EQUATIONS = range(1, 12)
-PLUGINS = Path(fluoromap.contracts.__file__).parent
+PLUGINS = Path(fluoromap.registry.__file__).parent
 TESTS = Path(__file__).parent
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
