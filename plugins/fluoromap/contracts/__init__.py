@@ -8,7 +8,7 @@ of the top-left pixel. World points are millimetres along DICOM patient axes (LP
 
 from __future__ import annotations
 
-from fluoromap.contracts.arrays import ADDED_LATER, Array, BoolArray, IntArray, frozen
+from fluoromap.contracts.arrays import Array, BoolArray, IntArray, frozen
 from fluoromap.contracts.context import Context, Refusal, Silent, StageStopped
 from fluoromap.contracts.fusion import ChamberMap, ConductionVelocity, MappedSite, SurfaceSite
 from fluoromap.contracts.grades import CHI2_95_3D, Grade, grade_of, grade_of_axis, grades_of, largest_semi_axes_mm
@@ -47,7 +47,7 @@ from fluoromap.contracts.triangulation import (
 )
 
 __all__ = [
-    "ADDED_LATER", "CHI2_95_3D", "APriori", "Alternative", "Array", "BoolArray", "Calibration", "Chain", "ChamberMap",
+    "CHI2_95_3D", "APriori", "Alternative", "Array", "BoolArray", "Calibration", "Chain", "ChamberMap",
     "ConductionVelocity", "Context", "ElectrodePoint", "ErrorBudget", "FrameChains", "FrameSource", "Fuser", "Grade",
     "IntArray", "LocatedSite", "MappedSite", "Marks", "MatchedRuns", "MatchedSite", "Matching", "MonoplaneSolver",
     "MonoplaneView", "NamedChain", "NoParams", "Observation", "PhasePair", "PixelFacts", "Refusal", "RejectedSite", "Run",

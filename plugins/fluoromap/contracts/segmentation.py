@@ -6,13 +6,13 @@ import copy
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fluoromap.contracts.arrays import ADDED_LATER, Array, frozen
+from fluoromap.contracts.arrays import Array, frozen
 from fluoromap.reasons import Reason
 
 View = Literal["a", "b"]
@@ -108,7 +108,7 @@ class Chain:
     kinds: tuple[tuple[str, float], ...]
     track: int = -1
     manual: bool = False
-    tip_odds: float | None = field(default=None, metadata=ADDED_LATER)
+    tip_odds: float | None = None
 
     def __post_init__(self) -> None:
         m = len(self.electrodes)

@@ -22,9 +22,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-ALIGNMENT = 8
-"""Bytes of a word: the parts of a plain form begin at a whole number of words."""
-
 _LEAST_PACKED_BYTES = 4096
 """Smaller pools are stored plain. A study has thousands of them, and reading a compressed pool takes longer than it saves."""
 _LEAST_SHARED_BYTES = 4096
@@ -36,8 +33,6 @@ _LEVEL = 1
 
 Place = TypeVar("Place")
 
-PlainPool = tuple[str, tuple[int, ...], list[int]]
-"""Type, shape of one array, and the numbers of the arrays."""
 PackedPool = tuple[str, tuple[int, ...], list[int], bool, list[int]]
 """Type, shape of one array, steps between the numbers of the arrays, whether only upper halves are stored, and the stored length of
 each byte of the numbers. Without lengths the numbers are stored plain."""
@@ -51,16 +46,6 @@ class Block:
 
     sha256: str
     content: bytes
-
-
-def whole(length: int) -> int:
-    """Return a length rounded up to whole words."""
-    return -(-length // ALIGNMENT) * ALIGNMENT
-
-
-def padded(content: bytes) -> bytes:
-    """Return the content with zeros up to whole words."""
-    return content + bytes(whole(len(content)) - len(content))
 
 
 class ArrayPools:
@@ -124,10 +109,6 @@ class Pool:
         """Return whether all numbers are finite."""
         return self.dtype.kind != "f" or bool(np.isfinite(np.frombuffer(self.content, self.dtype)).all())
 
-    def plain(self) -> PlainPool:
-        """Return the description of the pool where its content is stored plain."""
-        return self.dtype.str, self.shape, self.numbers
-
     def packed(self) -> tuple[PackedPool, bytes]:
         """Return the description of the pool, and its content in fewer bytes."""
         numbers = np.frombuffer(self.content, self.dtype)
@@ -163,22 +144,6 @@ class Pool:
     def may_share(self) -> bool:
         """Return whether a search for its arrays in partial results may save bytes."""
         return len(self.content) >= _LEAST_SHARED_BYTES
-
-
-def plain_arrays(content: bytes, pool: PlainPool, start: int) -> NDArray[Any]:
-    """Return the arrays of a plain pool as one array.
-
-    ``start`` is the place of its first byte in the content.
-    """
-    dtype, shape, numbers = pool
-    found = np.frombuffer(content, dtype, len(numbers) * math.prod(shape), start)
-    return found.reshape(len(numbers), *shape)
-
-
-def plain_length(pool: PlainPool) -> int:
-    """Return the stored bytes of a plain pool."""
-    dtype, shape, numbers = pool
-    return whole(np.dtype(dtype).itemsize * math.prod(shape) * len(numbers))
 
 
 def packed_arrays(content: bytes, pool: PackedPool, start: int) -> NDArray[Any]:

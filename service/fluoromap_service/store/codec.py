@@ -10,9 +10,7 @@ a partial result that a later job may use again. A block is copied into another 
 when they are first read.
 
 A value also has a plain form, without compression and without the content of its blocks. Its hash identifies the value, so that
-keys with values and blocks do not depend on the compressor. Earlier versions of fluoromap stored plain forms, with the blocks
-behind them. They are read too, and so are results without the fields whose
-metadata say "added later".
+keys with values and blocks do not depend on the compressor. Nobody stores it.
 """
 
 from __future__ import annotations
@@ -40,37 +38,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap_service.store.array_pools import (
-    ALIGNMENT,
     ArrayPools,
     Block,
     PackedPool,
-    PlainPool,
     Pool,
     SharedArrays,
     from_steps,
     packed_arrays,
     packed_length,
-    padded,
-    plain_arrays,
-    plain_length,
     steps_between,
-    whole,
 )
 
 T = typing.TypeVar("T")
 
-LAYOUT = 3
-"""The number of the layout of plain forms. It is part of every form, so that results of another one are computed again."""
+LAYOUT = 4
+"""The number of the layout. It is part of every form, so that results of another one are computed again."""
 
-_PACKED = 1 << 63
-"""Added to the length at the beginning of a packed form. A plain form begins with the length alone."""
+_LENGTH_BYTES = 8
+"""Bytes of the length with which a stored form begins."""
 _LEVEL = 1
 """Compression level of the tree."""
 
 _LEAST_SEARCHED_BYTES = 256
 """Fewest bytes of one type and shape in a partial result that are searched for arrays of the result."""
-_ADDED_LATER = "added later"
-"""Key of the metadata of a field with a default that earlier contracts lack; their results are read with the default."""
 _FEW_ARRAYS = 32
 """Most arrays that are looked up one by one. For more of them, all arrays of the content are taken apart at once."""
 _PLAIN = frozenset({str, int, float, bool, types.NoneType})
@@ -81,10 +71,7 @@ _Partial = dict[str, int]  # key, number of the block
 _Tree = tuple[int, list[msgspec.Raw]]  # one value with its fields as columns
 _Places = dict[tuple[np.dtype[Any], tuple[int, ...]], dict[bytes, tuple[int, int]]]
 """For arrays of each type and shape, by their bytes: number of a block, and number of the array in the block."""
-_unpack_plain_head = msgspec.msgpack.Decoder(tuple[str, list[PlainPool], _Blocks, _Partial, _Tree])
-_unpack_packed_head = msgspec.msgpack.Decoder(
-    tuple[str, list[PackedPool], list[SharedArrays], _Blocks, _Partial, _Tree]
-)
+_unpack_head = msgspec.msgpack.Decoder(tuple[str, list[PackedPool], list[SharedArrays], _Blocks, _Partial, _Tree])
 
 
 class StoredOtherwise(ValueError):
@@ -141,11 +128,10 @@ class _Encoded:
 
     def plain(self) -> bytes:
         """Return the plain form."""
-        pools = [pool.plain() for pool in self._pools]
-        blocks = [(block.sha256, 0) for block in self._arrays.blocks]
-        head = _pack.encode((self._form, pools, blocks, {}, self._tree))
-        parts = [len(head).to_bytes(ALIGNMENT, "little"), padded(head)]
-        return b"".join([*parts, *(padded(pool.content) for pool in self._pools)])
+        pools = [(pool.dtype.str, pool.shape, pool.numbers) for pool in self._pools]
+        blocks = [block.sha256 for block in self._arrays.blocks]
+        head = _pack.encode((self._form, pools, blocks, self._tree))
+        return b"".join([head, *(pool.content for pool in self._pools)])
 
     def packed(self, partial: Mapping[str, Block]) -> bytes:
         """Return the stored form, with partial results."""
@@ -158,7 +144,7 @@ class _Encoded:
         blocks = [(block.sha256, len(block.content)) for block in every]
         head = _pack.encode((self._form, [pool for pool, _ in described], shared, blocks, numbers, self._tree))
         head = zlib.compress(head, _LEVEL)
-        parts = [(len(head) | _PACKED).to_bytes(ALIGNMENT, "little"), head, *(content for _, content in described)]
+        parts = [len(head).to_bytes(_LENGTH_BYTES, "little"), head, *(content for _, content in described)]
         return b"".join([*parts, *(block.content for block in every)])
 
 
@@ -308,16 +294,11 @@ def form_of(kind: type[Any]) -> str:
 
 
 @functools.cache
-def _form_of(kind: Any, earlier: bool = False) -> str:
-    """Return the hash of a form, or of that without fields added later."""
+def _form_of(kind: Any) -> str:
     found: dict[str, list[tuple[str, str]]] = {}
     for name, one in _dataclasses_in(kind).items():
         hints = typing.get_type_hints(one)
-        fields = [
-            (field.name, str(hints[field.name]))
-            for field in dataclasses.fields(one)
-            if not (earlier and _ADDED_LATER in field.metadata)
-        ]
+        fields = [(field.name, str(hints[field.name])) for field in dataclasses.fields(one)]
         found[name] = [*fields, ("stored apart", "")] if _is_apart(one) else fields
     return hashlib.sha256(repr((LAYOUT, sorted(found.items()))).encode()).hexdigest()[:16]
 
@@ -409,43 +390,24 @@ class _Content:
     def __init__(self, kind: type | None, content: bytes) -> None:
         with _stored_otherwise(kind or object):
             self._kind, self._content = kind, content
-            length = int.from_bytes(content[:ALIGNMENT], "little")
-            read = self._read_packed if length & _PACKED else self._read_plain
-            form, (count, columns) = read(ALIGNMENT + (length & ~_PACKED))
+            end = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+            head = zlib.decompress(content[_LENGTH_BYTES:end])
+            form, pools, shared, blocks, self._partial, (count, columns) = _unpack_head.decode(head)
+            self._pools: list[_StoredPool | _SharedPool] = []
+            for pool in pools:
+                read = functools.partial(packed_arrays, content, pool, end)
+                self._pools.append(_StoredPool(np.dtype(pool[0]), pool[1], from_steps(pool[2]), read))
+                end += packed_length(pool)
+            for number, own, known in shared:
+                self._pools.append(_SharedPool(self, number, from_steps(own), from_steps(known)))
+            starts = itertools.accumulate((length for _, length in blocks), initial=end)
+            self._blocks = [(sha256, start, length) for (sha256, length), start in zip(blocks, starts, strict=False)]
             if kind is None:
                 return
-            # The earlier form is looked up only where it may be needed: a first overlay would wait for that.
-            if (form != form_of(kind) and form != _form_of(cast(Hashable, kind), earlier=True)) or count != 1:
+            if form != form_of(kind) or count != 1:
                 raise StoredOtherwise(f"another version of the contracts stored this {kind}")
-            names = [name for name, _ in _fields_column(kind).stored_fields(len(columns))]
+            names = [name for name, _ in _fields_column(kind).fields]
             self.columns = dict(zip(names, columns, strict=True))
-
-    def _read_packed(self, end: int) -> tuple[str, _Tree]:
-        head = zlib.decompress(self._content[ALIGNMENT:end])
-        form, pools, shared, blocks, self._partial, tree = _unpack_packed_head.decode(head)
-        self._pools: list[_StoredPool | _SharedPool] = []
-        for pool in pools:
-            read = functools.partial(packed_arrays, self._content, pool, end)
-            self._pools.append(_StoredPool(np.dtype(pool[0]), pool[1], from_steps(pool[2]), read))
-            end += packed_length(pool)
-        for number, own, known in shared:
-            self._pools.append(_SharedPool(self, number, from_steps(own), from_steps(known)))
-        self._locate_blocks(blocks, itertools.accumulate((length for _, length in blocks), initial=end))
-        return form, tree
-
-    def _read_plain(self, end: int) -> tuple[str, _Tree]:
-        form, pools, blocks, self._partial, tree = _unpack_plain_head.decode(self._content[ALIGNMENT:end])
-        start = whole(end)
-        self._pools = []
-        for pool in pools:
-            read = functools.partial(plain_arrays, self._content, pool, start)
-            self._pools.append(_StoredPool(np.dtype(pool[0]), pool[1], pool[2], read))
-            start += plain_length(pool)
-        self._locate_blocks(blocks, itertools.accumulate((whole(length) for _, length in blocks), initial=start))
-        return form, tree
-
-    def _locate_blocks(self, blocks: _Blocks, starts: Iterable[int]) -> None:
-        self._blocks = [(sha256, start, length) for (sha256, length), start in zip(blocks, starts, strict=False)]
 
     def field(self, name: str) -> Any:
         """Decode one field."""
@@ -731,18 +693,6 @@ class _DataclassColumn:
         hints = typing.get_type_hints(self._kind)
         return [(field.name, _column(hints[field.name])) for field in dataclasses.fields(cast(Any, self._kind))]
 
-    @functools.cached_property
-    def added(self) -> dict[str, Any]:
-        """Fields that earlier versions did not store, and their defaults."""
-        fields = dataclasses.fields(cast(Any, self._kind))
-        return {field.name: field.default for field in fields if _ADDED_LATER in field.metadata}
-
-    def stored_fields(self, count: int) -> list[tuple[str, _Column]]:
-        """Return the fields of which a result has so many columns."""
-        if count == len(self.fields):
-            return self.fields
-        return [(name, column) for name, column in self.fields if name not in self.added]
-
     def encode(self, values: Sequence[Any], arrays: ArrayPools) -> Any:
         if not values:
             return 0, []
@@ -755,11 +705,8 @@ class _DataclassColumn:
         count, columns = stored
         made = list(map(object.__new__, itertools.repeat(cast(Any, self._kind), count)))
         if made:
-            fields = self.stored_fields(len(columns))
-            for (name, column), items in zip(fields, columns, strict=True):
+            for (name, column), items in zip(self.fields, columns, strict=True):
                 _set_all(made, name, column.decode(items, arrays))
-            for name, default in self.added.items() if fields is not self.fields else ():
-                _set_all(made, name, [default] * count)
         return made
 
 

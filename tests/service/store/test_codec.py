@@ -6,14 +6,13 @@ import typing
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from fluoromap.contracts import ADDED_LATER, Array, Chain, FrameChains, Segmentation
+from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.reasons import Reason
 from fluoromap_service.store import array_pools, codec
@@ -24,7 +23,6 @@ from fluoromap_service.store.codec import (
     decode,
     deferred,
     encode,
-    form_of,
     partial_results,
     plain_form,
     undecoded,
@@ -344,50 +342,6 @@ def test_damaged_bytes_are_no_stored_result_or_other_numbers(part: int) -> None:
     for place in range(part, len(content) - len(block_of(_Numbers(np.arange(100.0))).content), 97):
         with pytest.raises(StoredOtherwise):
             decode(_Matrices, content[:place])
-
-
-def test_a_result_of_an_earlier_version_is_read() -> None:
-    """Results without compression: a head, the numbers of the arrays, and blocks, each padded to whole words."""
-
-    def stored(*parts: bytes) -> bytes:
-        return b"".join(part + bytes(-len(part) % 8) for part in parts)
-
-    def plain(kind: type, pools: list[Any], numbers: bytes, fields: list[Any], *blocks: bytes) -> bytes:
-        described = [(str(number), len(block)) for number, block in enumerate(blocks)]
-        partial = {f"key {number}": number for number in range(len(blocks))}
-        head = msgspec.msgpack.encode((form_of(kind), pools, described, partial, (1, fields)))
-        return stored(len(head).to_bytes(8, "little"), head, numbers, *blocks)
-
-    covariances = _covariances(5, 3)
-    block = plain(_Texts, [], b"", [[[2], ["a", "b"]]])
-    content = plain(_Apart, [("<f8", [5, 3, 3], [0])], covariances.tobytes(), [["name"], [0], [None]], block)
-    after = decode(_Apart, content)
-    assert (after.name, after.note, after.numbers.tobytes()) == ("name", None, covariances.tobytes())
-    (part,) = partial_results(content).values()
-    assert decode(_Texts, part.content) == _Texts(("a", "b"))
-    again = encode(after, {"key": part})
-    assert decode(_Texts, partial_results(again)["key"].content) == _Texts(("a", "b"))
-    assert decode(_Apart, again).numbers.tobytes() == covariances.tobytes()
-    assert plain_form(after) == plain(_Apart, [("<f8", [5, 3, 3], [0])], covariances.tobytes(), [["name"], [0], [None]])
-
-
-def test_a_result_without_the_fields_that_were_added_later_is_read() -> None:
-    """The earlier contracts have the names of today's, as in the version that stored the result."""
-
-    def contracts(*added: tuple[str, Any, Any]) -> tuple[type, type]:
-        part = dataclasses.make_dataclass("_Part", [("name", str), *added], frozen=True, slots=True)
-        parts: Any = tuple[part, ...]  # type: ignore[valid-type]
-        return part, dataclasses.make_dataclass("_Parts", [("parts", parts), *added], frozen=True)
-
-    later = dataclasses.field(default=7.0, metadata=ADDED_LATER)
-    (old_part, old), (part, parts) = contracts(), contracts(("weight", float, later))
-    content = encode(old((old_part("tip"), old_part("ring"))))
-    after = decode(parts, content)
-    assert after == parts((part("tip"), part("ring")))
-    assert [one.weight for one in after.parts] == [7.0, 7.0]
-    assert decode(parts, encode(parts((part("tip", 2.0),), 3.0))) == parts((part("tip", 2.0),), 3.0)
-    with pytest.raises(StoredOtherwise):
-        decode(old, encode(parts((part("tip"),))))
 
 
 def test_another_compressor_changes_no_hash(monkeypatch: pytest.MonkeyPatch) -> None:
