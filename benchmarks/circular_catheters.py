@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.catheters import CATHETER_TYPES, Catalogue, catheter_type
-from fluoromap.contracts import PixelFacts, Run, Segmentation, Silent
+from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.geometry import Camera, Gantry, camera_from_gantry
 from fluoromap.phantom import APPEARANCES
 from fluoromap.phantom.fluoroscopy import RenderedFrames, detect, expected_photons, transmission
@@ -48,9 +48,8 @@ def main() -> None:
 def _cell(loop_type: str, turn_deg: float, frames: int) -> str:
     found = numbered = false = reported = 0
     for side_deg in SIDES_DEG:
-        turn, side = np.deg2rad(turn_deg), np.deg2rad(side_deg)
-        normal = np.array([np.cos(turn), np.sin(turn) * np.cos(side), np.sin(turn) * np.sin(side)])
-        segmentation, truth = _segmented_run(loop_type, normal, frames)
+        run, catalogue, truth = loop_run(loop_type, turn_deg, side_deg, frames)
+        segmentation = LearnedChain().segment(run, catalogue, {}, Silent())
         reported += segmentation.diastole.manual_needed is Reason.EXTRA_CATHETER
         for entry in segmentation.frames:
             for chain in entry.chains:
@@ -67,8 +66,13 @@ def _cell(loop_type: str, turn_deg: float, frames: int) -> str:
     return f"{found / runs:.2f} {numbered / runs:.2f} {false:3} {reported}"
 
 
-def _segmented_run(loop_type: str, normal: Array, frames: int) -> tuple[Segmentation, dict[str, Array]]:
-    """Segment a run, and return the electrodes of each catheter with it, (frames, n, 2) pixels."""
+def loop_run(loop_type: str, turn_deg: float, side_deg: float, frames: int) -> tuple[Run, Catalogue, dict[str, Array]]:
+    """Render a run of a loop and an ablation catheter.
+
+    The loop's normal is turned from the ray towards a side. The electrodes of each catheter come with it, (frames, n, 2) pixels.
+    """
+    turn, side = np.deg2rad(turn_deg), np.deg2rad(side_deg)
+    normal = np.array([np.cos(turn), np.sin(turn) * np.cos(side), np.sin(turn) * np.sin(side)])
     spacing = 292.0 / 512
     gantry = Gantry(90.0, 0.0, 1000.0, 500.0, (spacing, spacing), 512, 512)
     camera, appearance = camera_from_gantry(gantry), APPEARANCES["LAT"]
@@ -85,7 +89,7 @@ def _segmented_run(loop_type: str, normal: Array, frames: int) -> tuple[Segmenta
     pictures, facts = RenderedFrames((512, 512), frames, render), PixelFacts(False, 12, False)
     catalogue = Catalogue((loop.catheter, ABLATION), "loop", "ablation")
     run = Run(pictures, np.arange(frames) * FRAME_MS, camera.px_per_mm, facts)
-    return LearnedChain().segment(run, catalogue, {}, Silent()), _places(camera, shafts, moves)
+    return run, catalogue, _places(camera, shafts, moves)
 
 
 def _places(camera: Camera, shafts: list[Shaft], moves: Array) -> dict[str, Array]:

@@ -62,8 +62,8 @@ class LabelledRun:
 def main() -> None:
     """Measure the segmenters on all runs of a folder."""
     given = _arguments()
-    labelled = _labelled_runs(given)
-    runs = [*labelled, *_copies(labelled, given.copies), *_empty_runs(given)]
+    labelled = labelled_runs(given)
+    runs = [*labelled, *copies_of(labelled, given.copies), *empty_runs(given)]
     print(f"{'':44}{'found':>12}{'missed':>8}{'false':>7}{'named':>7}{'numbered':>10}{'ms':>7}  frames   lag")
     for name in given.segmenter:
         for one in runs:
@@ -90,7 +90,7 @@ def _segmenter(name: str, weights: str | None) -> Segmenter:
     return CatheterChain() if name == "catheter-chain" else LearnedChain(LearnedChainParams(weights=weights))
 
 
-def _labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
+def labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
     runs = []
     for path in sorted(given.folder.glob("*_labels.csv")):
         described = path.with_name(path.name.replace("_labels.csv", "_set.json"))
@@ -115,7 +115,7 @@ def _labelled_runs(given: argparse.Namespace) -> list[LabelledRun]:
     return runs
 
 
-def _copies(runs: Sequence[LabelledRun], count: int) -> list[LabelledRun]:
+def copies_of(runs: Sequence[LabelledRun], count: int) -> list[LabelledRun]:
     """Return changed copies of runs; the seed of each is its number."""
     copies = []
     for one in runs:
@@ -127,7 +127,7 @@ def _copies(runs: Sequence[LabelledRun], count: int) -> list[LabelledRun]:
     return copies
 
 
-def _empty_runs(given: argparse.Namespace) -> list[LabelledRun]:
+def empty_runs(given: argparse.Namespace) -> list[LabelledRun]:
     runs = []
     for path in sorted(given.folder.glob("*.dcm")):
         try:

@@ -127,7 +127,7 @@ def main(first: int, seeds: int, frames: int) -> None:
         study = simulate_study(StudySpec(seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS))
         for view, simulated in zip(VIEWS, study.sites[0].runs, strict=True):
             _score_run(table, spent, view, simulated, tuple(SEGMENTERS))
-        for what, spec in _hard(seed, frames).items():
+        for what, spec in hard_studies(seed, frames).items():
             for view, simulated in zip(VIEWS, simulate_study(spec).sites[0].runs, strict=True):
                 _score_run(table, None, f"{view} {what}", simulated, CHAINS)
         for width_mm, spec in _displayed(seed, frames).items():
@@ -135,7 +135,7 @@ def main(first: int, seeds: int, frames: int) -> None:
                 _score_run(
                     table, None, f"{view} {1024 / width_mm:.2f} px/mm, 8 bit JPEG", simulated, CHAINS, displayed=True
                 )
-        for view, gantry in zip(VIEWS, _gantries(292.0), strict=True):
+        for view, gantry in zip(VIEWS, gantries(292.0), strict=True):
             for cables in (False, True):
                 rendered = decapolar_run(seed, view, gantry, frames, cables)
                 _score_rendered(table, f"{view} decapolar, 3.5 px/mm" + (", cables" if cables else ""), rendered)
@@ -165,11 +165,11 @@ def _without_catheters(first: int, seeds: int) -> None:
         print(f"{name}: {accepted} of {count} frames without catheters accepted")
 
 
-def _hard(seed: int, frames: int) -> dict[str, StudySpec]:
+def hard_studies(seed: int, frames: int) -> dict[str, StudySpec]:
     return {
         "dose 0.4": StudySpec(seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, dose=0.4),
         "4.1 px/mm": StudySpec(
-            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=_gantries(250.0)
+            seed, sites=1, frames=frames, frame_rate_hz=60.0, heart="dog", contrast=VIEWS, gantries=gantries(250.0)
         ),
     }
 
@@ -187,13 +187,13 @@ def _displayed(seed: int, frames: int) -> dict[float, StudySpec]:
             frame_rate_hz=60.0,
             heart="dog",
             contrast=VIEWS,
-            gantries=_gantries(width_mm),
+            gantries=gantries(width_mm),
         )
         for width_mm in (178.0, 250.0, 330.0)
     }
 
 
-def _gantries(width_mm: float) -> tuple[Gantry, Gantry]:
+def gantries(width_mm: float) -> tuple[Gantry, Gantry]:
     spacing = width_mm / 512
     lateral, frontal = (Gantry(angle, 0.0, 1000.0, 500.0, (spacing, spacing), 512, 512) for angle in (90.0, 0.0))
     return lateral, frontal

@@ -19,7 +19,7 @@ LABELS = "file,catheter,electrode,u_px,v_px\n"
 
 def read(folder: Path) -> list[real_frames.LabelledRun]:
     given = argparse.Namespace(folder=folder, frames=1000, px_per_mm=None, catheter=[])
-    return real_frames._labelled_runs(given)
+    return real_frames.labelled_runs(given)
 
 
 def write(folder: Path, name: str, pictures: int, rows: str) -> None:
