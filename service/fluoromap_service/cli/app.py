@@ -21,6 +21,7 @@ COMMANDS = {
     "up": "Run the API and a worker.",
     "run": "Run the pipeline over a folder, on a private service.",
     "simulate": "Simulate a study: DICOM runs, activation times and the truth.",
+    "recording": "Show the channels of an EP recorder's export, and check all its samples.",
     "tables": "Print the paper's tables beside our own, computed on simulated data.",
     "figures": "Make the paper's Figures 3, 4 and 5 on a simulated study.",
     "api": "Run the API alone.",
