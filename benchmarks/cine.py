@@ -54,11 +54,11 @@ LOADED = """([view, frames]) => new Promise(done => {
 def main(frames: int, seconds: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         simulate(Path(folder) / "study", StudySpec(seed=7, sites=5, frames=frames, frame_rate_hz=RATE_HZ))
-        with private_service(Path(folder) / "service") as url:
-            with Client(url) as client, progress_bars(Console(stderr=True)) as progress:
+        with private_service(Path(folder) / "service") as service:
+            with Client(service.url, service.token) as client, progress_bars(Console(stderr=True)) as progress:
                 study = upload(client, find_files(Path(folder) / "study"), "cine", progress).study
                 run_job(client, study, progress)
-            with open_page(url) as page:
+            with open_page(service) as page:
                 page.goto(f"/studies/{study}#electrodes")
                 page.locator(".view[data-frames]").nth(1).wait_for()
                 for letters in ("a", "ab"):

@@ -196,8 +196,8 @@ def _service(workers: int | None) -> Iterator[tuple[httpx.Client, ProcessFigures
     with (
         tempfile.TemporaryDirectory() as name,
         process_figures() as figures,
-        private_service(Path(name) / "service", workers=workers) as url,
-        httpx.Client(base_url=url, timeout=600, trust_env=False) as http,
+        private_service(Path(name) / "service", workers=workers) as service,
+        service.client() as http,
     ):
         yield http, figures, Path(name) / "service"
         figures.sample()

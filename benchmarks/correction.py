@@ -36,8 +36,8 @@ POLL_SECONDS = 0.05
 def main(corrections: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         simulate(Path(folder) / "study", SPEC)
-        with private_service(Path(folder) / "service") as url, httpx.Client(base_url=url, timeout=120) as http:
-            with Client(url) as client, progress_bars(Console(stderr=True)) as progress:
+        with private_service(Path(folder) / "service") as service, service.client() as http:
+            with Client(service.url, service.token) as client, progress_bars(Console(stderr=True)) as progress:
                 study = upload(client, find_files(Path(folder) / "study"), "correction", progress).study
             first_s, job = _until_map(http, study)
             print(f"first job, up to the map: {first_s:.2f} s ({len(job['stages'])} stages)")

@@ -38,6 +38,7 @@ import sqlalchemy
 from redis import Redis
 
 from fluoromap.phantom import StudySpec
+from fluoromap_service.cli.own_token import read_token
 from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port, program
 from fluoromap_service.dicom.simulation import simulate
@@ -180,11 +181,14 @@ class Stack:
 
         Only 429 and 503 may ask for patience.
         """
+        # 'fluoromap up' has made it; the other stack is open.
+        token = read_token(self.data_dir)
+        headers = options.pop("headers", {}) | ({} if token is None else {"Authorization": f"Bearer {token}"})
         end = time.monotonic() + PATIENCE_SECONDS
         last = "no answer"
         while time.monotonic() < end:
             try:
-                answer = httpx.request(method, self.url + path, timeout=60, trust_env=False, **options)
+                answer = httpx.request(method, self.url + path, headers=headers, timeout=60, trust_env=False, **options)
                 if answer.status_code not in (429, 503):
                     return answer
                 last = answer.text

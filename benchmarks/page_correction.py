@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 from statistics import median
 
-import httpx
 from browser import open_page
 from clinical_study import simulated_files, start_job, upload_study
 from playwright.sync_api import Page
@@ -37,13 +36,13 @@ SHOWN_JOB = "#panel-map [data-job]"
 def main(corrections: int, segmenter: str) -> None:
     """Compute the study, correct it, and print the waiting times."""
     files = simulated_files(SPEC)
-    with tempfile.TemporaryDirectory() as folder, private_service(Path(folder) / "service") as url:
-        with httpx.Client(base_url=url, timeout=600, trust_env=False) as http:
+    with tempfile.TemporaryDirectory() as folder, private_service(Path(folder) / "service") as service:
+        with service.client() as http:
             study, _ = upload_study(http, files)
             job = start_job(http, study, segmenter)
             while http.get(f"/v1/jobs/{job}?wait=30").json()["state"] in ("queued", "running"):
                 pass
-        with open_page(url) as page:
+        with open_page(service) as page:
             page.goto(f"/studies/{study}#map")
             page.wait_for_function(DRAWN, arg="")
             sites = [row.get_attribute("data-site") or "" for row in page.locator(LOCATED).all()]

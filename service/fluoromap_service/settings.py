@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import ipaddress
 import os
 import re
 from pathlib import Path
@@ -30,6 +31,14 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="Port the API listens on.")
     cors_origins: str = Field(
         "", description="Web pages that browsers let use the API, as origins with spaces between; empty: none."
+    )
+    allowed_hosts: str = Field(
+        "",
+        description="Names under which clients reach the API, with spaces between; loopback names always work; empty: any name.",
+    )
+    trusted_proxies: str = Field(
+        "",
+        description="Proxies whose X-Forwarded-For and X-Forwarded-Proto count: addresses or networks, with spaces between.",
     )
     dicom_host: str = Field("127.0.0.1", description="Address the DICOM listener listens on.")
     dicom_port: int = Field(11112, ge=0, le=65535, description="Port the DICOM listener listens on.")
@@ -85,10 +94,33 @@ class Settings(BaseSettings):
                 )
         return value
 
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _only_names(cls, value: str) -> str:
+        for name in value.split():
+            if not re.fullmatch(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]", name):
+                raise ValueError(f"{name!r} is no host; write the name or address alone, as fluoromap.example")
+        return value
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _only_networks(cls, value: str) -> str:
+        for proxy in value.split():
+            try:
+                ipaddress.ip_network(proxy)
+            except ValueError:
+                raise ValueError(f"{proxy!r} is no address and no network; write 192.0.2.7 or 192.0.2.0/24") from None
+        return value
+
     @property
     def allowed_origins(self) -> tuple[str, ...]:
         """The origins of other web pages that may use the API, without any by default."""
         return tuple(self.cors_origins.lower().split())
+
+    @functools.cached_property
+    def allowed_host_names(self) -> frozenset[str]:
+        """The names and addresses under which clients may reach the API; empty: any name."""
+        return frozenset(name.strip("[]") for name in self.allowed_hosts.lower().split())
 
     @functools.cached_property
     def effective_database_url(self) -> str:

@@ -24,6 +24,8 @@ import pydicom
 from processes import environment_of, process, wait_until_ready
 from pydicom.dataset import Dataset
 
+from fluoromap_service.cli.own_token import read_token
+
 PLUGIN = Path("/usr/share/orthanc/plugins/libOrthancDicomWeb.so")
 ORTHANC, SERVICE = "http://127.0.0.1:8042", "http://127.0.0.1:8000"
 PATIENCE_SECONDS = 600
@@ -58,6 +60,7 @@ def main() -> None:
         stack.enter_context(service(folder, sites=len(times)))
         eventually(lambda: client.get(f"{ORTHANC}/system").status_code == 200)
         wait_until_ready(SERVICE, folder / "data")
+        client.headers["Authorization"] = f"Bearer {read_token(folder / 'data')}"
         start = time.monotonic()
         subprocess.run(["storescu", "-aec", "ORTHANC", "127.0.0.1", "4242", *map(str, runs)], check=True)
         (known,) = client.get(f"{ORTHANC}/studies").json()

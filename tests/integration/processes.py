@@ -14,6 +14,8 @@ import httpx
 import psutil
 import pytest
 
+from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.own_token import read_token
 from fluoromap_service.cli.supervisor import program
 
 PATIENCE_SECONDS = 240
@@ -63,7 +65,7 @@ def embedded(environment: dict[str, str], port: int) -> Iterator[Kill]:
 
 @contextmanager
 def with_servers(environment: dict[str, str], port: int) -> Iterator[Kill]:
-    """Start API and worker as separate programs, as on several machines."""
+    """Start API and worker as separate programs, as on several machines. Without a token the service is open."""
     subprocess.run([program(), "db", "upgrade"], env=environment, check=True)
     with ExitStack() as stack:
         stack.enter_context(process("api", "--port", str(port), environment=environment))
@@ -91,6 +93,11 @@ def environment_of(data_dir: Path, **settings: str) -> dict[str, str]:
     }
 
 
+def client_of(environment: dict[str, str], port: int) -> Client:
+    """Return a client with the access token of the data folder, where ``fluoromap up`` has made one."""
+    return Client(f"http://127.0.0.1:{port}", read_token(Path(environment["FLUOROMAP_DATA_DIR"])))
+
+
 def wait_until_ready(url: str, log_folder: Path) -> None:
     end = time.monotonic() + PATIENCE_SECONDS
     answer = None
@@ -104,3 +111,12 @@ def wait_until_ready(url: str, log_folder: Path) -> None:
         time.sleep(0.1)
     logs = "\n".join(f"{path.name}: {path.read_text()[-2000:]}" for path in log_folder.glob("*.log"))
     pytest.fail(f"the service was not ready in time: {answer and answer.text}\n{logs}")
+
+
+def until_printed(log: Path, text: str) -> str:
+    """Wait until a log has a text, and return the whole log."""
+    end = time.monotonic() + PATIENCE_SECONDS
+    while text not in (printed := log.read_text()):
+        assert time.monotonic() < end, printed
+        time.sleep(0.1)
+    return printed

@@ -18,6 +18,7 @@ from faulty import faulty_plugins
 from processes import PATIENCE_SECONDS, environment_of, process, wait_until_ready
 
 from fluoromap_service.cli.client import Client
+from fluoromap_service.cli.own_token import read_token
 from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port, program
 
@@ -31,7 +32,8 @@ class Service:
 
     def __init__(self, up: subprocess.Popen[bytes], url: str, environment: dict[str, str], folder: Path) -> None:
         self.up, self.url, self.environment = up, url, environment
-        with Client(url) as client:
+        self.token = read_token(self.data_dir)
+        with Client(url, self.token) as client:
             self.study = client.make_study("faults")
             inputs = find_files(folder)
             assert not any(client.upload(self.study, path).objections for path in inputs.runs)
@@ -54,12 +56,19 @@ class Service:
         return server.children()
 
     def start_job(self, segmenter: str = "catheter-chain", **params: Any) -> str:
-        with Client(self.url) as client:
+        with Client(self.url, self.token) as client:
             return client.start_job(self.study, {"pipeline": {"segmenter": {"name": segmenter, "params": params}}})
 
     def job(self, job: str) -> dict[str, Any]:
-        answer: dict[str, Any] = httpx.get(f"{self.url}/v1/jobs/{job}").json()
+        answer: dict[str, Any] = self.ask("GET", f"/v1/jobs/{job}").json()
         return answer
+
+    def ask(self, method: str, path: str) -> httpx.Response:
+        return httpx.request(method, f"{self.url}{path}", headers=self.headers)
+
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"Authorization": f"Bearer {self.token}"}
 
     def ended(self, job: str) -> dict[str, Any]:
         until(lambda: self.job(job)["state"] in ("succeeded", "failed", "cancelled"))
@@ -103,7 +112,7 @@ def test_a_cancelled_job_ends_although_its_plugin_hangs(service: Service) -> Non
         job = service.start_job(segmenter, **params)
         service.until_running(job)
         begin = time.monotonic()
-        assert httpx.post(f"{service.url}/v1/jobs/{job}:cancel").status_code == 202
+        assert service.ask("POST", f"/v1/jobs/{job}:cancel").status_code == 202
         ended = service.ended(job)
         print(f"{segmenter}: cancelled after {time.monotonic() - begin:.1f} s")
         assert ended["state"] == "cancelled"
@@ -169,7 +178,7 @@ def test_event_streams_end_cleanly_when_the_api_ends(service: Service) -> None:
     job = service.start_job("hangs")
     service.until_running(job)
     api = service.child("api")
-    with httpx.stream("GET", f"{service.url}/v1/jobs/{job}/events", timeout=60) as stream:
+    with httpx.stream("GET", f"{service.url}/v1/jobs/{job}/events", headers=service.headers, timeout=60) as stream:
         lines = stream.iter_lines()
         assert next(lines).startswith("event:")
         api.terminate()
@@ -178,7 +187,7 @@ def test_event_streams_end_cleanly_when_the_api_ends(service: Service) -> None:
     # Its streams end before it stops to answer: the next answers could still be its own.
     until(lambda: gone(api))
     wait_until_ready(service.url, service.data_dir)
-    httpx.post(f"{service.url}/v1/jobs/{job}:cancel")
+    service.ask("POST", f"/v1/jobs/{job}:cancel")
     assert service.ended(job)["state"] == "cancelled"
 
 
@@ -193,7 +202,7 @@ def test_a_worker_that_must_end_gives_its_stages_back(service: Service) -> None:
     stages = service.job(job)["stages"]
     # The next worker may have taken the stage already.
     assert any((stage["state"], stage["attempt"]) == ("ready", 1) or stage["attempt"] == 2 for stage in stages)
-    httpx.post(f"{service.url}/v1/jobs/{job}:cancel")
+    service.ask("POST", f"/v1/jobs/{job}:cancel")
     assert service.ended(job)["state"] == "cancelled"
 
 

@@ -11,10 +11,9 @@ import numpy as np
 import psutil
 import pytest
 from numpy.typing import NDArray
-from processes import environment_of, process, wait_until_ready
+from processes import client_of, environment_of, process, wait_until_ready
 
 from fluoromap.geometry import Gantry
-from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port
 from fluoromap_service.dicom import write_cine
@@ -73,7 +72,7 @@ def _peaks_of_a_job(tmp_path: Path, frames: int) -> tuple[float, float]:
         children = psutil.Process(api.pid).children()
         worker = next(child.pid for child in children if "fluoromap worker" in " ".join(child.cmdline()))
         server = next(child.pid for child in children if "fluoromap api" in " ".join(child.cmdline()))
-        client = stack.enter_context(Client(url))
+        client = stack.enter_context(client_of(environment, port))
         study = client.make_study("memory")
         inputs = find_files(_study(tmp_path / f"study-{frames}", frames))
         assert not any(client.upload(study, path).objections for path in inputs.runs)

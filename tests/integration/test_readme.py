@@ -1,4 +1,4 @@
-"""The curl lines of the README, run as they are: on an open service, and on one with a token."""
+"""The curl lines of the README, run as they are: with the token that the service made, and with another one."""
 
 from __future__ import annotations
 
@@ -25,19 +25,21 @@ STARTS = {
 }
 
 
-def test_curl_lines_work_without_and_with_a_token(simulated_study: Path, tmp_path: Path) -> None:
+def test_curl_lines_work_with_the_token_of_the_folder_and_with_another(simulated_study: Path, tmp_path: Path) -> None:
     block = re.search(r"^```bash\n(HOST=.*?)^```", README.read_text(), re.M | re.S)
     assert block is not None
     lines = block[1]
     assert (lines.count("ask "), lines.count("curl")) == (11, 1)
-    environment = environment_of(tmp_path / "data")
+    (tmp_path / "home").mkdir()
+    data_dir = tmp_path / "home" / ".fluoromap"
+    environment = environment_of(data_dir)
     port = free_port()
     with embedded(environment, port):
-        wait_until_ready(f"http://127.0.0.1:{port}", tmp_path / "data")
-        _run(lines, port, tmp_path / "open", simulated_study, {})
+        wait_until_ready(f"http://127.0.0.1:{port}", data_dir)
+        _run(lines, port, tmp_path / "own", simulated_study, {"HOME": str(tmp_path / "home")})
         make = [program(), "token", "create", "--name", "readme", "--scope", "read", "--scope", "write"]
         token = subprocess.run(make, env=environment, check=True, capture_output=True, text=True).stdout
-        _run(lines, port, tmp_path / "closed", simulated_study, {"TOKEN": token.split()[-1]})
+        _run(lines, port, tmp_path / "other", simulated_study, {"TOKEN": token.split()[-1]})
 
 
 def _run(lines: str, port: int, folder: Path, study: Path, more: dict[str, str]) -> None:

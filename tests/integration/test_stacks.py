@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Fresh, Kill, embedded, environment_of, wait_until_ready, with_servers
+from processes import Fresh, Kill, client_of, embedded, environment_of, wait_until_ready, with_servers
 
 from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.submission import find_files
@@ -23,12 +23,12 @@ QUICK = {"pipeline": {"segmenter": {"name": "catheter-chain"}}}
 """What a killed worker leaves does not depend on the segmenter."""
 
 
-def _run_job(url: str, folder: Path, kill: Kill | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _run_job(client: Client, folder: Path, kill: Kill | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Send the study, run a job and kill the worker meanwhile.
 
     Return the ended job and its points.
     """
-    with Client(url) as client:
+    with client:
         study = client.make_study("stack")
         inputs = find_files(folder)
         assert not any(client.upload(study, path).objections for path in inputs.runs)
@@ -72,7 +72,9 @@ def test_a_killed_worker_changes_nothing(
             kill = opened.enter_context(start(environment, port))
             url = f"http://127.0.0.1:{port}"
             wait_until_ready(url, data_dir)
-            results[stack, disturbed] = _run_job(url, simulated_study, kill if disturbed else None)
+            results[stack, disturbed] = _run_job(
+                client_of(environment, port), simulated_study, kill if disturbed else None
+            )
     undisturbed, points = results.pop(("embedded", False))
     assert undisturbed["state"] == "succeeded"
     assert max(row["attempt"] for row in undisturbed["stages"]) == 1

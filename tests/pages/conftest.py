@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import servers
-from processes import embedded, environment_of, wait_until_ready
+from processes import environment_of, wait_until_ready, with_servers
 
 from fluoromap.phantom import StudySpec
 from fluoromap_service.cli.client import Client
@@ -35,7 +35,7 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("pages")
     environment = environment_of(folder / "data", FLUOROMAP_WORKERS="1")
     port = servers.free_port()
-    with embedded(environment, port):
+    with with_servers(environment, port):
         url = f"http://127.0.0.1:{port}"
         wait_until_ready(url, folder / "data")
         yield url

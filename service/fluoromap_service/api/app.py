@@ -22,6 +22,7 @@ from fluoromap_service.api.http.middleware.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.disk_space import DiskSpace
 from fluoromap_service.api.http.middleware.request_body import RequestBody
 from fluoromap_service.api.http.middleware.security_headers import SecurityHeaders
+from fluoromap_service.api.http.middleware.trusted_proxies import TrustedProxies
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
@@ -148,6 +149,7 @@ def create_app() -> FastAPI:
     app.add_middleware(RequestBody)
     app.add_middleware(AccessLog, counts=counts)
     app.add_middleware(SecurityHeaders)
+    app.add_middleware(TrustedProxies, proxies=tuple(settings().trusted_proxies.split()))
     return app
 
 

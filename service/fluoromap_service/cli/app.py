@@ -31,6 +31,7 @@ COMMANDS = {
     "deliveries": "Show and repeat the deliveries of results to targets.",
     "db": "Manage the database.",
     "token": "Manage access tokens.",
+    "sign-in": "Print a link that signs a browser in.",
     "backup": "Write database and files into one archive, while the service runs.",
     "restore": "Bring a backup into an empty data folder.",
     "export": "Write the runs and results of a job without the patient's identity.",

@@ -22,6 +22,7 @@ import httpx
 from fluoromap_service.cli.environment import SUPERVISOR
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.folder_lock import only_one
+from fluoromap_service.cli.own_token import read_token
 
 STOP_SECONDS = 30.0
 """Longest time that the children get to stop."""
@@ -53,6 +54,11 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def url_of(host: str, port: int) -> str:
+    """Return the address of a service. An IPv6 address has brackets in it."""
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def check_port(host: str, port: int) -> None:
@@ -179,9 +185,7 @@ class Supervisor:
         self._log_folder = log_folder
         self._was_ready = False
         self._next_look = self._last_answer = 0.0
-        # An IPv6 address has brackets in a URL.
-        address = f"[{host}]" if ":" in host else host
-        self.url = f"http://{address}:{port}"
+        self.url = url_of(host, port)
 
     def start(self) -> None:
         """Start all children."""
@@ -312,9 +316,54 @@ def _exit(number: int, frame: object) -> None:
     sys.exit(128 + number)
 
 
+@dataclass(frozen=True, slots=True)
+class PrivateService:
+    """A service that only its user can use.
+
+    Parameters
+    ----------
+    url : str
+        Its address.
+    token : str
+        The access token of its data folder.
+    environment : dict of str to str
+        The environment of its processes.
+    """
+
+    url: str
+    token: str = field(repr=False)
+    environment: dict[str, str] = field(repr=False)
+
+    def client(self) -> httpx.Client:
+        """Return an HTTP client that sends the token."""
+        headers = {"Authorization": f"Bearer {self.token}"}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=600, trust_env=False)
+
+    def sign_in_link(self) -> str:
+        """Return a new link that signs a browser in.
+
+        Raises
+        ------
+        CommandFailed
+            When the database cannot be used.
+        """
+        return _sign_in_link(self.environment)
+
+
+def _sign_in_link(environment: dict[str, str]) -> str:
+    """Migrate the database and make the token of a data folder, and return a link that signs a browser in."""
+    # Another process: this one has the settings of its user, not those of the private service.
+    answer = subprocess.run(
+        [program(), "sign-in"], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    if answer.returncode != 0:
+        raise CommandFailed(answer.stderr.strip().removeprefix("fluoromap: ") or "The database cannot be made.")
+    return answer.stdout.strip()
+
+
 @contextmanager
-def private_service(data_dir: Path, *, workers: int | None = None, computes: bool = True) -> Iterator[str]:
-    """Run the service on one data folder and yield its address.
+def private_service(data_dir: Path, *, workers: int | None = None, computes: bool = True) -> Iterator[PrivateService]:
+    """Run the service on one data folder, with an access token of its own.
 
     It listens on a free port of the loopback address. It ignores the FLUOROMAP_* variables of this user, so that it cannot
     touch the database or broker of another service.
@@ -337,19 +386,16 @@ def private_service(data_dir: Path, *, workers: int | None = None, computes: boo
         yield from _served(data_dir, workers, computes)
 
 
-def _served(data_dir: Path, workers: int | None, computes: bool) -> Iterator[str]:
+def _served(data_dir: Path, workers: int | None, computes: bool) -> Iterator[PrivateService]:
+    port = free_port()
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
-    environment["FLUOROMAP_DATA_DIR"] = str(data_dir.resolve())
+    environment |= {"FLUOROMAP_DATA_DIR": str(data_dir.resolve()), "FLUOROMAP_PORT": str(port)}
     if workers is not None:
         environment["FLUOROMAP_WORKERS"] = str(workers)
-    migration = subprocess.run(
-        [program(), "db", "upgrade"], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
-    )
-    if migration.returncode != 0:
-        raise CommandFailed(
-            migration.stderr.strip().removeprefix("fluoromap: ") or f"The database in {data_dir} cannot be made."
-        )
-    supervisor = Supervisor("127.0.0.1", free_port(), environment, log_folder=data_dir, worker=computes)
+    _sign_in_link(environment)
+    token = read_token(data_dir)
+    assert token is not None
+    supervisor = Supervisor("127.0.0.1", port, environment, log_folder=data_dir, worker=computes)
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         # The default action ends this process at once and leaves its children running.
         signal.signal(signal.SIGTERM, _exit)
@@ -359,7 +405,7 @@ def _served(data_dir: Path, workers: int | None, computes: bool) -> Iterator[str
         supervisor.start()
         supervisor.wait_until_ready()
         watcher.start()
-        yield supervisor.url
+        yield PrivateService(supervisor.url, token, environment)
     finally:
         stop.set()
         if watcher.is_alive():

@@ -95,6 +95,27 @@ class Token(Base):
     revoked: Mapped[float | None]
 
 
+class BrowserSession(Base):
+    """A session of a browser, or a link that begins one; the table has only the hash of its secret."""
+
+    __tablename__ = "browser_session"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    token_id: Mapped[int] = mapped_column(ForeignKey("token.id", ondelete="CASCADE"), index=True)
+    opened: Mapped[float | None]  # None while it is a link that nobody has opened
+    expires: Mapped[float]
+
+
+class SignInFailure(Base):
+    """A wrong token that somebody sent lately."""
+
+    __tablename__ = "sign_in_failure"
+    __table_args__ = (Index("ix_sign_in_failure_address_at", "address", "at"),)
+    id: Mapped[int] = mapped_column(primary_key=True)
+    address: Mapped[str] = mapped_column(String(64))
+    at: Mapped[float] = mapped_column(default=db_now(), index=True)
+
+
 class File(Base):
     """A file in the store, by the hash of its content."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import structlog
 from sqlalchemy import delete, func, select
 
+from fluoromap_service.auth import failures, sessions
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import audit, disk, files
@@ -36,6 +37,8 @@ def clean_up() -> None:
         log.info("incoming_files_removed", files=removed)
     with writing() as session:
         session.execute(delete(Idempotency).where(Idempotency.created < db_now() - ANSWER_SECONDS))
+    sessions.remove_ended()
+    failures.remove_old()
     if settings().retention_days > 0:
         delete_old_studies(settings().retention_days)
     if disk.free_bytes() < LOW_DISK_FACTOR * disk.reserve_bytes():

@@ -23,7 +23,7 @@ def test_token_is_shown_once_and_never_listed(fluoromap: Program) -> None:
 
 
 def test_a_token_of_that_name_cannot_be_made_twice_and_can_be_revoked(fluoromap: Program) -> None:
-    assert fluoromap("token", "create", "--name", "n", "--scope", "read").returncode == 0
+    assert fluoromap("token", "create", "--name", "n", "--scope", "write").returncode == 0
     assert "'n'" in one_sentence(fluoromap("token", "create", "--name", "n", "--scope", "read"))
     assert fluoromap("token", "revoke", "n").returncode == 0
     assert "'other'" in one_sentence(fluoromap("token", "revoke", "other"))
@@ -32,7 +32,18 @@ def test_a_token_of_that_name_cannot_be_made_twice_and_can_be_revoked(fluoromap:
 def test_given_token_is_made_once_and_known_afterwards(fluoromap: Program, tmp_path: Path) -> None:
     secret = tmp_path / "secret"
     secret.write_text("k" * 40 + "\n")
-    arguments = ("token", "create", "--name", "first", "--scope", "read", "--from-file", str(secret))
+    arguments = (
+        "token",
+        "create",
+        "--name",
+        "first",
+        "--scope",
+        "read",
+        "--scope",
+        "write",
+        "--from-file",
+        str(secret),
+    )
     for _ in range(2):
         answer = fluoromap(*arguments)
         assert (answer.returncode, answer.stdout) == (0, "")

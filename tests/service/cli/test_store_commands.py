@@ -14,7 +14,7 @@ from program import Program, one_sentence
 @pytest.fixture
 def first_token(fluoromap: Program) -> str:
     """A store with one token, which is one entry of the audit trail."""
-    return fluoromap("token", "create", "--name", "ada", "--scope", "read").stdout.strip()
+    return fluoromap("token", "create", "--name", "ada", "--scope", "write").stdout.strip()
 
 
 def test_backup_and_restore(fluoromap: Program, first_token: str, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from typing import Annotated
-from urllib.parse import urlsplit
 
 import structlog
 from anyio import CapacityLimiter, to_thread
@@ -16,16 +15,18 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from fluoromap_service import auth
+from fluoromap_service.api.http.hosts import check_host, host_name, is_forwarded
 from fluoromap_service.api.http.problems import answer, database_away
-from fluoromap_service.api.http.session import session_token
+from fluoromap_service.api.http.session import session_id
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
-from fluoromap_service.auth import Caller, Callers, Scope
+from fluoromap_service.auth import Caller, Callers, Credential, Scope
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import DATABASE_AWAY
 
 SIGN_IN = "/sign-in"
 SESSION = "/session"
+METRICS = "/metrics"
 OPEN_PATHS = frozenset(
     {"/v1/health", "/v1/ready", SIGN_IN, "/assets/style.css", "/assets/icon.svg", "/assets/sign-in.js"}
 )
@@ -39,7 +40,7 @@ _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 class Doorkeeper:
     """ASGI middleware that lets a request in only when its token has the scope.
 
-    Reading needs the scope ``read``, everything else ``write``.
+    The metrics need the scope ``metrics``, reading needs ``read``, everything else ``write``.
     """
 
     def __init__(self, app: ASGIApp, sign_ins: SignInLimit) -> None:
@@ -54,7 +55,7 @@ class Doorkeeper:
         connection = HTTPConnection(scope)
         try:
             caller = await self._identify(connection)
-            _demand(caller, Scope.READ if _only_reads(scope) else Scope.WRITE)
+            _demand(caller, _needed(scope))
         except Problem as problem:
             if problem.status == 401 and _opens_page(connection):
                 await RedirectResponse(SIGN_IN, 303)(scope, receive, send)
@@ -68,32 +69,45 @@ class Doorkeeper:
         await self._app(scope, receive, send)
 
     async def _identify(self, connection: HTTPConnection) -> Caller:
-        text = bearer_token(connection) or session_token(connection)
-        token = None if text is None else auth.token_hash(text)
-        address = connection.client.host if connection.client else ""
-        if token is not None:
-            self._sign_ins.check(address, token)
-        caller = self._callers.remembered(token)
+        credential = _credential(connection)
+        caller = self._callers.remembered(credential)
         if caller is None:
-            caller = await to_thread.run_sync(self._callers.look_up, token, limiter=_threads())
-        if caller is None and token is None:
-            raise _unauthorised("This service needs an access token: send 'Authorization: Bearer <token>'.")
+            caller = await to_thread.run_sync(self._callers.look_up, credential, limiter=_threads())
         if caller is None:
-            self._sign_ins.failed(address)
-            log.warning("sign_in_failed", address=address)
-            raise _unauthorised(
-                "This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"'
-            )
+            raise await self._refusal(connection, credential)
         if caller is auth.OPEN:
             _check_local(connection)
-        elif token is not None:
-            self._sign_ins.succeeded(address, token)
+        else:
+            check_host(connection)
         return caller
 
+    async def _refusal(self, connection: HTTPConnection, credential: Credential | None) -> Problem:
+        if credential is None:
+            return _unauthorised("This service needs an access token: send 'Authorization: Bearer <token>'.")
+        if credential.is_session:
+            # Nobody guesses an id of 256 random bits, and each page asks once more when its session has ended.
+            return _unauthorised("The session of this browser has ended; sign in again.")
+        address = connection.client.host if connection.client else ""
+        await to_thread.run_sync(self._sign_ins.failed, address, limiter=_threads())
+        log.warning("sign_in_failed", address=address)
+        return _unauthorised("This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"')
 
-def _only_reads(scope: AsgiScope) -> bool:
-    # A session begins and ends with any token.
-    return scope.get("method") in _READING or scope["path"] == SESSION
+
+def _credential(connection: HTTPConnection) -> Credential | None:
+    token = bearer_token(connection)
+    if token is not None:
+        return Credential(auth.token_hash(token))
+    session = session_id(connection)
+    return None if session is None else Credential(auth.token_hash(session), is_session=True)
+
+
+def _needed(scope: AsgiScope) -> Scope:
+    """Return the scope that a request needs."""
+    reads = scope.get("method") in _READING
+    if reads and scope["path"] == METRICS:
+        return Scope.METRICS
+    # A session begins and ends with any token that may read.
+    return Scope.READ if reads or scope["path"] == SESSION else Scope.WRITE
 
 
 def _opens_page(connection: HTTPConnection) -> bool:
@@ -121,8 +135,14 @@ def _check_local(connection: HTTPConnection) -> None:
     server = connection.scope.get("server")
     if server is None or not auth.is_loopback(str(server[0])):
         raise _unauthorised("This service has no access token yet; make one with 'fluoromap token create'.")
-    host = connection.headers.get("host", "")
-    name = _host_name(host)
+    if is_forwarded(connection):
+        # The service cannot see for whom a proxy asks.
+        raise Problem(
+            403,
+            "forwarded",
+            "Without tokens this service answers no proxy; make a token with 'fluoromap token create' and send it.",
+        )
+    name = host_name(connection)
     if name is None or not auth.is_loopback(name):
         raise Problem(403, "foreign_host", "Without tokens this service answers only under localhost or 127.0.0.1.")
     origin = connection.headers.get("origin")
@@ -130,7 +150,7 @@ def _check_local(connection: HTTPConnection) -> None:
     site = connection.headers.get("sec-fetch-site", "none")
     if site not in ("same-origin", "none") and not allowed and not _is_navigation(connection):
         raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
-    own = f"{connection.scope['scheme']}://{host}".lower()
+    own = f"{connection.scope['scheme']}://{connection.headers['host']}".lower()
     if origin is not None and not allowed and origin.lower() != own:
         raise Problem(403, "foreign_origin", "Without tokens this service answers only to its own pages.")
 
@@ -152,13 +172,6 @@ def _is_navigation(connection: HTTPConnection) -> bool:
 def _threads() -> CapacityLimiter:
     # Of its own, so that a request need not wait for the threads of other requests before it is even let in.
     return CapacityLimiter(8)
-
-
-def _host_name(host: str) -> str | None:
-    try:
-        return urlsplit(f"//{host}").hostname
-    except ValueError:
-        return None
 
 
 def _demand(caller: Caller, scope: Scope) -> None:
@@ -190,12 +203,19 @@ async def _reader(request: Request, _: Token) -> str:
     return _caller_with(request, Scope.READ)
 
 
+async def _monitor(request: Request, _: Token) -> str:
+    return _caller_with(request, Scope.METRICS)
+
+
 async def _writer(request: Request, _: Token) -> str:
     return _caller_with(request, Scope.WRITE)
 
 
 Reader = Annotated[str, Depends(_reader)]
 """The caller's name, "open" where the service needs no token; the caller may read."""
+
+Monitor = Annotated[str, Depends(_monitor)]
+"""The caller's name; the caller may at least read the metrics."""
 
 Writer = Annotated[str, Depends(_writer)]
 """The caller's name; the caller may also change things."""

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from fluoromap_service.api.http.middleware.access_log import RequestCounts
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
-from fluoromap_service.api.http.security import Reader
+from fluoromap_service.api.http.security import METRICS, Monitor
 from fluoromap_service.jobs.job_life import SECONDS_BUCKETS
 from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.store import disk, tally
@@ -69,12 +69,12 @@ def _number(value: float) -> str:
 
 
 @router.get(
-    "/metrics",
+    METRICS,
     summary="Metrics for Prometheus",
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **responses(401, 403)},
 )
-def metrics(request: Request, caller: Reader) -> Response:
+def metrics(request: Request, caller: Monitor) -> Response:
     """Return queues, durations, failures, disk and requests; no label holds patient data."""
     with reading() as session:
         sums = tally.all_sums(session)

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fastapi import Request, Response
+from pydantic import BaseModel, Field
 
 import fluoromap_service
 from fluoromap_service.api.http.etags import is_known
+from fluoromap_service.api.http.hosts import check_host
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import SESSION, SIGN_IN, Reader, bearer_token
-from fluoromap_service.api.http.session import begin_session, end_session
-from fluoromap_service.auth import OPEN
-from fluoromap_service.problem import not_found
+from fluoromap_service.api.http.session import remove_cookie, session_id, set_cookie
+from fluoromap_service.auth import OPEN, sessions, token_hash
+from fluoromap_service.problem import Problem, not_found
 
 router = new_router(include_in_schema=False)
 
@@ -94,6 +96,24 @@ def get_sign_in_page(request: Request) -> Response:
     return _send(request, "sign-in.html")
 
 
+class Link(BaseModel):
+    """The secret part of a link that signs a browser in."""
+
+    link: str = Field(max_length=100)
+
+
+@router.post(SIGN_IN, status_code=204, response_class=Response)
+def post_sign_in(request: Request, body: Link) -> Response:
+    """Begin a session of this browser by a link, which works once."""
+    check_host(request)
+    new_id = sessions.open_link(body.link)
+    if new_id is None:
+        raise Problem(401, "unauthorized", "This link was used or is too old; make a new one with 'fluoromap sign-in'.")
+    response = Response(status_code=204)
+    set_cookie(request, response, new_id)
+    return response
+
+
 @router.get("/assets/{name:path}")
 def get_asset(name: str, request: Request) -> Response:
     """Return a file of the pages."""
@@ -114,14 +134,18 @@ def post_session(request: Request, caller: Reader) -> Response:
     """Begin a session of this browser with the token of the header."""
     response = Response(status_code=204)
     token = bearer_token(request)
-    if token is not None:
-        begin_session(response, token, secure=request.url.scheme == "https")
+    new_id = None if token is None else sessions.begin(token_hash(token))
+    if new_id is not None:
+        set_cookie(request, response, new_id)
     return response
 
 
 @router.delete(SESSION, status_code=204, response_class=Response)
-def delete_session(caller: Reader) -> Response:
+def delete_session(request: Request, caller: Reader) -> Response:
     """End the session of this browser."""
     response = Response(status_code=204)
-    end_session(response)
+    ended = session_id(request)
+    if ended is not None:
+        sessions.end(token_hash(ended))
+    remove_cookie(response)
     return response

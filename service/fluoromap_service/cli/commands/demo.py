@@ -43,7 +43,7 @@ def _demonstrate(folder: Path, out: Path, console: Console, keep: bool) -> None:
         bar = progress.add_task("simulate", total=2 * SPEC.sites)
         files = simulate(folder / "simulated", SPEC, on_run=lambda: progress.advance(bar))
         service_bar = progress.add_task("start service", total=None)
-        with private_service(folder / "service") as url, Client(url) as client:
+        with private_service(folder / "service") as service, Client(service.url, service.token) as client:
             progress.update(service_bar, total=1, completed=1)
             inputs = StudyFiles(folder / "simulated", files.runs, files.activation_times)
             sent = upload(client, inputs, "Demonstration", progress)
@@ -57,7 +57,8 @@ def _demonstrate(folder: Path, out: Path, console: Console, keep: bool) -> None:
                 _print_map(console, chamber)
             _print_line(console, f"Results: {out.resolve()} (report.html, points.csv, map.png, mesh/, overlays/)")
             if keep:
-                console.print(f"The service runs at {url} (study {sent.study}); Ctrl-C ends it.", highlight=False)
+                _print_line(console, f"The service runs at {service.url} (study {sent.study}); Ctrl-C ends it.")
+                _print_line(console, f"Open {service.sign_in_link()} (once, within 10 minutes).")
                 stop_on_signals().wait()
 
 

@@ -48,8 +48,8 @@ def run(
     with ExitStack() as stack:
         service_dir = data_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fluoromap-run-")))
         with console.status("starting the service"):
-            url = stack.enter_context(private_service(service_dir, computes=not dry_run))
-        client = stack.enter_context(Client(url))
+            service = stack.enter_context(private_service(service_dir, computes=not dry_run))
+        client = stack.enter_context(Client(service.url, service.token))
         with progress_bars(console) as progress:
             sent = upload(client, files, folder.resolve().name, progress)
             sites = SiteTable.of(client, sent)

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fluoromap_service import auth
+from fluoromap_service.auth import sessions
 from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options
 from fluoromap_service.cli.options import DataDir
@@ -41,7 +42,9 @@ def create(
     name: Annotated[str, typer.Option(help="Name of the token.")],
     scope: Annotated[
         list[str],
-        typer.Option(help="read, write or admin; repeat the option for several scopes.", callback=_check_scopes),
+        typer.Option(
+            help="metrics, read, write or admin; repeat the option for several scopes.", callback=_check_scopes
+        ),
     ],
     expires: Annotated[
         str | None, typer.Option(help="Lifetime, for example 12h or 90d; without it the token never expires.")
@@ -55,6 +58,7 @@ def create(
     """Make an access token and print it once."""
     lifetime_seconds = None if expires is None else _seconds(expires)
     with _migrated_database(data_dir):
+        auth.check_first_token(scope)
         if from_file is None:
             typer.echo(auth.create_token(name, scope, lifetime_seconds))
             return
@@ -79,6 +83,17 @@ def revoke(name: Annotated[str, typer.Argument(help="Name of the token.")], data
     """Revoke a token at once."""
     with _migrated_database(data_dir):
         auth.revoke_token(name)
+
+
+@app.command("sessions")
+def list_sessions(data_dir: DataDir = None) -> None:
+    """List the sessions of browsers. Revoking a token ends its sessions."""
+    with _migrated_database(data_dir):
+        rows = sessions.list_sessions()
+    table = Table("token", "began", "expires")
+    for row in rows:
+        table.add_row(row.token, _minute(row.opened), _minute(row.expires))
+    Console().print(table)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from sql_statements import sql_statements
 from fluoromap_service import auth
 from fluoromap_service.api.app import create_app
 from fluoromap_service.api.http.security import OPEN_PATHS
+from fluoromap_service.auth import callers
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
 from fluoromap_service.store import schema
@@ -47,6 +48,19 @@ def test_an_open_service_answers_no_foreign_page(service: TestClient, headers: d
     answer = service.post("/v1/studies", json={"label": "x"}, headers=headers)
     assert answer.status_code == 403
     assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["Forwarded", "Via", "X-Forwarded-For", "X-Forwarded-Proto", "X-Forwarded-Host", "X-Forwarded-Prefix", "X-Real-IP"],
+)
+def test_an_open_service_answers_no_proxy(service: TestClient, header: str) -> None:
+    for path in ("/v1/studies", "/", "/metrics", "/dicom-web/studies"):
+        answer = service.get(path, headers={"Host": "127.0.0.1:8000", header: "192.0.2.7"})
+        assert (answer.status_code, answer.json()["code"]) == (403, "forwarded"), path
+    assert service.get("/v1/health", headers={header: "192.0.2.7"}).status_code == 200
+    token = auth.create_token("first", ["write"])
+    assert service.get("/v1/studies", headers={header: "192.0.2.7", **_bearer(token)}).status_code == 200
 
 
 def test_an_open_service_on_another_address_answers_nobody(data_dir: object) -> None:
@@ -105,7 +119,7 @@ def test_a_remembered_token_expires(service: TestClient, monkeypatch: pytest.Mon
     token = auth.create_token("brief", ["read"], expires_seconds=3600)
     assert [_asks_for_tokens(service, _bearer(token)) for _ in range(2)] == [True, False]
     later = time.time() + 3601
-    monkeypatch.setattr(auth.time, "time", lambda: later)
+    monkeypatch.setattr(callers.time, "time", lambda: later)
     # Only the memory believes that the hour is over; the database's clock says that the token is valid.
     assert _asks_for_tokens(service, _bearer(token))
 
@@ -136,6 +150,20 @@ def test_scopes_imply_the_lower_ones(service: TestClient) -> None:
     for token in (write, admin):
         assert service.post("/v1/studies", json={"label": "x"}, headers=_bearer(token)).status_code == 201
         assert service.get("/v1/studies", headers=_bearer(token)).status_code == 200
+
+
+def test_a_token_for_the_metrics_reads_nothing_else(service: TestClient) -> None:
+    monitor, reader = auth.create_token("prometheus", ["metrics"]), auth.create_token("reader", ["read"])
+    for token in (monitor, reader):
+        assert service.get("/metrics", headers=_bearer(token)).status_code == 200
+    assert service.post("/metrics", headers=_bearer(monitor)).status_code == 403
+    assert service.post("/session", headers=_bearer(monitor)).status_code == 403
+    for path, methods in create_app().openapi()["paths"].items():
+        if path in OPEN_PATHS or path == "/metrics":
+            continue
+        for method in methods:
+            answer = service.request(method, re.sub(r"\{[^}]*\}", "1", path), headers=_bearer(monitor))
+            assert (answer.status_code, answer.json()["code"]) == (403, "forbidden"), (method, path)
 
 
 def test_a_token_expires(service: TestClient) -> None:

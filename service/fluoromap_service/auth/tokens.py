@@ -1,27 +1,24 @@
 """Access tokens with scopes and an expiry; the command line makes and revokes them, the store holds their hashes.
 
-``admin`` implies ``write``, ``write`` implies ``read``. A service without any token is open, and listens on a loopback
-address only. A revoked or expired token still counts, so that revoking a token never opens the service.
+``admin`` implies ``write``, ``write`` implies ``read``, and ``read`` implies ``metrics``. A service without any token is open,
+and listens on a loopback address only. A revoked or expired token still counts, so that revoking a token never opens the service.
 """
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import ipaddress
 import secrets
-import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 
-from sqlalchemy import bindparam, or_, select
+from sqlalchemy import ColumnElement, and_, bindparam, or_, select
 from sqlalchemy.exc import IntegrityError
 
+from fluoromap_service.auth.addresses import is_loopback
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import audit
 from fluoromap_service.store.audit import Act
-from fluoromap_service.store.changes import Change, last_change
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Token
@@ -30,6 +27,7 @@ from fluoromap_service.store.models import Token
 class Scope(StrEnum):
     """The kinds of things that a caller may do."""
 
+    METRICS = "metrics"
     READ = "read"
     WRITE = "write"
     ADMIN = "admin"
@@ -38,7 +36,7 @@ class Scope(StrEnum):
 SHORTEST_TOKEN = 32
 """Fewest characters of a token that the installation brings."""
 
-_ORDER = (Scope.READ, Scope.WRITE, Scope.ADMIN)
+_ORDER = (Scope.METRICS, Scope.READ, Scope.WRITE, Scope.ADMIN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,88 +155,43 @@ _A_TOKEN = select(Token.id).limit(1)
 
 def verify(text: str) -> Caller | None:
     """Return the caller of a token; None when the token is unknown, expired or revoked."""
-    found = _valid(token_hash(text))
+    found = find(token_hash(text))
     return None if found is None else found[0]
 
 
-def _valid(token: str) -> tuple[Caller, float | None] | None:
+def find(sha256: str) -> tuple[Caller, float | None] | None:
+    """Return the caller of a token, given by its hash, and when it expires.
+
+    None when the token is not valid.
+    """
     with reading() as session:
-        row = session.execute(_VALID_TOKEN, {"sha256": token}).first()
+        row = session.execute(_VALID_TOKEN, {"sha256": sha256}).first()
     return None if row is None else (Caller(row.name, frozenset(Scope(scope) for scope in row.scopes)), row.expires)
 
 
-_VALID_TOKEN = select(Token.name, Token.scopes, Token.expires).where(
-    Token.sha256 == bindparam("sha256"),
-    Token.revoked.is_(None),
-    or_(Token.expires.is_(None), Token.expires > db_now()),
-)
+def is_valid() -> ColumnElement[bool]:
+    """Return the condition that a token is neither revoked nor expired."""
+    return and_(Token.revoked.is_(None), or_(Token.expires.is_(None), Token.expires > db_now()))
 
 
-class Callers:
-    """The callers of requests, remembered until the database changes.
+_VALID_TOKEN = select(Token.name, Token.scopes, Token.expires).where(Token.sha256 == bindparam("sha256"), is_valid())
 
-    Each request asks for the last change first. So a token ends with the commit that revokes it, and an open service with
-    the commit of its first token, as if each request queried the tokens. A token is given by its hash.
+
+def check_first_token(scopes: Iterable[str]) -> None:
+    """Check that a first token may also write.
+
+    It closes an open service. If it could only read, nobody could write any more.
+
+    Raises
+    ------
+    Problem
+        422 ``invalid_token`` when there is no token yet, and ``scopes`` lack ``write`` and ``admin``.
     """
-
-    def __init__(self) -> None:
-        self._memory = _Memory(None)
-
-    def remembered(self, token: str | None) -> Caller | None:
-        """Return the caller of a token; None when only a query can find it.
-
-        ``token`` None is a request without a token.
-        """
-        memory = self._memory
-        if memory.change is None or memory.change != last_change():
-            return None
-        if memory.open:
-            return OPEN
-        caller, expires = (None, None) if token is None else memory.callers.get(token, (None, None))
-        # Only SQLite has a last change, and its clock is the clock of this machine.
-        return caller if expires is None or time.time() < expires else None
-
-    def look_up(self, token: str | None) -> Caller | None:
-        """Return the caller of a token; None when nobody may be let in.
-
-        ``token`` None is a request without a token. While no token was ever made, the caller is :data:`OPEN`.
-        """
-        # Before the queries: a change between here and them makes the memory old, never wrong.
-        change = last_change()
-        found = None if token is None else _valid(token)
-        is_open = found is None and not any_token()
-        if change is not None:
-            memory = self._memory
-            if memory.change != change:
-                memory = self._memory = _Memory(change, is_open)
-            if token is not None and found is not None:
-                memory.callers[token] = found
-        if is_open:
-            return OPEN
-        return None if found is None else found[0]
-
-
-@dataclass(frozen=True, slots=True)
-class _Memory:
-    """The callers of valid tokens, and when these expire, as of one change of the database.
-
-    open : whether there was no token at all.
-    """
-
-    change: Change | None
-    open: bool = False
-    callers: dict[str, tuple[Caller, float | None]] = field(default_factory=dict)
-
-
-@functools.lru_cache(maxsize=1024)
-def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach an address or name."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
+    if not {Scope.WRITE, Scope.ADMIN} & set(scopes) and not any_token():
+        raise _invalid(
+            "The first token must be allowed to write, because it closes the service to everybody without a token. Make one "
+            "with 'fluoromap token create --name NAME --scope read --scope write' first, then this one."
+        )
 
 
 def check_may_start(host: str) -> None:
