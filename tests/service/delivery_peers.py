@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import socketserver
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -43,6 +44,7 @@ class Archive:
     arrival: Arrival = lambda item: None
     on_stored: Callable[[Dataset], None] = lambda item: None
     questions: int = 0
+    authorizations: list[str | None] = field(default_factory=list)
 
     @property
     def uids(self) -> list[str]:
@@ -102,6 +104,7 @@ def dicomweb_server(archive: Archive) -> Iterator[StowTarget]:
     class Handler(_Handler):
         def do_POST(self) -> None:
             assert self.path == "/dicom-web/studies"
+            archive.authorizations.append(self.headers["Authorization"])
             (content,) = _parts(self.headers["Content-Type"], self.body())
             item = pydicom.dcmread(io.BytesIO(content))
             status = archive.take(item)
@@ -119,6 +122,44 @@ def dicomweb_server(archive: Archive) -> Iterator[StowTarget]:
 
     with _serving(Handler) as url:
         yield StowTarget(name="archive", kind="dicomweb", url=f"{url}/dicom-web", **QUICK)
+
+
+@contextmanager
+def endless_server(head: bytes, part: bytes, pause_seconds: float) -> Iterator[tuple[str, list[int]]]:
+    """Run a server whose answers never end.
+
+    Yield its URL and the lengths of the answers that clients took until they hung up.
+    """
+    taken: list[int] = []
+
+    class Handler(socketserver.StreamRequestHandler):
+        def handle(self) -> None:
+            length = next(
+                int(line.split(b":")[1])
+                for line in iter(self.rfile.readline, b"")
+                if line.lower().startswith(b"content-length")
+            )
+            while self.rfile.readline().strip():
+                pass
+            self.rfile.read(length)
+            sent = 0
+            try:
+                self.wfile.write(head)
+                while not stop.wait(pause_seconds):
+                    self.wfile.write(part)
+                    sent += len(part)
+            except OSError:
+                taken.append(sent)
+
+    stop = threading.Event()
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}", taken
+        finally:
+            stop.set()
+            server.shutdown()
 
 
 @dataclass

@@ -51,6 +51,8 @@ class StowTarget(_Target):
     url: AnyHttpUrl
     authorization_file: Path | None = None
     ca_file: Path | None = None
+    allow_insecure: bool = False
+    """Whether the sender may send the header Authorization without TLS over a network."""
 
 
 class WebhookTarget(_Target):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import ssl
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -17,10 +18,12 @@ from pynetdicom.sop_class import StudyRootQueryRetrieveInformationModelFind  # t
 
 from fluoromap_service.api.results.result_objects import OutgoingObject
 from fluoromap_service.deliveries.targets import CStoreTarget
-from fluoromap_service.sender.peers import NotDelivered, Peer
+from fluoromap_service.sender.peers import NotDelivered, Peer, answer_too_long, answer_too_slow
 from fluoromap_service.settings import settings
 
 CONNECT_SECONDS = 10.0
+MOST_MATCHES = 16
+"""Most answers to a question for one object. A target that gives more does not end its answer."""
 _STORED = frozenset({0x0000, 0x0107, 0x0116, 0xB000, 0xB006, 0xB007, 0x0111})
 """Success, the warnings of PS3.4 table B.2-1, and "duplicate SOP instance" of PS3.7 annex C."""
 _PENDING = frozenset({0xFF00, 0xFF01})
@@ -46,7 +49,7 @@ def associated(target: CStoreTarget, objects: Sequence[OutgoingObject]) -> Itera
     association = entity.associate(target.host, target.port, ae_title=target.aet, tls_args=_tls(target))
     try:
         _check(association, objects)
-        yield _Node(association)
+        yield _Node(association, target.timeout_seconds)
     finally:
         if association.is_established:
             association.release()
@@ -90,8 +93,8 @@ def _check(association: Association, objects: Sequence[OutgoingObject]) -> None:
 class _Node:
     """An established association with a target."""
 
-    def __init__(self, association: Association) -> None:
-        self._association = association
+    def __init__(self, association: Association, answer_seconds: float) -> None:
+        self._association, self._answer_seconds = association, answer_seconds
 
     def has(self, item: OutgoingObject) -> bool | None:
         model = StudyRootQueryRetrieveInformationModelFind
@@ -102,11 +105,17 @@ class _Node:
         query.StudyInstanceUID = item.study_instance_uid
         query.SeriesInstanceUID = item.series_instance_uid
         query.SOPInstanceUID = item.sop_instance_uid
-        matches, status = 0, None
+        matches, answers, status = 0, 0, None
+        # The timeouts of pynetdicom are for each message of an answer.
+        end = time.monotonic() + self._answer_seconds
         try:
             for answer, match in self._association.send_c_find(query, model):
                 status = answer.get("Status")
                 matches += status in _PENDING and match is not None
+                answers += 1
+                if answers > MOST_MATCHES or time.monotonic() > end:
+                    self._association.abort()
+                    raise answer_too_long() if answers > MOST_MATCHES else answer_too_slow()
         except RuntimeError as error:
             raise _ended() from error
         # Without an end of the answers nobody knows whether it has the object.

@@ -16,6 +16,18 @@ class NotDelivered(Exception):
         self.failure = Failure(code, detail)
 
 
+def answer_too_long() -> NotDelivered:
+    """Return the failure of a target that answers without end."""
+    return NotDelivered("answer_too_long", "The target's answer is too long to be read; check its address.")
+
+
+def answer_too_slow() -> NotDelivered:
+    """Return the failure of a target whose answer does not end in time."""
+    return NotDelivered(
+        "answer_too_slow", "The target's answer did not end within its timeout_seconds; look at the target."
+    )
+
+
 class Peer(Protocol):
     """An open connection to a target."""
 

@@ -21,7 +21,7 @@ from fluoromap_service.problem import Problem
 from fluoromap_service.sender import webhook
 from fluoromap_service.sender.c_store import associated
 from fluoromap_service.sender.peers import NotDelivered, Peer
-from fluoromap_service.sender.stow import open_server
+from fluoromap_service.sender.stow import open_server, shows_secret
 from fluoromap_service.settings import settings
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import ObjectState
@@ -45,6 +45,9 @@ class Sender:
     def __init__(self, targets: Sequence[Target]) -> None:
         # pynetdicom's own lines may quote headers; this module logs what happens.
         logging.getLogger("pynetdicom").setLevel(logging.CRITICAL)
+        for target in targets:
+            if isinstance(target, StowTarget) and shows_secret(target):
+                log.warning("authorization_without_tls", target=target.name, allowed=target.allow_insecure)
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self._serve, args=(target,), daemon=True) for target in targets]
 

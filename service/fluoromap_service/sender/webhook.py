@@ -37,10 +37,10 @@ def send(target: WebhookTarget, held: Claim) -> None:
         "Fluoromap-Timestamp": moment,
         "Fluoromap-Signature": f"sha256={signature(secret_of(target.secret_file), moment, body)}",
     }
-    with connected(target, headers) as client:
-        answer = client.post(str(target.url), content=body)
+    with connected(target, headers) as connection:
+        answer = connection.post(str(target.url), [body])
     if not answer.is_success:
-        raise refused(answer.status_code, "the message")
+        raise refused(answer.status, "the message")
 
 
 def signature(secret: str, moment: str, body: bytes) -> str:

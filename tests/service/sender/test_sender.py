@@ -20,7 +20,7 @@ from typing import Any
 
 import pydicom
 import pytest
-from delivery_peers import Archive, Inbox, dicom_node, dicomweb_server, webhook_receiver
+from delivery_peers import Archive, Inbox, dicom_node, dicomweb_server, endless_server, webhook_receiver
 from finished_study import FinishedStudy, make_study
 from pydicom.dataset import Dataset
 from pynetdicom import evt
@@ -31,7 +31,9 @@ from fluoromap_service.cli.supervisor import free_port
 from fluoromap_service.deliveries import outbox
 from fluoromap_service.deliveries.targets import CStoreTarget, StowTarget, WebhookTarget
 from fluoromap_service.jobs import job_life
-from fluoromap_service.sender.service import send_next
+from fluoromap_service.sender.peers import NotDelivered
+from fluoromap_service.sender.service import Sender, send_next
+from fluoromap_service.sender.stow import open_server
 from fluoromap_service.settings import settings
 from fluoromap_service.store import audit, tally
 from fluoromap_service.store.clock import db_now
@@ -170,6 +172,101 @@ def test_refusals_of_the_negotiation(study: FinishedStudy, options: Any, changes
         send_next(target.model_copy(update=changes))
     assert history(study.job_id) == [code]
     assert archive.stored == []
+
+
+OK = b"HTTP/1.1 200 OK\r\nContent-Type: application/dicom+json\r\n"
+
+
+@pytest.mark.parametrize(
+    ("head", "part", "pause_seconds", "code"),
+    [
+        (OK + b"\r\n", b" " * 2**16, 0.0, "answer_too_long"),
+        (OK + b"Content-Length: 600000000\r\n\r\n", b" " * 2**16, 0.0, "answer_too_long"),
+        (OK + b"\r\n", b" ", 0.05, "answer_too_slow"),
+        # One header field that never ends.
+        (OK + b"X: ", b"x", 0.05, "answer_too_slow"),
+    ],
+    ids=["endless", "600 MB", "dripping", "dripping header"],
+)
+@pytest.mark.parametrize("kind", ["dicomweb", "webhook"])
+def test_answer_without_end(
+    study: FinishedStudy, tmp_path: Path, kind: str, head: bytes, part: bytes, pause_seconds: float, code: str
+) -> None:
+    with endless_server(head, part, pause_seconds) as (url, taken):
+        # The target is never silent, so the limit for silence does not end the attempt.
+        if kind == "dicomweb":
+            send_next(StowTarget(name="archive", kind="dicomweb", url=url, timeout_seconds=1.0))
+        else:
+            send_next(hook(tmp_path, url, timeout_seconds=1.0))
+        assert history(study.job_id) == [code]
+        end = time.monotonic() + PATIENCE_SECONDS
+        while not taken:
+            assert time.monotonic() < end, "the sender still reads"
+            time.sleep(0.01)
+    # The buffers of both sockets hold some megabytes beside what the sender has read.
+    assert taken[0] < 50 * 2**20
+
+
+def test_question_whose_answers_never_end(study: FinishedStudy) -> None:
+    archive = Archive()
+
+    def lose_answer(event: evt.Event) -> int:
+        archive.take(event.dataset)
+        event.assoc.abort()
+        return 0x0000
+
+    def match_for_ever(event: evt.Event) -> Iterator[tuple[int, Dataset]]:
+        while event.assoc.is_established:
+            yield 0xFF00, event.identifier
+
+    with dicom_node(archive, handlers=[(evt.EVT_C_STORE, lose_answer)]) as target:
+        send_next(target)
+    with dicom_node(archive, port=target.port, handlers=[(evt.EVT_C_FIND, match_for_ever)]):
+        attempt_again(target)
+    assert history(study.job_id) == ["connection_lost", "answer_too_long"]
+
+
+@pytest.mark.parametrize(
+    ("url", "allowed", "sends"),
+    [
+        ("http://192.0.2.8/dicom-web", False, False),
+        ("http://archive.example/dicom-web", False, False),
+        ("http://192.0.2.8/dicom-web", True, True),
+        ("https://192.0.2.8/dicom-web", False, True),
+        ("http://127.0.0.1/dicom-web", False, True),
+        ("http://[::1]/dicom-web", False, True),
+        ("http://localhost/dicom-web", False, True),
+    ],
+)
+def test_authorization_crosses_no_network_without_tls(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, allowed: bool, sends: bool
+) -> None:
+    secret = tmp_path / "authorization"
+    secret.write_text(f"Bearer {SECRET}\n")
+    target = StowTarget(name="archive", kind="dicomweb", url=url, authorization_file=secret, allow_insecure=allowed)
+    if sends:
+        with open_server(target):
+            pass
+    else:
+        with pytest.raises(NotDelivered, match="allow_insecure") as failure, open_server(target):
+            pass
+        assert failure.value.failure.code == "insecure_target"
+    Sender([target])
+    warned = "authorization_without_tls" in capsys.readouterr().out
+    assert warned is (allowed or not sends)
+    # Without a secret, a plain target is allowed: DICOM itself often has no TLS.
+    with open_server(target.model_copy(update={"authorization_file": None, "allow_insecure": False})):
+        pass
+
+
+def test_authorization_is_sent_to_a_loopback_target(study: FinishedStudy, tmp_path: Path) -> None:
+    secret = tmp_path / "authorization"
+    secret.write_text(f"Bearer {SECRET}\n")
+    archive = Archive()
+    with dicomweb_server(archive) as target:
+        send_next(target.model_copy(update={"authorization_file": secret}))
+    assert Counter(archive.uids) == Counter(objects_of(study).keys())
+    assert set(archive.authorizations) == {f"Bearer {SECRET}"}
 
 
 def test_target_that_dies_in_the_middle(study: FinishedStudy) -> None:
