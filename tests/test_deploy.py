@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import re
 import subprocess
@@ -159,9 +160,26 @@ def test_proxy_file_follows_the_specification() -> None:
     subprocess.run([checker, "--builtin-schema", "vendor.compose-spec", file], check=True, capture_output=True)
 
 
+def test_the_api_trusts_the_address_of_the_proxy_alone() -> None:
+    compose = yaml.safe_load((TOP / "deploy" / "proxy" / "docker-compose.yml").read_text())
+    api, proxy = compose["services"]["api"], compose["services"]["proxy"]
+    address = proxy["networks"]["front"]["ipv4_address"]
+    (subnet,) = (each["subnet"] for each in compose["networks"]["front"]["ipam"]["config"])
+    assert ipaddress.ip_address(address) in ipaddress.ip_network(subnet)
+    assert set(api["networks"]) == {"default", "front"}
+    values = {name.removeprefix("FLUOROMAP_").lower(): value for name, value in api["environment"].items()}
+    assert values["trusted_proxies"] == address
+    Settings(**values | {"allowed_hosts": values["allowed_hosts"].replace("${PROXY_NAME:-localhost}", "localhost")})
+
+
 def test_every_container_has_limits_and_a_bounded_log() -> None:
-    for file in (TOP / "docker-compose.yml", TOP / "deploy" / "proxy" / "docker-compose.yml"):
-        for name, service in yaml.safe_load(file.read_text())["services"].items():
+    first, second = (
+        yaml.safe_load((folder / "docker-compose.yml").read_text())["services"]
+        for folder in (TOP, TOP / "deploy" / "proxy")
+    )
+    # The second file adds to services of the first.
+    for services in (first, {name: first.get(name, {}) | service for name, service in second.items()}):
+        for name, service in services.items():
             assert service["mem_limit"], name
             assert service["logging"]["options"]["max-size"], name
             assert "no-new-privileges:true" in service["security_opt"], name

@@ -65,7 +65,10 @@ def embedded(environment: dict[str, str], port: int) -> Iterator[Kill]:
 
 @contextmanager
 def with_servers(environment: dict[str, str], port: int) -> Iterator[Kill]:
-    """Start API and worker as separate programs, as on several machines. Without a token the service is open."""
+    """Start API and worker as separate programs, as on several machines.
+
+    Without a token the service is open.
+    """
     subprocess.run([program(), "db", "upgrade"], env=environment, check=True)
     with ExitStack() as stack:
         stack.enter_context(process("api", "--port", str(port), environment=environment))
@@ -94,7 +97,10 @@ def environment_of(data_dir: Path, **settings: str) -> dict[str, str]:
 
 
 def client_of(environment: dict[str, str], port: int) -> Client:
-    """Return a client with the access token of the data folder, where ``fluoromap up`` has made one."""
+    """Return a client with the access token of the data folder.
+
+    ``fluoromap up`` makes the token; without one the service is open.
+    """
     return Client(f"http://127.0.0.1:{port}", read_token(Path(environment["FLUOROMAP_DATA_DIR"])))
 
 

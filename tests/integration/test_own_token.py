@@ -35,10 +35,18 @@ def test_up_lets_in_its_user_only(tmp_path: Path) -> None:
                 assert [browser.post("/sign-in", json={"link": link}).status_code for _ in range(2)] == [204, 401]
                 assert browser.get("/session").json() == {"name": "local"}
                 assert browser.post("/v1/studies", json={"label": "x"}, headers={"Origin": url}).status_code == 201
+            # The loopback address is no trusted proxy.
+            wrong = [_wrong_token(url, f"203.0.113.{n}") for n in range(21)]
+            assert wrong[-1] == 429
             with client_of(environment, port) as client:
                 client.make_study("y")
             assert file.read_text().strip() not in log.read_text()
     assert len(texts) == 1, "another start takes the same token"
+
+
+def _wrong_token(url: str, forwarded_for: str) -> int:
+    headers = {"Authorization": "Bearer wrong", "X-Forwarded-For": forwarded_for}
+    return httpx.get(f"{url}/v1/studies", headers=headers).status_code
 
 
 def test_a_folder_with_tokens_gets_no_other_unless_its_user_asks(tmp_path: Path) -> None:

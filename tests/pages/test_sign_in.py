@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from collections.abc import Iterator
@@ -36,6 +37,30 @@ def closed_service(tmp_path: Path) -> Iterator[tuple[str, str]]:
                 assert time.monotonic() < end, "the service did not answer in time"
                 time.sleep(0.1)
         yield url, made.stdout.split()[-1]
+
+
+def test_a_link_signs_in_once(browser: Any, closed_service: tuple[str, str], tmp_path: Path) -> None:
+    url, _ = closed_service
+    command = [program(), "sign-in", "--port", url.rpartition(":")[2]]
+    environment = os.environ | {"FLUOROMAP_DATA_DIR": str(tmp_path / "data")}
+    link = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.strip()
+    assert link.startswith(f"{url}/sign-in#")
+    with browser.new_context(base_url=url) as context:
+        page = context.new_page()
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(link)
+        page.get_by_text("Signed in as local").wait_for()
+        assert page.url == f"{url}/"
+        page.go_back()
+        assert link.rpartition("#")[2] not in page.evaluate("location.href")
+        assert not [each for each in asked if link.rpartition("#")[2] in each]
+    with browser.new_context(base_url=url) as context:
+        page = context.new_page()
+        page.goto(link)
+        page.get_by_role("alert").get_by_text("was used or is too old").wait_for()
+        assert context.cookies() == []
+    assert link.rpartition("#")[2] not in (tmp_path / "data" / "api.log").read_text()
 
 
 def test_a_browser_signs_in_and_out(browser: Any, closed_service: tuple[str, str]) -> None:

@@ -18,7 +18,10 @@ class Credential:
     is_session: bool = False
 
     def find(self) -> tuple[Caller, float | None] | None:
-        """Return its caller and when it expires; None when it is not valid."""
+        """Return the caller and the time of expiry.
+
+        None when the credential is not valid.
+        """
         return sessions.find(self.sha256) if self.is_session else tokens.find(self.sha256)
 
 

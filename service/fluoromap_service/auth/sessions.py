@@ -35,9 +35,9 @@ class SessionInfo:
 
 
 def begin(token_sha256: str) -> str | None:
-    """Begin a session with a token, given by its hash, and return its id.
+    """Begin a session with a token and return the session's id.
 
-    None when the token is not valid.
+    The token is given by its hash. None when the token is not valid.
     """
     return _add(token_sha256, SESSION_SECONDS, opened=True)
 
@@ -66,7 +66,7 @@ def _add(token_sha256: str, seconds: float, *, opened: bool) -> str | None:
 
 
 def open_link(secret: str) -> str | None:
-    """Open a link once, and return the id of the session that begins.
+    """Open a link and return the id of the session.
 
     None when the link is unknown, used or too old.
     """
@@ -106,7 +106,10 @@ def list_sessions() -> list[SessionInfo]:
 
 
 def remove_ended() -> int:
-    """Delete the sessions and links that ended by themselves, and return how many."""
+    """Delete the sessions and links that have ended.
+
+    Return how many.
+    """
     of_valid_token = BrowserSession.token_id.in_(select(Token.id).where(is_valid()))
     ended = not_(and_(BrowserSession.expires > db_now(), of_valid_token))
     with reading() as session:
@@ -117,7 +120,10 @@ def remove_ended() -> int:
 
 
 def find(session_sha256: str) -> tuple[Caller, float] | None:
-    """Return the caller of a session and when it expires; None when it is not valid."""
+    """Return the caller of a session and the time of expiry.
+
+    The session is given by the hash of its id. None when it is not valid.
+    """
     with reading() as session:
         row = session.execute(_OPEN_SESSION, {"sha256": session_sha256}).first()
     if row is None:

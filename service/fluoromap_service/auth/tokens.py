@@ -160,9 +160,9 @@ def verify(text: str) -> Caller | None:
 
 
 def find(sha256: str) -> tuple[Caller, float | None] | None:
-    """Return the caller of a token, given by its hash, and when it expires.
+    """Return the caller of a token and the time of expiry.
 
-    None when the token is not valid.
+    The token is given by its hash. None when the token is not valid.
     """
     with reading() as session:
         row = session.execute(_VALID_TOKEN, {"sha256": sha256}).first()

@@ -38,13 +38,16 @@ def read_token(data_dir: Path) -> str | None:
 
 
 def valid_token() -> str | None:
-    """Return the token of this data folder; None when there is none or it is no longer valid."""
+    """Return the valid token of this data folder; None without one."""
     text = read_token(settings().data_dir)
     return text if text is not None and auth.verify(text) is not None else None
 
 
 def make_token() -> str:
-    """Return the token of this data folder, and make one where there is no valid one."""
+    """Return the token of this data folder.
+
+    Make one where there is no valid one.
+    """
     text = valid_token()
     if text is not None:
         return text

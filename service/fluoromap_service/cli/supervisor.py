@@ -351,7 +351,10 @@ class PrivateService:
 
 
 def _sign_in_link(environment: dict[str, str]) -> str:
-    """Migrate the database and make the token of a data folder, and return a link that signs a browser in."""
+    """Return a link that signs a browser in.
+
+    The database is migrated, and the data folder gets a token, where needed.
+    """
     # Another process: this one has the settings of its user, not those of the private service.
     answer = subprocess.run(
         [program(), "sign-in"], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True

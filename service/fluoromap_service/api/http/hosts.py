@@ -16,7 +16,7 @@ _FORWARDING = frozenset({"forwarded", "via", "x-real-ip"})
 
 
 def is_forwarded(connection: HTTPConnection) -> bool:
-    """Return whether a proxy has passed the request on, as far as its headers show.
+    """Return whether the headers show that a proxy passed the request on.
 
     RFC 7239 defines Forwarded, RFC 9110 section 7.6.3 Via; the X-Forwarded headers are the custom of proxies.
     """
@@ -24,7 +24,10 @@ def is_forwarded(connection: HTTPConnection) -> bool:
 
 
 def host_name(connection: HTTPConnection) -> str | None:
-    """Return the name in the header Host, without its port; None when it is no host."""
+    """Return the name in the header Host without its port.
+
+    None when it is no host.
+    """
     host = connection.headers.get("host", "")
     try:
         return urlsplit(f"//{host}").hostname if _HOST.fullmatch(host) else None

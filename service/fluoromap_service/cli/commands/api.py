@@ -7,6 +7,7 @@ import sys
 from contextlib import suppress
 from types import FrameType
 
+import structlog
 import typer
 import uvicorn
 
@@ -39,6 +40,7 @@ COLLECTOR_THRESHOLDS = (10_000, 20, 20)
 """Rarer runs of the garbage collector than Python's own: answers and jobs of a large study make thousands of small objects."""
 
 app = typer.Typer(add_completion=False)
+log = structlog.get_logger(__name__)
 
 
 @app.command()
@@ -52,6 +54,8 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
     with explain_database_failures():
         schema.check()
         auth.check_may_start(settings().host)
+        if not auth.any_token():
+            log.warning("open_to_all_users_of_this_machine")
         # A request may name a target before the sender has started.
         with writing() as session:
             outbox.register(session, read_targets())
@@ -66,6 +70,8 @@ def api(host: Host = None, port: Port = None, data_dir: DataDir = None) -> None:
         log_config=None,
         host=settings().host,
         port=settings().port,
+        # The application itself reads the headers of trusted proxies.
+        proxy_headers=False,
         log_level="warning",
         server_header=False,
         timeout_graceful_shutdown=STOP_SECONDS,

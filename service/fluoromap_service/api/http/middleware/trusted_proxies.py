@@ -33,7 +33,10 @@ class TrustedProxies:
         await self._proxied(scope, receive, send)  # type: ignore[arg-type]
 
     def _warn(self, scope: Scope) -> None:
-        """Log once that a proxy is not trusted, because addresses in answers then lack https."""
+        """Log once that a proxy is not trusted.
+
+        Its clients then count as one, and addresses in answers lack https.
+        """
         peer = (scope.get("client") or ("",))[0]
         if "x-forwarded-for" in Headers(scope=scope) and peer not in self._proxied.trusted_hosts:
             self._has_warned = True
