@@ -25,6 +25,10 @@ LINK_SECONDS = 600.0
 """Time in which somebody must open a link."""
 
 
+MOST_SESSIONS = 1000
+"""Most sessions and links of one token; the oldest end first. So no program fills the table with a token."""
+
+
 @dataclass(frozen=True, slots=True)
 class SessionInfo:
     """A session in a list. Times are seconds since 1970 UTC."""
@@ -62,6 +66,10 @@ def _add(token_sha256: str, seconds: float, *, opened: bool) -> str | None:
                 sha256=token_hash(secret), token_id=token_id, opened=now if opened else None, expires=now + seconds
             )
         )
+        session.flush()
+        of_token = select(BrowserSession.id).where(BrowserSession.token_id == token_id)
+        surplus = of_token.order_by(BrowserSession.id.desc()).offset(MOST_SESSIONS)
+        session.execute(delete(BrowserSession).where(BrowserSession.id.in_(surplus.limit(MOST_SESSIONS))))
     return secret
 
 

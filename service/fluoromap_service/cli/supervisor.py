@@ -57,7 +57,11 @@ def free_port() -> int:
 
 
 def url_of(host: str, port: int) -> str:
-    """Return the address of a service. An IPv6 address has brackets in it."""
+    """Return the address at which programs of this machine reach a service.
+
+    An IPv6 address has brackets. A service that listens on every address is reached on the loopback address.
+    """
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 

@@ -27,6 +27,8 @@ def test_sign_in_makes_the_token_once_and_a_link_each_time(fluoromap: Program, t
     assert len(links) == 2
     assert all(re.fullmatch(r"http://127\.0\.0\.1:8123/sign-in#[\w-]{43}", link) for link in links)
     assert re.match(r"http://\[::1\]:8000/", _link(fluoromap, "--host", "::1", "--port", "8000"))
+    # A service that listens everywhere is reached from this machine on the loopback address.
+    assert re.match(r"http://127\.0\.0\.1:8000/", _link(fluoromap, "--host", "0.0.0.0", "--port", "8000"))
     assert _names() == ["local"]
     caller = auth.verify((tmp_path / "data" / "access-token").read_text().strip())
     assert caller is not None

@@ -88,7 +88,7 @@ class Doorkeeper:
             # Nobody guesses an id of 256 random bits, and each page asks once more when its session has ended.
             return _unauthorised("The session of this browser has ended; sign in again.")
         address = connection.client.host if connection.client else ""
-        await to_thread.run_sync(self._sign_ins.failed, address, limiter=_threads())
+        await to_thread.run_sync(self._sign_ins.failed, address, limiter=_threads_of_failures())
         log.warning("sign_in_failed", address=address)
         return _unauthorised("This token is unknown, expired or revoked; ask for a new one.", 'error="invalid_token"')
 
@@ -172,6 +172,12 @@ def _is_navigation(connection: HTTPConnection) -> bool:
 def _threads() -> CapacityLimiter:
     # Of its own, so that a request need not wait for the threads of other requests before it is even let in.
     return CapacityLimiter(8)
+
+
+@functools.cache
+def _threads_of_failures() -> CapacityLimiter:
+    # Counting a wrong token may wait for a lock of the database. No valid token waits behind it.
+    return CapacityLimiter(2)
 
 
 def _demand(caller: Caller, scope: Scope) -> None:

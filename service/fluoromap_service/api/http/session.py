@@ -43,7 +43,7 @@ def set_cookie(connection: HTTPConnection, response: Response, new_id: str) -> N
     name = host_name(connection)
     # A proxy may speak TLS to the browser and call the service as localhost.
     local = name is not None and is_loopback(name) and not is_forwarded(connection)
-    secure = connection.url.scheme == "https" or not local
+    secure = connection.scope["scheme"] == "https" or not local
     response.set_cookie(COOKIE, new_id, path="/", secure=secure, httponly=True, samesite="strict")
 
 

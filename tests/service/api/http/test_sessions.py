@@ -122,6 +122,19 @@ def test_each_sign_in_is_a_session_of_its_own(service: TestClient, token: str) -
     assert [each.token for each in sessions.list_sessions()] == ["doctor", "doctor"]
 
 
+def test_a_token_has_a_limited_number_of_sessions(
+    service: TestClient, token: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sessions, "MOST_SESSIONS", 3)
+    _sign_in(service, auth.create_token("other", ["read"]))
+    other = service.cookies.pop(COOKIE)
+    ids = [sessions.begin(auth.token_hash(token)) for _ in range(5)]
+    statuses = [
+        service.get("/v1/studies", headers={"Cookie": f"{COOKIE}={each}"}).status_code for each in [*ids, other]
+    ]
+    assert statuses == [401, 401, 200, 200, 200, 200]
+
+
 def test_session_ends_by_itself_and_leaves_the_table(service: TestClient, token: str) -> None:
     _sign_in(service, token)
     (listed,) = sessions.list_sessions()
