@@ -41,6 +41,7 @@ class HeaderWarning(StrEnum):
     PIXEL_DATA_LONGER = "pixel_data_longer"
     SHUTTER_IGNORED = "shutter_ignored"
     R_WAVES_IGNORED = "r_waves_ignored"
+    PATIENT_OR_STUDY_REPAIRED = "patient_or_study_repaired"
 
     @property
     def sentence(self) -> str:
@@ -81,6 +82,10 @@ _SENTENCES: dict[HeaderWarning, str] = {
     HeaderWarning.PIXEL_DATA_LONGER: "There is more pixel data than NumberOfFrames says; the service ignores the rest.",
     HeaderWarning.SHUTTER_IGNORED: "A shutter or collimator attribute makes no sense; the service ignores it.",
     HeaderWarning.R_WAVES_IGNORED: "RWavePointer names frames that do not exist; the service ignores them.",
+    HeaderWarning.PATIENT_OR_STUDY_REPAIRED: (
+        "An attribute of the patient or the study, or SpecificCharacterSet, breaks the rules of DICOM; results carry it repaired "
+        "or empty."
+    ),
 }
 
 

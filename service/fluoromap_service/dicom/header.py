@@ -22,6 +22,7 @@ from pydicom.uid import (
 )
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
+from fluoromap_service.dicom.repair import PATIENT_AND_STUDY, repair
 from fluoromap_service.problem import Problem
 
 # pydicom's warnings quote values, and a damaged header may have a person's name in any place.
@@ -90,6 +91,7 @@ _PLAIN = (
     "TableAngle", "Manufacturer", "ManufacturerModelName",
     "NumberOfFrames", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
 )  # fmt: skip
+_PATIENT_AND_STUDY = ("SpecificCharacterSet", *PATIENT_AND_STUDY)
 
 
 # GE's table position. The creator's element number 00bb gives its elements the numbers bb00 to bbFF, PS3.5 section 7.8.1.
@@ -108,9 +110,9 @@ def _tag(attribute: str | BaseTag) -> BaseTag:
     return Tag(tag)
 
 
-# The service reads only these: patient data stays in the file.
+# The service reads only these. Patient data stays in the file; its form is checked for a warning.
 _WANTED: list[BaseTag | int] = [
-    *(_tag(keyword) for keyword in (*_PLAIN, *_MACROS_OF, *_FRAME_GROUPS)),
+    *(_tag(keyword) for keyword in (*_PLAIN, *_MACROS_OF, *_FRAME_GROUPS, *_PATIENT_AND_STUDY)),
     *(Tag(_PRIVATE_GROUP, block) for block in _PRIVATE_BLOCKS),
     *(Tag(_PRIVATE_GROUP, block << 8 | element) for block in _PRIVATE_BLOCKS for element in _PRIVATE_ELEMENTS),
 ]
@@ -225,6 +227,15 @@ class Header:
     def tags(self, keyword: str) -> tuple[int, ...]:
         """Return the values of an attribute that refers to other attributes (VR AT)."""
         return tuple(int(value) for value in _values(self._value(self._dataset, keyword)) if isinstance(value, int))
+
+    @property
+    def names_need_repair(self) -> bool:
+        """Whether a result cannot carry the patient and study attributes as they are."""
+        part = Dataset()
+        for tag in map(_tag, _PATIENT_AND_STUDY):
+            if tag in self._dataset:
+                part[tag] = self._dataset.get_item(tag)
+        return bool(repair(part))
 
     def _places(self, keyword: str) -> Iterator[Dataset]:
         yield self._dataset
@@ -360,6 +371,27 @@ def data_set_start(file: BufferedReader) -> tuple[str, int]:
         As :func:`read_header`.
     """
     return _bounded(file, lambda reader, size: (_transfer_syntax(reader), reader.tell()))
+
+
+def read_attributes(file: BufferedReader) -> tuple[str, Dataset]:
+    """Return the transfer syntax, and all attributes before the pixel data.
+
+    The file is then at the element PixelData.
+
+    Raises
+    ------
+    Problem
+        As :func:`read_header`.
+    """
+    syntax, place = data_set_start(file)
+    file.seek(place)
+    dataset = read_dataset(
+        file,
+        syntax == ImplicitVRLittleEndian,
+        syntax != ExplicitVRBigEndian,
+        stop_when=lambda tag, representation, length: tag == _PIXEL_DATA,
+    )
+    return syntax, dataset
 
 
 def _bounded(file: BufferedReader, parse: Callable[[_BoundedReader, int], Result]) -> Result:

@@ -105,6 +105,8 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
     table_mm, table_origin = table_position(header)
     pixels = pixel_facts(header, rows, columns, bits_stored, warnings)
     waves = r_wave_frames(header, frames, warnings)
+    if header.names_need_repair:
+        warnings.append(HeaderWarning.PATIENT_OR_STUDY_REPAIRED)
     return InstanceFacts(
         sop_class_uid=_uid(header, "SOPClassUID"),
         sop_instance_uid=_uid(header, "SOPInstanceUID"),

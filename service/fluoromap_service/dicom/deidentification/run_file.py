@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pydicom.dataset import FileMetaDataset
-from pydicom.filereader import read_dataset
 from pydicom.filewriter import dcmwrite
-from pydicom.tag import BaseTag
 from pydicom.uid import (
     UID,
     DeflatedExplicitVRLittleEndian,
@@ -21,8 +19,9 @@ from pydicom.uid import (
 
 from fluoromap_service.dicom.deidentification.dataset import deidentify
 from fluoromap_service.dicom.deidentification.pseudonyms import Pseudonyms
-from fluoromap_service.dicom.header import data_set_start, truncation_problem
+from fluoromap_service.dicom.header import read_attributes, truncation_problem
 from fluoromap_service.dicom.inflation import open_dicom
+from fluoromap_service.dicom.repair import repair
 
 _PIXEL_DATA = (0x7FE0, 0x0010)
 _ITEM, _DELIMITER = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
@@ -42,13 +41,9 @@ def deidentify_file(source: Path, target: Path, pseudonyms: Pseudonyms) -> dict[
         The new UIDs by the original ones.
     """
     with open_dicom(source) as file, target.open("wb") as copy:
-        file.seek(0)
-        syntax, place = data_set_start(file)
-        file.seek(place)
-        dataset = read_dataset(
-            file, syntax == ImplicitVRLittleEndian, syntax != ExplicitVRBigEndian, stop_when=_is_pixel_data
-        )
+        syntax, dataset = read_attributes(file)
         start = file.tell()
+        repair(dataset)
         uids = deidentify(dataset, pseudonyms)
         dataset.file_meta = FileMetaDataset()
         dataset.file_meta.TransferSyntaxUID = (
@@ -59,10 +54,6 @@ def deidentify_file(source: Path, target: Path, pseudonyms: Pseudonyms) -> dict[
         file.seek(start)
         _copy_pixels(file, copy, "big" if syntax == ExplicitVRBigEndian else "little", syntax == ImplicitVRLittleEndian)
     return uids
-
-
-def _is_pixel_data(tag: BaseTag, representation: str | None, length: int) -> bool:
-    return bool(tag == _PIXEL_DATA)
 
 
 def _copy_pixels(file: BufferedReader, copy: BinaryIO, order: str, implicit: bool) -> None:

@@ -7,21 +7,22 @@ import re
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import version
+from pathlib import Path
 
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.filewriter import dcmwrite
 from pydicom.uid import ExplicitVRLittleEndian
 
+from fluoromap_service.dicom.header import read_attributes
+from fluoromap_service.dicom.inflation import open_dicom
+from fluoromap_service.dicom.repair import PATIENT_AND_STUDY, repair
 from fluoromap_service.dicom.writing import deterministic_uid
 
 MANUFACTURER = "fluoromap"
 RESEARCH = "Research result, preliminary"
+_FUNCTIONAL_GROUPS = 0x5200
+"""Group of the functional groups of Enhanced objects; the pixels follow in a higher one."""
 
-_COPIED = (
-    "SpecificCharacterSet", "PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyInstanceUID", "StudyDate",
-    "StudyTime", "AccessionNumber", "ReferringPhysicianName", "StudyID",
-)  # fmt: skip
-_REQUIRED = frozenset(_COPIED) - {"SpecificCharacterSet"}
 _DEIDENTIFICATION = (
     "PatientIdentityRemoved", "DeidentificationMethod", "DeidentificationMethodCodeSequence",
     "LongitudinalTemporalInformationModified",
@@ -36,13 +37,30 @@ def result_uid(job_id: str, *names: str) -> str:
     return deterministic_uid("job", job_id, *names)
 
 
+def source_header(path: Path) -> Dataset:
+    """Return the header of a run for its results: repaired, without private attributes and functional groups.
+
+    Each attribute of the patient and study modules that the run lacks is there and empty (type 2, PS3.5 section 7.4.3).
+    """
+    with open_dicom(path) as file:
+        _, header = read_attributes(file)
+    for tag in list(header.keys()):
+        if tag.is_private or tag.group >= _FUNCTIONAL_GROUPS:
+            del header[tag]
+    repair(header)
+    for keyword in PATIENT_AND_STUDY:
+        if keyword not in header:
+            setattr(header, keyword, "")
+    return header
+
+
 @dataclass(frozen=True, eq=False)
 class ResultSource:
     """The origin of the result objects of a job.
 
     job_id : id of the job, from which all UIDs derive. finished : its end, UTC; dates the objects, so that the same job
-    always gives the same bytes. headers : of the source runs, without pixels. The first gives patient and study; the others
-    need only their UIDs.
+    always gives the same bytes. headers : of the source runs, without pixels. The first gives patient and study, as
+    :func:`source_header` returns it; the others need only their UIDs.
     """
 
     job_id: str
@@ -63,10 +81,8 @@ def set_identity(
     dataset: Dataset, source: ResultSource, sop_class: str, name: str, series_number: int, modality: str
 ) -> None:
     """Set the modules that all result objects share (PS3.3 C.7.1.1, C.7.2.1, C.7.3.1, C.7.5.1, C.12.1)."""
-    for keyword in _COPIED:
-        value = source.headers[0].get(keyword)
-        if value is not None or keyword in _REQUIRED:
-            setattr(dataset, keyword, value)
+    for keyword in ("SpecificCharacterSet", *PATIENT_AND_STUDY):
+        setattr(dataset, keyword, source.headers[0][keyword].value)
     dataset.SOPClassUID = sop_class
     dataset.SOPInstanceUID = source.uid(name)
     dataset.SeriesInstanceUID = source.uid(name, "series")

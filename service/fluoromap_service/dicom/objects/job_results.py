@@ -8,13 +8,12 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-import pydicom
 from numpy.typing import NDArray
 from PIL import Image
 from pydicom.dataset import Dataset
 
 from fluoromap_service.dicom.json_model import Json, header_json
-from fluoromap_service.dicom.objects.identity import ResultSource
+from fluoromap_service.dicom.objects.identity import ResultSource, source_header
 from fluoromap_service.dicom.objects.pictures import PictureSeries, pictures_file
 from fluoromap_service.dicom.objects.report_site import ReportSite
 from fluoromap_service.dicom.objects.surface import surface_file
@@ -51,8 +50,8 @@ class ResultOrigin:
 
     def source(self) -> ResultSource:
         """Read the header of the first run."""
-        first = pydicom.dcmread(self.first_run, stop_before_pixels=True)
-        return ResultSource(self.job_id, self.finished, (first, *(run.dataset() for run in self.other_runs)))
+        headers = (source_header(self.first_run), *(run.dataset() for run in self.other_runs))
+        return ResultSource(self.job_id, self.finished, headers)
 
 
 def report_object(origin: ResultOrigin, sites: tuple[ReportSite, ...], volume_ml: float | None) -> bytes:

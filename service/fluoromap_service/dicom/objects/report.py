@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from highdicom.sr import (
     CodedConcept,
@@ -30,6 +32,9 @@ from fluoromap_service.dicom.objects.identity import (
     set_equipment,
 )
 from fluoromap_service.dicom.objects.report_site import ReportSite
+
+# highdicom's warnings quote the patient's name.
+warnings.filterwarnings("ignore", module=r"highdicom\.")
 
 _ELECTRODE = CodedConcept("electrode", "99FLUOROMAP", "Tip electrode of the mapping catheter")
 _ACTIVATION_TIME = CodedConcept("lat", "99FLUOROMAP", "Local activation time")
