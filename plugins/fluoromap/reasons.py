@@ -32,6 +32,7 @@ class Reason(StrEnum):
     PHASE_UNKNOWN = "phase_unknown"
     LAT_OUTLIER = "lat_outlier"
     PAIRED_BY_ORDER = "paired_by_order"
+    ORDER_UNKNOWN = "order_unknown"
     TOO_FEW_SITES = "too_few_sites"
     SITES_COPLANAR = "sites_coplanar"
     MARK_NOT_USED = "mark_not_used"
@@ -77,6 +78,7 @@ _SENTENCES: dict[Reason, str] = {
     Reason.PHASE_UNKNOWN: "No cardiac cycle could be recognised in this run; the quietest frames were used.",
     Reason.LAT_OUTLIER: "The activation time does not agree with its neighbours; check the annotation.",
     Reason.PAIRED_BY_ORDER: "The site's runs are a guess: pairs in order of time took the table's rows in order; confirm them.",
+    Reason.ORDER_UNKNOWN: "The headers do not say which of these runs came first; check which runs are paired at this site.",
     Reason.TOO_FEW_SITES: "Fewer than four sites could be located; a chamber surface needs at least four.",
     Reason.SITES_COPLANAR: "All located sites lie in one plane; a chamber surface needs sites on several walls.",
     Reason.MARK_NOT_USED: "Electrodes set by hand contradict the other view or the other frames and were not used; check them.",

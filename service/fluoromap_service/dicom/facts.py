@@ -116,7 +116,7 @@ class InstanceFacts:
     frame_time_ms : float
         Mean interval; 0 for a single frame.
     acquired : datetime or None
-        Start of the run, UTC. A time without zone in the file counts as UTC: it serves to order runs only.
+        Earliest start of the run, UTC. A time without zone in the file counts as UTC: it serves to order runs only.
     plane : {"single", "A", "B"}
         Plane of a biplane system.
     primary_deg, secondary_deg, source_detector_mm, source_isocentre_mm, pixel_spacing_mm
@@ -140,6 +140,10 @@ class InstanceFacts:
         The attributes that state ``table_mm``; None where the position is unknown.
     simulated : bool
         True for a run that ``fluoromap simulate`` wrote.
+    acquired_within_s : float
+        Seconds after ``acquired`` within which the run began, by the precision of the header.
+    acquired_zone_known : bool
+        Whether the header states the offset of ``acquired`` from UTC.
 
     Raises
     ------
@@ -175,6 +179,8 @@ class InstanceFacts:
     warnings: tuple[HeaderWarning, ...]
     table_origin: TableOrigin | None = None
     simulated: bool = False
+    acquired_within_s: float = 0.0
+    acquired_zone_known: bool = False
 
     def __post_init__(self) -> None:
         uids = (self.sop_class_uid, self.sop_instance_uid, self.study_instance_uid, self.series_instance_uid)

@@ -29,7 +29,7 @@ from fluoromap_service.dicom.positioner import (
     table_position,
     warn_of_motion,
 )
-from fluoromap_service.dicom.timing import acquisition_time, frame_times_ms
+from fluoromap_service.dicom.timing import acquisition_start, frame_times_ms
 from fluoromap_service.problem import Problem
 
 PROJECTIONS = frozenset(
@@ -104,6 +104,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
     warn_of_motion(header, warnings)
     table_mm, table_origin = table_position(header)
     pixels = pixel_facts(header, rows, columns, bits_stored, warnings)
+    start = acquisition_start(header)
     waves = r_wave_frames(header, frames, warnings)
     if header.names_need_repair:
         warnings.append(HeaderWarning.PATIENT_OR_STUDY_REPAIRED)
@@ -119,7 +120,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
         transfer_syntax=layout.transfer_syntax,
         frame_times_ms=times,
         frame_time_ms=times[-1] / (frames - 1) if frames > 1 else 0.0,
-        acquired=acquisition_time(header),
+        acquired=None if start is None else start.earliest,
         plane=_plane(header),
         primary_deg=gantry.primary_deg,
         secondary_deg=gantry.secondary_deg,
@@ -136,6 +137,8 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
         warnings=tuple(dict.fromkeys(warnings)),
         table_origin=table_origin,
         simulated=_is_simulated(header),
+        acquired_within_s=0.0 if start is None else start.within_s,
+        acquired_zone_known=start is not None and start.zone_known,
     )
 
 

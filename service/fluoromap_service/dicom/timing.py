@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 
+from fluoromap_service.dicom.date_times import date_text, date_time_text, time_text
 from fluoromap_service.dicom.facts import HeaderWarning
 from fluoromap_service.dicom.header import Header
 
 _LONGEST_INTERVAL_MS = 10_000.0
 _ASSUMED_INTERVAL_MS = 1000.0 / 15
 _FRAME_TIME = 0x00181063
-_CLOCK = re.compile(r"(\d{4})\.?(\d\d)\.?(\d\d)(\d\d)?:?(\d\d)?:?(\d\d)?(?:\.(\d{1,6})\d*)?([+-]\d{4})?")
+_MOMENT = re.compile(r"(\d{4})(\d\d)(\d\d)(?:(\d\d)(?:(\d\d)(?:(\d\d)(?:\.(\d+))?)?)?)?([+-]\d{4})?")
+_DAY_S, _SHORTEST_S = 86_400.0, 1e-6
+_PRECISIONS_S = {3: _DAY_S, 4: 3600.0, 5: 60.0, 6: 1.0}
+"""Seconds within which a moment lies of which a header states so many of year, month, day, hour, minute and second."""
 
 
 def frame_times_ms(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[float, ...]:
@@ -60,8 +66,8 @@ def _frame_clocks(header: Header, frames: int) -> tuple[float, ...] | None:
 
 
 def _clock_steps(header: Header, frames: int, keyword: str) -> tuple[float, ...] | None:
-    clocks = [_clock(values[0], UTC) if values else None for values in header.texts_per_frame(keyword)]
-    known = [clock for clock in clocks if clock is not None]
+    starts = [_start(values[0], None) if values else None for values in header.texts_per_frame(keyword)]
+    known = [start.earliest for start in starts if start is not None]
     if len(known) != frames or not all(
         0 < (later - earlier).total_seconds() * 1000 <= _LONGEST_INTERVAL_MS
         for earlier, later in itertools.pairwise(known)
@@ -78,39 +84,90 @@ def _frame_rate(header: Header, frames: int) -> tuple[float, ...] | None:
     return None
 
 
-def acquisition_time(header: Header) -> datetime | None:
-    """Return the start of the run in UTC.
+@dataclass(frozen=True, slots=True)
+class Start:
+    """The start of a run, as exactly as the header states it.
 
-    The first that exists of AcquisitionDateTime, and of the Acquisition, Content and Series date and time.
+    Parameters
+    ----------
+    earliest : datetime
+        UTC; a time without zone counts as UTC.
+    within_s : float
+        Seconds after ``earliest`` within which the run began: 1 for a time in whole seconds, 86400 for a date alone.
+    zone_known : bool
+        Whether the header states the offset from UTC.
     """
-    zone = _zone(header.text("TimezoneOffsetFromUTC")) or UTC
-    for text in _clock_texts(header):
-        if clock := _clock(text, zone):
-            return clock
-    return None
+
+    earliest: datetime
+    within_s: float
+    zone_known: bool
+
+    def contains(self, other: Start) -> bool:
+        """Return whether another statement may mean the same moment."""
+        return 0 <= (other.earliest - self.earliest).total_seconds() < max(self.within_s, _SHORTEST_S)
 
 
-def _clock_texts(header: Header) -> Iterator[str]:
-    yield header.text("AcquisitionDateTime")
+def acquisition_start(header: Header) -> Start | None:
+    """Return the start of the run; None where the header states no day.
+
+    These state it, the most direct first: AcquisitionDateTime, and the Acquisition, Content and Series date and time. The
+    first with a time of the day counts; a later one replaces it that states the same moment more exactly. AcquisitionTime
+    without its date takes the day on which it is nearest to the moment of another attribute. Without any time of the day the
+    first date counts.
+    """
+    found = [start for start in _starts(header) if start is not None]
+    timed = [start for start in found if start.within_s < _DAY_S]
+    if not timed:
+        return found[0] if found else None
+    best = timed[0]
+    for start in timed[1:]:
+        if start.within_s < best.within_s and best.contains(start):
+            best = start
+    return best
+
+
+def _starts(header: Header) -> Iterator[Start | None]:
+    zone = _zone(header.text("TimezoneOffsetFromUTC"))
+    yield _start(header.text("AcquisitionDateTime"), zone)
+    dates = {kind: date_text(header.text(f"{kind}Date")) for kind in ("Acquisition", "Content", "Series", "Study")}
+    times = {kind: time_text(header.text(f"{kind}Time")) for kind in dates}
+    if not dates["Acquisition"] and times["Acquisition"]:
+        day = date_text(date_time_text(header.text("AcquisitionDateTime"))[:8])
+        others = [(day, ""), *((dates[kind], times[kind]) for kind in ("Content", "Series", "Study"))]
+        yield next((_nearest(times["Acquisition"], *other, zone) for other in others if other[0]), None)
     for kind in ("Acquisition", "Content", "Series"):
-        date, time = header.text(f"{kind}Date"), header.text(f"{kind}Time")
-        if date and time:
-            yield date + time
+        yield _start(dates[kind] + times[kind], zone) if dates[kind] else None
 
 
-def _clock(text: str, zone: timezone) -> datetime | None:
-    match = _CLOCK.fullmatch(text)
+def _nearest(time: str, day: str, day_time: str, zone: timezone | None) -> Start | None:
+    """Return a time of the day on the day that brings it nearest to another moment.
+
+    A run that begins before midnight may have the date of its end, and a series begins before its last run.
+    """
+    start, other = _start(day + time, zone), _start(day + day_time, zone)
+    if start is None or other is None or not day_time:
+        return start
+    apart_s = (start.earliest - other.earliest).total_seconds()
+    days = -round(apart_s / _DAY_S)
+    return dataclasses.replace(start, earliest=start.earliest + timedelta(days=days))
+
+
+def _start(text: str, zone: timezone | None) -> Start | None:
+    match = _MOMENT.fullmatch(date_time_text(text))
     if match is None:
         return None
-    year, month, day, hour, minute, second, fraction, offset = match.groups()
+    *fields, fraction, offset = match.groups()
+    known = _zone(offset) or zone
+    year, month, day, hour, minute, second = (int(field or 0) for field in fields)
     try:
-        moment = datetime(
-            int(year), int(month), int(day), int(hour or 0), int(minute or 0), int(second or 0),
-            int((fraction or "0").ljust(6, "0")), tzinfo=_zone(offset) or zone,
-        )  # fmt: skip
-        return moment.astimezone(UTC)
+        # A leap second is the last one of its minute for Python's clock.
+        earliest = datetime(
+            year, month, day, hour, minute, min(second, 59), int((fraction or "0").ljust(6, "0")), tzinfo=known or UTC
+        ).astimezone(UTC)
     except (ValueError, OverflowError):
         return None
+    within_s = 10.0 ** -len(fraction) if fraction else _PRECISIONS_S[sum(field is not None for field in fields)]
+    return Start(earliest, within_s, known is not None)
 
 
 def _zone(offset: str | None) -> timezone | None:

@@ -112,9 +112,9 @@ def binding_of(
     values = [_run_value(run, gantry) for run, gantry in zip(runs, gantries, strict=True)]
     paired = pairing.pair_runs([_site_value(row) for row in rows], values)
     with_geometry = {run.uid for run, gantry in zip(runs, gantries, strict=True) if None not in gantry.values()}
-    sites = tuple(_bound(row, paired.sites[row.name], with_geometry) for row in rows)
+    sites = tuple(_bound(row, paired.sites[row.name], with_geometry, paired.doubtful) for row in rows)
     pairs = tuple(
-        _unnamed(number, pairing.lateral_first(*pair), with_geometry)
+        _unnamed(number, pairing.lateral_first(*pair), with_geometry, paired.doubtful)
         for number, pair in enumerate(paired.unnamed, start=1)
     )
     return Binding(sites, pairs)
@@ -151,6 +151,8 @@ def _run_value(run: StudyRun, gantry: Mapping[str, Any]) -> pairing.Run:
         arrival=run.arrival,
         direction=None if primary is None or secondary is None else pairing.central_ray(primary, secondary),
         acquired=run.facts.acquired,
+        within_s=run.facts.acquired_within_s,
+        zone_known=run.facts.acquired_zone_known,
         table_origin=run.facts.table_origin,
         series_number=run.facts.series_number,
         file_name=run.file_name,
@@ -161,12 +163,11 @@ def _run_value(run: StudyRun, gantry: Mapping[str, Any]) -> pairing.Run:
     )
 
 
-def _bound(row: Row[*tuple[Any, ...]], runs: SiteRuns, with_geometry: set[str]) -> BoundSite:
+def _bound(row: Row[*tuple[Any, ...]], runs: SiteRuns, with_geometry: set[str], doubtful: frozenset[str]) -> BoundSite:
     missing = () if row.lat_ms is not None else ("lat_ms",)
     unusable, angle_deg = _pair_check(runs)
     doubts = _doubts(runs)
-    warnings = [str(Reason.PAIRED_BY_ORDER)] if runs.bound_by == "order" else []
-    warnings += [str(reason) for reason in (*doubts, *([] if unusable is None else [unusable]))]
+    guessed = [Reason.PAIRED_BY_ORDER] if runs.bound_by == "order" else []
     return BoundSite(
         site=row.name,
         lat_ms=row.lat_ms,
@@ -175,14 +176,14 @@ def _bound(row: Row[*tuple[Any, ...]], runs: SiteRuns, with_geometry: set[str]) 
         view_b=runs.b.uid if runs.b else None,
         bound_by=runs.bound_by,
         missing=(*missing, *_missing_runs(runs, with_geometry)),
-        warnings=tuple(warnings),
+        warnings=_warnings(*guessed, *_order_doubt(runs, doubtful), *doubts, unusable),
         unusable=unusable,
         angle_deg=angle_deg,
         doubts=doubts,
     )
 
 
-def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundSite:
+def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str], doubtful: frozenset[str]) -> BoundSite:
     runs = SiteRuns(*pair)
     unusable, angle_deg = _pair_check(runs)
     doubts = _doubts(runs)
@@ -194,12 +195,20 @@ def _unnamed(number: int, pair: pairing.Pair, with_geometry: set[str]) -> BoundS
         view_b=pair[1].uid,
         bound_by="time",
         missing=("site", "lat_ms", *_missing_runs(runs, with_geometry)),
-        warnings=tuple(str(reason) for reason in (*doubts, *([] if unusable is None else [unusable]))),
+        warnings=_warnings(*_order_doubt(runs, doubtful), *doubts, unusable),
         unusable=unusable,
         angle_deg=angle_deg,
         pair=number,
         doubts=doubts,
     )
+
+
+def _warnings(*reasons: Reason | None) -> tuple[str, ...]:
+    return tuple(str(reason) for reason in reasons if reason is not None)
+
+
+def _order_doubt(runs: SiteRuns, doubtful: frozenset[str]) -> tuple[Reason, ...]:
+    return (Reason.ORDER_UNKNOWN,) if runs.a is not None and runs.a.uid in doubtful else ()
 
 
 def _is_empty(row: Row[*tuple[Any, ...]]) -> bool:

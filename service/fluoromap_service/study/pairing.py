@@ -28,6 +28,9 @@ PAIRING_ANGLE_DEG = 30.0
 ROUNDING_DEG = 1e-6
 """Tolerance of the comparison of angles, so that 30 degrees count as 30 degrees."""
 
+LARGEST_OFFSET_S = 14 * 3600.0
+"""Largest offset from UTC; times of which only one has a known zone may differ by so much."""
+
 Direction = tuple[float, float, float]
 """Unit vector from the isocentre to the detector in patient axes (LPS)."""
 Rule = Literal["explicit", "csv", "upload", "order"]
@@ -47,6 +50,11 @@ class Run:
     direction : Direction or None
         None while gantry angles are missing.
     acquired : datetime or None
+        Earliest start of the run, UTC.
+    within_s : float
+        Seconds after ``acquired`` within which it began.
+    zone_known : bool
+        Whether the offset of ``acquired`` from UTC is known.
     table_origin : TableOrigin or None
         The attributes that state the table's position; None where it is unknown.
     series_number : int or None
@@ -69,6 +77,8 @@ class Run:
     site_by: str | None = None
     gantry_turned: bool = False
     table_moved: bool = False
+    within_s: float = 0.0
+    zone_known: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +122,14 @@ class SiteRuns:
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
-    """The runs of all sites by the site's name, and the pairs without a name in the order of acquisition."""
+    """The runs of all sites by the site's name, and the pairs without a name in the order of acquisition.
+
+    ``doubtful`` : UIDs of the runs that time paired although the headers allow another order.
+    """
 
     sites: Mapping[str, SiteRuns]
     unnamed: tuple[Pair, ...]
+    doubtful: frozenset[str] = frozenset()
 
 
 def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
@@ -125,6 +139,7 @@ def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
     draft.take_members("explicit")
     draft.take_table_views()
     draft.take_members("upload")
+    timed = [run for run in draft.free.values() if run.acquired is not None]
     draft.take_ordered_pairs()
     unnamed = pairs_by_time(list(draft.free.values()))
     rows = draft.rows_without_runs()
@@ -132,7 +147,35 @@ def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
         for site, pair in zip(rows, unnamed, strict=True):
             draft.slots[site.name] = _Slots(*pair, "order")
         unnamed = []
-    return Pairing({name: slots.result() for name, slots in draft.slots.items()}, tuple(unnamed))
+    sites_runs = {name: slots.result() for name, slots in draft.slots.items()}
+    ordered = [(each.a, each.b) for each in sites_runs.values() if each.bound_by == "order" and each.a and each.b]
+    return Pairing(sites_runs, tuple(unnamed), _doubtful([*ordered, *unnamed], timed))
+
+
+def _doubtful(pairs: Sequence[Pair], timed: Sequence[Run]) -> frozenset[str]:
+    """Return the UIDs of the pairs into which a third run may fall by the precision of the times.
+
+    The order within a pair does not matter: the two planes of a biplane system begin together.
+    """
+    return frozenset(
+        uid
+        for first, second in pairs
+        for uid in (first.uid, second.uid)
+        if any(
+            not order_known(run, third)
+            for run in (first, second)
+            for third in timed
+            if third.uid not in (first.uid, second.uid)
+        )
+    )
+
+
+def order_known(first: Run, second: Run) -> bool:
+    """Return whether the headers say which of two runs with a time began first."""
+    earlier, later = sorted((first, second), key=_moment)
+    apart_s = (_acquired(later) - _acquired(earlier)).total_seconds()
+    zones_s = 0.0 if first.zone_known == second.zone_known else LARGEST_OFFSET_S
+    return apart_s > 0 and apart_s >= earlier.within_s + zones_s
 
 
 def _nobody_named(sites: Sequence[Site], runs: Sequence[Run]) -> bool:

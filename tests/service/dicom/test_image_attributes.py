@@ -63,6 +63,47 @@ def test_acquired(make_xa: MakeXa, attributes: dict[str, str], acquired: datetim
     assert facts(make_xa, **attributes).acquired == acquired
 
 
+@pytest.mark.parametrize(
+    ("attributes", "acquired", "within_s"),
+    [
+        # The date alone is less exact than date and time.
+        ({"AcquisitionDateTime": "20240105", "AcquisitionDate": "20240105", "AcquisitionTime": "101500"}, "2024-01-05 10:15", 1),
+        ({"AcquisitionDateTime": "2024", "AcquisitionDate": "20240105", "AcquisitionTime": "1015"}, "2024-01-05 10:15", 60),
+        ({"AcquisitionDateTime": "20240105", "AcquisitionTime": "10"}, "2024-01-05 10:00", 3600),
+        ({"AcquisitionDateTime": "202401051015", "ContentDate": "20240105", "ContentTime": "101530.25"},
+         "2024-01-05 10:15:30.25", 0.01),
+        # Another moment does not replace a more direct one, however exact.
+        ({"AcquisitionDateTime": "202401051015", "ContentDate": "20240301", "ContentTime": "101530.25"}, "2024-01-05 10:15", 60),
+        ({"AcquisitionDate": "20240105", "AcquisitionTime": "101500", "ContentDate": "20240105", "ContentTime": "120000",
+          "SeriesDate": "20240105", "SeriesTime": "090000.123"}, "2024-01-05 10:15", 1),
+        ({"AcquisitionDate": "20240105"}, "2024-01-05 00:00", 86400),
+        ({"AcquisitionDateTime": "202401"}, None, 0),
+        ({"AcquisitionTime": "101500"}, None, 0),
+        ({"AcquisitionTime": "101500", "StudyDate": "20240105"}, "2024-01-05 10:15", 1),
+        # Midnight between the start of the series, the run, and the storing of its content.
+        ({"AcquisitionTime": "000100", "SeriesDate": "20240104", "SeriesTime": "235900"}, "2024-01-05 00:01", 1),
+        ({"AcquisitionTime": "235959", "ContentDate": "20240105", "ContentTime": "000030"}, "2024-01-04 23:59:59", 1),
+        ({"AcquisitionDateTime": "20240105101500.5+0200"}, "2024-01-05 08:15:00.5", 0.1),
+        ({"AcquisitionDateTime": "20240105", "AcquisitionTime": "0030", "TimezoneOffsetFromUTC": "+0200"}, "2024-01-04 22:30", 60),
+    ],
+)  # fmt: skip
+def test_start_is_as_exact_as_the_header(
+    make_xa: MakeXa, attributes: dict[str, str], acquired: str | None, within_s: float
+) -> None:
+    found = facts(make_xa, **attributes)
+    assert found.acquired == (None if acquired is None else datetime.fromisoformat(f"{acquired}+00:00"))
+    assert found.acquired_within_s == pytest.approx(within_s)
+    stated = "TimezoneOffsetFromUTC" in attributes or "+" in attributes.get("AcquisitionDateTime", "")
+    assert found.acquired_zone_known is stated
+    assert InstanceFacts.from_json(found.to_json()) == found
+
+
+def test_times_and_dates_of_other_forms(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES, AcquisitionDate="2024010506", AcquisitionTime="10150000")
+    path.write_bytes(path.read_bytes().replace(b"2024010506", b"2024.01.05").replace(b"10150000", b"10:15:00"))
+    assert read_instance(path).acquired == datetime(2024, 1, 5, 10, 15, tzinfo=UTC)
+
+
 def test_impossible_date(make_xa: MakeXa) -> None:
     path = make_xa(FRAMES, AcquisitionDateTime="20240102030405")
     path.write_bytes(path.read_bytes().replace(b"20240102030405", b"20241399030405"))

@@ -17,6 +17,7 @@ from fluoromap_service.study.pairing import (
     RunNames,
     Site,
     central_ray,
+    order_known,
     pair_runs,
     pairs_by_time,
     tables_comparable,
@@ -63,6 +64,51 @@ def test_most_pairs_win_then_the_shortest_time_within_pairs_then_the_earliest() 
     assert [(a.uid, b.uid) for a, b in pairs_by_time(odd)] == [("1.2.2", "1.2.3")]
     equal = [run(1, LAT, 0), run(2, PA, 20), run(3, LAT, 40)]
     assert [(a.uid, b.uid) for a, b in pairs_by_time(equal)] == [("1.2.1", "1.2.2")]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "within_s", "doubtful"),
+    [
+        ((0, 60, 600, 660), 1.0, ()),
+        ((0, 60, 600, 660), 60.0, ()),
+        ((0, 60, 600, 660), 61.0, ()),  # within each pair the order does not matter
+        ((0, 60, 120, 180), 61.0, (1, 2, 3, 4)),
+        ((0, 60, 600, 660), 3600.0, (1, 2, 3, 4)),
+        ((0, 0, 60, 60), 1.0, ()),  # the planes of a biplane system begin together
+        ((0, 0, 0, 0), 0.0, (1, 2, 3, 4)),
+        ((0, 0, 0, 60), 1.0, (1, 2, 3, 4)),
+        ((0, 60), 86400.0, ()),
+    ],
+)
+def test_a_pair_is_doubtful_where_another_run_may_belong_between(
+    seconds: tuple[float, ...], within_s: float, doubtful: tuple[int, ...]
+) -> None:
+    runs = [
+        run(number, LAT if number % 2 else PA, float(second), within_s=within_s)
+        for number, second in enumerate(seconds, start=1)
+    ]
+    found = pair_runs([], runs)
+    assert unnamed(found) == [(f"1.2.{number}", f"1.2.{number + 1}") for number in range(1, len(runs), 2)]
+    assert found.doubtful == {f"1.2.{number}" for number in doubtful}
+
+
+def test_the_order_is_unknown_between_a_known_and_an_unknown_zone() -> None:
+    first, second = run(1, LAT, 0.0), run(2, PA, 3600.0, zone_known=False)
+    assert not order_known(first, second)
+    assert order_known(first, replace(second, zone_known=True))
+    assert order_known(first, replace(second, acquired=START + timedelta(hours=15)))
+
+
+def test_named_runs_are_never_doubtful() -> None:
+    runs = [run(number, LAT if number % 2 else PA, 0.0) for number in range(1, 5)]
+    named = [Site("first", explicit_a="1.2.1", explicit_b="1.2.2"), Site("second", csv_row=1)]
+    found = pair_runs(named, runs)
+    assert uids(found, "first") == ("1.2.1", "1.2.2", "explicit")
+    # Only one pair is left, so that nothing can be exchanged.
+    assert found.doubtful == frozenset()
+    by_order = pair_runs([Site("first", csv_row=1), Site("second", csv_row=2)], runs)
+    assert uids(by_order, "second") == ("1.2.3", "1.2.4", "order")
+    assert by_order.doubtful == {run.uid for run in runs}
 
 
 def test_runs_without_time_or_angles_stay_alone() -> None:

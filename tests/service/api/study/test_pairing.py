@@ -67,6 +67,53 @@ def test_runs_that_arrive_one_by_one_in_any_order_pair_by_acquisition(upload: Up
     assert set(found) == {"pair 1", "pair 2"}
 
 
+def _times(tmp_path: Path, number: int, angle: float, **times: str | None) -> bytes:
+    """Return a run without any time but these."""
+    stated = dict.fromkeys(
+        (
+            "AcquisitionDateTime",
+            "AcquisitionDate",
+            "AcquisitionTime",
+            "ContentDate",
+            "ContentTime",
+            "SeriesDate",
+            "SeriesTime",
+        )
+    )
+    return edited(small_run(tmp_path, number, angle), TimezoneOffsetFromUTC=None, **stated | times)
+
+
+def test_a_date_alone_does_not_count_as_midnight(
+    service: TestClient, study_path: str, tmp_path: Path, site_list: Any
+) -> None:
+    for number, angle, time in ((1, 90.0, "100000"), (4, 0.0, "101100"), (3, 90.0, "101000"), (2, 0.0, "100100")):
+        content = _times(
+            tmp_path, number, angle, AcquisitionDateTime="20240105", AcquisitionDate="20240105", AcquisitionTime=time
+        )
+        answer = service.post(f"{study_path}/instances", content=content, headers={"Content-Type": "application/dicom"})
+        assert answer.status_code == 201
+    found = site_list().values()
+    assert [_views(site)[:2] for site in found] == [(run_uid(1), run_uid(2)), (run_uid(3), run_uid(4))]
+    assert [site["warnings"] for site in found] == [[], []]
+
+
+def test_the_list_tells_that_the_order_is_unknown(
+    service: TestClient, study_path: str, tmp_path: Path, site_list: Any
+) -> None:
+    for number, angle in ((1, 90.0), (2, 0.0), (3, 90.0), (4, 0.0)):
+        content = _times(
+            tmp_path, number, angle, AcquisitionDate="20240105", SeriesDate="20240105", SeriesTime="101112"
+        )
+        service.post(f"{study_path}/instances", content=content, headers={"Content-Type": "application/dicom"})
+    assert {name: site["warnings"] for name, site in site_list().items()} == {
+        "pair 1": ["order_unknown"],
+        "pair 2": ["order_unknown"],
+    }
+    assert service.get(f"{study_path}/instances/{run_uid(1)}").json()["warnings"] == ["order_unknown"]
+    service.put(f"{study_path}/sites/A", json={"view_a": run_uid(1), "view_b": run_uid(2)})
+    assert [site["warnings"] for site in site_list().values()] == [[], []]
+
+
 def test_view_a_is_nearer_to_lateral(upload: Upload, site_list: Any) -> None:
     upload((1, 10.0), (2, 70.0))
     assert _views(site_list()["pair 1"])[:2] == (run_uid(2), run_uid(1))

@@ -22,6 +22,8 @@ const BOUND_BY = {
 /** @type {Record<string, string>} */
 const WARNINGS = {
   paired_by_order: "runs and times were paired in order of time",
+  order_unknown: "the files do not say which runs came first; check the pair",
+  patient_or_study_repaired: "an attribute of patient or study breaks the rules of DICOM; results carry it repaired or empty",
   table_moved: "the table may have moved",
   gantry_turned: "the gantry turned during one of the runs; record this view again",
   views_parallel: "the two views are less than 20° apart, which shows no depth",
