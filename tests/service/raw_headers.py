@@ -31,6 +31,31 @@ from fluoromap_service.dicom.objects.job_results import (
 from fluoromap_service.dicom.objects.pictures import PictureSeries
 from fluoromap_service.dicom.objects.report_site import ReportSite
 
+UNUSUAL: dict[str, dict[str, bytes | None]] = {
+    "charset_leading_empty_ISO2022IR87": {
+        "SpecificCharacterSet": b"\\ISO 2022 IR 87",
+        "PatientName": b"Yamada^Tarou=\x1b$B;3ED\x1b(B^\x1b$BB@O:\x1b(B",
+    },
+    "charset_empty": {"SpecificCharacterSet": b""},
+    "charset_ISO_IR_6": {"SpecificCharacterSet": b"ISO_IR 6"},
+    "charset_without_underscore": {"SpecificCharacterSet": b"ISO IR 192", "PatientName": "MÜLLER".encode()},
+    "no_PatientBirthDate": {"PatientBirthDate": None},
+    "PatientSex_question_mark": {"PatientSex": b"?"},
+    "StudyTime_with_colons": {"StudyTime": b"10:11:12"},
+    "nothing_of_type_2": dict.fromkeys(
+        ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "AccessionNumber",
+         "ReferringPhysicianName", "StudyID"),
+    ),
+    "everything_at_once": {
+        "SpecificCharacterSet": b"NONE", "PatientName": b"M\xdcLLER\\A^B^C^D^E^F", "PatientID": b"X" * 70,
+        "PatientBirthDate": b"1952-03-17", "PatientSex": b"w", "PatientAge": b"old", "StudyDate": b"2024.01.05",
+        "StudyTime": b"noon", "AccessionNumber": b"1\\2", "StudyID": b"\x01\x02\x03", "ReferringPhysicianName": b"R" * 80,
+        "InstanceNumber": b"1.5", "TimezoneOffsetFromUTC": b"+01:00", "StudyDescription": b"Stra\xdfe" * 20,
+        "Manufacturer": b"\x1b$B", "PatientIdentityRemoved": b"maybe", "SeriesDate": b"tomorrow",
+    },
+}  # fmt: skip
+"""Headers that scanners and archives write and that strict readers refuse."""
+
 FINISHED = datetime(2026, 3, 1, 10, 0, tzinfo=UTC)
 
 

@@ -39,9 +39,12 @@ _PROSE = frozenset({"LT", "ST", "UT"})
 """One value each, which may have backslashes, tabs and line ends (PS3.5 section 6.2)."""
 _PADDING = " \0\t\n\f\r"
 """Characters at the ends of a value that mean nothing."""
-_SEX = Tag("PatientSex")
 _NAME_COMPONENTS, _NAME_GROUPS, _NAME_LENGTH = 5, 3, 64
-_SEXES = {"M": "M", "F": "F", "O": "O", "MALE": "M", "FEMALE": "F", "OTHER": "O"}
+_CHOICES = {
+    Tag("PatientSex"): {"M": "M", "F": "F", "O": "O", "MALE": "M", "FEMALE": "F", "OTHER": "O"},
+    Tag("PatientIdentityRemoved"): {"YES": "YES", "NO": "NO"},
+}
+"""Attributes of a patient with few allowed values (PS3.3 C.7.1.1), by what systems write for each."""
 
 
 def repair(dataset: Dataset) -> frozenset[str]:
@@ -128,8 +131,8 @@ def _values(tag: BaseTag, representation: str, values: list[str]) -> list[str]:
     if len(values) > 1 and dictionary_has_tag(tag) and dictionary_VM(tag) == "1":
         # The door reads the first of several UIDs. Of other values nobody knows which one counts.
         values = {"UI": values[:1], "PN": [" ".join(values)]}.get(representation, [""])
-    if tag == _SEX:
-        return [_SEXES.get(value.upper(), "") for value in values]
+    if tag in _CHOICES:
+        return [_CHOICES[tag].get(value.upper(), "") for value in values]
     return [_repaired(representation, value) for value in values]
 
 

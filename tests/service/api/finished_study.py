@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -38,7 +38,7 @@ from fluoromap_service.jobs.stage_results import MapResult, SiteTracks, ViewTrac
 from fluoromap_service.store import files
 from fluoromap_service.store.codec import encode
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Instance, Json, StageRow, Study, StudyInstance
+from fluoromap_service.store.models import Instance, Job, Json, StageRow, Study, StudyInstance
 from fluoromap_service.study.catheters import StudyCatheter
 from fluoromap_service.study.snapshot import (
     GantrySnapshot,
@@ -209,6 +209,18 @@ def make_study() -> FinishedStudy:
         )  # fmt: skip
         job = job_life.create(session, study.id, snapshot)
         return FinishedStudy(study.id, job.id, uids)
+
+
+def edit_runs(made: FinishedStudy, edit: Callable[[bytes], bytes]) -> None:
+    """Replace the files of all runs, in the store and in the job."""
+    with writing() as session:
+        job = session.get_one(Job, made.job_id)
+        snapshot = {**job.snapshot, "runs": dict(job.snapshot["runs"])}
+        for instance in session.query(Instance):
+            instance.sha256 = files.keep_bytes(session, edit(files.read(instance.sha256)))
+            uid = instance.sop_instance_uid
+            snapshot["runs"][uid] = {**snapshot["runs"][uid], "sha256": instance.sha256}
+        job.snapshot = snapshot
 
 
 @functools.cache

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import functools
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -121,6 +124,18 @@ def test_values(tmp_path: Path, keyword: str, value: bytes | None, read: str, to
 def test_the_warning_does_not_quote_the_value() -> None:
     assert "PatientName" not in TOLD.sentence
     assert TOLD.sentence.endswith(".")
+
+
+def test_making_results_writes_no_name_into_a_log(tmp_path: Path) -> None:
+    """In a process of its own, because pytest changes the filters of warnings."""
+    path = _file(tmp_path, {"PatientName": b"CANARY7", "PatientID": b"CANARY7\\", "PatientSex": b"CANARY7"})
+    program = "import sys, pathlib, raw_headers; raw_headers.results_of(*map(pathlib.Path, sys.argv[1:]))"
+    made = subprocess.run(
+        [sys.executable, "-c", program, path, tmp_path],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert "CANARY7" not in made.stdout + made.stderr
 
 
 @pytest.mark.parametrize("text", ["20240105", "2024.01.05", "2024-1-5", "2024/01/05"])

@@ -21,9 +21,10 @@ from typing import Any
 import pydicom
 import pytest
 from delivery_peers import Archive, Inbox, dicom_node, dicomweb_server, endless_server, webhook_receiver
-from finished_study import FinishedStudy, make_study
+from finished_study import FinishedStudy, edit_runs, make_study
 from pydicom.dataset import Dataset
 from pynetdicom import evt
+from raw_headers import UNUSUAL, with_raw_values
 from sqlalchemy import select, update
 
 from fluoromap_service.api.results.result_objects import delivery_objects
@@ -99,6 +100,18 @@ def test_objects_arrive_as_they_are(study: FinishedStudy, serve: Serve) -> None:
         acts = [(act.who, act.what, act.study, act.job) for act in audit.entries(session)]
     assert sums[f"delivered_objects|{target.name}"] == len(archive.stored)
     assert acts == [("sender", f"delivery to {target.name}: delivered", study.study_id, study.job_id)]
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["charset_leading_empty_ISO2022IR87", "everything_at_once"])
+def test_results_of_unusual_headers_arrive(study: FinishedStudy, serve: Serve, kind: str) -> None:
+    edit_runs(study, lambda content: with_raw_values(content, UNUSUAL[kind]))
+    archive = Archive()
+    with serve(archive) as target:
+        assert send_next(target)
+    assert {item.SOPInstanceUID: item for item in archive.stored} == objects_of(study)
+    row = delivery(study.job_id)
+    assert (row.state, row.error) == ("delivered", None)
 
 
 def test_target_that_was_away_for_a_day(study: FinishedStudy) -> None:

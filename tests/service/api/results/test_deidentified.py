@@ -15,13 +15,13 @@ import pydicom
 import pytest
 from click.testing import CliRunner
 from fastapi.testclient import TestClient
-from finished_study import FinishedStudy, make_study, no_map
+from finished_study import FinishedStudy, edit_runs, make_study, no_map
 from pydicom.dataset import Dataset
 from small_runs import edited
 
 from fluoromap_service.cli.app import load
 from fluoromap_service.store import audit, files, schema
-from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Instance, Job
 
 pytestmark = pytest.mark.usefixtures("file_processes")
@@ -39,15 +39,7 @@ NAMED = {
 def study(client: TestClient) -> FinishedStudy:
     """A finished job whose runs name a patient."""
     made = make_study()
-    with writing() as session:
-        job = session.get_one(Job, made.job_id)
-        snapshot = {**job.snapshot, "runs": dict(job.snapshot["runs"])}
-        for instance in session.query(Instance):
-            content = edited(files.read(instance.sha256), **NAMED)
-            instance.sha256 = files.keep_bytes(session, content)
-            uid = instance.sop_instance_uid
-            snapshot["runs"][uid] = {**snapshot["runs"][uid], "sha256": instance.sha256}
-        job.snapshot = snapshot
+    edit_runs(made, lambda content: edited(content, **NAMED))
     return made
 
 
