@@ -60,9 +60,9 @@ FINISHED = datetime(2026, 3, 1, 10, 0, tzinfo=UTC)
 
 
 def with_raw_values(content: bytes, values: Mapping[str, bytes | None]) -> bytes:
-    """Return a DICOM file with these bytes as values of attributes, whatever the standard says; None removes one.
+    """Return a DICOM file with these bytes as values of attributes.
 
-    The file is Explicit VR Little Endian, and the attributes have the short form of PS3.5 table 7.1-2 or that of table 7.1-1.
+    They may break the standard. None removes an attribute. The file is Explicit VR Little Endian, and the attributes have the short form of PS3.5 table 7.1-2 or that of table 7.1-1.
     """
     dataset = pydicom.dcmread(io.BytesIO(content))
     written = {tag: _element(dataset, tag) for tag in dataset.keys()}  # noqa: SIM118 - a data set iterates over elements
@@ -90,7 +90,7 @@ def _raw_element(keyword: str, value: bytes) -> bytes:
 
 
 def results_of(run: Path, folder: Path) -> dict[str, bytes]:
-    """Return one result object of each kind for a job whose first run is a file."""
+    """Return a result object of each kind; the file is the job's first run."""
     origin = ResultOrigin("job", FINISHED, run, ())
     picture, surface = folder / "picture.png", folder / "surface.stl"
     Image.fromarray(np.zeros((8, 16, 3), np.uint8)).save(picture)
@@ -114,7 +114,10 @@ def strict_pydicom() -> Any:
 
 
 def strictly_read(content: bytes, *, with_uids: bool = True) -> Dataset:
-    """Return a DICOM object, all of whose values pydicom's strict mode accepts; UIDs may be left out."""
+    """Read a DICOM object with all its values in pydicom's strict mode.
+
+    ``with_uids`` : whether UIDs have to be valid too.
+    """
     dataset = pydicom.dcmread(io.BytesIO(content))
     with strict_pydicom():
         _read_values(dataset, with_uids)

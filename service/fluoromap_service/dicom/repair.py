@@ -48,9 +48,9 @@ _CHOICES = {
 
 
 def repair(dataset: Dataset) -> frozenset[str]:
-    """Repair all values of a data set in place, and write its texts in Unicode.
+    """Repair all values of a data set in place.
 
-    A value whose meaning is certain gets the form of PS3.5 table 6.2-1. A name or a long text is cut at its length. Another
+    Its texts are in Unicode afterwards. A value whose meaning is certain gets the form of PS3.5 table 6.2-1. A name or a long text is cut at its length. Another
     wrong value becomes empty. A UID never changes, because it must match that of other objects. An attribute that cannot be
     read is removed.
 
@@ -103,7 +103,7 @@ def _repair_element(dataset: Dataset, tag: BaseTag, sets: CharacterSets) -> bool
 
 
 def _representation(tag: BaseTag, element: DataElement | RawDataElement) -> str:
-    """Return the value representation of the dictionary for an attribute that holds text, else the element's own."""
+    """Return the dictionary's representation of a text, else the element's own."""
     own = str(element.VR or "UN")
     known = dictionary_VR(tag) if dictionary_has_tag(tag) else own
     return known if known in _TEXTUAL else own
@@ -137,7 +137,10 @@ def _values(tag: BaseTag, representation: str, values: list[str]) -> list[str]:
 
 
 def _repaired(representation: str, text: str) -> str:
-    """Return a value in the form of its representation; empty where its meaning is uncertain."""
+    """Return a value in the form of its representation.
+
+    It is empty where the meaning is uncertain.
+    """
     if representation == "UI":
         return text
     if representation in _FORMS:

@@ -38,8 +38,9 @@ def result_uid(job_id: str, *names: str) -> str:
 
 
 def source_header(path: Path) -> Dataset:
-    """Return the header of a run for its results: repaired, without private attributes and functional groups.
+    """Return the repaired header of a run for its results.
 
+    Private attributes and functional groups are left out.
     Each attribute of the patient and study modules that the run lacks is there and empty (type 2, PS3.5 section 7.4.3).
     """
     with open_dicom(path) as file:
