@@ -62,7 +62,8 @@ FINISHED = datetime(2026, 3, 1, 10, 0, tzinfo=UTC)
 def with_raw_values(content: bytes, values: Mapping[str, bytes | None]) -> bytes:
     """Return a DICOM file with these bytes as values of attributes.
 
-    They may break the standard. None removes an attribute. The file is Explicit VR Little Endian, and the attributes have the short form of PS3.5 table 7.1-2 or that of table 7.1-1.
+    They may break the standard. None removes an attribute. The file is Explicit VR Little Endian, and the attributes have the
+    short form of PS3.5 table 7.1-2 or that of table 7.1-1.
     """
     dataset = pydicom.dcmread(io.BytesIO(content))
     written = {tag: _element(dataset, tag) for tag in dataset.keys()}  # noqa: SIM118 - a data set iterates over elements

@@ -50,9 +50,9 @@ _CHOICES = {
 def repair(dataset: Dataset) -> frozenset[str]:
     """Repair all values of a data set in place.
 
-    Its texts are in Unicode afterwards. A value whose meaning is certain gets the form of PS3.5 table 6.2-1. A name or a long text is cut at its length. Another
-    wrong value becomes empty. A UID never changes, because it must match that of other objects. An attribute that cannot be
-    read is removed.
+    Its texts are in Unicode afterwards. A value whose meaning is certain gets the form of PS3.5 table 6.2-1. A name or a long
+    text is cut at its length. Another wrong value becomes empty. A UID never changes, because it must match that of other
+    objects. An attribute that cannot be read is removed.
 
     Returns
     -------

@@ -142,7 +142,8 @@ def _starts(header: Header) -> Iterator[Start | None]:
 def _nearest(time: str, day: str, day_time: str, zone: timezone | None) -> Start | None:
     """Return a time of the day on the right day.
 
-    On that day it is nearest to another moment. A run that begins before midnight may have the date of its end, and a series begins before its last run.
+    On that day it is nearest to another moment. A run that begins before midnight may have the date of its end, and a series
+    begins before its last run.
     """
     start, other = _start(day + time, zone), _start(day + day_time, zone)
     if start is None or other is None or not day_time:

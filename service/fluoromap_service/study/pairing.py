@@ -155,7 +155,8 @@ def pair_runs(sites: Sequence[Site], runs: Sequence[Run]) -> Pairing:
 def _doubtful(pairs: Sequence[Pair], timed: Sequence[Run]) -> frozenset[str]:
     """Return the UIDs of the pairs that another run may change.
 
-    The times of that run and of a run of the pair do not say which of them came first. The order within a pair does not matter: the two planes of a biplane system begin together.
+    The times of that run and of a run of the pair do not say which of them came first. The order within a pair does not
+    matter: the two planes of a biplane system begin together.
     """
     return frozenset(
         uid

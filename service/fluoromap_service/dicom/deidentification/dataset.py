@@ -11,6 +11,7 @@ from pydicom.tag import BaseTag, Tag
 
 from fluoromap_service.dicom.deidentification.profile import Action, action_for
 from fluoromap_service.dicom.deidentification.pseudonyms import DUMMY_DATE, Dates, Pseudonyms
+from fluoromap_service.dicom.facts import is_uid
 
 METHOD = "PS3.15 Basic Profile; pixels not examined, burned-in text stays"
 _REGISTERED = "1.2.840.10008."
@@ -138,7 +139,7 @@ def _set_dummy(element: DataElement) -> None:
 
 def _replace_uids(element: DataElement, pseudonyms: Pseudonyms, uids: dict[str, str]) -> None:
     values = [str(value) for value in _values(element) if value]
-    new = [value if value.startswith(_REGISTERED) else pseudonyms.uid(value) for value in values]
+    new = [value if value.startswith(_REGISTERED) and is_uid(value) else pseudonyms.uid(value) for value in values]
     uids.update({old: made for old, made in zip(values, new, strict=True) if old != made})
     element.value = new if len(new) > 1 else "".join(new)
 
