@@ -59,8 +59,12 @@ UNUSUAL: dict[str, dict[str, bytes | None]] = {
 FINISHED = datetime(2026, 3, 1, 10, 0, tzinfo=UTC)
 
 
-def with_raw_values(content: bytes, values: Mapping[str, bytes | None]) -> bytes:
+def with_raw_values(
+    content: bytes, values: Mapping[str, bytes | None], representations: Mapping[str, str] | None = None
+) -> bytes:
     """Return a DICOM file with these bytes as values of attributes.
+
+    ``representations`` : of attributes that the file gives another one than the dictionary.
 
     They may break the standard. None removes an attribute. The file is Explicit VR Little Endian, and the attributes have the
     short form of PS3.5 table 7.1-2 or that of table 7.1-1.
@@ -70,7 +74,8 @@ def with_raw_values(content: bytes, values: Mapping[str, bytes | None]) -> bytes
     for keyword, value in values.items():
         written.pop(Tag(keyword), None)
         if value is not None:
-            written[Tag(keyword)] = _raw_element(keyword, value)
+            representation = (representations or {}).get(keyword) or dictionary_VR(keyword)
+            written[Tag(keyword)] = _raw_element(keyword, representation, value)
     _, start = data_set_start(BufferedReader(io.BytesIO(content)))  # type: ignore[arg-type]
     return content[:start] + b"".join(written[tag] for tag in sorted(written))
 
@@ -82,11 +87,11 @@ def _element(dataset: Dataset, tag: BaseTag) -> bytes:
     return stream.getvalue()
 
 
-def _raw_element(keyword: str, value: bytes) -> bytes:
-    tag, representation = Tag(keyword), dictionary_VR(keyword)
+def _raw_element(keyword: str, representation: str, value: bytes) -> bytes:
+    tag = Tag(keyword)
     value += (b"\0" if representation == "UI" else b" ") * (len(value) % 2)
     head = struct.pack("<HH2s", tag.group, tag.element, representation.encode())
-    long = representation in ("UC", "UR", "UT", "UN")
+    long = representation in ("OB", "SQ", "UC", "UR", "UT", "UN")
     return head + struct.pack("<HL" if long else "<H", *((0, len(value)) if long else (len(value),))) + value
 
 

@@ -176,7 +176,8 @@ def _age(text: str) -> str:
 
 
 def _integer(text: str) -> str:
-    return re.sub(r"\.0*$", "", text)
+    text = re.sub(r"\.0*$", "", text)
+    return text if re.fullmatch(r"[+-]?\d{1,10}", text) and -(2**31) <= int(text) < 2**31 else ""
 
 
 def _decimal(text: str) -> str:

@@ -110,6 +110,8 @@ def test_names_in_every_character_set(tmp_path: Path, terms: bytes | None, name:
         ("PatientName", b"DOE\\JOHN", "DOE JOHN", True),
         ("PatientName", b"DOE^JOHN^^", "DOE^JOHN^^", False),
         ("PatientName", b"DOE\x07^JOHN", "DOE^JOHN", True),
+        ("SeriesNumber", b"4.0", "4", False),
+        ("SeriesNumber", b"99999999999", "", False),
         ("StudyInstanceUID", b"1.02.003", "1.02.003", False),
         ("StudyInstanceUID", b" 1.2.3 ", "1.2.3", False),
     ],
@@ -119,6 +121,24 @@ def test_values(tmp_path: Path, keyword: str, value: bytes | None, read: str, to
     header = source_header(path)
     assert str(header[keyword].value or "") == read
     assert (TOLD in read_instance(path).warnings) is told
+
+
+def test_other_representations_than_those_of_the_dictionary(tmp_path: Path) -> None:
+    values: dict[str, bytes | None] = {
+        "PatientBirthDate": b"1952.03.17", "PatientName": b"DOE^JOHN", "PatientID": b"4711", "StudyDate": b"20240105",
+        "AccessionNumber": b"\xfe\xff\x00\xe0\0\0\0\0",
+    }  # fmt: skip
+    representations = {
+        "PatientBirthDate": "LO", "PatientName": "UN", "PatientID": "OB", "StudyDate": "XX", "AccessionNumber": "SQ",
+    }  # fmt: skip
+    path = tmp_path / "run.dcm"
+    path.write_bytes(with_raw_values(_run(), values, representations))
+    header = source_header(path)
+    found = [header[keyword].value for keyword in values]
+    assert found == ["19520317", "DOE^JOHN", "4711", "20240105", ""]
+    assert [header[keyword].VR for keyword in values] == ["DA", "PN", "LO", "DA", "SH"]
+    deidentify_file(path, tmp_path / "copy.dcm", Pseudonyms(b"secret", "patient", "", Dates.KEEP))
+    assert strictly_read((tmp_path / "copy.dcm").read_bytes()).StudyDate == "20240105"
 
 
 def test_the_warning_does_not_quote_the_value() -> None:
