@@ -15,6 +15,7 @@ from starlette.middleware.cors import CORSMiddleware
 
 from fluoromap import registry
 from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
+from fluoromap_service.api.dicomweb.indexing import index_some_runs
 from fluoromap_service.api.http import file_pool, problems
 from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestCounts
 from fluoromap_service.api.http.middleware.audit_trail import FLUSH_SECONDS, Acts, AuditTrail
@@ -66,6 +67,7 @@ from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
 CLEAN_UP_SECONDS = 60.0
+INDEX_SECONDS = 2.0
 RULE_SECONDS = 2.0
 
 ROUTERS = (
@@ -174,6 +176,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     tasks = [
         asyncio.create_task(_repeat("audit_not_written", acts.flush, FLUSH_SECONDS)),
         asyncio.create_task(_repeat("clean_up_failed", clean_up, CLEAN_UP_SECONDS)),
+        asyncio.create_task(_repeat("runs_not_indexed", index_some_runs, INDEX_SECONDS)),
     ]
     rules: RuleWatch | None = app.state.rules
     if rules is not None:

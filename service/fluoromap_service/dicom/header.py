@@ -6,15 +6,17 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BufferedReader
 from typing import Any, TypeVar, cast
 
 from pydicom import config
+from pydicom.charset import convert_encodings
 from pydicom.datadict import tag_for_keyword
 from pydicom.dataelem import RawDataElement
 from pydicom.dataset import Dataset
-from pydicom.filereader import read_dataset
+from pydicom.filereader import data_element_generator, read_dataset
 from pydicom.tag import BaseTag, Tag
 from pydicom.uid import (
     ExplicitVRBigEndian,
@@ -31,6 +33,8 @@ config.settings.reading_validation_mode = config.IGNORE
 HEADER_BYTES = 16 * 2**20
 """Largest header; an Enhanced XA run of 1000 frames has about 2 MB of functional groups."""
 HEADER_READS = 250_000
+LONGEST_VALUE_BYTES = 2**20
+"""Longest value that :func:`read_all_attributes` reads; a longer one is bulk data."""
 SEQUENCE_ITEMS = 50_000
 UNDEFINED_LENGTH = 0xFFFFFFFF
 _ITEM_TAG = {True: b"\xfe\xff\x00\xe0", False: b"\xff\xfe\xe0\x00"}
@@ -39,6 +43,7 @@ _ITEM_TAG = {True: b"\xfe\xff\x00\xe0", False: b"\xff\xfe\xe0\x00"}
 Result = TypeVar("Result")
 
 _PIXEL_DATA = 0x7FE00010
+_CHARACTER_SET = 0x00080005
 _FRAME_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
 
 # Functional group macros of Enhanced XA and RF, PS3.3 C.8.19.6, and the attributes read from each.
@@ -392,6 +397,53 @@ def read_attributes(file: BufferedReader) -> tuple[str, Dataset]:
         stop_when=lambda tag, representation, length: tag == _PIXEL_DATA,
     )
     return syntax, dataset
+
+
+def read_all_attributes(file: BufferedReader) -> tuple[Dataset, bool]:
+    """Read every attribute before the pixel data, as far as the header can be read.
+
+    :func:`read_header` skips what the service does not use, so it accepts a file that is damaged there. This function keeps
+    the attributes before such a damage. Values above ``LONGEST_VALUE_BYTES`` are not read.
+
+    Returns
+    -------
+    tuple of Dataset and bool
+        The attributes, and whether these are all.
+
+    Raises
+    ------
+    Problem
+        As :func:`read_header`, for damaged file meta information.
+    """
+    return _bounded(file, _parse_all)
+
+
+def _parse_all(reader: _BoundedReader, size: int) -> tuple[Dataset, bool]:
+    stream = cast(Any, reader)
+    syntax = _transfer_syntax(reader)
+    start = reader.tell()
+    implicit, little_endian = syntax == ImplicitVRLittleEndian, syntax != ExplicitVRBigEndian
+
+    def at_pixel_data(tag: BaseTag, vr: str | None, length: int) -> bool:
+        return int(tag) == _PIXEL_DATA
+
+    try:
+        return (
+            read_dataset(stream, implicit, little_endian, stop_when=at_pixel_data, defer_size=LONGEST_VALUE_BYTES),
+            True,
+        )
+    except Exception:
+        # The damage may raise anything, also a RecursionError for sequences without end.
+        reader.seek(start)
+    found: dict[BaseTag, Any] = {}
+    elements = data_element_generator(stream, implicit, little_endian, at_pixel_data, defer_size=LONGEST_VALUE_BYTES)
+    with suppress(Exception):
+        for element in elements:
+            found[element.tag] = element
+    dataset = Dataset(found)
+    charset = dataset.get("SpecificCharacterSet") if _CHARACTER_SET in found else None
+    dataset.set_original_encoding(implicit, little_endian, convert_encodings(charset))
+    return dataset, False
 
 
 def _bounded(file: BufferedReader, parse: Callable[[_BoundedReader, int], Result]) -> Result:

@@ -15,7 +15,8 @@ from pynetdicom.transport import ThreadedAssociationServer
 from sqlalchemy.exc import SQLAlchemyError
 
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
-from fluoromap_service.dicom import DicomCode, dicom_problem, read_instance
+from fluoromap_service.dicom import DicomCode, dicom_problem
+from fluoromap_service.dicom.indexed_header import read_run
 from fluoromap_service.dicom.pixel_layout import DECODABLE
 from fluoromap_service.dicom.reading import CAPTURES, PROJECTIONS
 from fluoromap_service.dicom.store_statuses import StoreStatus, status_of
@@ -179,10 +180,11 @@ def _keep(request: Any, file: ArrivingFile, title: str) -> tuple[str, bool]:
         raise OSError("no space")
     file.finish()
     # A hostile file can crash a decoder, so another process reads it.
-    facts = run_in_pool(Task.READ_FILE, read_instance, file.path)
+    run = run_in_pool(Task.READ_FILE, read_run, file.path)
+    facts = run.facts
     if (facts.sop_class_uid, facts.sop_instance_uid) != (request.AffectedSOPClassUID, request.AffectedSOPInstanceUID):
         raise dicom_problem(
             DicomCode.NOT_XA, "The UIDs of the data set differ from those of the C-STORE command; send it again."
         )
     with writing() as session:
-        return add_arrival(session, file.path, facts, file.sha256, Act(f"DICOM {title}", "C-STORE"))
+        return add_arrival(session, file.path, run, file.sha256, Act(f"DICOM {title}", "C-STORE"))

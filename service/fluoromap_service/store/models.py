@@ -18,12 +18,17 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     event,
+    false,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from fluoromap_service.store.clock import db_now
 
 Json = dict[str, Any]
+
+
+CodePoints = Text().with_variant(Text(collation="C"), "postgresql")
+"""Text in the order of code points, as SQLite orders it; the index then serves ranges and beginnings too."""
 
 
 class Base(DeclarativeBase):
@@ -152,6 +157,40 @@ class Instance(Base):
     study_instance_uid: Mapped[str] = mapped_column(String(64), index=True)
     series_instance_uid: Mapped[str] = mapped_column(String(64))
     facts: Mapped[Json]  # InstanceFacts.to_json()
+    # False until the run has its row of DicomObject: runs that an earlier version stored are searched after it.
+    is_indexed: Mapped[bool] = mapped_column(Boolean, default=False, server_default=false(), index=True)
+
+
+class DicomObject(Base):
+    """An object that DICOMweb shows: a stored run, or a result of a job. Searches read this table and DicomValue alone."""
+
+    __tablename__ = "dicom_object"
+    __table_args__ = (Index("ix_dicom_object_place", "study_uid", "series_uid", "uid"),)
+    id: Mapped[int] = mapped_column(primary_key=True)
+    uid: Mapped[str] = mapped_column(CodePoints, unique=True)  # SOP Instance UID
+    study_uid: Mapped[str] = mapped_column(CodePoints)
+    series_uid: Mapped[str] = mapped_column(CodePoints)
+    run: Mapped[str | None] = mapped_column(
+        ForeignKey("instance.sop_instance_uid", ondelete="CASCADE"), unique=True
+    )  # null for a result
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)  # null for a run
+    name: Mapped[str | None] = mapped_column(String(64))  # of a result: report.dcm
+    header: Mapped[str] = mapped_column(Text)  # IndexedHeader.json
+    is_whole: Mapped[bool] = mapped_column(Boolean)  # the header has all that the metadata show
+    unreadable: Mapped[int]  # attributes that could not be read
+
+
+class DicomValue(Base):
+    """A value of an object's header, in the form in which searches compare it."""
+
+    __tablename__ = "dicom_value"
+    __table_args__ = (Index("ix_dicom_value_path_first", "path", "first", "last", "object_id", "item"),)
+    id: Mapped[int] = mapped_column(primary_key=True)
+    object_id: Mapped[int] = mapped_column(ForeignKey("dicom_object.id", ondelete="CASCADE"), index=True)
+    path: Mapped[str] = mapped_column(CodePoints)  # tags, with dots between
+    item: Mapped[int]  # number of the item of a sequence; 0 outside sequences
+    first: Mapped[str | None] = mapped_column(CodePoints)  # null: exists and cannot be compared
+    last: Mapped[str | None] = mapped_column(CodePoints)  # of a date or time: the last moment that it may mean
 
 
 class StudyInstance(Base):

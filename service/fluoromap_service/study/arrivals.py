@@ -8,6 +8,7 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from fluoromap_service.dicom.facts import InstanceFacts
+from fluoromap_service.dicom.indexed_header import ReadRun
 from fluoromap_service.store import audit
 from fluoromap_service.store.audit import Act
 from fluoromap_service.store.models import Study
@@ -16,7 +17,7 @@ from fluoromap_service.study import instances, studies
 _LOCK = 0x70616373  # "pacs" in ASCII; any number that no other lock of this database uses
 
 
-def add_arrival(session: Session, path: Path, facts: InstanceFacts, sha256: str, act: Act) -> tuple[str, bool]:
+def add_arrival(session: Session, path: Path, run: ReadRun, sha256: str, act: Act) -> tuple[str, bool]:
     """Store a run from a DICOM door in the mapping study of its DICOM study.
 
     The run joins the newest mapping study that a DICOM door made for its Study Instance UID. Where there is none, a new
@@ -27,7 +28,7 @@ def add_arrival(session: Session, path: Path, facts: InstanceFacts, sha256: str,
     session : Session
     path : Path
         The incoming file.
-    facts : InstanceFacts
+    run : ReadRun
     sha256 : str
         Hash of the file.
     act : Act
@@ -46,8 +47,8 @@ def add_arrival(session: Session, path: Path, facts: InstanceFacts, sha256: str,
     if session.get_bind().dialect.name == "postgresql":
         # Two associations must not make two studies. SQLite has only one writer at a time.
         session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
-    study = _study_of(session, facts)
-    new = instances.add(session, study.id, path, facts, sha256, file_name=None, site=None)
+    study = _study_of(session, run.facts)
+    new = instances.add(session, study.id, path, run, sha256, file_name=None, site=None)
     audit.append(session, [Act(act.who, act.what, study.id, status=act.status)])
     return study.id, new
 

@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from fluoromap.geometry.gantry import UPRIGHT, ImageAxes
 from fluoromap_service.dicom.facts import InstanceFacts
+from fluoromap_service.dicom.indexed_header import ReadRun
 from fluoromap_service.dicom.inflation import have_same_data_set
 from fluoromap_service.dicom.orientation import image_axes_from_orientation
 from fluoromap_service.problem import Problem, not_found
@@ -30,6 +31,7 @@ from fluoromap_service.store.models import (
     Study,
     StudyInstance,
 )
+from fluoromap_service.study import dicom_index
 from fluoromap_service.study.snapshot import GantrySnapshot
 
 GANTRY_KEYWORDS = {
@@ -206,7 +208,7 @@ def add(
     session: Session,
     study_id: str,
     path: Path,
-    facts: InstanceFacts,
+    run: ReadRun,
     sha256: str,
     *,
     file_name: str | None,
@@ -223,6 +225,7 @@ def add(
     Problem
         409 when the store has another data set under the same SOP Instance UID.
     """
+    facts = run.facts
     files.lock(session)
     known = session.scalar(_STORED_HASH, {"uid": facts.sop_instance_uid})
     copy = known is not None and known != sha256
@@ -246,6 +249,8 @@ def add(
             )
         )
         session.flush()
+    if not copy:
+        dicom_index.put_run(session, facts, run.header)
     link = session.scalar(_LINK, {"study_id": study_id, "uid": facts.sop_instance_uid})
     if link is not None:
         if site is not None and link.site_by != "explicit":
@@ -302,6 +307,7 @@ def remove(session: Session, study_id: str, uid: str) -> list[str]:
     ended = select(Job.id).where(Job.study_id == study_id)
     kept = list(session.scalars(select(Rendering.sha256).where(Rendering.job_id.in_(ended))))
     session.execute(delete(Rendering).where(Rendering.job_id.in_(ended)))
+    dicom_index.forget_results(session, session.scalars(ended))
     session.flush()
     return forget_instances(session, [uid], also=kept)
 

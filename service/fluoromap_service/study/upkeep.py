@@ -13,7 +13,7 @@ from fluoromap_service.store.audit import Act
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import empty_write_ahead_log, reading, writing
 from fluoromap_service.store.models import Idempotency, Job, Rendering, Study
-from fluoromap_service.study import studies
+from fluoromap_service.study import dicom_index, studies
 from fluoromap_service.study.instances import unlink_unreferenced
 
 ANSWER_SECONDS = 24 * 3600.0
@@ -86,6 +86,7 @@ def delete_renderings() -> int:
             rows = session.scalars(select(Rendering).order_by(Rendering.id).limit(_BATCH)).all()
             if not rows:
                 return deleted
+            dicom_index.forget_results(session, {row.job_id for row in rows})
             for row in rows:
                 session.delete(row)
             session.flush()

@@ -13,7 +13,7 @@ import pytest
 from small_runs import run_uid, small_run
 from sqlalchemy import select, text, update
 
-from fluoromap_service.dicom import read_instance
+from fluoromap_service.dicom.indexed_header import read_run
 from fluoromap_service.jobs.rule_watch import RuleWatch
 from fluoromap_service.jobs.start_rules import StartRule, read_rules
 from fluoromap_service.problem import Problem
@@ -46,7 +46,7 @@ def arrive(data_dir: Path, tmp_path: Path) -> Arrive:
             path.write_bytes(content)
             with writing() as session:
                 sha256 = hashlib.sha256(content).hexdigest()
-                add_arrival(session, path, read_instance(path), sha256, Act("DICOM XA_ROOM_1", "C-STORE"))
+                add_arrival(session, path, read_run(path), sha256, Act("DICOM XA_ROOM_1", "C-STORE"))
 
     return add
 

@@ -6,11 +6,11 @@ import re
 from collections.abc import Iterable, Iterator
 
 from fastapi import Request
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import Response, StreamingResponse
 
 from fluoromap_service.api.dicomweb.accept import accepted_types, asked_syntaxes, not_acceptable
 from fluoromap_service.api.dicomweb.store import DICOM_JSON
-from fluoromap_service.api.dicomweb.stored import StoredInstance, existing
+from fluoromap_service.api.dicomweb.stored import StoredInstance, existing, metadata_of_all
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
@@ -22,26 +22,26 @@ _EXPLICIT_LITTLE_ENDIAN = "1.2.840.10008.1.2.1"
 
 
 @router.get("/studies/{study_uid}/metadata")
-def study_metadata(study_uid: str, request: Request, caller: Reader) -> JSONResponse:
+def study_metadata(study_uid: str, request: Request, caller: Reader) -> Response:
     """Return the headers of a study."""
     return _metadata(request, existing(study_uid))
 
 
 @router.get("/studies/{study_uid}/series/{series_uid}/metadata")
-def series_metadata(study_uid: str, series_uid: str, request: Request, caller: Reader) -> JSONResponse:
+def series_metadata(study_uid: str, series_uid: str, request: Request, caller: Reader) -> Response:
     """Return the headers of a series."""
     return _metadata(request, existing(study_uid, series_uid))
 
 
 @router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/metadata")
-def instance_metadata(study_uid: str, series_uid: str, uid: str, request: Request, caller: Reader) -> JSONResponse:
+def instance_metadata(study_uid: str, series_uid: str, uid: str, request: Request, caller: Reader) -> Response:
     """Return the header of an instance."""
     return _metadata(request, existing(study_uid, series_uid, uid))
 
 
-def _metadata(request: Request, instances: list[StoredInstance]) -> JSONResponse:
+def _metadata(request: Request, instances: list[StoredInstance]) -> Response:
     accepted_types(request, DICOM_JSON, "application/json")
-    return JSONResponse([instance.header for instance in instances], media_type=DICOM_JSON)
+    return Response(b"[" + b",".join(metadata_of_all(instances)) + b"]", media_type=DICOM_JSON)
 
 
 @router.get("/studies/{study_uid}")

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+import msgspec
 from fastapi import Request, Response
-from fastapi.responses import JSONResponse
-from pydicom.datadict import dictionary_VR, tag_for_keyword
+from pydicom.datadict import dictionary_VR
+from sqlalchemy import ColumnElement, Select, func, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from fluoromap_service.api.dicomweb.addresses import instance_url, series_url, study_url
+from fluoromap_service.api.dicomweb.indexing import Scope, index_results, index_runs
+from fluoromap_service.api.dicomweb.matching_rules import (
+    AVAILABILITY,
+    MODALITIES_IN_STUDY,
+    MODALITY,
+    ONLINE,
+    PLACE_TAGS,
+    SOP_CLASS,
+    SOP_CLASSES_IN_STUDY,
+    conditions_of,
+    places_of,
+)
+from fluoromap_service.api.dicomweb.search_parameters import Search, read_search, tag_of
 from fluoromap_service.api.dicomweb.store import DICOM_JSON
-from fluoromap_service.api.dicomweb.stored import StoredInstance, instances_of
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
-from fluoromap_service.problem import Problem
+from fluoromap_service.dicom.indexed_header import LONGEST_ATTRIBUTE_BYTES
+from fluoromap_service.store.engine import engine, reading
+from fluoromap_service.store.models import DicomObject, DicomValue
 
 router = new_router("/dicom-web", include_in_schema=False)
 
-DEFAULT_LIMIT, MOST_RESULTS = 100, 500
 STUDY_KEYWORDS = (
     "StudyDate", "StudyTime", "AccessionNumber", "ReferringPhysicianName", "PatientName", "PatientID", "PatientBirthDate",
     "PatientSex", "StudyInstanceUID", "StudyID", "StudyDescription",
@@ -33,204 +46,218 @@ INSTANCE_KEYWORDS = (
 )  # fmt: skip
 """Attributes of an instance in the answers (table 10.6.3-5)."""
 
+_STUDY = (DicomObject.study_uid,)
+_SERIES = (DicomObject.study_uid, DicomObject.series_uid)
+_INSTANCE = (DicomObject.study_uid, DicomObject.series_uid, DicomObject.uid)
+
 Json = dict[str, Any]
+Place = tuple[str, ...]
+"""UIDs of a study; of a study and a series; or of these and an instance."""
+
+_header_decoder = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
-@dataclass(frozen=True, slots=True)
-class _Search:
-    """A search: the attributes to match, the further attributes to return, and the page."""
+class _Found:
+    """The page of a search: for each result its place, and the header of its first matching object."""
 
-    matches: dict[str, str]
-    include: tuple[str, ...]
-    include_all: bool
-    limit: int
-    offset: int
+    def __init__(self, search: Search, level: Sequence[InstrumentedAttribute[str]]) -> None:
+        self.search = search
+        self.level = level
+        self.headers: dict[Place, dict[str, msgspec.Raw]] = {}
+        self.has_more = False
+        self.warnings: list[str] = []
+
+    def count(self, *columns: ColumnElement[Any]) -> dict[Place, list[int]]:
+        """Return numbers of objects for each result, whether they match or not."""
+        query: Select[Any] = select(*self.level, *columns).where(self._is_on_page()).group_by(*self.level)
+        with reading() as session:
+            rows = session.execute(query).all()
+        length = len(self.level)
+        return {tuple(row[:length]): list(row[length:]) for row in rows}
+
+    def values(self, tag: str) -> dict[Place, list[str]]:
+        """Return the values of an attribute of all objects of each result, in order."""
+        query = select(*self.level, DicomValue.first).join(DicomValue, DicomValue.object_id == DicomObject.id)
+        query = query.where(DicomValue.path == tag, DicomValue.first.is_not(None), self._is_on_page()).distinct()
+        with reading() as session:
+            rows = session.execute(query.order_by(*self.level, DicomValue.first)).all()
+        found: dict[Place, list[str]] = {}
+        for row in rows:
+            found.setdefault(tuple(row[:-1]), []).append(row[-1])
+        return found
+
+    def load(self, scope: Sequence[ColumnElement[bool]], conditions: Sequence[ColumnElement[bool]]) -> None:
+        """Read the page; ``scope`` limits the search to a study or series."""
+        with reading() as session:
+            self._read_page(session, [*scope, *conditions])
+            self._warn_of_unreadable_keys(session, scope)
+
+    def _read_page(self, session: Session, conditions: Sequence[ColumnElement[bool]]) -> None:
+        search = self.search
+        groups = select(*self.level).where(*conditions).distinct().order_by(*self.level)
+        places = [tuple(row) for row in session.execute(groups.offset(search.offset).limit(search.limit + 1))]
+        self.has_more = len(places) > search.limit
+        self.headers = {place: {} for place in places[: search.limit]}
+        number = func.row_number().over(partition_by=list(self.level), order_by=list(_INSTANCE)).label("number")
+        ranked = select(DicomObject.id, number).where(*conditions, self._is_on_page()).subquery()
+        first = select(ranked.c.id).where(ranked.c.number == 1)
+        query = select(*self.level, DicomObject.header, DicomObject.unreadable).where(DicomObject.id.in_(first))
+        rows = session.execute(query.order_by(*self.level)).all()
+        # Somebody may have deleted an object meanwhile.
+        self.headers = {tuple(row[: len(self.level)]): _header_decoder.decode(row.header) for row in rows}
+        if unreadable := sum(row.unreadable > 0 for row in rows):
+            self.warnings.append(f"{unreadable} of these results lack attributes that could not be read.")
+
+    def _warn_of_unreadable_keys(self, session: Session, scope: Sequence[ColumnElement[bool]]) -> None:
+        paths = {key.path for key in self.search.keys if not key.is_universal}
+        if not paths:
+            return
+        query = select(func.count(DicomValue.object_id.distinct()))
+        query = query.join(DicomObject, DicomObject.id == DicomValue.object_id)
+        query = query.where(DicomValue.path.in_(["", *paths]), DicomValue.first.is_(None), *scope)
+        if lacking := session.scalar(query):
+            self.warnings.append(f"{lacking} objects have values of these attributes that could not be compared.")
+
+    def _is_on_page(self) -> ColumnElement[bool]:
+        places = list(self.headers)
+        if len(self.level) == 1:
+            return self.level[0].in_([place[0] for place in places])
+        return tuple_(*self.level).in_(places)
 
 
 @router.get("/studies")
 def search_studies(request: Request, caller: Reader) -> Response:
     """Search for studies."""
-    search = _search(request)
-    stored = instances_of()
-    wholes = _grouped(stored, "study_uid")
+    found = _searched(request, _STUDY, None, None)
+    counts = found.count(func.count(DicomObject.series_uid.distinct()), func.count())
+    modalities = found.values(MODALITY)
+    classes = found.values(SOP_CLASS) if _is_asked(found.search, SOP_CLASSES_IN_STUDY) else {}
     results = []
-    for study_uid, members in _grouped(_matching(stored, search), "study_uid").items():
-        whole = wholes[study_uid]
-        result = _chosen(members[0].header, STUDY_KEYWORDS, search)
-        result |= {
-            "00080056": {"vr": "CS", "Value": ["ONLINE"]},
-            "00080061": {"vr": "CS", "Value": sorted({_text(each.header, _tag("Modality")) for each in whole})},
-            "00081190": {"vr": "UR", "Value": [study_url(str(request.base_url), study_uid)]},
-            "00201206": {"vr": "IS", "Value": [len({each.series_uid for each in whole})]},
-            "00201208": {"vr": "IS", "Value": [len(whole)]},
+    for place, header in found.headers.items():
+        series, instances = counts.get(place, [0, 0])
+        result = _chosen(header, STUDY_KEYWORDS, search) | {
+            AVAILABILITY: {"vr": "CS", "Value": [ONLINE]},
+            MODALITIES_IN_STUDY: {"vr": "CS", "Value": modalities.get(place, [])},
+            "00081190": {"vr": "UR", "Value": [study_url(str(request.base_url), *place)]},
+            "00201206": {"vr": "IS", "Value": [series]},
+            "00201208": {"vr": "IS", "Value": [instances]},
         }
+        if place in classes:
+            result[SOP_CLASSES_IN_STUDY] = {"vr": "UI", "Value": classes[place]}
         results.append(result)
-    return _page(results, search)
+    return _page(results, found)
 
 
 @router.get("/series")
 def search_all_series(request: Request, caller: Reader) -> Response:
     """Search for series of all studies."""
-    return _series(request, instances_of(), (*STUDY_KEYWORDS, *SERIES_KEYWORDS))
+    return _series(request, None, (*STUDY_KEYWORDS, *SERIES_KEYWORDS))
 
 
 @router.get("/studies/{study_uid}/series")
 def search_series(study_uid: str, request: Request, caller: Reader) -> Response:
     """Search for series of one study."""
-    return _series(request, instances_of(study_uid), ("StudyInstanceUID", *SERIES_KEYWORDS))
+    return _series(request, study_uid, ("StudyInstanceUID", *SERIES_KEYWORDS))
 
 
-def _series(request: Request, stored: list[StoredInstance], keywords: tuple[str, ...]) -> Response:
-    search = _search(request)
-    wholes = _grouped(stored, "series_uid")
+def _series(request: Request, study_uid: str | None, keywords: tuple[str, ...]) -> Response:
+    found = _searched(request, _SERIES, study_uid, None)
+    counts = found.count(func.count())
     results = []
-    for series_uid, members in _grouped(_matching(stored, search), "series_uid").items():
-        url = series_url(str(request.base_url), members[0].study_uid, series_uid)
-        result = _chosen(members[0].header, keywords, search)
-        result |= {
-            "00081190": {"vr": "UR", "Value": [url]},
-            "00201209": {"vr": "IS", "Value": [len(wholes[series_uid])]},
+    for place, header in found.headers.items():
+        study, series = place
+        result = _chosen(header, keywords, found.search) | {
+            "00081190": {"vr": "UR", "Value": [series_url(str(request.base_url), study, series)]},
+            "00201209": {"vr": "IS", "Value": counts.get(place, [0])},
         }
         results.append(result)
-    return _page(results, search)
+    return _page(results, found)
 
 
 @router.get("/instances")
 def search_all_instances(request: Request, caller: Reader) -> Response:
     """Search for instances of all studies."""
-    return _instances(request, instances_of(), (*STUDY_KEYWORDS, *SERIES_KEYWORDS, *INSTANCE_KEYWORDS))
+    return _instances(request, None, None, (*STUDY_KEYWORDS, *SERIES_KEYWORDS, *INSTANCE_KEYWORDS))
 
 
 @router.get("/studies/{study_uid}/instances")
 def search_instances_of_study(study_uid: str, request: Request, caller: Reader) -> Response:
     """Search for instances of one study."""
-    keywords = ("StudyInstanceUID", *SERIES_KEYWORDS, *INSTANCE_KEYWORDS)
-    return _instances(request, instances_of(study_uid), keywords)
+    return _instances(request, study_uid, None, ("StudyInstanceUID", *SERIES_KEYWORDS, *INSTANCE_KEYWORDS))
 
 
 @router.get("/studies/{study_uid}/series/{series_uid}/instances")
 def search_instances(study_uid: str, series_uid: str, request: Request, caller: Reader) -> Response:
     """Search for instances of one series."""
-    keywords = ("StudyInstanceUID", "SeriesInstanceUID", *INSTANCE_KEYWORDS)
-    return _instances(request, instances_of(study_uid, series_uid), keywords)
+    return _instances(request, study_uid, series_uid, ("StudyInstanceUID", "SeriesInstanceUID", *INSTANCE_KEYWORDS))
 
 
-def _instances(request: Request, stored: list[StoredInstance], keywords: tuple[str, ...]) -> Response:
-    search = _search(request)
+def _instances(request: Request, study_uid: str | None, series_uid: str | None, keywords: tuple[str, ...]) -> Response:
+    found = _searched(request, _INSTANCE, study_uid, series_uid)
     results = []
-    for each in _matching(stored, search):
-        result = _chosen(each.header, keywords, search)
-        url = instance_url(str(request.base_url), each.study_uid, each.series_uid, each.uid)
-        result["00081190"] = {"vr": "UR", "Value": [url]}
-        result["00080056"] = {"vr": "CS", "Value": ["ONLINE"]}
+    for (study, series, uid), header in found.headers.items():
+        result = _chosen(header, keywords, found.search) | {
+            "00081190": {"vr": "UR", "Value": [instance_url(str(request.base_url), study, series, uid)]},
+            AVAILABILITY: {"vr": "CS", "Value": [ONLINE]},
+        }
         results.append(result)
-    return _page(results, search)
+    return _page(results, found)
 
 
-def _search(request: Request) -> _Search:
-    """Read the parameters of a search.
+def _searched(
+    request: Request, level: Sequence[InstrumentedAttribute[str]], study_uid: str | None, series_uid: str | None
+) -> _Found:
+    """Read the parameters of a search, complete the index where it needs that, and read the page.
 
     Raises
     ------
     Problem
-        422 ``unknown_parameter`` for a name that is no DICOM attribute; 422 ``invalid`` for a wrong number.
+        422 as :func:`read_search` and :func:`conditions_of`; 503 ``indexing``.
     """
-    matches: dict[str, str] = {}
-    include: list[str] = []
-    numbers = {"limit": DEFAULT_LIMIT, "offset": 0}
-    unknown = []
-    for name, value in request.query_params.multi_items():
-        if name in numbers:
-            if not re.fullmatch(r"[0-9]{1,9}", value):
-                raise Problem(422, "invalid", f"{name} is not a number; send 0 or more.", [(f"query.{name}", "wrong")])
-            numbers[name] = int(value)
-        elif name == "includefield":
-            include += value.split(",")
-        elif name == "fuzzymatching":
-            pass  # Optional in PS3.18; names match without regard to case, and by wildcards.
-        elif (tag := _tag(name)) is not None:
-            matches[tag] = value
-        else:
-            unknown.append(name)
-    tags = {field: _tag(field) for field in include if field != "all"}
-    unknown += [field for field, tag in tags.items() if tag is None]
-    if unknown:
-        detail = "The address has unknown query parameters; use keywords or tags of DICOM attributes."
-        raise Problem(422, "unknown_parameter", detail, [(f"query.{name}", "unknown") for name in unknown])
-    return _Search(
-        matches,
-        tuple(tag for tag in tags.values() if tag is not None),
-        "all" in include,
-        min(numbers["limit"], MOST_RESULTS),
-        numbers["offset"],
-    )
+    search = read_search(request.query_params.multi_items())
+    found = _Found(search, level)
+    if search.is_fuzzy:
+        found.warnings.append("The fuzzymatching parameter is not supported. Only literal matching has been performed.")
+    conditions = conditions_of(search.keys, engine().dialect.name)
+    places = places_of(search.keys)
+    scope = []
+    for column, tag, wanted in zip(_INSTANCE, PLACE_TAGS, (study_uid, series_uid, None), strict=True):
+        if wanted is not None:
+            scope.append(column == wanted)
+            places[tag] = [wanted]
+    index_runs(Scope(*(places.get(tag) for tag in PLACE_TAGS)))
+    if study_uid is not None and (lost := index_results(study_uid)):
+        found.warnings.append(f"The results of {lost} jobs of this study cannot be listed.")
+    found.load(scope, conditions)
+    return found
 
 
-def _tag(name: str) -> str | None:
-    """Return an attribute's tag as eight hexadecimal digits; None for another name."""
-    if re.fullmatch(r"[0-9A-Fa-f]{8}", name):
-        return name.upper()
-    number = tag_for_keyword(name)
-    return None if number is None else f"{number:08X}"
+def _is_asked(search: Search, tag: str) -> bool:
+    return tag in search.include or any(key.path == tag for key in search.keys)
 
 
-def _matching(stored: Iterable[StoredInstance], search: _Search) -> Iterator[StoredInstance]:
-    return (each for each in stored if all(_matches(each.header, tag, text) for tag, text in search.matches.items()))
-
-
-def _matches(header: Json, tag: str, wanted: str) -> bool:
-    """Return whether an attribute matches (PS3.4 section C.2.2.2)."""
-    if wanted in ("", "*"):
-        return True
-    tag = "00080060" if tag == "00080061" else tag  # ModalitiesInStudy is no attribute of an instance.
-    value = _text(header, tag)
-    try:
-        representation = dictionary_VR(int(tag, 16))
-    except KeyError:
-        representation = "LO"
-    if representation == "UI":
-        return value in re.split(r"[,\\]", wanted)
-    if representation in ("DA", "TM", "DT") and "-" in wanted:
-        first, _, last = wanted.partition("-")
-        return bool(value) and first <= value[: len(first) or None] and (not last or value[: len(last)] <= last)
-    if representation == "PN":
-        value, wanted = value.casefold(), wanted.casefold()
-    pattern = re.escape(wanted).replace(r"\*", ".*").replace(r"\?", ".")
-    return re.fullmatch(pattern, value, re.S) is not None
-
-
-def _text(header: Json, tag: str | None) -> str:
-    """Return the first value of an attribute as text; empty without a value."""
-    values = header.get(tag or "", {}).get("Value") or [""]
-    first = values[0]
-    return str(first.get("Alphabetic", "") if isinstance(first, dict) else first)
-
-
-def _grouped(stored: Iterable[StoredInstance], field: str) -> dict[str, list[StoredInstance]]:
-    groups: dict[str, list[StoredInstance]] = {}
-    for each in stored:
-        groups.setdefault(getattr(each, field), []).append(each)
-    return groups
-
-
-def _chosen(header: Json, keywords: Iterable[str], search: _Search) -> Json:
+def _chosen(header: dict[str, msgspec.Raw], keywords: Iterable[str], search: Search) -> Json:
     if search.include_all:
-        return dict(header)
-    tags = [tag for tag in map(_tag, keywords) if tag is not None]
+        return {tag: element for tag, element in header.items() if len(element) <= LONGEST_ATTRIBUTE_BYTES}
+    tags = {tag for tag in map(tag_of, keywords) if tag is not None}
     shown: Json = {}
-    for tag in sorted({*tags, *search.include, *search.matches}):
-        if tag in header:
+    for tag in {*tags, *search.include, *(key.path.partition(".")[0] for key in search.keys)}:
+        if tag in header and len(header[tag]) <= LONGEST_ATTRIBUTE_BYTES:
             shown[tag] = header[tag]
         elif tag in tags:
             shown[tag] = {"vr": dictionary_VR(int(tag, 16))}
     return shown
 
 
-def _page(results: list[Json], search: _Search) -> Response:
-    page = results[search.offset : search.offset + search.limit]
-    if not page:
-        return Response(status_code=204)  # PS3.18 section 8.3.4.4.1
-    headers = {}
-    if len(results) > search.offset + len(page):
-        headers["Warning"] = '299 fluoromap "There are more results; ask for them with offset."'
-    return JSONResponse(page, headers=headers, media_type=DICOM_JSON)
+def _page(results: list[Json], found: _Found) -> Response:
+    warnings = list(found.warnings)
+    if found.has_more and results:
+        warnings.append("There are more results; ask for them with offset.")
+    headers = {"Warning": ", ".join(f'299 fluoromap "{warning}"' for warning in warnings)} if warnings else None
+    if not results:
+        return Response(status_code=204, headers=headers)  # PS3.18 section 8.3.4.4.1
+    return Response(
+        msgspec.json.encode([dict(sorted(result.items())) for result in results]),
+        headers=headers,
+        media_type=DICOM_JSON,
+    )

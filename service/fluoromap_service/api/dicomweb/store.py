@@ -16,7 +16,8 @@ from fluoromap_service.api.http.multipart import MultipartBody, malformed
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.uploads import ArrivingPart, Part, arriving_file, in_upload_thread, write_all
-from fluoromap_service.dicom import InstanceFacts, read_instance
+from fluoromap_service.dicom import InstanceFacts
+from fluoromap_service.dicom.indexed_header import read_run
 from fluoromap_service.dicom.store_statuses import status_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.audit import Act
@@ -105,11 +106,12 @@ def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) ->
         facts: InstanceFacts | None = None
         try:
             # A hostile file can crash a decoder, so another process reads it.
-            facts = run_in_pool(Task.READ_FILE, read_instance, part.path)
+            run = run_in_pool(Task.READ_FILE, read_run, part.path)
+            facts = run.facts
             if study_uid not in (None, facts.study_instance_uid):
                 raise Problem(422, "not_xa", "The run is of another DICOM study than the address; send it to its own.")
             with writing() as session:
-                add_arrival(session, part.path, facts, part.sha256, Act(caller, "STOW-RS"))
+                add_arrival(session, part.path, run, part.sha256, Act(caller, "STOW-RS"))
         except Problem as problem:
             if problem.status in (429, 503):
                 raise

@@ -2,63 +2,30 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import msgspec
 from pydicom.uid import ExplicitVRLittleEndian
 from sqlalchemy import select
 
 from fluoromap_service.api.dicomweb.display import Display, render_result, render_run, result_frame_bytes
+from fluoromap_service.api.dicomweb.indexing import Scope, index_results, index_runs
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
-from fluoromap_service.api.results.result_objects import (
-    REPORT_NAME,
-    JobObjects,
-    find_object,
-    made_object,
-    object_file,
-    plan_objects,
-)
+from fluoromap_service.api.results.result_objects import object_file
 from fluoromap_service.dicom import InstanceFacts
 from fluoromap_service.dicom.frames import frame_bytes
-from fluoromap_service.dicom.json_model import header_json
-from fluoromap_service.dicom.objects.job_results import picture_headers
-from fluoromap_service.problem import Problem, not_found
+from fluoromap_service.dicom.indexed_header import metadata_of
+from fluoromap_service.problem import not_found
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import Instance, Job, JobState, StudyInstance
+from fluoromap_service.store.models import DicomObject, Instance
 
 Json = dict[str, Any]
 
-
-class _Remembered:
-    """The headers that were read last, by the hash of their file or the id of their job; ``most`` limits their number."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._headers: OrderedDict[str, Json] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: str, read: Callable[[], Json]) -> Json:
-        """Return what is remembered under a key; read it when there is nothing."""
-        with self._lock:
-            if key in self._headers:
-                self._headers.move_to_end(key)
-                return self._headers[key]
-        header = read()
-        with self._lock:
-            self._headers[key] = header
-            while len(self._headers) > self._most:
-                self._headers.popitem(last=False)
-        return header
-
-
-_headers_of_runs = _Remembered(2000)
-_headers_of_jobs = _Remembered(500)
-"""The headers of all results of a job, by the names of the objects."""
+_PLACE = (DicomObject.study_uid, DicomObject.series_uid, DicomObject.uid)
 
 
 class StoredInstance(Protocol):
@@ -77,8 +44,18 @@ class StoredInstance(Protocol):
         """SOP Instance UID."""
 
     @property
+    def id(self) -> int:
+        """Id of the row in the index of searches."""
+
+    @property
     def header(self) -> Json:
-        """The header in the DICOM JSON model; the content of a file never changes, so it is read once."""
+        """The header in the DICOM JSON model, without long attributes."""
+
+    def metadata(self, header: str, is_whole: bool) -> bytes:
+        """Return the whole header in the DICOM JSON model as UTF-8.
+
+        ``header`` is that of the index, and ``is_whole`` whether it has all attributes.
+        """
 
     @property
     def transfer_syntax(self) -> str:
@@ -112,8 +89,9 @@ class StoredInstance(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StoredRun:
-    """A stored run."""
+    """A stored run; ``id`` is that of its row in the index of searches."""
 
+    id: int
     study_uid: str
     series_uid: str
     uid: str
@@ -123,8 +101,14 @@ class StoredRun:
     @property
     def header(self) -> Json:
         """The header in the DICOM JSON model."""
+        return header_of(self.id)
+
+    def metadata(self, header: str, is_whole: bool) -> bytes:
+        """Return the header in the DICOM JSON model as UTF-8."""
+        # Also where the index has the whole header: nobody may take a damaged file for a whole one.
+        path = self._path
         # A hostile header can take any time, so another process reads it.
-        return _headers_of_runs.get(self.sha256, lambda: run_in_pool(Task.READ_FILE, header_json, self._path))
+        return header.encode() if is_whole else run_in_pool(Task.READ_FILE, metadata_of, path)
 
     @property
     def transfer_syntax(self) -> str:
@@ -161,24 +145,21 @@ class StoredRun:
 class StoredResult:
     """A DICOM object of a job. Its header is known before the object is made."""
 
+    id: int
+    study_uid: str
+    series_uid: str
+    uid: str
     job_id: str
     name: str
-    header: Json
 
     @property
-    def study_uid(self) -> str:
-        """Study Instance UID."""
-        return self._value("0020000D")
+    def header(self) -> Json:
+        """The header in the DICOM JSON model."""
+        return header_of(self.id)
 
-    @property
-    def series_uid(self) -> str:
-        """Series Instance UID."""
-        return self._value("0020000E")
-
-    @property
-    def uid(self) -> str:
-        """SOP Instance UID."""
-        return self._value("00080018")
+    def metadata(self, header: str, is_whole: bool) -> bytes:
+        """Return the header in the DICOM JSON model as UTF-8."""
+        return header.encode() if is_whole else run_in_pool(Task.READ_FILE, metadata_of, self._path)
 
     @property
     def transfer_syntax(self) -> str:
@@ -210,114 +191,67 @@ class StoredResult:
     def _path(self) -> Path:
         return object_file(self.job_id, self.name).path
 
-    def _value(self, tag: str) -> str:
-        return str(self.header[tag]["Value"][0])
-
 
 def _chunks(path: Path) -> Iterator[bytes]:
     with path.open("rb") as stream:
         yield from iter(lambda: stream.read(files.CHUNK_BYTES), b"")
 
 
-def instances_of(
-    study_uid: str | None = None, series_uid: str | None = None, uid: str | None = None
-) -> list[StoredInstance]:
-    """Return the stored instances in the order of their UIDs.
-
-    Each argument limits them to a DICOM study, to a series, or to one UID. Without ``study_uid`` the list has the results only
-    of jobs whose DICOM study somebody has asked for.
-    """
-    query = select(Instance)
-    if study_uid is not None:
-        query = query.where(Instance.study_instance_uid == study_uid)
-    if series_uid is not None:
-        query = query.where(Instance.series_instance_uid == series_uid)
-    if uid is not None:
-        query = query.where(Instance.sop_instance_uid == uid)
+def header_of(object_id: int) -> Json:
+    """Return the header of an object in the DICOM JSON model, from the index of searches."""
     with reading() as session:
-        runs: list[StoredInstance] = [
-            StoredRun(
-                row.study_instance_uid,
-                row.series_instance_uid,
-                row.sop_instance_uid,
-                row.sha256,
-                InstanceFacts.from_json(row.facts),
-            )
-            for row in session.scalars(query)
-        ]
-    # Results have their own series, so a series of runs needs none.
-    results = [] if series_uid is not None and runs else _results(study_uid)
-    found = [
-        result
-        for result in results
-        if study_uid in (None, result.study_uid)
-        and series_uid in (None, result.series_uid)
-        and uid in (None, result.uid)
-    ]
-    return sorted([*runs, *found], key=lambda each: (each.study_uid, each.series_uid, each.uid))
+        header = session.scalar(select(DicomObject.header).where(DicomObject.id == object_id))
+    answer: Json = msgspec.json.decode(header or "{}")
+    return answer
 
 
-def _results(study_uid: str | None) -> Iterator[StoredResult]:
-    """Yield the DICOM objects of the jobs over a DICOM study.
-
-    Without ``study_uid`` these are the objects of all jobs whose report exists.
-    """
-    query = (
-        select(Job.id)
-        .join(StudyInstance, StudyInstance.study_id == Job.study_id)
-        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
-        .where(Job.state == JobState.SUCCEEDED)
-        .distinct()
-    )
-    if study_uid is not None:
-        query = query.where(Instance.study_instance_uid == study_uid)
-    with reading() as session:
-        jobs = list(session.scalars(query))
-    for job_id in jobs:
-        if study_uid is not None or find_object(job_id, REPORT_NAME) is not None:
-            for name, header in _headers_of_results(job_id).items():
-                yield StoredResult(job_id, name, header)
-
-
-def _headers_of_results(job_id: str) -> dict[str, Json]:
-    """Return the headers of the DICOM objects of a job by name.
-
-    It draws no picture. Empty for a job without results, or whose runs are damaged: the other instances of the study are
-    shown nevertheless.
-    """
-    try:
-        planned = plan_objects(job_id)
-        return _headers_of_jobs.get(job_id, lambda: _planned_headers(planned))
-    except files.BrokenFile:
-        return {}
-    except Problem as problem:
-        if problem.status in (429, 503):
-            raise
-        return {}
-
-
-def _planned_headers(planned: JobObjects) -> dict[str, Json]:
-    job_id = planned.origin.job_id
-    kept = {each.name: find_object(job_id, each.name) for each in planned.objects}
-    drawn_later = [each for each in planned.objects if kept[each.name] is None and each.series is not None]
-    series = tuple(each.series for each in drawn_later if each.series is not None)
-    later = run_in_pool(Task.WRITE_DICOM, picture_headers, planned.origin, series) if series else []
-    headers = {each.name: header for each, header in zip(drawn_later, later, strict=True)}
-    return {
-        each.name: headers.get(each.name) or header_json(made_object(planned.origin, each).path)
-        for each in planned.objects
-    }
+def metadata_of_all(instances: list[StoredInstance]) -> list[bytes]:
+    """Return the whole headers of instances in the DICOM JSON model as UTF-8."""
+    found = []
+    for each in instances:
+        with reading() as session:
+            query = select(DicomObject.header, DicomObject.is_whole).where(DicomObject.id == each.id)
+            row = session.execute(query).first()
+        # A request may delete an object at any moment.
+        if row is not None:
+            found.append(each.metadata(row.header, row.is_whole))
+    return found
 
 
 def existing(study_uid: str, series_uid: str | None = None, uid: str | None = None) -> list[StoredInstance]:
-    """Return the stored instances of a resource.
+    """Return the stored instances of a resource in the order of their UIDs.
 
     Raises
     ------
     Problem
         404 when there is none.
     """
-    found = instances_of(study_uid, series_uid, uid)
+    index_runs(Scope(*(None if wanted is None else [wanted] for wanted in (study_uid, series_uid, uid))))
+    found = _stored(study_uid, series_uid, uid)
+    # Results have their own series, so a series of runs needs none.
+    if series_uid is None or not found:
+        index_results(study_uid)
+        found = _stored(study_uid, series_uid, uid)
     if not found:
         raise not_found("DICOM study, series or instance")
     return found
+
+
+def _stored(study_uid: str, series_uid: str | None, uid: str | None) -> list[StoredInstance]:
+    """Return the indexed instances of a resource in the order of their UIDs."""
+    query = (
+        select(DicomObject.id, *_PLACE, DicomObject.job_id, DicomObject.name, Instance.sha256, Instance.facts)
+        .outerjoin(Instance, Instance.sop_instance_uid == DicomObject.run)
+        .order_by(*_PLACE)
+    )
+    for column, wanted in zip(_PLACE, (study_uid, series_uid, uid), strict=True):
+        if wanted is not None:
+            query = query.where(column == wanted)
+    with reading() as session:
+        rows = session.execute(query).all()
+    return [
+        StoredRun(row.id, row.study_uid, row.series_uid, row.uid, row.sha256, InstanceFacts.from_json(row.facts))
+        if row.facts is not None
+        else StoredResult(row.id, row.study_uid, row.series_uid, row.uid, row.job_id, row.name)
+        for row in rows
+    ]

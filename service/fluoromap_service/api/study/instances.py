@@ -20,7 +20,7 @@ from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
 from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
 from fluoromap_service.api.study.uploads import Part, in_upload_thread, receive
-from fluoromap_service.dicom import InstanceFacts, read_instance
+from fluoromap_service.dicom.indexed_header import ReadRun, read_run
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
@@ -170,14 +170,14 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
         stored: list[str] = []
         rejected: list[Problem] = []
         new = False
-        for number, (part, facts) in enumerate(zip(parts, checked, strict=True), start=1):
+        for number, (part, run) in enumerate(zip(parts, checked, strict=True), start=1):
             try:
-                if isinstance(facts, Problem):
-                    raise facts
+                if isinstance(run, Problem):
+                    raise run
                 new |= instances.add(
-                    session, study_id, part.path, facts, part.sha256, file_name=part.file_name, site=site
+                    session, study_id, part.path, run, part.sha256, file_name=part.file_name, site=site
                 )
-                stored.append(facts.sop_instance_uid)
+                stored.append(run.facts.sop_instance_uid)
             except Problem as problem:
                 rejected.append(_of_part(problem, number))
         documents = [document(problem) for problem in rejected]
@@ -192,10 +192,10 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
     return once.answer(act)
 
 
-def _read(part: Part) -> InstanceFacts | Problem:
+def _read(part: Part) -> ReadRun | Problem:
     # A hostile file can crash a decoder, so another process reads it.
     try:
-        return run_in_pool(Task.READ_FILE, read_instance, part.path)
+        return run_in_pool(Task.READ_FILE, read_run, part.path)
     except Problem as problem:
         if problem.status == 429:
             raise

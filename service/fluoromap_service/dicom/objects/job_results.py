@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydicom.dataset import Dataset
 
-from fluoromap_service.dicom.json_model import Json, header_json
+from fluoromap_service.dicom.indexed_header import IndexedHeader, read_indexed
 from fluoromap_service.dicom.objects.identity import ResultSource, source_header
 from fluoromap_service.dicom.objects.pictures import PictureSeries, pictures_file
 from fluoromap_service.dicom.objects.report_site import ReportSite
@@ -76,13 +76,10 @@ def pictures_object(origin: ResultOrigin, series: PictureSeries, pictures: tuple
     return pictures_file(origin.source(), series, pixels)
 
 
-def picture_headers(origin: ResultOrigin, series: tuple[PictureSeries, ...]) -> list[Json]:
-    """Return the headers of secondary captures that nobody has drawn.
-
-    They are in the DICOM JSON model.
-    """
+def picture_headers(origin: ResultOrigin, series: tuple[PictureSeries, ...]) -> list[IndexedHeader]:
+    """Return the headers of secondary captures that nobody has drawn, as searches need them."""
     source = origin.source()
-    return [header_json(io.BytesIO(pictures_file(source, each, None))) for each in series]
+    return [read_indexed(io.BytesIO(pictures_file(source, each, None))) for each in series]
 
 
 def surface_object(origin: ResultOrigin, stl: Path) -> bytes:
