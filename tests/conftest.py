@@ -52,7 +52,7 @@ def _is_xdist_worker(config: pytest.Config) -> bool:
     return hasattr(config, "workerinput")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def fresh_postgres() -> Fresh:
     """Return a function that makes an empty database on a real PostgreSQL."""
     folder = Path(os.environ[_FOLDER])

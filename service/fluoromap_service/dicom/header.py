@@ -268,7 +268,8 @@ class Header:
                 DicomCode.HEADER_TOO_LARGE, f"{keyword} has too many items; export the run again.", keyword
             )
         items = self._value(dataset, keyword)
-        return list(items) if items is not None and not isinstance(items, str | bytes) else []
+        # With another value representation than SQ the value is text or numbers.
+        return [item for item in _values(items) if isinstance(item, Dataset)]
 
     def _numbers(self, dataset: Dataset, attribute: str | BaseTag) -> tuple[float, ...]:
         try:

@@ -79,7 +79,7 @@ def conditions_of(keys: Sequence[Key], dialect: str) -> list[Condition]:
             if all("-" in wanted[number].text for number in (date, time)):
                 combined |= {date, time}
                 found.append(_combined(wanted[date].path, wanted[time].path, *ranges))
-    nested: dict[str, list[Select[Any]]] = defaultdict(list)
+    nested: dict[str, list[Select[int, int]]] = defaultdict(list)
     for number, key in enumerate(wanted):
         if number in combined:
             continue
@@ -96,7 +96,7 @@ def conditions_of(keys: Sequence[Key], dialect: str) -> list[Condition]:
             )
         else:
             parent = key.path.rpartition(".")[0]
-            query: Select[Any] = select(DicomValue.object_id, DicomValue.item)
+            query = select(DicomValue.object_id, DicomValue.item)
             nested[parent or key.path].append(query.where(DicomValue.path == key.path, _value(key, dialect)))
     for queries in nested.values():
         # All keys of one sequence match in the same item (PS3.4 section C.2.2.2.6).

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from fastapi import Request, Response
 from pydicom.datadict import dictionary_VR
-from sqlalchemy import ColumnElement, Select, func, select, tuple_
+from sqlalchemy import ColumnElement, func, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from fluoromap_service.api.dicomweb.addresses import instance_url, series_url, study_url
@@ -69,11 +69,11 @@ class _Found:
 
     def count(self, *columns: ColumnElement[Any]) -> dict[Place, list[int]]:
         """Return numbers of objects for each result, whether they match or not."""
-        query: Select[Any] = select(*self.level, *columns).where(self._is_on_page()).group_by(*self.level)
+        query = select(*self.level, *columns).where(self._is_on_page()).group_by(*self.level)
         with reading() as session:
             rows = session.execute(query).all()
         length = len(self.level)
-        return {tuple(row[:length]): list(row[length:]) for row in rows}
+        return {tuple(row[:length]): [int(number) for number in row[length:]] for row in rows}
 
     def values(self, tag: str) -> dict[Place, list[str]]:
         """Return the values of an attribute of all objects of each result, in order."""
@@ -135,7 +135,7 @@ def search_studies(request: Request, caller: Reader) -> Response:
     results = []
     for place, header in found.headers.items():
         series, instances = counts.get(place, [0, 0])
-        result = _chosen(header, STUDY_KEYWORDS, search) | {
+        result = _chosen(header, STUDY_KEYWORDS, found.search) | {
             AVAILABILITY: {"vr": "CS", "Value": [ONLINE]},
             MODALITIES_IN_STUDY: {"vr": "CS", "Value": modalities.get(place, [])},
             "00081190": {"vr": "UR", "Value": [study_url(str(request.base_url), *place)]},

@@ -44,7 +44,7 @@ class Key:
     @property
     def is_universal(self) -> bool:
         """Whether every object matches, also one without the attribute."""
-        return not self.text.strip("* ")
+        return not self.text.strip("* \0")
 
 
 @dataclass(frozen=True, slots=True)
