@@ -23,6 +23,8 @@ def upgrade() -> None:
         sa.Column("uid", CODE_POINTS, nullable=False),
         sa.Column("study_uid", CODE_POINTS, nullable=False),
         sa.Column("series_uid", CODE_POINTS, nullable=False),
+        sa.Column("modality", CODE_POINTS, nullable=True),
+        sa.Column("sop_class_uid", CODE_POINTS, nullable=True),
         sa.Column("run", sa.String(64), sa.ForeignKey("instance.sop_instance_uid", ondelete="CASCADE"), nullable=True),
         sa.Column("job_id", sa.String(32), sa.ForeignKey("job.id", ondelete="CASCADE"), nullable=True),
         sa.Column("name", sa.String(64), nullable=True),
@@ -32,7 +34,9 @@ def upgrade() -> None:
         sa.UniqueConstraint("uid", name="uq_dicom_object_uid"),
         sa.UniqueConstraint("run", name="uq_dicom_object_run"),
     )
-    op.create_index("ix_dicom_object_place", "dicom_object", ["study_uid", "series_uid", "uid"])
+    op.create_index(
+        "ix_dicom_object_place", "dicom_object", ["study_uid", "series_uid", "uid", "modality", "sop_class_uid"]
+    )
     op.create_index("ix_dicom_object_job_id", "dicom_object", ["job_id"])
     op.create_table(
         "dicom_value",

@@ -90,7 +90,7 @@ def read_indexed(file: Path | IO[bytes]) -> IndexedHeader:
     Problem, OSError
         As :func:`fluoromap_service.dicom.json_model.read_json_header`.
     """
-    return _indexed(read_json_header(file))
+    return indexed(read_json_header(file))
 
 
 def indexed_facts(facts: InstanceFacts) -> IndexedHeader:
@@ -101,7 +101,7 @@ def indexed_facts(facts: InstanceFacts) -> IndexedHeader:
         "00280008": ("IS", facts.frames), "00280010": ("US", facts.rows), "00280011": ("US", facts.columns),
     }  # fmt: skip
     elements: Json = {tag: {"vr": vr, "Value": [value]} for tag, (vr, value) in texts.items()}
-    return _indexed(JsonHeader(elements, [""]), is_whole=False)
+    return indexed(JsonHeader(elements, [""]), is_whole=False)
 
 
 def metadata_of(path: Path) -> bytes:
@@ -109,7 +109,8 @@ def metadata_of(path: Path) -> bytes:
     return msgspec.json.encode(read_json_header(path).elements)
 
 
-def _indexed(header: JsonHeader, is_whole: bool = True) -> IndexedHeader:
+def indexed(header: JsonHeader, is_whole: bool = True) -> IndexedHeader:
+    """Return a header as searches need it; ``is_whole`` says whether it has all that the metadata show."""
     encoded = msgspec.json.encode(header.elements).decode()
     if len(encoded) > LARGEST_HEADER_BYTES:
         encoded, is_whole = _shortened(header.elements), False

@@ -165,11 +165,14 @@ class DicomObject(Base):
     """An object that DICOMweb shows: a stored run, or a result of a job. Searches read this table and DicomValue alone."""
 
     __tablename__ = "dicom_object"
-    __table_args__ = (Index("ix_dicom_object_place", "study_uid", "series_uid", "uid"),)
+    __table_args__ = (Index("ix_dicom_object_place", "study_uid", "series_uid", "uid", "modality", "sop_class_uid"),)
     id: Mapped[int] = mapped_column(primary_key=True)
     uid: Mapped[str] = mapped_column(CodePoints, unique=True)  # SOP Instance UID
     study_uid: Mapped[str] = mapped_column(CodePoints)
     series_uid: Mapped[str] = mapped_column(CodePoints)
+    # Beside their rows of DicomValue: most objects have the same ones, so that an index of values helps little.
+    modality: Mapped[str | None] = mapped_column(CodePoints)
+    sop_class_uid: Mapped[str | None] = mapped_column(CodePoints)
     run: Mapped[str | None] = mapped_column(
         ForeignKey("instance.sop_instance_uid", ondelete="CASCADE"), unique=True
     )  # null for a result

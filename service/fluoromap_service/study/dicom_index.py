@@ -11,6 +11,7 @@ from fluoromap_service.dicom.facts import InstanceFacts
 from fluoromap_service.dicom.indexed_header import IndexedHeader
 from fluoromap_service.store.models import DicomObject, DicomValue, Instance
 
+MODALITY, SOP_CLASS = "00080060", "00080016"
 _INSERT_VALUES = DicomValue.__table__.insert()  # type: ignore[attr-defined]
 
 
@@ -39,6 +40,8 @@ def forget_results(session: Session, job_ids: Iterable[str]) -> None:
 
 
 def _add(session: Session, row: DicomObject, header: IndexedHeader) -> None:
+    single = {value.path: value.first for value in reversed(header.values)}
+    row.modality, row.sop_class_uid = single.get(MODALITY), single.get(SOP_CLASS)
     row.header, row.is_whole, row.unreadable = header.json, header.is_whole, header.unreadable
     session.add(row)
     session.flush()

@@ -30,18 +30,19 @@ from fluoromap_service.dicom.matching import (
 )
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.models import DicomObject, DicomValue
+from fluoromap_service.study.dicom_index import MODALITY, SOP_CLASS
 
 Condition = ColumnElement[bool]
 Text = ColumnElement[Any] | InstrumentedAttribute[str | None]
 
 MODALITIES_IN_STUDY, SOP_CLASSES_IN_STUDY, AVAILABILITY = "00080061", "00080062", "00080056"
-MODALITY, SOP_CLASS = "00080060", "00080016"
 ONLINE = "ONLINE"
 """Instance Availability of every object."""
 MOST_ALTERNATIVES = 1000
 """Values of a list; a longer list is refused."""
 _OF_STUDY = {MODALITIES_IN_STUDY: MODALITY, SOP_CLASSES_IN_STUDY: SOP_CLASS}
 """Attributes that gather an attribute of all objects of a study."""
+_COLUMNS = {MODALITY: "modality", SOP_CLASS: "sop_class_uid"}
 _PLACE = {"0020000D": DicomObject.study_uid, "0020000E": DicomObject.series_uid, "00080018": DicomObject.uid}
 """Attributes that are columns."""
 PLACE_TAGS = tuple(_PLACE)
@@ -84,16 +85,15 @@ def conditions_of(keys: Sequence[Key], dialect: str) -> list[Condition]:
         if number in combined:
             continue
         if key.path == AVAILABILITY:
-            found.append(or_(false(), *(_like(literal(ONLINE), text, dialect) for text in _alternatives(key))))
+            found.append(_listed(literal(ONLINE), key, dialect))
         elif key.path in _PLACE:
             found.append(_PLACE[key.path].in_(_alternatives(key)))
+        elif key.path in _COLUMNS:
+            found.append(_listed(getattr(DicomObject, _COLUMNS[key.path]), key, dialect))
         elif key.path in _OF_STUDY:
             member = aliased(DicomObject)
-            values = select(member.study_uid).join(DicomValue, DicomValue.object_id == member.id)
-            source = Key(key.name, _OF_STUDY[key.path], key.text)
-            found.append(
-                DicomObject.study_uid.in_(values.where(DicomValue.path == source.path, _value(source, dialect)))
-            )
+            column = getattr(member, _COLUMNS[_OF_STUDY[key.path]])
+            found.append(DicomObject.study_uid.in_(select(member.study_uid).where(_listed(column, key, dialect))))
         else:
             parent = key.path.rpartition(".")[0]
             query = select(DicomValue.object_id, DicomValue.item)
@@ -118,7 +118,7 @@ def _value(key: Key, dialect: str) -> Condition:
     if representation == UNIQUE_IDENTIFIER:
         return DicomValue.first.in_(_alternatives(key))
     if representation == "CS":
-        return or_(false(), *(_like(DicomValue.first, text, dialect) for text in _alternatives(key)))
+        return _listed(DicomValue.first, key, dialect)
     if representation in NUMERIC:
         number = number_form(text_form(key.text))
         if number is not None:
@@ -136,6 +136,11 @@ def _alternatives(key: Key) -> list[str]:
     if len(texts) > MOST_ALTERNATIVES:
         raise _invalid(key, f"a list of at most {MOST_ALTERNATIVES} values")
     return [text for text in texts if text]
+
+
+def _listed(value: Text, key: Key, dialect: str) -> Condition:
+    """Return the condition that a text matches one value of a list."""
+    return or_(false(), *(_like(value, text, dialect) for text in _alternatives(key)))
 
 
 def _name_patterns(text: str) -> list[str]:

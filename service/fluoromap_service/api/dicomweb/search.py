@@ -16,10 +16,8 @@ from fluoromap_service.api.dicomweb.indexing import Scope, index_results, index_
 from fluoromap_service.api.dicomweb.matching_rules import (
     AVAILABILITY,
     MODALITIES_IN_STUDY,
-    MODALITY,
     ONLINE,
     PLACE_TAGS,
-    SOP_CLASS,
     SOP_CLASSES_IN_STUDY,
     conditions_of,
     places_of,
@@ -48,6 +46,7 @@ INSTANCE_KEYWORDS = (
 
 _STUDY = (DicomObject.study_uid,)
 _SERIES = (DicomObject.study_uid, DicomObject.series_uid)
+_BETWEEN = " "
 _INSTANCE = (DicomObject.study_uid, DicomObject.series_uid, DicomObject.uid)
 
 Json = dict[str, Any]
@@ -75,12 +74,11 @@ class _Found:
         length = len(self.level)
         return {tuple(row[:length]): [int(number) for number in row[length:]] for row in rows}
 
-    def values(self, tag: str) -> dict[Place, list[str]]:
-        """Return the values of an attribute of all objects of each result, in order."""
-        query = select(*self.level, DicomValue.first).join(DicomValue, DicomValue.object_id == DicomObject.id)
-        query = query.where(DicomValue.path == tag, DicomValue.first.is_not(None), self._is_on_page()).distinct()
+    def values(self, column: InstrumentedAttribute[str | None]) -> dict[Place, list[str]]:
+        """Return the values of a column of all objects of each result, in order."""
+        query = select(*self.level, column).where(self._is_on_page(), column.is_not(None)).distinct()
         with reading() as session:
-            rows = session.execute(query.order_by(*self.level, DicomValue.first)).all()
+            rows = session.execute(query.order_by(*self.level, column)).all()
         found: dict[Place, list[str]] = {}
         for row in rows:
             found.setdefault(tuple(row[:-1]), []).append(row[-1])
@@ -94,14 +92,13 @@ class _Found:
 
     def _read_page(self, session: Session, conditions: Sequence[ColumnElement[bool]]) -> None:
         search = self.search
-        groups = select(*self.level).where(*conditions).distinct().order_by(*self.level)
-        places = [tuple(row) for row in session.execute(groups.offset(search.offset).limit(search.limit + 1))]
+        # UIDs have digits and dots only, so that the texts have the order of the UIDs.
+        first = func.min(DicomObject.series_uid + _BETWEEN + DicomObject.uid)
+        groups = select(*self.level, first).where(*conditions).group_by(*self.level).order_by(*self.level)
+        places = session.execute(groups.offset(search.offset).limit(search.limit + 1)).all()
         self.has_more = len(places) > search.limit
-        self.headers = {place: {} for place in places[: search.limit]}
-        number = func.row_number().over(partition_by=list(self.level), order_by=list(_INSTANCE)).label("number")
-        ranked = select(DicomObject.id, number).where(*conditions, self._is_on_page()).subquery()
-        first = select(ranked.c.id).where(ranked.c.number == 1)
-        query = select(*self.level, DicomObject.header, DicomObject.unreadable).where(DicomObject.id.in_(first))
+        uids = [place[-1].partition(_BETWEEN)[2] for place in places[: search.limit]]
+        query = select(*self.level, DicomObject.header, DicomObject.unreadable).where(DicomObject.uid.in_(uids))
         rows = session.execute(query.order_by(*self.level)).all()
         # Somebody may have deleted an object meanwhile.
         self.headers = {tuple(row[: len(self.level)]): _header_decoder.decode(row.header) for row in rows}
@@ -130,8 +127,8 @@ def search_studies(request: Request, caller: Reader) -> Response:
     """Search for studies."""
     found = _searched(request, _STUDY, None, None)
     counts = found.count(func.count(DicomObject.series_uid.distinct()), func.count())
-    modalities = found.values(MODALITY)
-    classes = found.values(SOP_CLASS) if _is_asked(found.search, SOP_CLASSES_IN_STUDY) else {}
+    modalities = found.values(DicomObject.modality)
+    classes = found.values(DicomObject.sop_class_uid) if _is_asked(found.search, SOP_CLASSES_IN_STUDY) else {}
     results = []
     for place, header in found.headers.items():
         series, instances = counts.get(place, [0, 0])
