@@ -90,8 +90,11 @@ def text_form(text: str) -> str:
 def name_form(text: str) -> str:
     """Return a person's name, or a group of it, as it is compared: without regard to case and to empty components.
 
-    An empty component at the end may be left out with its caret (PS3.5 section 6.2.1.1).
+    An empty component at the end may be left out with its caret (PS3.5 section 6.2.1.1). A text that is too long to be
+    compared keeps its form: composing many marks would take the square of their number.
     """
+    if len(text) > LONGEST_BYTES:
+        return text
     return unicodedata.normalize("NFC", text_form(text).casefold()).rstrip("^ ")
 
 

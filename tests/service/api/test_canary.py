@@ -1,4 +1,4 @@
-"""Canaries: no identifier of a patient leaves the stored DICOM file and the index of its header, and no file name leaves its one column."""
+"""Canaries: identifiers of a patient stay in the DICOM file and the index of headers, file names in their one column."""
 
 from __future__ import annotations
 

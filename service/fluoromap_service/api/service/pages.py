@@ -53,8 +53,12 @@ class Asset:
 
 def asset(name: str) -> Asset | None:
     """Return a file of the pages; None when there is no such file."""
-    path = (ASSETS / name).resolve()
-    if not (path.is_relative_to(ASSETS) and path.suffix in MEDIA_TYPES and path.is_file()):
+    try:
+        path = (ASSETS / name).resolve()
+        if not (path.is_relative_to(ASSETS) and path.suffix in MEDIA_TYPES and path.is_file()):
+            return None
+    except (ValueError, OSError):
+        # A name with NUL, or a longer one than the disk allows.
         return None
     return _read(path, path.stat().st_mtime_ns)
 
