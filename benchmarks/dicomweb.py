@@ -188,7 +188,10 @@ def started_api(environment: dict[str, str]) -> Iterator[str]:
 
 
 def measure(address: str, runs: int, folder: Path) -> dict[str, tuple[float, float]]:
-    """Return the median of some requests and the slowest of eight at once, in seconds, for each search."""
+    """Return the times of each search, in seconds.
+
+    They are the median of some requests and the slowest of eight at once.
+    """
     last_run = max(runs - 100, 0)
     last_study = max(runs // RUNS_OF_A_STUDY - 100, 0)
     figures = {}

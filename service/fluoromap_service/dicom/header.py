@@ -401,7 +401,7 @@ def read_attributes(file: BufferedReader) -> tuple[str, Dataset]:
 
 
 def read_all_attributes(file: BufferedReader) -> tuple[Dataset, bool]:
-    """Read every attribute before the pixel data, as far as the header can be read.
+    """Read every attribute before the pixel data, as far as possible.
 
     :func:`read_header` skips what the service does not use, so it accepts a file that is damaged there. This function keeps
     the attributes before such a damage. Values above ``LONGEST_VALUE_BYTES`` are not read.

@@ -94,7 +94,10 @@ def read_indexed(file: Path | IO[bytes]) -> IndexedHeader:
 
 
 def indexed_facts(facts: InstanceFacts) -> IndexedHeader:
-    """Return all that is known of a run whose file cannot be read now."""
+    """Return the header of a run whose file cannot be read.
+
+    It has all that the facts have.
+    """
     texts = {
         "00080016": ("UI", facts.sop_class_uid), "00080018": ("UI", facts.sop_instance_uid),
         "0020000D": ("UI", facts.study_instance_uid), "0020000E": ("UI", facts.series_instance_uid),
@@ -110,7 +113,10 @@ def metadata_of(path: Path) -> bytes:
 
 
 def indexed(header: JsonHeader, is_whole: bool = True) -> IndexedHeader:
-    """Return a header as searches need it; ``is_whole`` says whether it has all that the metadata show."""
+    """Return a header as searches need it.
+
+    ``is_whole`` says whether it has all that the metadata show.
+    """
     encoded = msgspec.json.encode(header.elements).decode()
     if len(encoded) > LARGEST_HEADER_BYTES:
         encoded, is_whole = _shortened(header.elements), False
@@ -133,7 +139,10 @@ def _shortened(elements: Json) -> str:
 
 
 def _values(elements: Json) -> list[IndexedValue]:
-    """Return the values of a header: those outside sequences first, then those of each deeper level."""
+    """Return the values of a header.
+
+    Those outside sequences come first, then those of each deeper level.
+    """
     found: list[IndexedValue] = []
     level = [("", 0, elements)]
     items = 0

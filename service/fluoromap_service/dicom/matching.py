@@ -55,8 +55,9 @@ def representation_of(tag: str) -> str | None:
 
 
 def comparable_values(tag: str, element: dict[str, Any]) -> list[Comparable | None]:
-    """Return the values of an attribute in the DICOM JSON model in the form in which they are compared.
+    """Return the values of an attribute as searches compare them.
 
+    ``element`` is the attribute in the DICOM JSON model.
     A person's name has one for each component group, and one for all groups together. None takes the place of a value that
     cannot be compared.
     """
@@ -73,7 +74,10 @@ def comparable_values(tag: str, element: dict[str, Any]) -> list[Comparable | No
 
 
 def comparable(representation: str, text: str) -> Comparable | None:
-    """Return a value in the form in which it is compared; None for a malformed date, time or number."""
+    """Return a value as searches compare it.
+
+    None for a malformed date, time or number.
+    """
     if representation in TEMPORAL:
         return time_form(representation, text)
     if representation in NUMERIC:
@@ -83,13 +87,17 @@ def comparable(representation: str, text: str) -> Comparable | None:
 
 
 def text_form(text: str) -> str:
-    """Return a text without the spaces around it, and without NUL, which a database does not store."""
+    """Return a text without the spaces around it.
+
+    NUL goes too, because a database does not store it.
+    """
     return text.replace("\0", "").strip(" ")
 
 
 def name_form(text: str) -> str:
-    """Return a person's name, or a group of it, as it is compared: without regard to case and to empty components.
+    """Return a person's name, or a group of it, for comparison.
 
+    Case and empty components at the end do not count.
     An empty component at the end may be left out with its caret (PS3.5 section 6.2.1.1). A text that is too long to be
     compared keeps its form: composing many marks would take the square of their number.
     """
@@ -116,8 +124,9 @@ def number_form(text: str) -> str | None:
 
 
 def time_form(representation: str, text: str) -> Comparable | None:
-    """Return the first and the last moment that a date, a time, or both may mean; None for a malformed text.
+    """Return the first and last moment that a text may mean.
 
+    None for a malformed text.
     The old forms with dots and colons count too. A moment with an offset is compared in UTC.
     """
     text = text.strip(" \0")

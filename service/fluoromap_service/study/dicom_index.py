@@ -16,7 +16,10 @@ _INSERT_VALUES = DicomValue.__table__.insert()  # type: ignore[attr-defined]
 
 
 def put_run(session: Session, facts: InstanceFacts, header: IndexedHeader) -> None:
-    """Store the rows of a run in place of those that it has; the run's own row exists already."""
+    """Store the rows of a run in place of its old ones.
+
+    The run's own row exists already.
+    """
     session.execute(delete(DicomObject).where(DicomObject.run == facts.sop_instance_uid))
     row = DicomObject(
         uid=facts.sop_instance_uid,
@@ -35,7 +38,10 @@ def add_result(session: Session, job_id: str, name: str, header: IndexedHeader) 
 
 
 def forget_results(session: Session, job_ids: Iterable[str]) -> None:
-    """Delete the rows of the results of jobs; a search for their study makes them again."""
+    """Delete the rows of the results of jobs.
+
+    A search for their study makes them again.
+    """
     session.execute(delete(DicomObject).where(DicomObject.job_id.in_(list(job_ids))))
 
 

@@ -31,7 +31,10 @@ Element = tuple[int, str, bytes]
 
 
 def element(tag: int, vr: str, value: bytes) -> bytes:
-    """Return an element of explicit VR, little endian; its value may be any bytes."""
+    """Return an element of explicit VR, little endian.
+
+    Its value may be any bytes.
+    """
     group, number = tag >> 16, tag & 0xFFFF
     if vr in LONG_LENGTH:
         return struct.pack("<HH2sHL", group, number, vr.encode(), 0, len(value)) + value
@@ -44,13 +47,19 @@ def open_sequence(tag: int) -> bytes:
 
 
 def with_bytes(file: bytes, added: bytes) -> bytes:
-    """Return the file with bytes before its pixel data; of two elements with one tag, readers take the second."""
+    """Return the file with bytes before its pixel data.
+
+    Of two elements with one tag, readers take the second.
+    """
     at = file.rindex(struct.pack("<HH", 0x7FE0, 0x0010) + b"OW")
     return file[:at] + added + file[at:]
 
 
 def strict(text: str) -> Any:
-    """Return the value of a JSON text; NaN and infinity, which JSON lacks, are an error."""
+    """Return the value of a JSON text.
+
+    NaN and infinity, which JSON lacks, are an error.
+    """
 
     def refuse(name: str) -> Any:
         raise AssertionError(f"{name} is no JSON")
@@ -91,7 +100,10 @@ CASES = {
 
 
 def answers(service: TestClient, study: str, run: str) -> dict[str, Any]:
-    """Return the answers to the requests about a run, and the part about it of those over the archive."""
+    """Return the answers to the requests about a run.
+
+    Of the answers over the archive it returns the part about the run.
+    """
     series = found(service, f"/dicom-web/instances?SOPInstanceUID={run}")[0]["0020000E"]["Value"][0]
     address = f"{STUDIES}/{STUDY_UID}/series/{series}"
     instance = f"{address}/instances/{run}"
@@ -146,7 +158,10 @@ def good(service: TestClient, tmp_path: Path) -> GoodRun:
 
 @contextmanager
 def odd_run(service: TestClient, file: bytes, added: bytes) -> Iterator[str | None]:
-    """Store a run with added bytes; yield its UID, or None where the door refuses it. Delete it at the end."""
+    """Store a run with added bytes, and delete it at the end.
+
+    Yield its UID, or None where the door refuses it.
+    """
     answer = store(service, with_bytes(file, added))
     assert answer.status_code in (200, 409), answer.text
     header = pydicom.dcmread(io.BytesIO(file), stop_before_pixels=True)

@@ -108,7 +108,10 @@ def _index_run(uid: str) -> None:
 
 
 def _header_of(sha256: str, facts: InstanceFacts) -> IndexedHeader:
-    """Return the header of a run; that of its facts where the file cannot be read."""
+    """Return the header of a run for the index.
+
+    A file that cannot be read leaves what the facts have.
+    """
     try:
         # A hostile header can take any time, so another process reads it.
         return run_in_pool(Task.READ_FILE, read_indexed, files.checked_path(sha256))
@@ -121,8 +124,9 @@ def _header_of(sha256: str, facts: InstanceFacts) -> IndexedHeader:
 
 
 def index_results(study_uid: str) -> int:
-    """Index the results of the jobs over a DICOM study, and return of how many jobs they cannot be listed.
+    """Index the results of the jobs over a DICOM study.
 
+    Return of how many jobs they cannot be listed.
     It draws no picture. A job without results has none to list. The results of a job that cannot be listed change nothing
     about the other instances of the study.
     """

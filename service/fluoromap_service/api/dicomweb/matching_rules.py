@@ -186,7 +186,10 @@ def _sql_like(value: Text, pattern: str) -> Condition:
 
 
 def _after(text: str) -> str | None:
-    """Return the first text after all those that begin with ``text``; None when there is none."""
+    """Return the first text after all those with a beginning.
+
+    None when there is none.
+    """
     last = ord(text[-1])
     if last == 0x10FFFF:
         return None
@@ -195,7 +198,10 @@ def _after(text: str) -> str | None:
 
 
 def _collapsed(pattern: str) -> str:
-    """Return the same pattern with one star at most in each row of wildcards."""
+    """Return the same pattern with fewer stars.
+
+    Each row of wildcards has one star at most.
+    """
     parts = []
     for is_wildcard, characters in itertools.groupby(pattern, "*?".__contains__):
         part = "".join(characters)
@@ -204,7 +210,10 @@ def _collapsed(pattern: str) -> str:
 
 
 def _range(key: Key, representation: str) -> tuple[str, str]:
-    """Return the first and the last moment that a date, a time, both, or a range of them may mean."""
+    """Return the first and the last moment that a key means.
+
+    The key is a date, a time, both, or a range of them.
+    """
     text = text_form(key.text).rstrip("*")
     single = time_form(representation, text)
     if single is not None and single.last is not None:
@@ -227,7 +236,7 @@ def _overlaps(first: Text, last: Text, start: str, end: str) -> Condition:
 
 
 def _combined(date_path: str, time_path: str, dates: tuple[str, str], times: tuple[str, str]) -> Condition:
-    """Return the condition that date and time together lie in one range of moments."""
+    """Return the condition that date and time lie in one range."""
     time = aliased(DicomValue)
     start, end = dates[0] and dates[0] + times[0], dates[1] + times[1]
     moments = select(DicomValue.object_id).join(time, time.object_id == DicomValue.object_id)

@@ -204,7 +204,9 @@ def _instances(request: Request, study_uid: str | None, series_uid: str | None, 
 def _searched(
     request: Request, level: Sequence[InstrumentedAttribute[str]], study_uid: str | None, series_uid: str | None
 ) -> _Found:
-    """Read the parameters of a search, complete the index where it needs that, and read the page.
+    """Read the parameters and the page of a search.
+
+    It completes the index first, where the search needs that.
 
     Raises
     ------

@@ -77,7 +77,7 @@ def pictures_object(origin: ResultOrigin, series: PictureSeries, pictures: tuple
 
 
 def picture_headers(origin: ResultOrigin, series: tuple[PictureSeries, ...]) -> list[IndexedHeader]:
-    """Return the headers of secondary captures that nobody has drawn, as searches need them."""
+    """Return the headers of secondary captures that nobody has drawn."""
     source = origin.source()
     return [read_indexed(io.BytesIO(pictures_file(source, each, None))) for each in series]
 

@@ -87,7 +87,10 @@ class Watchdog:
 
     @contextmanager
     def watching(self) -> Iterator[list[float]]:
-        """Yield a list that at the end of the block holds the longest time for which the lock was held."""
+        """Yield a list for the longest time of a held lock.
+
+        It is filled at the end of the block.
+        """
         found: list[float] = []
         self._look()
         self._longest = 0.0
@@ -125,7 +128,10 @@ def routes(method: str) -> list[str]:
 
 
 def held(watchdog: Watchdog, service: TestClient, method: str, path: str, **request: object) -> float:
-    """Return the shortest of some longest holds of the interpreter's lock during a request, in seconds."""
+    """Return how long a request held the interpreter's lock, in seconds.
+
+    The best of some tries.
+    """
     best = float("inf")
     for _ in range(TRIES):
         with watchdog.watching() as found:
