@@ -94,7 +94,11 @@ class _Found:
         search = self.search
         # UIDs have digits and dots only, so that the texts have the order of the UIDs.
         first = func.min(DicomObject.series_uid + _BETWEEN + DicomObject.uid)
-        groups = select(*self.level, first).where(*conditions).group_by(*self.level).order_by(*self.level)
+        groups = select(*self.level, first).group_by(*self.level)
+        if self.level == _INSTANCE:
+            # Each object is a group of its own; many of them take a database long.
+            groups = select(*self.level, DicomObject.series_uid + _BETWEEN + DicomObject.uid)
+        groups = groups.where(*conditions).order_by(*self.level)
         places = session.execute(groups.offset(search.offset).limit(search.limit + 1)).all()
         self.has_more = len(places) > search.limit
         uids = [place[-1].partition(_BETWEEN)[2] for place in places[: search.limit]]
