@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from fastapi import Request, Response
 from pydicom.datadict import dictionary_VR
-from sqlalchemy import ColumnElement, func, select, tuple_
+from sqlalchemy import ColumnElement, Select, func, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from fluoromap_service.api.dicomweb.addresses import instance_url, series_url, study_url
@@ -94,7 +94,7 @@ class _Found:
         search = self.search
         # UIDs have digits and dots only, so that the texts have the order of the UIDs.
         first = func.min(DicomObject.series_uid + _BETWEEN + DicomObject.uid)
-        groups = select(*self.level, first).group_by(*self.level)
+        groups: Select[*tuple[Any, ...]] = select(*self.level, first).group_by(*self.level)
         if self.level == _INSTANCE:
             # Each object is a group of its own; many of them take a database long.
             groups = select(*self.level, DicomObject.series_uid + _BETWEEN + DicomObject.uid)
