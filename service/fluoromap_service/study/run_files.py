@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
+from sqlalchemy import select
+
 from fluoromap_service.dicom.facts import InstanceFacts
 from fluoromap_service.dicom.pixel_layout import NATIVE
+from fluoromap_service.problem import Problem
 from fluoromap_service.store import files
+from fluoromap_service.store.engine import reading
+from fluoromap_service.store.models import Instance
 
 
 def checked_run(sha256: str, facts: InstanceFacts) -> AbstractContextManager[Path]:
@@ -24,3 +30,20 @@ def checked_run(sha256: str, facts: InstanceFacts) -> AbstractContextManager[Pat
     if facts.transfer_syntax in NATIVE:
         return files.checked_meanwhile(sha256)
     return nullcontext(files.checked_path(sha256))
+
+
+def check_not_deleted(hashes: Iterable[str]) -> None:
+    """Check that the runs with these files still exist.
+
+    A job outlives the runs that somebody deletes. A file that is missing although its run exists is damage: the reader reports it.
+
+    Raises
+    ------
+    Problem
+        409 ``run_deleted``.
+    """
+    wanted = set(hashes)
+    with reading() as session:
+        known = set(session.scalars(select(Instance.sha256).where(Instance.sha256.in_(wanted))))
+    if known != wanted:
+        raise Problem(409, "run_deleted", "Somebody deleted a run of this job; upload it again and start a new job.")

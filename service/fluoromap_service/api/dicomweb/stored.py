@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,14 +15,14 @@ from sqlalchemy import select
 from fluoromap_service.api.dicomweb.display import Display, render_result, render_run, result_frame_bytes
 from fluoromap_service.api.dicomweb.indexing import Scope, index_results, index_runs
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
-from fluoromap_service.api.results.result_objects import object_file
+from fluoromap_service.api.results.result_objects import object_file, plan_objects
 from fluoromap_service.dicom import InstanceFacts
 from fluoromap_service.dicom.frames import frame_bytes
 from fluoromap_service.dicom.indexed_header import metadata_of
-from fluoromap_service.problem import not_found
+from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.models import DicomObject, Instance
+from fluoromap_service.store.models import DicomObject, Instance, Job, JobState, StudyInstance
 
 Json = dict[str, Any]
 
@@ -66,7 +67,7 @@ class StoredInstance(Protocol):
         """Number of frames; 0 for an object without pictures."""
 
     def make_file(self) -> None:
-        """Make the file when it does not exist yet.
+        """Make the file when it does not exist yet, and check it.
 
         A fault then comes before the first byte of an answer.
         """
@@ -121,7 +122,8 @@ class StoredRun:
         return self.facts.frames
 
     def make_file(self) -> None:
-        """Do nothing: somebody sent the file."""
+        """Check the file that somebody sent."""
+        files.checked_path(self.sha256)
 
     def chunks(self) -> Iterator[bytes]:
         """Return the content of the file, piece by piece."""
@@ -218,6 +220,19 @@ def metadata_of_all(instances: list[StoredInstance]) -> list[bytes]:
     return found
 
 
+def _jobs_over(study_uid: str) -> list[str]:
+    """Return the jobs over a DICOM study that succeeded."""
+    query = (
+        select(Job.id)
+        .join(StudyInstance, StudyInstance.study_id == Job.study_id)
+        .join(Instance, Instance.sop_instance_uid == StudyInstance.sop_instance_uid)
+        .where(Job.state == JobState.SUCCEEDED, Instance.study_instance_uid == study_uid)
+        .distinct()
+    )
+    with reading() as session:
+        return list(session.scalars(query))
+
+
 def existing(study_uid: str, series_uid: str | None = None, uid: str | None = None) -> list[StoredInstance]:
     """Return the stored instances of a resource in the order of their UIDs.
 
@@ -225,6 +240,8 @@ def existing(study_uid: str, series_uid: str | None = None, uid: str | None = No
     ------
     Problem
         404 when there is none.
+    BrokenFile
+        When there may be one, and damage hides it: a job's results are not listed while a run that they need is damaged.
     """
     index_runs(Scope(*(None if wanted is None else [wanted] for wanted in (study_uid, series_uid, uid))))
     found = _stored(study_uid, series_uid, uid)
@@ -233,6 +250,9 @@ def existing(study_uid: str, series_uid: str | None = None, uid: str | None = No
         index_results(study_uid)
         found = _stored(study_uid, series_uid, uid)
     if not found:
+        for job_id in _jobs_over(study_uid):
+            with suppress(Problem):
+                plan_objects(job_id)
         raise not_found("DICOM study, series or instance")
     return found
 

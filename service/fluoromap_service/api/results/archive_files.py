@@ -14,10 +14,11 @@ from fluoromap_service.api.http.file_names import plain_name
 from fluoromap_service.api.http.file_pool import PROCESSES
 from fluoromap_service.api.jobs.job_answers import read_job
 from fluoromap_service.api.results.maps import activation_map, map_picture_of
-from fluoromap_service.api.results.overlays import picture_of
+from fluoromap_service.api.results.overlays import check_picture, picture_of
 from fluoromap_service.api.results.points import points_csv, points_of
 from fluoromap_service.api.results.report_page import report_of
 from fluoromap_service.api.results.tracks import tracks_table_of
+from fluoromap_service.jobs.stage_results import stages_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import ended_job_of, job_of, snapshot_of
 from fluoromap_service.results.fusion import Fusion, fusion_of
@@ -25,6 +26,7 @@ from fluoromap_service.results.maps import FinishedMap, map_of
 from fluoromap_service.results.mesh_files import MeshFormat, mesh_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.results.placement import LocatedView, located_views
+from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 from fluoromap_service.store.renderings import KeptFile
@@ -45,21 +47,29 @@ class ArchiveFile:
 def archive_files(job_id: str) -> Iterator[ArchiveFile]:
     """Return the files of a job's archive, one after the other.
 
-    The first one comes at once. The pool draws the overlays while the others are made.
+    The pool draws the overlays while the others are made.
 
     Raises
     ------
     Problem
         Before the first file: 404 when there is no such job; 409 ``not_ready`` while the job runs.
+    BrokenFile
+        Before the first file: when a stored file that the archive needs is missing or damaged.
     """
     with reading() as session:
         job = ended_job_of(session, job_id, "archive")
         state, parameters, job_version = read_job(session, job).model_dump(mode="json"), _parameters(job), job.version
+        tracks = [stage.result for stage in stages_of(session, job_id, "monoplane") if stage.result is not None]
+    # An error after the first file could only end the connection.
+    for sha256 in tracks:
+        files.checked_path(sha256)
+    found = _map_and_fusions(job_id)
+    for _, fusion in [] if found is None else found[1]:
+        check_picture(job_id, fusion, Look())
     yield ArchiveFile("job.json", _json(state))
     yield ArchiveFile("parameters.json", _json(parameters))
     threads = ThreadPoolExecutor(PROCESSES)
     try:
-        found = _map_and_fusions(job_id)
         overlays = [] if found is None else _start_overlays(job_id, found[1], threads)
         yield from _tables(job_id, job_version)
         yield ArchiveFile("report.html", report_of(job_id).path)

@@ -34,6 +34,7 @@ from fluoromap_service.results.finished import ended_job_of, snapshot_of
 from fluoromap_service.results.origins import Origin
 from fluoromap_service.store import files, reidentification
 from fluoromap_service.store.engine import reading
+from fluoromap_service.study.run_files import check_not_deleted
 from fluoromap_service.study.snapshot import SiteSnapshot
 
 router = new_router(tags=["results"])
@@ -143,8 +144,7 @@ def write_export(job_id: str, stream: IO[bytes], options: ExportOptions) -> Path
         runs = {uid: run.sha256 for uid, run in snapshot.runs.items()}
         tables = dict(_tables(job_id))
     planned = _planned(job_id)
-    if not all(files.path_of(sha256).exists() for sha256 in runs.values()):
-        raise Problem(409, "run_deleted", "Somebody deleted a run of this job; upload it again and start a new job.")
+    check_not_deleted(runs.values())
     pseudonyms = Pseudonyms(
         reidentification.secret(), _patient(next(iter(runs.values()))), options.subject, options.dates
     )

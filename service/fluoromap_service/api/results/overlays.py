@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,8 +27,8 @@ from fluoromap_service.results.fusion import Fusion, draw_fusion, draw_fusion_jp
 from fluoromap_service.results.placement import LocatedView, located_views
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
-from fluoromap_service.store.renderings import KeptFile, kept_rendering
-from fluoromap_service.study.run_files import checked_run
+from fluoromap_service.store.renderings import KeptFile, find_rendering, kept_rendering
+from fluoromap_service.study.run_files import check_not_deleted, checked_run
 
 router = new_router(tags=["results"])
 
@@ -78,6 +78,22 @@ def picture_of(job_id: str, fusion: Fusion, look: Look, *, moving: bool = False)
     return kept_rendering(job_id, overlay_dependencies(fusion, look, moving=moving), make)
 
 
+def check_picture(job_id: str, fusion: Fusion, look: Look) -> None:
+    """Check the run from which :func:`picture_of` will draw; a kept picture needs none.
+
+    A deleted run passes, because its picture has a problem of its own.
+
+    Raises
+    ------
+    BrokenFile
+    """
+    dependencies = overlay_dependencies(fusion, _marked(fusion, look), moving=False)
+    if find_rendering(job_id, dependencies) is None:
+        with suppress(Problem):
+            check_not_deleted([fusion.sha256])
+            files.checked_path(fusion.sha256)
+
+
 def jpeg_of(fusion: Fusion, look: Look) -> bytes:
     """Return a new JPEG of an overlay, which nothing keeps."""
     with _run_file(fusion) as path:
@@ -90,9 +106,7 @@ def _marked(fusion: Fusion, look: Look) -> Look:
 
 
 def _run_file(fusion: Fusion) -> AbstractContextManager[Path]:
-    if not files.path_of(fusion.sha256).exists():
-        detail = "Somebody deleted this run; upload it again and start a new job to get its overlay."
-        raise Problem(409, "run_deleted", detail)
+    check_not_deleted([fusion.sha256])
     return checked_run(fusion.sha256, fusion.facts)
 
 

@@ -44,6 +44,7 @@ from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Point
 from fluoromap_service.store.renderings import KeptFile, find_rendering, kept_rendering
+from fluoromap_service.study.run_files import check_not_deleted
 from fluoromap_service.study.snapshot import RunSnapshot, Snapshot
 
 REPORT_NAME = "report.dcm"
@@ -111,8 +112,7 @@ def plan_objects(job_id: str) -> JobObjects:
         ended = datetime.fromtimestamp(int(job.finished or 0), UTC)
     named = dict.fromkeys(uid for row in tips for uid in (row.view_a, row.view_b) if uid in snapshot.runs)
     runs = [snapshot.runs[uid] for uid in named]
-    if not all(files.path_of(run.sha256).exists() for run in runs):
-        raise Problem(409, "run_deleted", "Somebody deleted a run of this job; upload it again and start a new job.")
+    check_not_deleted(run.sha256 for run in runs)
     origin = ResultOrigin(
         job_id, ended, files.checked_path(runs[0].sha256), tuple(_reference(run) for run in runs[1:])
     )  # fmt: skip

@@ -14,9 +14,9 @@ from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.dicom import cine_8bit
 from fluoromap_service.problem import not_found
-from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading
 from fluoromap_service.study import instances
+from fluoromap_service.study.run_files import checked_run
 
 router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
@@ -30,7 +30,7 @@ _CONTENT = {"application/octet-stream": {"schema": {"type": "string", "format": 
     "/{uid}/frames",
     summary="Many frames of a run",
     response_class=Response,
-    responses={200: {"content": _CONTENT, "description": "The frames."}, **responses(401, 403, 404, 422, 429)},
+    responses={200: {"content": _CONTENT, "description": "The frames."}, **responses(401, 403, 404, 409, 422, 429)},
 )
 def get_frames(
     study_id: StudyId,
@@ -53,10 +53,10 @@ def get_frames(
         raise not_found("frame")
     sent = min(count, facts.frames - first + 1, max(1, MOST_BYTES // (facts.rows * facts.columns)))
     etag = f'"{run.sha256[:32]}-{first}-{sent}"'
-    if is_known(request, etag):
-        return not_modified(etag)
-    path = files.path_of(run.sha256)
-    content = run_in_pool(Task.DRAW_PICTURE, cine_8bit, path, facts, first - 1, sent)
+    with checked_run(run.sha256, facts) as path:
+        if is_known(request, etag):
+            return not_modified(etag)
+        content = run_in_pool(Task.DRAW_PICTURE, cine_8bit, path, facts, first - 1, sent)
     return Response(
         content,
         media_type="application/octet-stream",

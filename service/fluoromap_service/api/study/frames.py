@@ -24,6 +24,7 @@ from fluoromap_service.study import instances, preview, studies
 from fluoromap_service.study.catheters import catalogue_of
 from fluoromap_service.study.instances import StudyRun
 from fluoromap_service.study.preview import ScaleSource
+from fluoromap_service.study.run_files import checked_run
 
 router = new_router("/v1/studies/{study_id}/instances", tags=["instances"])
 
@@ -87,10 +88,10 @@ def get_frame(
         return Response(marked, media_type="image/png", headers={"Cache-Control": "no-store"})
     shown = "" if chosen is None else f"-{chosen[0]:g}-{chosen[1]:g}"
     etag = f'"{run.sha256[:32]}-{n}{shown}"'
-    if is_known(request, etag):
-        return not_modified(etag)
-    path = files.checked_path(run.sha256)
-    picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
+    with checked_run(run.sha256, run.facts) as path:
+        if is_known(request, etag):
+            return not_modified(etag)
+        picture = run_in_pool(Task.DRAW_PICTURE, frame_png, path, run.facts, n - 1, chosen)
     # A stored file never changes, so a browser may keep the picture.
     return Response(
         picture, media_type="image/png", headers={"ETag": etag, "Cache-Control": "private, max-age=3600, immutable"}

@@ -158,8 +158,12 @@ def test_wrong_requests(client: TestClient, study: FinishedStudy, data_dir: Path
     assert client.get(f"{path}?subject=Doe%5EJane").status_code == 422
     assert client.get("/v1/jobs/none/deidentified.zip").status_code == 404
     with reading() as session:
-        sha256 = next(iter(session.get_one(Job, study.job_id).snapshot["runs"].values()))["sha256"]
-    os.remove(files.path_of(sha256))
+        uid, run = next(iter(session.get_one(Job, study.job_id).snapshot["runs"].items()))
+    content = files.read(run["sha256"])
+    os.remove(files.path_of(run["sha256"]))
+    assert client.get(path).json()["code"] == "run_broken"
+    files.path_of(run["sha256"]).write_bytes(content)
+    assert client.delete(f"/v1/studies/{study.study_id}/instances/{uid}").status_code == 204
     assert client.get(path).json()["code"] == "run_deleted"
     assert list(files.incoming_folder().iterdir()) == []
 

@@ -183,14 +183,14 @@ def test_the_star_is_where_the_tip_was_seen(client: TestClient, study: FinishedS
     np.testing.assert_allclose(_fusion(study, "a", 3).tip_uv, camera("a").project(TIP_MM))
 
 
-def test_a_deleted_runs_overlay_stays_when_it_was_drawn(client: TestClient, study: FinishedStudy) -> None:
+def test_a_missing_runs_overlay_stays_when_it_was_drawn(client: TestClient, study: FinishedStudy) -> None:
     study.mapped()
     path = f"/v1/jobs/{study.job_id}/overlays/{study.uids['S01', 'a']}.png"
     kept = client.get(path).content
     files.path_of(_fusion(study, "a", None).sha256).unlink()
     assert client.get(path).content == kept
     answer = client.get(f"{path}?frame=1")
-    assert (answer.status_code, answer.json()["code"]) == (409, "run_deleted")
+    assert (answer.status_code, answer.json()["code"]) == (409, "run_broken")
 
 
 def test_a_deleted_run_takes_the_pictures_of_it_along(client: TestClient, study: FinishedStudy) -> None:
