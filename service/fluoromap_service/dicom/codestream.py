@@ -13,7 +13,7 @@ from pydicom.pixels.decoders.base import get_decoder
 from pydicom.uid import JPEGExtended12Bit
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
-from fluoromap_service.dicom.pixel_layout import JPEG_2000, RLE, PixelLayout, syntax_name
+from fluoromap_service.dicom.pixel_layout import JP2_SIGNATURE, JPEG_2000, RLE, PixelLayout, syntax_name
 from fluoromap_service.problem import Problem
 
 Pixels = NDArray[np.unsignedinteger[Any]]
@@ -47,7 +47,7 @@ def largest_codestream(layout: PixelLayout) -> int:
 
 
 def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
-    """Return the pixels of one compressed frame, (rows, columns) uint8 or uint16, writable.
+    """Return the pixels of one compressed frame, (rows, columns) uint8 or uint16 by BitsAllocated, writable.
 
     The function first compares the codestream's own size with the header's. So a few bytes that claim gigabytes allocate
     nothing.
@@ -77,8 +77,15 @@ def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
             "send uncompressed, JPEG Lossless or JPEG 2000.",
             "TransferSyntaxUID",
         )
-    if not 1 <= described.precision <= 16:
-        raise _undecodable(layout, f"it has {described.precision} bits a pixel")
+    if described.precision > layout.bits_allocated:
+        raise dicom_problem(
+            DicomCode.PIXEL_DATA_MISMATCH,
+            f"The compressed frame has {described.precision} bits a pixel, but BitsAllocated is {layout.bits_allocated}; "
+            "export the run again.",
+            "BitsAllocated",
+        )
+    if described.precision < 1:
+        raise _undecodable(layout, "its pixels have no bits")
     options: dict[str, Any] = {
         "rows": layout.rows,
         "columns": layout.columns,
@@ -98,7 +105,7 @@ def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
         raise _undecodable(layout, "the decoder fails") from error
     if pixels.shape != (layout.rows, layout.columns) or pixels.dtype.kind != "u":
         raise _undecodable(layout, "the decoder returned another size or type of pixels")
-    return np.require(pixels, requirements=["C", "W"])
+    return np.require(pixels, f"<u{layout.bits_allocated // 8}", ["C", "W"])
 
 
 def _undecodable(layout: PixelLayout, why: str) -> Problem:
@@ -114,6 +121,7 @@ def _parse(layout: PixelLayout, codestream: bytes) -> tuple[Codestream, bytes] |
     try:
         if layout.transfer_syntax not in JPEG_2000:
             return _parse_jpeg(codestream)
+        codestream = _without_boxes(codestream)
         described = _parse_jpeg_2000(codestream)
     except (struct.error, IndexError):
         return None
@@ -148,6 +156,28 @@ def _parse_jpeg(codestream: bytes) -> tuple[Codestream, bytes] | None:
             return None
         position += 2 + length
     return None
+
+
+def _without_boxes(content: bytes) -> bytes:
+    """Return the codestream of a JP2 file, ITU-T T.800 annex I.4; other content is returned unchanged.
+
+    PS3.5 A.4.4 allows the codestream only. Some systems put a whole JP2 file into a frame.
+    """
+    if not content.startswith(JP2_SIGNATURE):
+        return content
+    position = 0
+    while position < len(content):
+        length, kind = struct.unpack_from(">L4s", content, position)
+        header = 8
+        if length == 1:
+            (length,) = struct.unpack_from(">Q", content, position + 8)
+            header = 16
+        end = len(content) if length == 0 else position + length
+        if kind == b"jp2c":
+            return content[position + header : end]
+        # A box that is shorter than its header would lead nowhere.
+        position = max(end, position + header)
+    return content
 
 
 def _parse_jpeg_2000(codestream: bytes) -> Codestream | None:

@@ -40,6 +40,7 @@ class HeaderWarning(StrEnum):
     BITS_STORED_EXCEEDED = "bits_stored_exceeded"
     PIXEL_DATA_LONGER = "pixel_data_longer"
     SHUTTER_IGNORED = "shutter_ignored"
+    WINDOW_IGNORED = "window_ignored"
     R_WAVES_IGNORED = "r_waves_ignored"
     PATIENT_OR_STUDY_REPAIRED = "patient_or_study_repaired"
 
@@ -81,6 +82,9 @@ _SENTENCES: dict[HeaderWarning, str] = {
     HeaderWarning.BITS_STORED_EXCEEDED: "The pixels use more bits than BitsStored says; the service uses the larger number.",
     HeaderWarning.PIXEL_DATA_LONGER: "There is more pixel data than NumberOfFrames says; the service ignores the rest.",
     HeaderWarning.SHUTTER_IGNORED: "A shutter or collimator attribute makes no sense; the service ignores it.",
+    HeaderWarning.WINDOW_IGNORED: (
+        "The display window lies beside the values that the pixels can have; the service shows the range of the picture."
+    ),
     HeaderWarning.R_WAVES_IGNORED: "RWavePointer names frames that do not exist; the service ignores them.",
     HeaderWarning.PATIENT_OR_STUDY_REPAIRED: (
         "An attribute of the patient or the study, or SpecificCharacterSet, breaks the rules of DICOM; results carry it repaired "

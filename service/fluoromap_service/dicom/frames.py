@@ -48,10 +48,14 @@ class DicomFrames:
         Problem
             ``undecodable`` or ``pixel_data_mismatch`` for a damaged frame.
         """
+        return _pixels(self.cells(index), self._layout)
+
+    def cells(self, index: int) -> Pixels:
+        """Return the pixel cells of a frame as :meth:`__getitem__`, with the overlay planes that they may hold."""
         if not 0 <= index < len(self):
             raise IndexError(f"the run has {len(self)} frames")
         with self._opened() as file:
-            return read_frame(file, self._layout, index)
+            return _read_cells(file, self._layout, index)
 
     def __iter__(self) -> Iterator[Pixels]:
         with self._opened() as file:
@@ -85,6 +89,17 @@ def open_frames(path: Path, facts: InstanceFacts) -> DicomFrames:
 
 def read_frame(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
     """Return the stored pixels of one frame of an open file."""
+    return _pixels(_read_cells(file, layout, index), layout)
+
+
+def _pixels(cells: Pixels, layout: PixelLayout) -> Pixels:
+    """Return pixel cells without overlay planes; changes them in place."""
+    if layout.overlay_bits:
+        cells &= np.array(~layout.overlay_bits & (1 << layout.bits_allocated) - 1, cells.dtype)
+    return cells
+
+
+def _read_cells(file: BufferedReader, layout: PixelLayout, index: int) -> Pixels:
     if layout.transfer_syntax in NATIVE:
         if layout.big_endian_words:
             return _read_big_endian(file, layout, index)
@@ -178,8 +193,8 @@ def frame_png(path: Path, facts: InstanceFacts, frame: int, window: Pair | None)
 
 
 def frame_bytes(path: Path, facts: InstanceFacts, frame: int) -> bytes:
-    """Return the stored pixels of one frame as bytes.
+    """Return the pixel cells of one frame as bytes, as the header describes them.
 
-    ``frame`` counts from 0. The bytes are row by row, little endian.
+    ``frame`` counts from 0. The bytes are row by row, little endian. Overlay planes stay: OverlayBitPosition is in the header.
     """
-    return open_frames(path, facts)[frame].tobytes()
+    return open_frames(path, facts).cells(frame).tobytes()

@@ -21,7 +21,9 @@ from pydicom.tag import BaseTag, Tag
 from pydicom.uid import (
     ExplicitVRBigEndian,
     ImplicitVRLittleEndian,
+    MediaStorageDirectoryStorage,
 )
+from pydicom.valuerep import VR
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.repair import PATIENT_AND_STUDY, repair
@@ -44,6 +46,8 @@ Result = TypeVar("Result")
 
 _PIXEL_DATA = 0x7FE00010
 _CHARACTER_SET = 0x00080005
+_REPRESENTATIONS = frozenset(map(str, VR))
+"""The value representations of PS3.5 section 6.2."""
 _FRAME_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
 
 # Functional group macros of Enhanced XA and RF, PS3.3 C.8.19.6, and the attributes read from each.
@@ -103,6 +107,8 @@ _PATIENT_AND_STUDY = ("SpecificCharacterSet", *PATIENT_AND_STUDY)
 _PRIVATE_GROUP = 0x0019
 _PRIVATE_ELEMENTS = (0x21, 0x22, 0x23)
 _PRIVATE_BLOCKS = range(0x10, 0x100)
+_OVERLAY_GROUPS, _OVERLAY_BIT_POSITION = range(0x6000, 0x6020, 2), 0x0102
+"""OverlayBitPosition (60xx,0102) of the sixteen overlays of PS3.3 C.9.2."""
 
 
 def _tag(attribute: str | BaseTag) -> BaseTag:
@@ -118,6 +124,7 @@ def _tag(attribute: str | BaseTag) -> BaseTag:
 # The service reads only these. Patient data stays in the file; its form is checked for a warning.
 _WANTED: list[BaseTag | int] = [
     *(_tag(keyword) for keyword in (*_PLAIN, *_MACROS_OF, *_FRAME_GROUPS, *_PATIENT_AND_STUDY)),
+    *(Tag(group, _OVERLAY_BIT_POSITION) for group in _OVERLAY_GROUPS),
     *(Tag(_PRIVATE_GROUP, block) for block in _PRIVATE_BLOCKS),
     *(Tag(_PRIVATE_GROUP, block << 8 | element) for block in _PRIVATE_BLOCKS for element in _PRIVATE_ELEMENTS),
 ]
@@ -140,8 +147,16 @@ class Header:
     value counts as absent.
     """
 
-    def __init__(self, dataset: Dataset, transfer_syntax: str, pixel_element: PixelElement | None, size: int) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        transfer_syntax: str,
+        pixel_element: PixelElement | None,
+        size: int,
+        unknown_representation: BaseTag | None = None,
+    ) -> None:
         self.transfer_syntax = transfer_syntax
+        self.unknown_representation = unknown_representation
         self.pixel_element = pixel_element
         self.file_size = size
         self._dataset = dataset
@@ -218,6 +233,11 @@ class Header:
                 values = self._numbers(self._dataset, Tag(_PRIVATE_GROUP, block << 8 | element))
                 return values[0] if values else None
         return None
+
+    def overlay_bits(self) -> tuple[int, ...]:
+        """Return OverlayBitPosition (60xx,0102) of every overlay."""
+        found = (self._numbers(self._dataset, Tag(group, _OVERLAY_BIT_POSITION)) for group in _OVERLAY_GROUPS)
+        return tuple(int(position) for positions in found for position in positions)
 
     def code(self, *sequences: str) -> str:
         """Return the value of a code; "" when absent.
@@ -376,7 +396,7 @@ def data_set_start(file: BufferedReader) -> tuple[str, int]:
     Problem
         As :func:`read_header`.
     """
-    return _bounded(file, lambda reader, size: (_transfer_syntax(reader), reader.tell()))
+    return _bounded(file, lambda reader, size: (_file_meta(reader)[0], reader.tell()))
 
 
 def read_attributes(file: BufferedReader) -> tuple[str, Dataset]:
@@ -421,7 +441,7 @@ def read_all_attributes(file: BufferedReader) -> tuple[Dataset, bool]:
 
 def _parse_all(reader: _BoundedReader, size: int) -> tuple[Dataset, bool]:
     stream = cast(Any, reader)
-    syntax = _transfer_syntax(reader)
+    syntax, _ = _file_meta(reader)
     start = reader.tell()
     implicit, little_endian = syntax == ImplicitVRLittleEndian, syntax != ExplicitVRBigEndian
 
@@ -467,43 +487,71 @@ def _bounded(file: BufferedReader, parse: Callable[[_BoundedReader, int], Result
         raise dicom_problem(DicomCode.MALFORMED, "The DICOM header is damaged; export the run again.") from error
 
 
-def _transfer_syntax(reader: _BoundedReader) -> str:
+def _file_meta(reader: _BoundedReader) -> tuple[str, str]:
+    """Read the file meta information; return the transfer syntax and the SOP class."""
     stream = cast(Any, reader)
-    syntax_tag = _tag("TransferSyntaxUID")
+    keywords = ("TransferSyntaxUID", "MediaStorageSOPClassUID")
     meta = read_dataset(
-        stream, False, True, stop_when=lambda tag, vr, length: tag.group != 2, specific_tags=[syntax_tag]
+        stream, False, True, stop_when=lambda tag, vr, length: tag.group != 2, specific_tags=[*map(_tag, keywords)]
     )
-    syntax = str(meta.get("TransferSyntaxUID", "")).strip(" \0")
+    syntax, sop_class = (str(meta.get(keyword, "")).strip(" \0") for keyword in keywords)
     if not syntax:
         raise dicom_problem(
             DicomCode.MALFORMED,
             "The file meta information has no TransferSyntaxUID; export the run again.",
             "TransferSyntaxUID",
         )
-    return syntax
+    return syntax, sop_class
 
 
 def _parse(reader: _BoundedReader, size: int) -> Header:
     stream = cast(Any, reader)
-    syntax = _transfer_syntax(reader)
+    syntax, sop_class = _file_meta(reader)
+    if sop_class == MediaStorageDirectoryStorage:
+        raise dicom_problem(
+            DicomCode.NOT_XA,
+            "This is a DICOMDIR, the table of contents of a disc; send the image files that lie beside it.",
+            "MediaStorageSOPClassUID",
+        )
     found: list[PixelElement] = []
+    unknown: list[tuple[BaseTag, str | None]] = []
 
     def at_pixel_data(tag: BaseTag, vr: str | None, length: int) -> bool:
         if tag == _PIXEL_DATA:
             found.append(PixelElement(reader.tell(), length, vr or "OW"))
             return True
+        if vr not in _REPRESENTATIONS and syntax != ImplicitVRLittleEndian:
+            unknown.append((tag, vr))
         if length != UNDEFINED_LENGTH and reader.tell() + length > size:
             raise truncation_problem()
         return False
 
-    dataset = read_dataset(
-        stream,
-        syntax == ImplicitVRLittleEndian,
-        syntax != ExplicitVRBigEndian,
-        stop_when=at_pixel_data,
-        specific_tags=_WANTED,
+    try:
+        dataset = read_dataset(
+            stream,
+            syntax == ImplicitVRLittleEndian,
+            syntax != ExplicitVRBigEndian,
+            stop_when=at_pixel_data,
+            specific_tags=_WANTED,
+        )
+    except Exception:
+        # The length of such an element is a guess, so that the parser reads on at a wrong place.
+        if unknown:
+            raise representation_problem(unknown[0][0]) from None
+        raise
+    # An element without any letters is one of implicit representation, which readers understand.
+    named = [tag for tag, vr in unknown if vr is not None]
+    return Header(dataset, syntax, found[-1] if found else None, size, named[0] if named else None)
+
+
+def representation_problem(tag: BaseTag) -> Problem:
+    """Return the problem of an element whose value representation (VR) no edition of DICOM has."""
+    return dicom_problem(
+        DicomCode.MALFORMED,
+        f"The element ({tag.group:04X},{tag.element:04X}) has an unknown value representation (VR); "
+        "export the run again, without this element.",
+        f"({tag.group:04X},{tag.element:04X})",
     )
-    return Header(dataset, syntax, found[-1] if found else None, size)
 
 
 def _no_preamble(start: bytes) -> Problem:

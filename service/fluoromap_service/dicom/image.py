@@ -30,10 +30,26 @@ def pixel_facts(header: Header, rows: int, columns: int, bits_stored: int, warni
     )
 
 
-def window(header: Header) -> Pair | None:
-    """Return the first display window (centre, width): WindowCenter (0028,1050), WindowWidth (0028,1051)."""
+LEAST_GREYS = 0.25
+"""Part of a display window that the possible pixel values must fill; below it the picture is nearly black or white.
+
+A window for 16 bits over pixels of 12 bits shows 16 of 256 greys. A window that is meant for other units lies beside all values.
+"""
+
+
+def window(header: Header, bits_stored: int, warnings: list[HeaderWarning]) -> Pair | None:
+    """Return the first display window (centre, width): WindowCenter (0028,1050), WindowWidth (0028,1051).
+
+    A window that shows hardly any of the values that pixels of ``bits_stored`` bits can have is ignored.
+    """
     centre, width = header.number("WindowCenter"), header.number("WindowWidth")
-    return (centre, width) if centre is not None and width is not None and width >= 1 else None
+    if centre is None or width is None or width < 1:
+        return None
+    low, high = max(centre - width / 2, 0), min(centre + width / 2, (1 << bits_stored) - 1)
+    if high - low < LEAST_GREYS * (width - 1):
+        warnings.append(HeaderWarning.WINDOW_IGNORED)
+        return None
+    return centre, width
 
 
 def r_wave_frames(header: Header, frames: int, warnings: list[HeaderWarning]) -> tuple[int, ...]:

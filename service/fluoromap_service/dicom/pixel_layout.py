@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BufferedReader
 
 from pydicom import uid
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
-from fluoromap_service.dicom.facts import HeaderWarning
+from fluoromap_service.dicom.facts import HeaderWarning, is_uid
 from fluoromap_service.dicom.header import UNDEFINED_LENGTH, Header, truncation_problem
 from fluoromap_service.problem import Problem
 
@@ -30,6 +30,8 @@ JPEG_2000 = frozenset({uid.JPEG2000Lossless, uid.JPEG2000})
 RLE = frozenset({uid.RLELossless})
 DECODABLE = NATIVE | JPEG | JPEG_LS | JPEG_2000 | RLE
 
+JP2_SIGNATURE = b"\x00\x00\x00\x0cjP  \r\n\x87\n"
+"""The first box of a JP2 file, ITU-T T.800 I.5.1."""
 _MOST_FRAGMENTS = 200_000
 _ITEM, _DELIMITER = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
 
@@ -52,6 +54,8 @@ class PixelLayout:
     big_endian_words : bool
         Whether the bytes of each 16-bit word lie in the other order, also where a word holds two 8-bit pixels
         (PS3.5 section A.3 and annex D).
+    overlay_bits : int
+        Mask of the bits of a pixel cell that are overlay planes and no pixel.
     """
 
     rows: int
@@ -62,6 +66,7 @@ class PixelLayout:
     transfer_syntax: str
     extents: tuple[tuple[Extent, ...], ...]
     big_endian_words: bool = False
+    overlay_bits: int = 0
 
     @property
     def frame_bytes(self) -> int:
@@ -71,7 +76,7 @@ class PixelLayout:
 
 def syntax_name(transfer_syntax: str) -> str:
     """Return the name of a transfer syntax for messages; the UID where the syntax is unknown."""
-    return uid.UID(transfer_syntax).name
+    return uid.UID(transfer_syntax).name if is_uid(transfer_syntax) else "no valid UID"
 
 
 def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarning]) -> PixelLayout:
@@ -87,26 +92,43 @@ def pixel_layout(file: BufferedReader, header: Header, warnings: list[HeaderWarn
     ----------
     PS3.3 C.7.6.3 (image pixel module), PS3.5 section 8 and annex A.4 (encapsulation).
     """
+    syntax = header.transfer_syntax
+    if syntax not in DECODABLE:
+        raise _undecodable_syntax(syntax)
     rows, columns, frames = _size(header)
     bits_allocated, bits_stored = _bits(header)
-    element, syntax = header.pixel_element, header.transfer_syntax
+    element = header.pixel_element
     if element is None or element.length == 0:
         raise dicom_problem(
             DicomCode.NO_PIXEL_DATA, "The object has no image (no PixelData); send a run with pixels.", "PixelData"
         )
-    if syntax not in DECODABLE:
-        raise dicom_problem(
-            DicomCode.UNDECODABLE,
-            f"The service cannot decode transfer syntax {syntax_name(syntax)}; send uncompressed, RLE, JPEG, JPEG-LS or JPEG 2000.",
-            "TransferSyntaxUID",
-        )
-    if syntax in NATIVE:
-        extents = _native_extents(header, frames, rows * columns * bits_allocated // 8, warnings)
-    else:
-        fragments = _fragments(file, header)
-        extents = _group(file, fragments, frames, syntax, warnings)
     swapped = syntax == uid.ExplicitVRBigEndian and (bits_allocated == 16 or element.vr == "OW")
-    return PixelLayout(rows, columns, frames, bits_allocated, bits_stored, syntax, extents, swapped)
+    overlays = _overlay_bits(header, bits_stored, bits_allocated)
+    layout = PixelLayout(rows, columns, frames, bits_allocated, bits_stored, syntax, (), swapped, overlays)
+    if syntax in NATIVE:
+        extents = _native_extents(header, frames, layout.frame_bytes, warnings)
+    else:
+        extents = _group(file, _fragments(file, header), layout, warnings)
+    return replace(layout, extents=extents)
+
+
+def _undecodable_syntax(syntax: str) -> Problem:
+    # A video is one stream of all frames: MPEG-2, MPEG-4, HEVC, PS3.5 section 10.
+    kind = "video" if uid.UID(syntax) in uid.MPEGTransferSyntaxes else "image"
+    return dicom_problem(
+        DicomCode.UNDECODABLE,
+        f"The service cannot decode this {kind}: its transfer syntax is {syntax_name(syntax)}; "
+        "send the frames uncompressed or as RLE, JPEG, JPEG-LS or JPEG 2000.",
+        "TransferSyntaxUID",
+    )
+
+
+def _overlay_bits(header: Header, bits_stored: int, bits_allocated: int) -> int:
+    """Return the bits of a pixel cell that hold overlay planes, as a mask.
+
+    Retired in PS3.5 section 8.1.2: an overlay is in a bit above BitsStored, and OverlayBitPosition (60xx,0102) names it.
+    """
+    return sum(1 << bit for bit in header.overlay_bits() if bits_stored <= bit < bits_allocated)
 
 
 def _size(header: Header) -> tuple[int, int, int]:
@@ -224,11 +246,11 @@ def _fragments(file: BufferedReader, header: Header) -> _Fragments:
         if position + length > header.file_size:
             raise truncation_problem("PixelData")
         if table is None:
-            if length > 4 * MOST_FRAMES:
+            if length > 4 * _MOST_FRAGMENTS:
                 raise dicom_problem(
                     DicomCode.MALFORMED, "The offset table is too long; export the run again.", "PixelData"
                 )
-            table = struct.unpack(f"<{length // 4}L", file.read(length // 4 * 4))
+            table = struct.unpack(f"<{length // 4}L", file.read(length // 4 * 4)) if length % 4 == 0 else ()
         elif length:
             extents.append((position, length))
             if len(extents) > _MOST_FRAGMENTS:
@@ -240,14 +262,15 @@ def _fragments(file: BufferedReader, header: Header) -> _Fragments:
 
 
 def _group(
-    file: BufferedReader, fragments: _Fragments, frames: int, syntax: str, warnings: list[HeaderWarning]
+    file: BufferedReader, fragments: _Fragments, layout: PixelLayout, warnings: list[HeaderWarning]
 ) -> tuple[tuple[Extent, ...], ...]:
     """Return the fragments of each frame.
 
-    With as many fragments as frames, each frame has one. Otherwise the offset table divides them; without a usable table a
-    frame begins at each start of a compressed image (PS3.5 A.4: a fragment never contains parts of two frames).
+    With as many fragments as frames, each frame has one. Otherwise a frame begins at each start of a compressed image: a
+    fragment never contains parts of two frames (PS3.5 A.4). The offset table only counts where the starts do not show; a table
+    whose length is not NumberOfFrames is ignored.
     """
-    extents = fragments.extents
+    extents, frames = fragments.extents, layout.frames
     if len(extents) < frames:
         raise _mismatch(
             f"NumberOfFrames announces {frames} frames, but PixelData has {len(extents)} fragments; send it again."
@@ -256,7 +279,11 @@ def _group(
         return tuple((extent,) for extent in extents)
     if frames == 1 and len(fragments.offset_table) <= 1:
         return (extents,)
-    starts = _starts_by_table(fragments) or _starts_by_signature(file, extents, syntax)
+    starts = _starts_by_signature(file, extents, layout)
+    if len(starts) != frames:
+        starts = _starts_by_table(fragments, frames) or starts
+    if not starts:
+        raise _mismatch("The fragments of PixelData cannot be divided into frames; export the run again.", "PixelData")
     if len(starts) < frames:
         raise _mismatch(f"NumberOfFrames announces {frames} frames, but PixelData has {len(starts)}; send it again.")
     if len(starts) > frames:
@@ -265,13 +292,13 @@ def _group(
     return tuple(extents[start:end] for start, end in list(zip(starts, ends, strict=True))[:frames])
 
 
-def _starts_by_table(fragments: _Fragments) -> list[int]:
-    """Return the number of each frame's first fragment.
+def _starts_by_table(fragments: _Fragments, frames: int) -> list[int]:
+    """Return the number of each frame's first fragment by the offset table.
 
-    The list is empty when the table is empty or wrong.
+    The list is empty when the table has another length than ``frames``, or is wrong.
     """
     table, extents = fragments.offset_table, fragments.extents
-    if not table or table[0] != 0:
+    if len(table) != frames or table[0] != 0:
         return []
     # Offsets count from the first fragment's item tag, 8 bytes before its value.
     number_at = {offset - extents[0][0]: number for number, (offset, _) in enumerate(extents)}
@@ -279,13 +306,22 @@ def _starts_by_table(fragments: _Fragments) -> list[int]:
     return starts if starts == sorted(set(starts)) and starts[0] == 0 else []
 
 
-def _starts_by_signature(file: BufferedReader, extents: tuple[Extent, ...], syntax: str) -> list[int]:
-    if syntax in RLE:
-        return list(range(len(extents)))
-    signature = b"\xff\x4f\xff\x51" if syntax in JPEG_2000 else b"\xff\xd8\xff"
+def _starts_by_signature(file: BufferedReader, extents: tuple[Extent, ...], layout: PixelLayout) -> list[int]:
+    """Return the number of each fragment that begins as a compressed image does."""
+    signatures = _signatures(layout)
     starts = []
     for number, (offset, _) in enumerate(extents):
         file.seek(offset)
-        if file.read(len(signature)) == signature:
+        if file.read(len(signatures[0])).startswith(signatures):
             starts.append(number)
     return starts if starts and starts[0] == 0 else []
+
+
+def _signatures(layout: PixelLayout) -> tuple[bytes, ...]:
+    """Return the first bytes of a compressed image; the longest first."""
+    if layout.transfer_syntax in RLE:
+        # Number of segments, and the offset of the first one behind the header: PS3.5 G.5.
+        return (struct.pack("<2L", layout.bits_allocated // 8, 64),)
+    if layout.transfer_syntax in JPEG_2000:
+        return JP2_SIGNATURE, b"\xff\x4f\xff\x51"
+    return (b"\xff\xd8\xff",)

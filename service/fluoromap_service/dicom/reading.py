@@ -6,6 +6,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from pydicom.uid import (
+    UID,
     EnhancedXAImageStorage,
     EnhancedXRFImageStorage,
     MultiFrameGrayscaleByteSecondaryCaptureImageStorage,
@@ -18,7 +19,7 @@ from pydicom.uid import (
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.facts import SIMULATED_EQUIPMENT, HeaderWarning, InstanceFacts, Plane, is_uid
 from fluoromap_service.dicom.frames import read_frame
-from fluoromap_service.dicom.header import Header, read_header
+from fluoromap_service.dicom.header import Header, read_header, representation_problem
 from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
 from fluoromap_service.dicom.inflation import open_dicom
 from fluoromap_service.dicom.pixel_layout import PixelLayout, pixel_layout
@@ -66,6 +67,9 @@ def read_instance(path: Path) -> InstanceFacts:
     """
     with open_dicom(path) as file:
         header = read_header(file)
+        if header.unknown_representation is not None:
+            # Stored, it would break every reader of the whole header.
+            raise representation_problem(header.unknown_representation)
         _check_kind(header)
         warnings: list[HeaderWarning] = []
         layout = pixel_layout(file, header, warnings)
@@ -81,9 +85,10 @@ def _check_kind(header: Header) -> None:
         return
     if not kind:
         raise _lacks("SOPClassUID")
+    name = UID(kind).name if is_uid(kind) else "of an invalid class"
     raise dicom_problem(
         DicomCode.NOT_XA,
-        "This object is no X-ray angiographic (XA) or radiofluoroscopic (RF) run; send XA or RF.",
+        f"This object ({name}) is no X-ray angiographic (XA) or radiofluoroscopic (RF) run; send XA or RF.",
         "SOPClassUID",
     )
 
@@ -105,6 +110,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
     table_mm, table_origin = table_position(header)
     pixels = pixel_facts(header, rows, columns, bits_stored, warnings)
     start = acquisition_start(header)
+    shown = window(header, bits_stored, warnings)
     waves = r_wave_frames(header, frames, warnings)
     if header.names_need_repair:
         warnings.append(HeaderWarning.PATIENT_OR_STUDY_REPAIRED)
@@ -131,7 +137,7 @@ def _facts(header: Header, layout: PixelLayout, bits_stored: int, warnings: list
         patient_orientation=orientation_letters(header),
         table_mm=table_mm,
         pixels=pixels,
-        window=window(header),
+        window=shown,
         r_wave_frames=waves,
         missing=gantry.missing,
         warnings=tuple(dict.fromkeys(warnings)),

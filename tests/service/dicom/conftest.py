@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.encaps import encapsulate
+from pydicom.tag import BaseTag
 from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
 from fluoromap.geometry import Gantry
@@ -80,6 +81,7 @@ def make_xa(tmp_path: Path) -> MakeXa:
         syntax: str = ExplicitVRLittleEndian,
         fragments: list[bytes] | None = None,
         offset_table: bool = False,
+        elements: Mapping[BaseTag, tuple[str, Any]] | None = None,
         **attributes: Any,
     ) -> Path:
         dataset = Dataset()
@@ -110,6 +112,8 @@ def make_xa(tmp_path: Path) -> MakeXa:
                 delattr(dataset, keyword)
             else:
                 setattr(dataset, keyword, value)
+        for tag, (representation, value) in (elements or {}).items():
+            dataset.add_new(tag, representation, value)
         dataset.file_meta = FileMetaDataset()
         dataset.file_meta.TransferSyntaxUID = pydicom.uid.UID(syntax)
         path = tmp_path / "made.dcm"

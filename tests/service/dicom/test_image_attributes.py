@@ -9,8 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydicom.dataset import Dataset
+from pydicom.tag import Tag
+from pydicom.uid import EnhancedXAImageStorage, ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from fluoromap_service.dicom import HeaderWarning, InstanceFacts, frame_to_8bit, open_frames, read_instance
+from fluoromap_service.dicom.frames import frame_bytes, frame_png
 
 MakeXa = Callable[..., Path]
 FRAMES = np.arange(4 * 8 * 16, dtype=np.uint16).reshape(4, 8, 16)
@@ -176,6 +180,70 @@ def test_display_window(make_xa: MakeXa) -> None:
     assert shown[frame <= 49].max() == 0
     assert frame_to_8bit(frame, found, (20.5, 2)).max() == 255
     assert (np.diff(shown.ravel().astype(int)) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("window", "kept"),
+    [
+        ((2048, 4096), True), ((60, 20), True), ((4095, 4096), True), ((1000, 10_000), True),
+        ((32_768, 65_536), False), ((-500, 1000), False), ((9000, 100), False),
+    ],
+)  # fmt: skip
+def test_a_window_beside_the_possible_values_is_ignored(
+    make_xa: MakeXa, window: tuple[float, float], kept: bool
+) -> None:
+    path = make_xa(FRAMES, BitsStored=12, HighBit=11, WindowCenter=window[0], WindowWidth=window[1])
+    found = read_instance(path)
+    assert (found.window, found.warnings) == (window if kept else None, () if kept else (HeaderWarning.WINDOW_IGNORED,))
+    if not kept:
+        shown = frame_to_8bit(open_frames(path, found)[1], found)
+        assert (shown.min(), shown.max()) == (0, 255)
+
+
+def test_the_window_of_an_enhanced_run(make_xa: MakeXa) -> None:
+    """Pixels of 12 bits over their whole range: the picture has black, white and greys between."""
+    window, groups = Dataset(), Dataset()
+    window.WindowCenter, window.WindowWidth = 2048, 4096
+    groups.FrameVOILUTSequence = [window]
+    frames = np.linspace(0, 4095, FRAMES.size).astype(np.uint16).reshape(FRAMES.shape)
+    for shared in ([groups], [Dataset()]):
+        path = make_xa(
+            frames, SOPClassUID=EnhancedXAImageStorage, BitsStored=12, HighBit=11,
+            SharedFunctionalGroupsSequence=shared, PerFrameFunctionalGroupsSequence=[Dataset()] * 4,
+        )  # fmt: skip
+        found = read_instance(path)
+        assert found.window == ((2048, 4096) if shared == [groups] else None)
+        pictures = [frame_to_8bit(frame, found) for frame in open_frames(path, found)]
+        assert (pictures[0].min(), pictures[3].max()) == (0, 255)
+        assert found.window is None or 90 < np.mean(pictures) < 165
+
+
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian])
+@pytest.mark.parametrize("bits", [(12,), (12, 15), (14,)])
+def test_overlay_planes_in_pixel_cells_are_no_pixels(make_xa: MakeXa, syntax: str, bits: tuple[int, ...]) -> None:
+    plain = make_xa(FRAMES, BitsStored=12, HighBit=11, syntax=syntax)
+    facts = read_instance(plain)
+    picture = frame_png(plain, facts, 1, None)
+    planes = np.random.default_rng(1).integers(0, 2, (len(bits), *FRAMES.shape), np.uint16)
+    cells = FRAMES + sum(plane << bit for bit, plane in zip(bits, planes, strict=True))
+    overlay = {}
+    for number, bit in enumerate(bits):
+        group = 0x6000 + 2 * number
+        overlay |= {Tag(group, 0x0010): ("US", 8), Tag(group, 0x0100): ("US", 16), Tag(group, 0x0102): ("US", bit)}
+    path = make_xa(cells.astype(np.uint16), BitsStored=12, HighBit=11, syntax=syntax, elements=overlay)
+    found = read_instance(path)
+    assert (found.warnings, found.pixels) == ((), facts.pixels)
+    assert frame_png(path, found, 1, None) == picture
+    np.testing.assert_array_equal(np.stack(list(open_frames(path, found))), FRAMES)
+    # The header that goes with the raw frame names the planes.
+    assert frame_bytes(path, found, 1) == cells[1].astype("<u2").tobytes()
+
+
+def test_bits_that_no_overlay_names_are_pixels(make_xa: MakeXa) -> None:
+    path = make_xa(FRAMES + 4096, BitsStored=12, HighBit=11, elements={Tag(0x6000, 0x0102): ("US", 14)})
+    found = read_instance(path)
+    assert found.warnings == (HeaderWarning.BITS_STORED_EXCEEDED,)
+    np.testing.assert_array_equal(open_frames(path, found)[0], FRAMES[0] + 4096)
 
 
 def test_display_without_window_uses_the_whole_range(make_xa: MakeXa) -> None:

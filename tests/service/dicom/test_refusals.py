@@ -15,6 +15,7 @@ import pydicom
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydicom.fileset import FileSet
 from pydicom.uid import (
     MPEG2MPML,
     CTImageStorage,
@@ -72,6 +73,54 @@ def test_bare_data_set(tmp_path: Path, cine: Path) -> None:
 def test_other_kinds(make_xa: MakeXa, kind: str) -> None:
     problem = refusal(make_xa(FRAMES, SOPClassUID=kind))
     assert (problem.code, problem.status, _where(problem)) == (DicomCode.NOT_XA, 422, "SOPClassUID")
+
+
+def test_the_class_of_another_kind_is_named(make_xa: MakeXa) -> None:
+    assert "CT Image Storage" in str(refusal(make_xa(FRAMES, SOPClassUID=CTImageStorage)))
+    assert "SECRET" not in str(refusal(make_xa(FRAMES, SOPClassUID="SECRET^PATIENT")))
+
+
+def test_the_table_of_contents_of_a_disc(tmp_path: Path, cine: Path) -> None:
+    disc = FileSet()
+    disc.add(with_patient(cine))
+    disc.write(tmp_path / "disc")
+    problem = refusal((tmp_path / "disc" / "DICOMDIR").rename(tmp_path / "table"))
+    assert (problem.code, problem.status) == (DicomCode.NOT_XA, 422)
+    assert "DICOMDIR" in str(problem)
+    assert "image files" in str(problem)
+
+
+def with_patient(path: Path) -> pydicom.Dataset:
+    """Return the data set of a file with the attributes that a DICOMDIR needs."""
+    dataset = pydicom.dcmread(path)
+    dataset.PatientID, dataset.PatientName, dataset.StudyID, dataset.StudyDate = "P", "SECRET", "1", "20240506"
+    dataset.StudyTime, dataset.InstanceNumber, dataset.SeriesNumber = "070809", 1, 1
+    dataset.AccessionNumber = ""
+    return dataset
+
+
+def element(representation: bytes, length_bytes: int) -> bytes:
+    """Return an element of explicit representation with four bytes."""
+    length = struct.pack("<H", 4) if length_bytes == 2 else struct.pack("<HL", 0, 4)
+    return struct.pack("<HH", 0x0027, 0x1001) + representation + length + b"abcd"
+
+
+@pytest.mark.parametrize("representation", [b"ZZ", b"OX", b"??", b"  ", b"\0\0", b"us"])
+@pytest.mark.parametrize("length_bytes", [2, 4])
+def test_an_unknown_value_representation_is_named(cine: Path, representation: bytes, length_bytes: int) -> None:
+    content = cine.read_bytes()
+    at = content.index(b"\x28\x00\x02\x00US")
+    cine.write_bytes(content[:at] + element(representation, length_bytes) + content[at:])
+    problem = refusal(cine)
+    assert (problem.code, _where(problem)) == (DicomCode.MALFORMED, "(0027,1001)")
+    assert "value representation" in str(problem)
+
+
+def test_an_element_of_implicit_representation_among_explicit_ones(cine: Path) -> None:
+    content = cine.read_bytes()
+    at = content.index(b"\x28\x00\x02\x00US")
+    cine.write_bytes(content[:at] + struct.pack("<HHL", 0x0027, 0x1001, 4) + b"abcd" + content[at:])
+    assert read_instance(cine).frames == 5
 
 
 def test_secondary_capture_of_another_modality(make_xa: MakeXa) -> None:
@@ -179,6 +228,17 @@ def test_transfer_syntaxes_nobody_decodes(make_xa: MakeXa, syntax: str) -> None:
     problem = refusal(with_syntax(path, JPEGLosslessSV1, syntax))
     assert (problem.code, problem.status, _where(problem)) == (DicomCode.UNDECODABLE, 422, "TransferSyntaxUID")
     assert pydicom.uid.UID(syntax).name in str(problem)
+
+
+@pytest.mark.parametrize("syntax", pydicom.uid.MPEGTransferSyntaxes)
+def test_a_video_is_called_one(make_xa: MakeXa, syntax: str) -> None:
+    path = make_xa(
+        FRAMES, syntax=JPEGLosslessSV1, fragments=[b"movie!"], SamplesPerPixel=3, PhotometricInterpretation="YBR_PARTIAL_420"
+    )  # fmt: skip
+    problem = refusal(with_syntax(path, JPEGLosslessSV1, syntax))
+    assert (problem.code, _where(problem)) == (DicomCode.UNDECODABLE, "TransferSyntaxUID")
+    assert "video" in str(problem)
+    assert "send the frames" in str(problem)
 
 
 def test_deflated_data_that_is_none(make_xa: MakeXa) -> None:
