@@ -126,10 +126,25 @@ def _check_sender(event: evt.Event, allow: AllowList) -> None:
     title = _text(cast(Any, association.requestor.primitive).calling_ae_title)
     address = cast(Any, association.requestor.address_info).address
     if allow.allows(title, address):
+        _take_senders_order(association)
         return
     log.warning("association_rejected", calling_aet=title, address=address)
     association.acse.send_reject(_REJECTED_PERMANENT, _BY_USER, _CALLING_TITLE)
     association.kill()
+
+
+def _take_senders_order(association: Any) -> None:
+    """Let each proposed context have the first transfer syntax of the sender that the listener accepts.
+
+    A sender names the syntax first in which it has the object, so that it need not decompress. pynetdicom would take the first
+    syntax of the listener's own list (PS3.8 section 9.3.2.2: the acceptor chooses).
+    """
+    accepted = {context.abstract_syntax: context.transfer_syntax for context in association.acceptor.supported_contexts}
+    for proposed in association.requestor.primitive.presentation_context_definition_list:
+        known = accepted.get(proposed.abstract_syntax, ())
+        first = next((syntax for syntax in proposed.transfer_syntax if syntax in known), None)
+        if first is not None:
+            proposed.transfer_syntax = [first]
 
 
 def _text(title: str | bytes | None) -> str:

@@ -84,7 +84,7 @@ def test_the_table_of_contents_of_a_disc(tmp_path: Path, cine: Path) -> None:
     disc = FileSet()
     disc.add(with_patient(cine))
     disc.write(tmp_path / "disc")
-    problem = refusal((tmp_path / "disc" / "DICOMDIR").rename(tmp_path / "table"))
+    problem = refusal((tmp_path / "disc" / "DICOMDIR").rename(tmp_path / "first.dcm"))
     assert (problem.code, problem.status) == (DicomCode.NOT_XA, 422)
     assert "DICOMDIR" in str(problem)
     assert "image files" in str(problem)

@@ -16,12 +16,16 @@ import pytest
 from fastapi.testclient import TestClient
 from pydicom.dataset import Dataset
 from pydicom.uid import (
+    JPEG2000,
     MPEG2MPML,
     CTImageStorage,
     DeflatedExplicitVRLittleEndian,
     EnhancedXAImageStorage,
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
+    JPEGBaseline8Bit,
+    JPEGLosslessSV1,
+    RLELossless,
     XRayAngiographicImageStorage,
     XRayRadiofluoroscopicImageStorage,
 )
@@ -170,6 +174,30 @@ def test_negotiation_accepts_what_the_service_reads_and_nothing_else(open_associ
     assert set(contexts[:3]) < accepted
     # PS3.8 table 9-18: 3 abstract syntax, 4 transfer syntaxes not supported.
     assert refused == {(str(CTImageStorage), 3), (str(XRayAngiographicImageStorage), 4)}
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_first_syntax_of_the_sender_is_taken(open_association: Open, order: int) -> None:
+    """For each context by itself, also where several have one class."""
+    xa = str(XRayAngiographicImageStorage)
+    proposed = [
+        [JPEGLosslessSV1, ImplicitVRLittleEndian], [ExplicitVRLittleEndian, ImplicitVRLittleEndian],
+        [MPEG2MPML, JPEG2000, ExplicitVRLittleEndian], [ExplicitVRLittleEndian, JPEG2000, MPEG2MPML],
+        [RLELossless, JPEGBaseline8Bit, DeflatedExplicitVRLittleEndian],
+    ]  # fmt: skip
+    lists = [[str(syntax) for syntax in syntaxes][::order] for syntaxes in proposed]
+    contexts = [(xa, syntaxes) for syntaxes in lists]
+    with open_association(*contexts) as association:
+        taken = [cx.transfer_syntax[0] for cx in association.accepted_contexts if cx.abstract_syntax == xa]
+        assert association.send_c_echo().Status == 0x0000
+    assert taken == [next(syntax for syntax in syntaxes if syntax != MPEG2MPML) for syntaxes in lists]
+
+
+def test_a_context_without_a_known_syntax_is_refused_beside_others(open_association: Open) -> None:
+    xa = str(XRayAngiographicImageStorage)
+    with open_association((xa, [str(MPEG2MPML)]), (xa, [str(JPEG2000)])) as association:
+        assert [cx.result for cx in association.rejected_contexts] == [4]
+        assert JPEG2000 in [cx.transfer_syntax[0] for cx in association.accepted_contexts]
 
 
 @pytest.mark.parametrize(
