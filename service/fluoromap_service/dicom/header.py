@@ -388,6 +388,27 @@ def read_header(file: BufferedReader) -> Header:
     return _bounded(file, _parse)
 
 
+@dataclass(frozen=True, slots=True)
+class FileMeta:
+    """The file meta information (PS3.10 section 7.1), and the place of the data set after it."""
+
+    transfer_syntax: str
+    sop_class_uid: str
+    sop_instance_uid: str
+    data_set_start: int
+
+
+def read_file_meta(file: BufferedReader) -> FileMeta:
+    """Read the file meta information.
+
+    Raises
+    ------
+    Problem
+        As :func:`read_header`.
+    """
+    return _bounded(file, lambda reader, size: _file_meta(reader))
+
+
 def data_set_start(file: BufferedReader) -> tuple[str, int]:
     """Return the transfer syntax, and the place of the data set after the file meta information.
 
@@ -396,7 +417,8 @@ def data_set_start(file: BufferedReader) -> tuple[str, int]:
     Problem
         As :func:`read_header`.
     """
-    return _bounded(file, lambda reader, size: (_file_meta(reader)[0], reader.tell()))
+    meta = read_file_meta(file)
+    return meta.transfer_syntax, meta.data_set_start
 
 
 def read_attributes(file: BufferedReader) -> tuple[str, Dataset]:
@@ -487,27 +509,27 @@ def _bounded(file: BufferedReader, parse: Callable[[_BoundedReader, int], Result
         raise dicom_problem(DicomCode.MALFORMED, "The DICOM header is damaged; export the run again.") from error
 
 
-def _file_meta(reader: _BoundedReader) -> tuple[str, str]:
-    """Read the file meta information; return the transfer syntax and the SOP class."""
+def _file_meta(reader: _BoundedReader) -> FileMeta:
     stream = cast(Any, reader)
-    keywords = ("TransferSyntaxUID", "MediaStorageSOPClassUID")
+    keywords = ("TransferSyntaxUID", "MediaStorageSOPClassUID", "MediaStorageSOPInstanceUID")
     meta = read_dataset(
         stream, False, True, stop_when=lambda tag, vr, length: tag.group != 2, specific_tags=[*map(_tag, keywords)]
     )
-    syntax, sop_class = (str(meta.get(keyword, "")).strip(" \0") for keyword in keywords)
+    syntax, sop_class_uid, sop_instance_uid = (str(meta.get(keyword, "")).strip(" \0") for keyword in keywords)
     if not syntax:
         raise dicom_problem(
             DicomCode.MALFORMED,
             "The file meta information has no TransferSyntaxUID; export the run again.",
             "TransferSyntaxUID",
         )
-    return syntax, sop_class
+    return FileMeta(syntax, sop_class_uid, sop_instance_uid, reader.tell())
 
 
 def _parse(reader: _BoundedReader, size: int) -> Header:
     stream = cast(Any, reader)
-    syntax, sop_class = _file_meta(reader)
-    if sop_class == MediaStorageDirectoryStorage:
+    meta = _file_meta(reader)
+    syntax = meta.transfer_syntax
+    if meta.sop_class_uid == MediaStorageDirectoryStorage:
         raise dicom_problem(
             DicomCode.NOT_XA,
             "This is a DICOMDIR, the table of contents of a disc; send the image files that lie beside it.",

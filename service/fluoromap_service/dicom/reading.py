@@ -19,7 +19,7 @@ from pydicom.uid import (
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
 from fluoromap_service.dicom.facts import SIMULATED_EQUIPMENT, HeaderWarning, InstanceFacts, Plane, is_uid
 from fluoromap_service.dicom.frames import read_frame
-from fluoromap_service.dicom.header import Header, read_header, representation_problem
+from fluoromap_service.dicom.header import Header, read_file_meta, read_header, representation_problem
 from fluoromap_service.dicom.image import pixel_facts, r_wave_frames, window
 from fluoromap_service.dicom.inflation import open_dicom
 from fluoromap_service.dicom.pixel_layout import PixelLayout, pixel_layout
@@ -77,6 +77,29 @@ def read_instance(path: Path) -> InstanceFacts:
     if bits_used > layout.bits_stored:
         warnings.append(HeaderWarning.BITS_STORED_EXCEEDED)
     return _facts(header, layout, max(bits_used, layout.bits_stored), warnings)
+
+
+def read_instance_uids(path: Path) -> tuple[str | None, str | None]:
+    """Return SOP Class UID and SOP Instance UID of a file, also of one that :func:`read_instance` refuses.
+
+    Where the data set is damaged, those of the file meta information count. None for a UID that cannot be read.
+
+    Raises
+    ------
+    Problem
+        As :func:`fluoromap_service.dicom.header.read_header`, when nothing can be read.
+    """
+    keywords = ("SOPClassUID", "SOPInstanceUID")
+    try:
+        with open_dicom(path) as file:
+            header = read_header(file)
+        uids = [header.text(keyword) for keyword in keywords]
+    except Problem:
+        with path.open("rb") as file:
+            meta = read_file_meta(file)
+        uids = [meta.sop_class_uid, meta.sop_instance_uid]
+    sop_class_uid, sop_instance_uid = (uid if is_uid(uid) else None for uid in uids)
+    return sop_class_uid, sop_instance_uid
 
 
 def _check_kind(header: Header) -> None:

@@ -12,8 +12,22 @@ import numpy as np
 import pydicom
 import pytest
 from fastapi.testclient import TestClient
+from numpy.typing import NDArray
 from PIL import Image
+from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
+from pydicom.encaps import encapsulate
+from pydicom.pixels.encoders.base import get_encoder
+from pydicom.uid import (
+    UID,
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    JPEG2000Lossless,
+    JPEGBaseline8Bit,
+    RLELossless,
+)
 from small_runs import COLUMNS, FRAMES, ROWS, STUDY_UID, edited, run_uid, small_run
 from sqlalchemy import func, select
 
@@ -130,6 +144,117 @@ def test_bad_requests_store_nothing(service: TestClient, content_type: str, cont
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     assert (stored_count(), left_files()) == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("head", "tail"),
+    [
+        (b"A preamble that readers ignore\r\n--edge\r\n", b"\r\n--edge--\r\n"),
+        (b"--edge \r\n", b"\r\n--edge--\r\n"),
+        (b"--edge\r\n", b"\r\n--edge-- \t\r\nAn epilogue, also with --edge in it"),
+        (b"\r\n--edge\t\r\nContent-Length: 7\r\n", b"\r\n--edge--"),
+        (b"--edge\nContent-Location: a\n", b"\n--edge--\n"),
+    ],
+    ids=["preamble", "blank", "epilogue", "length", "line feeds"],
+)
+@pytest.mark.parametrize("content_type", [RELATED, 'Multipart/Related; boundary="edge"; type=application/dicom'])
+def test_bodies_as_rfc_2046_allows_them(
+    service: TestClient, tmp_path: Path, head: bytes, tail: bytes, content_type: str
+) -> None:
+    file = small_run(tmp_path, 1, 0.0)
+    end = b"\n\n" if b"\r" not in head else b"\r\n\r\n"
+    content = head + b"Content-Type: application/dicom" + end + file + tail
+    answer = service.post(STUDIES, content=content, headers={"content-type": content_type})
+    assert answer.status_code == 200, answer.text
+    assert parts_of(service.get(address(file))) == [file]
+
+
+def test_failed_items_have_the_uids_that_can_be_read(service: TestClient, tmp_path: Path) -> None:
+    whole = small_run(tmp_path, 1, 0.0)
+    xa, computed = "1.2.840.10008.5.1.4.1.1.12.1", "1.2.840.10008.5.1.4.1.1.2"
+    files = {
+        "signed": edited(whole, PixelRepresentation=1),
+        "another kind": edited(whole, SOPClassUID=computed),
+        "no rows": edited(whole, Rows=None),
+        "pixels cut off": whole[:-500],
+        "header cut off": whole[: whole.index(b"\x28\x00\x10\x00US")],
+        "no study": edited(whole, StudyInstanceUID=None),
+        "no DICOM": b"no DICOM",
+        "empty": b"",
+        "wrong UID": whole.replace(run_uid(1).encode(), b"X" * len(run_uid(1))),
+    }
+    answer = store(service, *files.values())
+    assert answer.status_code == 409
+    items = Dataset.from_json(answer.json()).FailedSOPSequence
+    found = {
+        name: (item.get("ReferencedSOPClassUID"), item.get("ReferencedSOPInstanceUID"))
+        for name, item in zip(files, items, strict=True)
+    }
+    unreadable = {"no DICOM": (None, None), "empty": (None, None), "wrong UID": (xa, None)}
+    kinds = dict.fromkeys(files, (xa, run_uid(1))) | {"another kind": (computed, run_uid(1))} | unreadable
+    assert found == kinds
+    assert all(item.FailureReason for item in items)
+
+
+FRAME_SYNTAXES = (
+    ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, RLELossless,
+    JPEGBaseline8Bit, JPEG2000Lossless,
+)  # fmt: skip
+
+
+def recoded(content: bytes, syntax: str, allocated: int, stored: int) -> bytes:
+    """Return a run with other pixels, in another transfer syntax."""
+    dataset = pydicom.dcmread(io.BytesIO(content))
+    pixels = dataset.pixel_array >> (12 - stored)
+    dataset.BitsAllocated, dataset.BitsStored, dataset.HighBit = allocated, stored, stored - 1
+    dataset.file_meta.TransferSyntaxUID = syntax
+    frames = pixels.astype(f"u{allocated // 8}")
+    if not syntax.is_compressed or syntax == DeflatedExplicitVRLittleEndian:
+        words = frames.byteswap() if syntax == ExplicitVRBigEndian and allocated == 16 else frames
+        dataset["PixelData"] = DataElement(0x7FE00010, "OW" if allocated == 16 else "OB", words.tobytes())
+    else:
+        dataset.PixelData = encapsulate([coded(frame, syntax, stored) for frame in frames])
+        dataset["PixelData"].VR = "OB"
+        dataset["PixelData"].is_undefined_length = True
+    stream = io.BytesIO()
+    pydicom.dcmwrite(stream, dataset, enforce_file_format=True)
+    return stream.getvalue()
+
+
+def coded(frame: NDArray[Any], syntax: str, stored: int) -> bytes:
+    if syntax == RLELossless:
+        bits = frame.dtype.itemsize * 8
+        return get_encoder(RLELossless).encode(
+            frame, rows=ROWS, columns=COLUMNS, samples_per_pixel=1, bits_allocated=bits, bits_stored=bits,
+            pixel_representation=0, photometric_interpretation="MONOCHROME2", number_of_frames=1, encoding_plugin="pydicom",
+        )  # fmt: skip
+    stream = io.BytesIO()
+    picture = Image.fromarray(frame.astype(np.uint8) if stored <= 8 else frame)
+    if syntax == JPEG2000Lossless:
+        picture.save(stream, "JPEG2000", irreversible=False, no_jp2=True)
+    else:
+        picture.save(stream, "JPEG", quality=95)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(("allocated", "stored"), [(8, 8), (8, 7), (16, 8), (16, 12), (16, 5)])
+@pytest.mark.parametrize("syntax", FRAME_SYNTAXES, ids=lambda syntax: UID(syntax).name)
+def test_frames_have_the_bytes_that_the_header_promises(
+    service: TestClient, tmp_path: Path, syntax: UID, allocated: int, stored: int
+) -> None:
+    if syntax == JPEGBaseline8Bit and stored > 8:
+        pytest.skip("JPEG Baseline has 8 bits")
+    file = recoded(small_run(tmp_path, 1, 0.0), syntax, allocated, stored)
+    assert store(service, file).status_code == 200
+    run = address(file)
+    (header,) = found(service, f"{run}/metadata")
+    promised = header.Rows * header.Columns * header.SamplesPerPixel * header.BitsAllocated // 8
+    frames = parts_of(service.get(f"{run}/frames/1,3,2"))
+    assert [len(frame) for frame in frames] == [promised] * 3
+    assert [parts_of(service.get(f"{run}/frames/{number}")) for number in (1, 3, 2)] == [[frame] for frame in frames]
+    pixels = np.frombuffer(frames[0], f"<u{header.BitsAllocated // 8}").reshape(ROWS, COLUMNS)
+    sent = pydicom.dcmread(io.BytesIO(small_run(tmp_path, 1, 0.0))).pixel_array[0] >> (12 - stored)
+    assert np.abs(pixels.astype(int) - sent).max() <= (40 if syntax == JPEGBaseline8Bit else 0)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from fluoromap_service.api.http.security import Writer
 from fluoromap_service.api.study.uploads import ArrivingPart, Part, arriving_file, in_upload_thread, write_all
 from fluoromap_service.dicom import InstanceFacts
 from fluoromap_service.dicom.indexed_header import read_run
+from fluoromap_service.dicom.reading import read_instance_uids
 from fluoromap_service.dicom.store_statuses import status_of
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.audit import Act
@@ -34,7 +35,7 @@ Json = dict[str, Any]
 class _RelatedParts(MultipartBody):
     """A body of DICOM files, one in each part."""
 
-    def __init__(self, boundary: bytes, stack: ExitStack) -> None:
+    def __init__(self, boundary: bytes | None, stack: ExitStack) -> None:
         super().__init__(boundary)
         self._stack = stack
         self._arriving: ArrivingPart | None = None
@@ -77,17 +78,15 @@ async def _store_all(request: Request, caller: str, study_uid: str | None) -> JS
     if kind != b"multipart/related" or options.get(b"type", b"application/dicom").lower() != b"application/dicom":
         detail = 'Send the runs as multipart/related with type="application/dicom".'
         raise Problem(415, "unsupported_media_type", detail)
-    boundary = options.get(b"boundary")
-    if not boundary:
-        raise malformed()
     with ExitStack() as stack:
-        body = _RelatedParts(boundary, stack)
+        body = _RelatedParts(options.get(b"boundary"), stack)
         try:
             await write_all(request, body.write)
         except ClientDisconnect:
             raise Problem(400, "truncated", "The connection ended before the body; send the request again.") from None
-        if not body.ended or not body.parts:
-            raise malformed()
+        body.check_end()
+        if not body.parts:
+            raise malformed("The body has no part between its boundaries; send each run as a part.")
         return await in_upload_thread(_answer, body.parts, caller, study_uid, str(request.base_url))
 
 
@@ -115,10 +114,14 @@ def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) ->
         except Problem as problem:
             if problem.status in (429, 503):
                 raise
-            failed.append(_reference(facts) | {"00081197": {"vr": "US", "Value": [int(status_of(problem))]}})
+            failed.append(
+                _failed_reference(part, facts) | {"00081197": {"vr": "US", "Value": [int(status_of(problem))]}}
+            )
         else:
             url = instance_url(base, facts.study_instance_uid, facts.series_instance_uid, facts.sop_instance_uid)
-            stored.append(_reference(facts) | {"00081190": {"vr": "UR", "Value": [url]}})
+            stored.append(
+                _reference(facts.sop_class_uid, facts.sop_instance_uid) | {"00081190": {"vr": "UR", "Value": [url]}}
+            )
             studies.add(facts.study_instance_uid)
     answer: Json = {}
     if len(studies) == 1:
@@ -131,10 +134,16 @@ def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) ->
     return JSONResponse(answer, status, media_type=DICOM_JSON)
 
 
-def _reference(facts: InstanceFacts | None) -> Json:
-    if facts is None:
+def _failed_reference(part: Part, facts: InstanceFacts | None) -> Json:
+    """Return the UIDs of a part that is not stored, as far as they can be read."""
+    if facts is not None:
+        return _reference(facts.sop_class_uid, facts.sop_instance_uid)
+    try:
+        return _reference(*run_in_pool(Task.READ_FILE, read_instance_uids, part.path))
+    except Problem:
         return {}
-    return {
-        "00081150": {"vr": "UI", "Value": [facts.sop_class_uid]},
-        "00081155": {"vr": "UI", "Value": [facts.sop_instance_uid]},
-    }
+
+
+def _reference(sop_class_uid: str | None, sop_instance_uid: str | None) -> Json:
+    uids = {"00081150": sop_class_uid, "00081155": sop_instance_uid}
+    return {tag: {"vr": "UI", "Value": [uid]} for tag, uid in uids.items() if uid is not None}

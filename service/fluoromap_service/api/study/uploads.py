@@ -17,7 +17,7 @@ from fastapi import Request
 from python_multipart.multipart import parse_options_header
 from starlette.requests import ClientDisconnect
 
-from fluoromap_service.api.http.multipart import MultipartBody, malformed
+from fluoromap_service.api.http.multipart import MultipartBody
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import disk, files
 
@@ -63,7 +63,7 @@ class ArrivingPart:
 class _Form(MultipartBody):
     """A form: its parts named ``file`` go to disk, its field ``site`` to memory."""
 
-    def __init__(self, boundary: bytes, stack: ExitStack) -> None:
+    def __init__(self, boundary: bytes | None, stack: ExitStack) -> None:
         super().__init__(boundary)
         self._stack = stack
         self._arriving: ArrivingPart | None = None
@@ -136,13 +136,9 @@ async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str |
         if kind == b"application/dicom":
             return [await _receive_raw(request, stack)], None
         if kind == b"multipart/form-data":
-            boundary = options.get(b"boundary")
-            if not boundary:
-                raise malformed()
-            form = _Form(boundary, stack)
+            form = _Form(options.get(b"boundary"), stack)
             await write_all(request, form.write)
-            if not form.ended:
-                raise malformed()
+            form.check_end()
             return form.files, form.site
     except ClientDisconnect:
         raise Problem(400, "truncated", "The connection ended before the body; send the request again.") from None
