@@ -12,6 +12,8 @@ LONGEST_HEADERS = 16 * 1024
 """Bytes of the headers of a part."""
 LONGEST_PADDING = 1024
 """Bytes of blanks behind a boundary; a longer line is content."""
+_PIECE_BYTES = 1 << 16
+"""Bytes that are searched at once: their copies take memory that is warm already, which is several times as fast."""
 _BLANK_LINE = re.compile(rb"(?:\A|\n)\r?\n")
 _FOLD = re.compile(rb"\r?\n[ \t]+")
 
@@ -65,11 +67,13 @@ class MultipartBody(ABC):
         Problem
             400 for a malformed body, 413 for too many parts.
         """
-        if self._ended:
-            return
-        self._waiting += data
-        while not self._ended and (self._read_headers() if self._in_headers else self._read_content()):
-            pass
+        with memoryview(data) as view:
+            for start in range(0, len(data), _PIECE_BYTES):
+                if self._ended:
+                    return
+                self._waiting += view[start : start + _PIECE_BYTES]
+                while not self._ended and (self._read_headers() if self._in_headers else self._read_content()):
+                    pass
 
     def check_end(self) -> None:
         """Check that the body has come to its closing boundary.
@@ -117,7 +121,8 @@ class MultipartBody(ABC):
         if self._in_part:
             # The line end before a boundary belongs to the boundary.
             ends_line = is_end and not self._line_feeds_alone and count > start and waiting[count - 1] == ord("\r")
-            content = bytes(waiting[start : count - 1 if ends_line else count])
+            with memoryview(waiting) as view:
+                content = bytes(view[start : count - 1 if ends_line else count])
             if content:
                 self.add(content)
             if is_end:
