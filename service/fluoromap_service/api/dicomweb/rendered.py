@@ -9,7 +9,7 @@ from typing import Any
 
 from fastapi import Request, Response
 
-from fluoromap_service.api.dicomweb.accept import not_acceptable
+from fluoromap_service.api.dicomweb.accept import media_ranges, not_acceptable
 from fluoromap_service.api.dicomweb.display import (
     JPEG_QUALITY,
     LARGEST_SIDE_PX,
@@ -96,11 +96,10 @@ def _display(request: Request) -> Display:
 
 def _media_type(request: Request) -> MediaType:
     # The query parameter is for clients that cannot set headers, so it counts first (PS3.18 section 8.3.3.1).
-    text = request.query_params.get("accept") or request.headers.get("accept", "*/*")
-    for item in text.lower().split(","):
-        kind = item.split(";")[0].strip()
-        if kind in _MEDIA_TYPES:
-            return _MEDIA_TYPES[kind]
+    sent = request.query_params.get("accept") or ",".join(request.headers.getlist("accept"))
+    for item in media_ranges(sent):
+        if item.quality > 0 and item.kind in _MEDIA_TYPES:
+            return _MEDIA_TYPES[item.kind]
     raise not_acceptable("Rendered frames are image/jpeg or image/png; change the Accept header.")
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
-from fastapi import Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
 
-from fluoromap_service.api.dicomweb.accept import accepted_types, asked_syntaxes, not_acceptable
-from fluoromap_service.api.dicomweb.store import DICOM_JSON
+from fluoromap_service.api.dicomweb.accept import Form, answer_form, json_type, refuse_parameters
 from fluoromap_service.api.dicomweb.stored import StoredInstance, existing, metadata_of_all
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
@@ -18,6 +17,7 @@ from fluoromap_service.problem import Problem, not_found
 router = new_router("/dicom-web", include_in_schema=False)
 
 _BOUNDARY = "fluoromap-part-7d2f4c9e81b34a06"
+_DICOM, _PIXELS = "application/dicom", "application/octet-stream"
 _EXPLICIT_LITTLE_ENDIAN = "1.2.840.10008.1.2.1"
 
 
@@ -40,8 +40,9 @@ def instance_metadata(study_uid: str, series_uid: str, uid: str, request: Reques
 
 
 def _metadata(request: Request, instances: list[StoredInstance]) -> Response:
-    accepted_types(request, DICOM_JSON, "application/json")
-    return Response(b"[" + b",".join(metadata_of_all(instances)) + b"]", media_type=DICOM_JSON)
+    refuse_parameters(request)
+    media_type = json_type(request)
+    return Response(b"[" + b",".join(metadata_of_all(instances)) + b"]", media_type=media_type)
 
 
 @router.get("/studies/{study_uid}")
@@ -67,47 +68,53 @@ def _files(request: Request, instances: list[StoredInstance]) -> StreamingRespon
 
     A request for another transfer syntax is refused.
     """
-    asked = asked_syntaxes(accepted_types(request, "multipart/related", "application/dicom"))
-    for instance in instances:
-        if asked and not asked & {"*", instance.transfer_syntax}:
-            raise not_acceptable("The file is stored in another transfer syntax; ask for transfer-syntax=*.")
+    refuse_parameters(request)
+    form = answer_form(request, _DICOM, [instance.transfer_syntax for instance in instances])
     for instance in instances:
         instance.make_file()
+    if form is Form.SINGLE:
+        (instance,) = instances
+        return StreamingResponse(instance.chunks(), media_type=_with_syntax(_DICOM, instance.transfer_syntax))
 
     def parts() -> Iterator[tuple[str, Iterator[bytes]]]:
         for instance in instances:
-            yield f"application/dicom; transfer-syntax={instance.transfer_syntax}", instance.chunks()
+            yield _with_syntax(_DICOM, instance.transfer_syntax), instance.chunks()
 
-    return _related("application/dicom", parts())
+    return _related(_DICOM, parts())
+
+
+def _with_syntax(kind: str, syntax: str) -> str:
+    return f"{kind}; transfer-syntax={syntax}"
 
 
 @router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{numbers}")
 def retrieve_frames(
     study_uid: str, series_uid: str, uid: str, numbers: str, request: Request, caller: Reader
-) -> StreamingResponse:
+) -> Response:
     """Return frames, uncompressed and little endian.
 
     The numbers count from 1, with commas between.
     """
-    asked = asked_syntaxes(accepted_types(request, "multipart/related", "application/octet-stream"))
-    if asked and not asked & {"*", _EXPLICIT_LITTLE_ENDIAN}:
-        raise not_acceptable("Frames are sent uncompressed; ask for Explicit VR Little Endian.")
+    refuse_parameters(request)
     (instance,) = existing(study_uid, series_uid, uid)
     if not re.fullmatch(r"[0-9]{1,5}(,[0-9]{1,5})*", numbers):
         raise Problem(400, "malformed", "The frames are no list of numbers; write them as in frames/1,2,3.")
     wanted = [int(number) for number in numbers.split(",")]
+    form = answer_form(request, _PIXELS, [_EXPLICIT_LITTLE_ENDIAN] * len(wanted))
     if not all(1 <= number <= instance.frames for number in wanted):
         raise not_found("frame")
+    kind = _with_syntax(_PIXELS, _EXPLICIT_LITTLE_ENDIAN)
     # The first frame now, so that a damaged file has an error for its answer.
     first = instance.frame(wanted[0] - 1)
+    if form is Form.SINGLE:
+        return Response(first, media_type=kind)
 
     def parts() -> Iterator[tuple[str, Iterator[bytes]]]:
-        kind = f"application/octet-stream; transfer-syntax={_EXPLICIT_LITTLE_ENDIAN}"
         yield kind, iter([first])
         for number in wanted[1:]:
             yield kind, iter([instance.frame(number - 1)])
 
-    return _related("application/octet-stream", parts())
+    return _related(_PIXELS, parts())
 
 
 def _related(kind: str, parts: Iterable[tuple[str, Iterator[bytes]]]) -> StreamingResponse:

@@ -11,6 +11,7 @@ from pydicom.datadict import dictionary_VR
 from sqlalchemy import ColumnElement, Select, func, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
+from fluoromap_service.api.dicomweb.accept import json_type
 from fluoromap_service.api.dicomweb.addresses import instance_url, series_url, study_url
 from fluoromap_service.api.dicomweb.indexing import Scope, index_results, index_runs
 from fluoromap_service.api.dicomweb.matching_rules import (
@@ -23,7 +24,6 @@ from fluoromap_service.api.dicomweb.matching_rules import (
     places_of,
 )
 from fluoromap_service.api.dicomweb.search_parameters import Search, read_search, tag_of
-from fluoromap_service.api.dicomweb.store import DICOM_JSON
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.dicom.indexed_header import LONGEST_ATTRIBUTE_BYTES
@@ -59,8 +59,9 @@ _header_decoder = msgspec.json.Decoder(dict[str, msgspec.Raw])
 class _Found:
     """The page of a search: for each result its place, and the header of its first matching object."""
 
-    def __init__(self, search: Search, level: Sequence[InstrumentedAttribute[str]]) -> None:
+    def __init__(self, search: Search, level: Sequence[InstrumentedAttribute[str]], media_type: str) -> None:
         self.search = search
+        self.media_type = media_type
         self.level = level
         self.headers: dict[Place, dict[str, msgspec.Raw]] = {}
         self.has_more = False
@@ -215,10 +216,10 @@ def _searched(
     Raises
     ------
     Problem
-        422 as :func:`read_search` and :func:`conditions_of`; 503 ``indexing``.
+        422 as :func:`read_search` and :func:`conditions_of`; 406 ``not_acceptable``; 503 ``indexing``.
     """
     search = read_search(request.query_params.multi_items())
-    found = _Found(search, level)
+    found = _Found(search, level, json_type(request))
     if search.is_fuzzy:
         found.warnings.append("The fuzzymatching parameter is not supported. Only literal matching has been performed.")
     conditions = conditions_of(search.keys, engine().dialect.name)
@@ -262,5 +263,5 @@ def _page(results: list[Json], found: _Found) -> Response:
     return Response(
         msgspec.json.encode([dict(sorted(result.items())) for result in results]),
         headers=headers,
-        media_type=DICOM_JSON,
+        media_type=found.media_type,
     )

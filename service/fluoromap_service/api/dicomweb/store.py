@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse
 from python_multipart.multipart import parse_options_header
 from starlette.requests import ClientDisconnect
 
+from fluoromap_service.api.dicomweb.accept import DICOM_JSON, refuse_parameters
 from fluoromap_service.api.dicomweb.addresses import instance_url, study_url
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.multipart import MultipartBody, malformed
@@ -26,8 +27,6 @@ from fluoromap_service.store.engine import writing
 from fluoromap_service.study.arrivals import add_arrival
 
 router = new_router("/dicom-web", include_in_schema=False)
-
-DICOM_JSON = "application/dicom+json"
 
 Json = dict[str, Any]
 
@@ -73,7 +72,7 @@ async def store_instances_of_study(study_uid: str, request: Request, caller: Wri
 
 
 async def _store_all(request: Request, caller: str, study_uid: str | None) -> JSONResponse:
-    _refuse_parameters(request)
+    refuse_parameters(request)
     kind, options = parse_options_header(request.headers.get("content-type"))
     if kind != b"multipart/related" or options.get(b"type", b"application/dicom").lower() != b"application/dicom":
         detail = 'Send the runs as multipart/related with type="application/dicom".'
@@ -88,12 +87,6 @@ async def _store_all(request: Request, caller: str, study_uid: str | None) -> JS
         if not body.parts:
             raise malformed("The body has no part between its boundaries; send each run as a part.")
         return await in_upload_thread(_answer, body.parts, caller, study_uid, str(request.base_url))
-
-
-def _refuse_parameters(request: Request) -> None:
-    if request.query_params:
-        detail = "This address has no query parameters; leave them out."
-        raise Problem(422, "unknown_parameter", detail, [(f"query.{name}", "unknown") for name in request.query_params])
 
 
 def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) -> JSONResponse:
