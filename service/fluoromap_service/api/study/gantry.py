@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from fluoromap.geometry import LEAST_SOURCE_MM
+from fluoromap_service.dicom.facts import TableOrigin
 from fluoromap_service.problem import Problem
 from fluoromap_service.study.instances import GANTRY_KEYWORDS, is_behind_detector
 
@@ -22,6 +23,20 @@ class GantryOut(BaseModel):
     source_isocentre_mm: float | None = Field(examples=[750.0])
     pixel_spacing_mm: list[float] | None = Field(
         description="[row, column] spacing at the detector (ImagerPixelSpacing).", examples=[[0.3, 0.3]]
+    )
+
+
+class RunGantryOut(GantryOut):
+    """Gantry values of a run, with the position of the table."""
+
+    table_mm: list[float] | None = Field(
+        description="[x, y, z] of the table along the patient's axes (LPS). Only differences between runs with the same "
+        "`table_origin` have a meaning.",
+        examples=[[9.2, 84.0, 503.9]],
+    )
+    table_origin: TableOrigin | None = Field(
+        description="The attributes that state `table_mm`: `isocentre` (TableXPositionToIsocenter ff.), `table_top` "
+        "(TableTopVerticalPosition ff.) or `ge` (the private block of GE)."
     )
 
 

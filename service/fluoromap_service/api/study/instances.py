@@ -18,7 +18,7 @@ from fluoromap_service.api.http.problems import ProblemDocument, document, respo
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339_or_none
-from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
+from fluoromap_service.api.study.gantry import GantryPatch, RunGantryOut, changed_gantry, check_gantry
 from fluoromap_service.api.study.uploads import Part, in_upload_thread, receive
 from fluoromap_service.dicom.indexed_header import ReadRun, read_run
 from fluoromap_service.problem import Problem, not_found
@@ -45,7 +45,9 @@ class InstanceOut(BaseModel):
     frame_time_ms: float | None = Field(description="Null for a single frame.", examples=[16.7])
     acquired: str | None = Field(examples=["2026-03-01T09:30:00.000Z"])
     plane: Literal["single", "A", "B"]
-    gantry: GantryOut = Field(description="The values in use: the run's own, else the header's, else the study's.")
+    gantry: RunGantryOut = Field(
+        description="The values in use: the run's own, else the header's, else the study's; and the header's table."
+    )
     missing: list[str] = Field(
         description="DICOM keywords to complete by PATCH.", examples=[["DistanceSourceToDetector"]]
     )
@@ -93,7 +95,7 @@ def instance_shape(run: StudyRun, views: dict[str, tuple[BoundSite, str]]) -> In
             "frame_time_ms": run.facts.frame_time_ms if run.facts.frames > 1 else None,
             "acquired": rfc3339_or_none(run.facts.acquired),
             "plane": run.facts.plane,
-            "gantry": run.gantry,
+            "gantry": run.gantry | {"table_mm": run.facts.table_mm, "table_origin": run.facts.table_origin},
             "missing": run.missing,
             "simulated": run.facts.simulated,
             "warnings": list(dict.fromkeys(warnings)),

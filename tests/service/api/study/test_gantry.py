@@ -50,6 +50,39 @@ def test_values_of_the_study_complete_headers_and_override_none(
     assert _patch(service, study_path, None).json()["gantry"] == dict.fromkeys(GANTRY_KEYWORDS)
 
 
+@pytest.mark.parametrize(
+    ("attributes", "table_mm", "origin"),
+    [
+        (
+            {"TableTopVerticalPosition": 900, "TableTopLongitudinalPosition": 40, "TableTopLateralPosition": 3},
+            [40.0, 900.0, 3.0],  # lateral is towards the head, PS3.3 C.8.7.4.1.3
+            "table_top",
+        ),
+        (
+            {"TableXPositionToIsocenter": 1, "TableYPositionToIsocenter": -2, "TableZPositionToIsocenter": 3.5},
+            [1.0, -2.0, 3.5],
+            "isocentre",
+        ),
+        ({"TableTopVerticalPosition": 900}, None, None),
+    ],
+)
+def test_the_position_of_the_table_is_shown(
+    service: TestClient,
+    study_path: str,
+    tmp_path: Path,
+    attributes: dict[str, float],
+    table_mm: list[float] | None,
+    origin: str | None,
+) -> None:
+    content = edited(small_run(tmp_path, 1, 0.0), PatientPosition="HFS", **attributes)
+    answer = service.post(f"{study_path}/instances", content=content, headers={"content-type": "application/dicom"})
+    assert answer.status_code == 201, answer.text
+    path = f"{study_path}/instances/{run_uid(1)}"
+    for run in (answer.json()["instances"][0], service.get(path).json(), _patch(service, path, None).json()):
+        assert (run["gantry"]["table_mm"], run["gantry"]["table_origin"]) == (table_mm, origin)
+    assert _patch(service, path, {"table_mm": [0, 0, 0]}).status_code == 422
+
+
 def test_the_keywords_of_missing_are_names_too(service: TestClient, study_path: str, two_runs: list[str]) -> None:
     missing = service.get(two_runs[0]).json()["missing"]
     answer = _patch(service, two_runs[0], dict(zip(missing, (1190, 780), strict=True)))
@@ -63,7 +96,7 @@ def test_the_keywords_of_missing_are_names_too(service: TestClient, study_path: 
         "ImagerPixelSpacing": [0.2, 0.2],
     }
     assert list(_patch(service, study_path, every).json()["gantry"].values()) == list(every.values())
-    assert list(_patch(service, two_runs[1], every).json()["gantry"].values()) == list(every.values())
+    assert list(_patch(service, two_runs[1], every).json()["gantry"].values()) == [*every.values(), None, None]
     assert _patch(service, two_runs[1], dict.fromkeys(every)).json()["gantry"]["primary_deg"] == 90
 
 

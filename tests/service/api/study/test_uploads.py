@@ -55,7 +55,7 @@ def test_a_run_is_stored_and_described(upload: Upload, data_dir: Path) -> None:
         "plane": "single",
         "gantry": {
             "primary_deg": -90.0, "secondary_deg": 0.0, "source_detector_mm": 1000.0, "source_isocentre_mm": 750.0,
-            "pixel_spacing_mm": [0.3, 0.3],
+            "pixel_spacing_mm": [0.3, 0.3], "table_mm": None, "table_origin": None,
         },
         "missing": [],
         "warnings": run["warnings"],

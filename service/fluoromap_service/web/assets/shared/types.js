@@ -4,10 +4,11 @@
  * @typedef {{name: string, electrodes: number, spacing_mm: number[], tip_mm: number, ring_mm: number}} Catheter
  * @typedef {{primary_deg: number|null, secondary_deg: number|null, source_detector_mm: number|null,
  *   source_isocentre_mm: number|null, pixel_spacing_mm: number[]|null}} Gantry
+ * @typedef {Gantry & {table_mm: number[]|null, table_origin: string|null}} RunGantry
  * @typedef {{id: string, label: string, chamber: string|null, catheters: Catheter[], reference: string|null, mapping: string,
  *   notes: string|null, gantry: Gantry, created: string}} Study
  * @typedef {{sop_instance_uid: string, site: string|null, view: "a"|"b"|null, frames: number, rows: number, columns: number,
- *   frame_time_ms: number|null, acquired: string|null, plane: string, gantry: Gantry, missing: string[],
+ *   frame_time_ms: number|null, acquired: string|null, plane: string, gantry: RunGantry, missing: string[],
  *   warnings: string[], simulated: boolean}} Run
  * @typedef {{site: string|null, pair: number|null, lat_ms: number|null, view_a: string|null, view_b: string|null,
  *   bound_by: string|null, missing: string[], warnings: string[], angle_deg: number|null, ready: boolean}} Site

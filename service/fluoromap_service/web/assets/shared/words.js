@@ -69,6 +69,20 @@ export function listed(words) {
   return words.length < 2 ? words.join("") : `${words.slice(0, -1).join(", ")} and ${words.at(-1)}`;
 }
 
+/** @type {Record<string, string>} */
+const TABLE_ORIGINS = {
+  isocentre: "from the isocentre",
+  table_top: "of the table top",
+  ge: "by the private attributes of GE",
+};
+
+/** The table's position in words. @param {import("./types.js").RunGantry} gantry */
+export function tableWords(gantry) {
+  if (!gantry.table_mm || !gantry.table_origin) return "The file does not state the position of the table.";
+  const [x, y, z] = gantry.table_mm.map((value) => value.toFixed(1).replace("-", "−"));
+  return `Table ${TABLE_ORIGINS[gantry.table_origin]}: left ${x} mm, back ${y} mm, head ${z} mm. Only differences between runs count.`;
+}
+
 /** Direction of a view as people say it. @param {import("./types.js").Gantry} gantry */
 export function direction(gantry) {
   const { primary_deg: primary, secondary_deg: secondary } = gantry;

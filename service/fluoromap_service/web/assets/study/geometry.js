@@ -1,7 +1,7 @@
 /** The form of the gantry's geometry, for the whole study or for one run. */
 import { send } from "../shared/api.js";
 import { announce, attempt, element, field, select } from "../shared/elements.js";
-import { KEYWORDS, listed } from "../shared/words.js";
+import { KEYWORDS, listed, tableWords } from "../shared/words.js";
 import { runLabel } from "./sites.js";
 
 /** @typedef {import("./page.js").StudyState} StudyState */
@@ -25,6 +25,7 @@ export function geometryForm(state) {
   const target = select(targets, STUDY, { id: "geometry-of" });
   const inputs = FIELDS.map(([name]) => element("input", { name, inputMode: "decimal" }));
   const lacks = element("p", { class: "soft" });
+  const table = element("p", { class: "soft" });
 
   const fill = () => {
     const run = state.runs.find((each) => each.sop_instance_uid === target.value);
@@ -34,6 +35,8 @@ export function geometryForm(state) {
       const value = gantry[name];
       inputs[index].value = value === null || value === undefined ? "" : Array.isArray(value) ? value[0] : value;
     });
+    table.hidden = !run;
+    table.textContent = run ? tableWords(run.gantry) : "";
     const missing = run ? run.missing : [...new Set(open.flatMap((each) => each.missing))];
     lacks.textContent = missing.length ? `Missing: ${listed(missing.map((keyword) => KEYWORDS[keyword] ?? keyword))}.` : "Nothing is missing.";
   };
@@ -61,5 +64,6 @@ export function geometryForm(state) {
       element("p", {}, "The position of source and detector. The service reads it from the files; complete what they lack. It is on the console of the X-ray system."),
       field("Geometry of", target), lacks,
       element("div", { class: "fields" }, ...FIELDS.map(([, label, hint], index) => field(label, inputs[index], hint))),
+      table,
       element("button", { type: "submit", class: "main" }, "Save the geometry")));
 }
