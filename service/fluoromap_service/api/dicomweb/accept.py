@@ -89,19 +89,6 @@ def _accepted(request: Request) -> list[MediaRange]:
     return media_ranges(",".join(request.headers.getlist("accept")))
 
 
-def refuse_parameters(request: Request) -> None:
-    """Refuse query parameters.
-
-    Raises
-    ------
-    Problem
-        422 ``unknown_parameter``.
-    """
-    if request.query_params:
-        detail = "This address has no query parameters; leave them out."
-        raise Problem(422, "unknown_parameter", detail, [(f"query.{name}", "unknown") for name in request.query_params])
-
-
 def json_type(request: Request) -> str:
     """Return the media type for an answer in JSON.
 

@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import Request, Response
 
 from fluoromap_service.api.dicomweb.accept import media_ranges, not_acceptable
+from fluoromap_service.api.dicomweb.descriptions import RENDERED_ANSWERS, rendered_parameters
 from fluoromap_service.api.dicomweb.display import (
     JPEG_QUALITY,
     LARGEST_SIDE_PX,
@@ -24,7 +25,7 @@ from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
 
-router = new_router("/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", tags=["dicomweb"], describe=rendered_parameters, responses=RENDERED_ANSWERS)
 
 _MEDIA_TYPES: dict[str, MediaType] = {
     "image/jpeg": "image/jpeg", "image/png": "image/png", "image/*": "image/jpeg", "*/*": "image/jpeg",
@@ -32,7 +33,6 @@ _MEDIA_TYPES: dict[str, MediaType] = {
 _FUNCTIONS: dict[str, WindowFunction] = {
     "linear": "LINEAR", "linear-exact": "LINEAR_EXACT", "linear_exact": "LINEAR_EXACT", "sigmoid": "SIGMOID",
 }  # fmt: skip
-_PARAMETERS = frozenset({"accept", "window", "viewport", "quality"})
 
 
 @router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/rendered")
@@ -82,12 +82,9 @@ def _display(request: Request) -> Display:
     Raises
     ------
     Problem
-        406 ``not_acceptable``; 422 ``unknown_parameter`` or ``invalid``.
+        406 ``not_acceptable``; 422 ``invalid``.
     """
     parameters = request.query_params
-    if unknown := [name for name in parameters if name not in _PARAMETERS]:
-        detail = "The address has unknown query parameters; send accept, window, viewport or quality."
-        raise Problem(422, "unknown_parameter", detail, [(f"query.{name}", "unknown") for name in unknown])
     quality = _numbers(parameters, "quality", (1,)) or (JPEG_QUALITY,)
     if not (1 <= quality[0] <= 100 and quality[0] == int(quality[0])):
         raise _invalid("quality", "a whole number from 1 to 100")

@@ -8,56 +8,63 @@ from collections.abc import Iterable, Iterator
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from fluoromap_service.api.dicomweb.accept import Form, answer_form, json_type, refuse_parameters
+from fluoromap_service.api.dicomweb.accept import Form, answer_form, json_type
+from fluoromap_service.api.dicomweb.descriptions import METADATA_ANSWERS, related_answers
 from fluoromap_service.api.dicomweb.stored import StoredInstance, existing, metadata_of_all
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
 
-router = new_router("/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", tags=["dicomweb"])
 
 _BOUNDARY = "fluoromap-part-7d2f4c9e81b34a06"
 _DICOM, _PIXELS = "application/dicom", "application/octet-stream"
 _EXPLICIT_LITTLE_ENDIAN = "1.2.840.10008.1.2.1"
+_FILE_ANSWERS = related_answers(_DICOM, "The files.")
 
 
-@router.get("/studies/{study_uid}/metadata")
+@router.get("/studies/{study_uid}/metadata", response_class=Response, responses=METADATA_ANSWERS)
 def study_metadata(study_uid: str, request: Request, caller: Reader) -> Response:
     """Return the headers of a study."""
     return _metadata(request, existing(study_uid))
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}/metadata")
+@router.get("/studies/{study_uid}/series/{series_uid}/metadata", response_class=Response, responses=METADATA_ANSWERS)
 def series_metadata(study_uid: str, series_uid: str, request: Request, caller: Reader) -> Response:
     """Return the headers of a series."""
     return _metadata(request, existing(study_uid, series_uid))
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/metadata")
+@router.get(
+    "/studies/{study_uid}/series/{series_uid}/instances/{uid}/metadata",
+    response_class=Response,
+    responses=METADATA_ANSWERS,
+)
 def instance_metadata(study_uid: str, series_uid: str, uid: str, request: Request, caller: Reader) -> Response:
     """Return the header of an instance."""
     return _metadata(request, existing(study_uid, series_uid, uid))
 
 
 def _metadata(request: Request, instances: list[StoredInstance]) -> Response:
-    refuse_parameters(request)
     media_type = json_type(request)
     return Response(b"[" + b",".join(metadata_of_all(instances)) + b"]", media_type=media_type)
 
 
-@router.get("/studies/{study_uid}")
+@router.get("/studies/{study_uid}", response_class=Response, responses=_FILE_ANSWERS)
 def retrieve_study(study_uid: str, request: Request, caller: Reader) -> StreamingResponse:
     """Return the files of a study."""
     return _files(request, existing(study_uid))
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}")
+@router.get("/studies/{study_uid}/series/{series_uid}", response_class=Response, responses=_FILE_ANSWERS)
 def retrieve_series(study_uid: str, series_uid: str, request: Request, caller: Reader) -> StreamingResponse:
     """Return the files of a series."""
     return _files(request, existing(study_uid, series_uid))
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}")
+@router.get(
+    "/studies/{study_uid}/series/{series_uid}/instances/{uid}", response_class=Response, responses=_FILE_ANSWERS
+)
 def retrieve_instance(study_uid: str, series_uid: str, uid: str, request: Request, caller: Reader) -> StreamingResponse:
     """Return the file of an instance."""
     return _files(request, existing(study_uid, series_uid, uid))
@@ -68,7 +75,6 @@ def _files(request: Request, instances: list[StoredInstance]) -> StreamingRespon
 
     A request for another transfer syntax is refused.
     """
-    refuse_parameters(request)
     form = answer_form(request, _DICOM, [instance.transfer_syntax for instance in instances])
     for instance in instances:
         instance.make_file()
@@ -87,7 +93,11 @@ def _with_syntax(kind: str, syntax: str) -> str:
     return f"{kind}; transfer-syntax={syntax}"
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{numbers}")
+@router.get(
+    "/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{numbers}",
+    response_class=Response,
+    responses=related_answers(_PIXELS, "The frames, uncompressed."),
+)
 def retrieve_frames(
     study_uid: str, series_uid: str, uid: str, numbers: str, request: Request, caller: Reader
 ) -> Response:
@@ -95,7 +105,6 @@ def retrieve_frames(
 
     The numbers count from 1, with commas between.
     """
-    refuse_parameters(request)
     (instance,) = existing(study_uid, series_uid, uid)
     if not re.fullmatch(r"[0-9]{1,5}(,[0-9]{1,5})*", numbers):
         raise Problem(400, "malformed", "The frames are no list of numbers; write them as in frames/1,2,3.")

@@ -13,6 +13,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from fluoromap_service.api.dicomweb.accept import json_type
 from fluoromap_service.api.dicomweb.addresses import instance_url, series_url, study_url
+from fluoromap_service.api.dicomweb.descriptions import SEARCH_ANSWERS, search_parameters
 from fluoromap_service.api.dicomweb.indexing import Scope, index_results, index_runs
 from fluoromap_service.api.dicomweb.matching_rules import (
     AVAILABILITY,
@@ -30,7 +31,9 @@ from fluoromap_service.dicom.indexed_header import LONGEST_ATTRIBUTE_BYTES
 from fluoromap_service.store.engine import engine, reading
 from fluoromap_service.store.models import DicomObject, DicomValue
 
-router = new_router("/dicom-web", include_in_schema=False)
+router = new_router(
+    "/dicom-web", tags=["dicomweb"], any_query_name=True, describe=search_parameters, responses=SEARCH_ANSWERS
+)
 
 STUDY_KEYWORDS = (
     "StudyDate", "StudyTime", "AccessionNumber", "ReferringPhysicianName", "PatientName", "PatientID", "PatientBirthDate",

@@ -10,8 +10,9 @@ from fastapi.responses import JSONResponse
 from python_multipart.multipart import parse_options_header
 from starlette.requests import ClientDisconnect
 
-from fluoromap_service.api.dicomweb.accept import DICOM_JSON, refuse_parameters
+from fluoromap_service.api.dicomweb.accept import DICOM_JSON
 from fluoromap_service.api.dicomweb.addresses import instance_url, study_url
+from fluoromap_service.api.dicomweb.descriptions import STORE_ANSWERS, STORE_BODY
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.multipart import MultipartBody, malformed
 from fluoromap_service.api.http.routers import new_router
@@ -26,7 +27,7 @@ from fluoromap_service.store.audit import Act
 from fluoromap_service.store.engine import writing
 from fluoromap_service.study.arrivals import add_arrival
 
-router = new_router("/dicom-web", include_in_schema=False)
+router = new_router("/dicom-web", tags=["dicomweb"], responses=STORE_ANSWERS)
 
 Json = dict[str, Any]
 
@@ -59,20 +60,22 @@ class _RelatedParts(MultipartBody):
         self._arriving = None
 
 
-@router.post("/studies")
+@router.post("/studies", openapi_extra=STORE_BODY)
 async def store_instances(request: Request, caller: Writer) -> JSONResponse:
-    """Store runs; each joins the mapping study of its DICOM study."""
+    """Store runs; each joins the mapping study of its DICOM study.
+
+    When all runs fail, the status is 409 and the answer has FailedSOPSequence as with 202.
+    """
     return await _store_all(request, caller, None)
 
 
-@router.post("/studies/{study_uid}")
+@router.post("/studies/{study_uid}", openapi_extra=STORE_BODY)
 async def store_instances_of_study(study_uid: str, request: Request, caller: Writer) -> JSONResponse:
-    """Store runs of one DICOM study."""
+    """Store runs of one DICOM study; further as without its UID."""
     return await _store_all(request, caller, study_uid)
 
 
 async def _store_all(request: Request, caller: str, study_uid: str | None) -> JSONResponse:
-    refuse_parameters(request)
     kind, options = parse_options_header(request.headers.get("content-type"))
     if kind != b"multipart/related" or options.get(b"type", b"application/dicom").lower() != b"application/dicom":
         detail = 'Send the runs as multipart/related with type="application/dicom".'

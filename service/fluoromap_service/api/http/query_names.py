@@ -13,15 +13,15 @@ from fluoromap_service.problem import Problem
 async def check_query_names(request: Request) -> None:
     """Check that the route has every query parameter of the request.
 
-    The application gives this dependency to all of its routes. The routes of DICOMweb check theirs themselves: their
-    parameters are DICOM attributes (PS3.18 section 8.3.4).
+    The application gives this dependency to all of its routes but the searches of DICOMweb. Their parameters are DICOM attributes
+    (PS3.18 section 8.3.4), and they check the names themselves.
 
     Raises
     ------
     Problem
         422 ``unknown_parameter`` with each unknown name.
     """
-    if not request.scope["query_string"] or request.scope["route"].path.startswith("/dicom-web/"):
+    if not request.scope["query_string"]:
         return
     known = sorted(set(_names(request.scope["route"].dependant)))
     unknown = [name for name in dict.fromkeys(request.query_params) if name not in known]

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Response
+from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
@@ -39,15 +40,39 @@ def _in_thread(function: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def new_router(prefix: str = "", *, tags: list[str | Enum] | None = None, include_in_schema: bool = True) -> APIRouter:
-    """Return an empty router whose routes the application takes over as they are."""
+def new_router(
+    prefix: str = "",
+    *,
+    tags: list[str | Enum] | None = None,
+    include_in_schema: bool = True,
+    any_query_name: bool = False,
+    describe: Callable[..., None] | None = None,
+    responses: dict[int | str, dict[str, Any]] | None = None,
+) -> APIRouter:
+    """Return an empty router whose routes the application takes over as they are.
+
+    Parameters
+    ----------
+    prefix : str
+    tags : list of str, optional
+    include_in_schema : bool
+    any_query_name : bool
+        For routes that check the names of their query parameters themselves.
+    describe : callable, optional
+        Its arguments are further query parameters of all routes.
+    responses : dict, optional
+        Answers of all routes for the OpenAPI document. Their own media types are these alone.
+    """
+    checks = [] if any_query_name else [check_query_names]
     return APIRouter(
         prefix=prefix,
         tags=tags,
         include_in_schema=include_in_schema,
-        dependencies=[Depends(check_query_names)],
+        dependencies=[Depends(each) for each in (*checks, *([describe] if describe else []))],
         generate_unique_id_function=_operation_id,
         route_class=OneThreadRoute,
+        responses=responses,
+        default_response_class=JSONResponse if responses is None else Response,
     )
 
 

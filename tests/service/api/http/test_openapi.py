@@ -6,8 +6,10 @@ import re
 from typing import Any
 
 import pytest
+from fastapi.routing import APIRoute
 
 from fluoromap_service.api.app import create_app
+from fluoromap_service.api.dicomweb import rendered, retrieve, search, store
 from fluoromap_service.api.openapi import document
 
 PATHS: dict[str, dict[str, Any]] = document(create_app())["paths"]
@@ -58,10 +60,34 @@ def test_every_body_has_its_media_type_and_schema(name: str, operation: Operatio
     assert all(form["schema"] for form in body["content"].values())
     if path.endswith(("/activation-times", "/electrograms/{site}")):
         assert set(body["content"]) == MEDIA_OF_TABLES
+    elif path.startswith("/dicom-web/"):
+        assert set(body["content"]) == {"multipart/related"}
     elif path.endswith("/instances"):
         assert set(body["content"]) == {"multipart/form-data", "application/dicom"}
     else:
         assert set(body["content"]) == {"application/json"}
+
+
+def test_the_routes_of_dicomweb_are_described() -> None:
+    modules = (store, search, retrieve, rendered)
+    routes = [route for module in modules for route in module.router.routes if isinstance(route, APIRoute)]
+    assert {(route.path, method.lower()) for route in routes for method in route.methods} == {
+        (path, method) for path, methods in PATHS.items() if path.startswith("/dicom-web/") for method in methods
+    }
+    for path, kinds in {
+        "/studies": {"application/dicom+json", "application/json"},
+        "/studies/{study_uid}/metadata": {"application/dicom+json", "application/json"},
+        "/studies/{study_uid}": {"multipart/related", "application/dicom"},
+        "/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{numbers}": {
+            "multipart/related",
+            "application/octet-stream",
+        },
+        "/studies/{study_uid}/series/{series_uid}/instances/{uid}/rendered": {"image/jpeg", "image/png"},
+    }.items():
+        operation = PATHS[f"/dicom-web{path}"]["get"]
+        assert set(operation["responses"]["200"]["content"]) == kinds
+        assert "406" in operation["responses"]
+        assert operation["tags"] == ["dicomweb"]
 
 
 def test_binary_answers_and_texts_are_declared_as_such() -> None:
