@@ -63,12 +63,14 @@ def new_router(
     responses : dict, optional
         Answers of all routes for the OpenAPI document. Their own media types are these alone.
     """
-    checks = [] if any_query_name else [check_query_names]
+    first: list[Callable[..., Any]] = [] if any_query_name else [check_query_names]
+    if describe is not None:
+        first.append(describe)
     return APIRouter(
         prefix=prefix,
         tags=tags,
         include_in_schema=include_in_schema,
-        dependencies=[Depends(each) for each in (*checks, *([describe] if describe else []))],
+        dependencies=[Depends(each) for each in first],
         generate_unique_id_function=_operation_id,
         route_class=OneThreadRoute,
         responses=responses,
