@@ -51,7 +51,7 @@ class DicomFrames:
         return _pixels(self.cells(index), self._layout)
 
     def cells(self, index: int) -> Pixels:
-        """Return the pixel cells of a frame as :meth:`__getitem__`, with the overlay planes that they may hold."""
+        """Return the pixel cells of a frame: its pixels with embedded overlay planes."""
         if not 0 <= index < len(self):
             raise IndexError(f"the run has {len(self)} frames")
         with self._opened() as file:

@@ -134,7 +134,7 @@ def _check_sender(event: evt.Event, allow: AllowList) -> None:
 
 
 def _take_senders_order(association: Any) -> None:
-    """Let each proposed context have the first transfer syntax of the sender that the listener accepts.
+    """Reduce each proposed context to its first transfer syntax that is accepted.
 
     A sender names the syntax first in which it has the object, so that it need not decompress. pynetdicom would take the first
     syntax of the listener's own list (PS3.8 section 9.3.2.2: the acceptor chooses).

@@ -52,7 +52,7 @@ def study(service: TestClient) -> FinishedStudy:
 
 
 def routes() -> list[str]:
-    """Return the paths of all routes that read and that name a study, a run or a job."""
+    """Return the paths of all routes that read a study or a job."""
     paths = [
         route.path for route in create_app().routes if isinstance(route, APIRoute) and "GET" in (route.methods or ())
     ]
@@ -60,7 +60,7 @@ def routes() -> list[str]:
 
 
 def addresses(service: TestClient, study: FinishedStudy) -> dict[str, list[str]]:
-    """Return addresses of each route: of a run, and over DICOMweb of each result too."""
+    """Return addresses of each route; over DICOMweb also those of results."""
     instances = service.get(f"/dicom-web/studies/{DICOM_STUDY}/instances").json()
     places = [(item["0020000E"]["Value"][0], item["00080018"]["Value"][0]) for item in instances]
     run = study.uids["S01", "a"]
@@ -79,7 +79,7 @@ def addresses(service: TestClient, study: FinishedStudy) -> dict[str, list[str]]
 
 
 def forget_everything_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forget the renderings, and what the process remembers of files, so that every route reads again."""
+    """Forget the renderings and results, so that every route reads again."""
     with writing() as session:
         session.execute(delete(Rendering))
     for name in ("_headers_of_runs", "_headers_of_jobs"):

@@ -46,9 +46,9 @@ class MediaRange:
 
 
 def media_ranges(text: str) -> list[MediaRange]:
-    """Return the items of an Accept header, the preferred one first; damaged items are left out.
+    """Return the items of an Accept header, the preferred one first.
 
-    An empty header accepts everything. Items with quality 0 come last: they refuse a type.
+    Damaged items are left out. An empty header accepts everything. Items with quality 0 come last: they refuse a type.
     """
     if not text.strip():
         return [MediaRange("*/*", {})]

@@ -20,7 +20,7 @@ def _of_kinds(schema: dict[str, Any], *kinds: str) -> dict[str, Any]:
 
 
 def related_answers(kind: str, description: str) -> Described:
-    """Return the answers of a route that sends parts of a media type: together, or one alone."""
+    """Return the answers of a route that sends parts of a media type."""
     content = _of_kinds(_BINARY, "multipart/related", kind)
     return {200: {"content": content, "description": description}, **responses(400, 401, 403, 404, 406, 409, 422, 429)}
 

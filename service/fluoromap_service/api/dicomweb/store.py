@@ -131,7 +131,7 @@ def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) ->
 
 
 def _failed_reference(part: Part, facts: InstanceFacts | None) -> Json:
-    """Return the UIDs of a part that is not stored, as far as they can be read."""
+    """Return the readable UIDs of a part that is not stored."""
     if facts is not None:
         return _reference(facts.sop_class_uid, facts.sop_instance_uid)
     try:

@@ -132,7 +132,7 @@ class MultipartBody(ABC):
         self._no_content = 0
 
     def _read_headers(self) -> bool:
-        """Read the headers of a part up to the blank line; return whether it was there."""
+        """Read the headers of a part; return whether they are complete."""
         found = _BLANK_LINE.search(self._waiting, 0, LONGEST_HEADERS)
         if found is None:
             if len(self._waiting) >= LONGEST_HEADERS:
