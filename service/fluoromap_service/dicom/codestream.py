@@ -161,7 +161,8 @@ def _parse_jpeg(codestream: bytes) -> tuple[Codestream, bytes] | None:
 def _without_boxes(content: bytes) -> bytes:
     """Return the codestream of a JP2 file; other content is returned unchanged.
 
-    The boxes are those of ITU-T T.800 annex I.4. PS3.5 A.4.4 allows the codestream only. Some systems put a whole JP2 file into a frame.
+    The boxes are those of ITU-T T.800 annex I.4. PS3.5 A.4.4 allows the codestream only. Some systems put a whole
+    JP2 file into a frame.
     """
     if not content.startswith(JP2_SIGNATURE):
         return content

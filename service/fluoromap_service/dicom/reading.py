@@ -82,7 +82,8 @@ def read_instance(path: Path) -> InstanceFacts:
 def read_instance_uids(path: Path) -> tuple[str | None, str | None]:
     """Return SOP Class UID and SOP Instance UID of any DICOM file.
 
-    :func:`read_instance` may refuse the file. Where the data set is damaged, those of the file meta information count. None for a UID that cannot be read.
+    :func:`read_instance` may refuse the file. Where the data set is damaged, those of the file meta information count.
+    None for a UID that cannot be read.
 
     Raises
     ------
