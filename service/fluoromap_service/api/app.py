@@ -145,7 +145,14 @@ def create_app() -> FastAPI:
             CORSMiddleware,
             allow_origins=settings().allowed_origins,
             allow_methods=["GET", "POST", "PUT", "PATCH", "DELETE"],
-            allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "If-None-Match", "Last-Event-ID"],
+            allow_headers=[
+                "Authorization",
+                "Content-Type",
+                "Idempotency-Key",
+                "If-Match",
+                "If-None-Match",
+                "Last-Event-ID",
+            ],
             expose_headers=["Location", "Link", "ETag", "Retry-After", "Idempotency-Replayed", "Content-Disposition"],
         )
     app.add_middleware(RequestBody)

@@ -1,4 +1,4 @@
-"""Routers of the service: all routes check the names of their parameters, and a request takes one thread."""
+"""Routers of the service: all routes check names of parameters and conditions, and a request takes one thread."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
+from fluoromap_service.api.http.preconditions import refuse_unknown_condition
 from fluoromap_service.api.http.query_names import check_query_names
 
 
@@ -63,7 +64,9 @@ def new_router(
     responses : dict, optional
         Answers of all routes for the OpenAPI document. Their own media types are these alone.
     """
-    first: list[Callable[..., Any]] = [] if any_query_name else [check_query_names]
+    first: list[Callable[..., Any]] = [refuse_unknown_condition]
+    if not any_query_name:
+        first.insert(0, check_query_names)
     if describe is not None:
         first.append(describe)
     return APIRouter(

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
+from fluoromap_service.api.http.preconditions import IfMatch
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
@@ -65,7 +66,7 @@ def get_electrodes(
         return _answer(session, study_id, uid, n, correction, response)
 
 
-@router.put("", responses=responses(400, 401, 403, 404, 422))
+@router.put("", responses=responses(400, 401, 403, 404, 412, 422))
 def put_electrodes(
     study_id: StudyId,
     uid: InstanceUid,
@@ -73,29 +74,33 @@ def put_electrodes(
     body: Annotated[list[ElectrodeIn], Body(max_length=512)],
     response: Response,
     caller: Writer,
+    condition: IfMatch,
 ) -> list[ElectrodeOut]:
     """Set this frame's electrodes by hand.
 
-    The next job tracks the run again from this frame.
+    The next job tracks the run again from this frame. With `If-Match` the electrodes are set only when nobody has set
+    others since they were read.
     """
     with writing() as session:
         study = studies.lock(session, study_id)
         run = _run_with_frame(session, study_id, uid, n)
+        condition.check(_etag(corrections.newest(session, study_id, uid, n)))
         _check(study, run, body)
         electrodes = tuple(CorrectedElectrode(**item.model_dump(exclude={"source"})) for item in body)
         correction = corrections.put(session, study_id, uid, n, electrodes, caller)
         return _answer(session, study_id, uid, n, correction, response)
 
 
-@router.delete("", responses=responses(401, 403, 404, 422))
+@router.delete("", responses=responses(401, 403, 404, 412, 422))
 def delete_electrodes(
-    study_id: StudyId, uid: InstanceUid, n: FrameNumber, response: Response, caller: Writer
+    study_id: StudyId, uid: InstanceUid, n: FrameNumber, response: Response, caller: Writer, condition: IfMatch
 ) -> list[ElectrodeOut]:
     """Return this frame to automatic detection; the answer lists the last detected electrodes."""
     with writing() as session:
         studies.lock(session, study_id)
         _run_with_frame(session, study_id, uid, n)
         correction = corrections.newest(session, study_id, uid, n)
+        condition.check(_etag(correction))
         if correction is not None and correction.electrodes is not None:
             correction = corrections.put(session, study_id, uid, n, None, caller)
         return _answer(session, study_id, uid, n, correction, response)
@@ -111,11 +116,15 @@ def _run_with_frame(session: Session, study_id: str, uid: str, n: int) -> StudyR
 def _answer(
     session: Session, study_id: str, uid: str, n: int, correction: Correction | None, response: Response
 ) -> list[ElectrodeOut]:
-    response.headers["ETag"] = f'"{correction.version if correction else 0}"'
+    response.headers["ETag"] = _etag(correction)
     if correction is not None and correction.electrodes is not None:
         return [ElectrodeOut(**electrode, source="manual") for electrode in correction.electrodes]
     detected = detected_electrodes(session, study_id, uid, n - 1)
     return [ElectrodeOut(**asdict(electrode), source="automatic") for electrode in detected]
+
+
+def _etag(correction: Correction | None) -> str:
+    return f'"{correction.version if correction else 0}"'
 
 
 def _check(study: Study, run: StudyRun, body: list[ElectrodeIn]) -> None:
