@@ -131,6 +131,7 @@ def create_app() -> FastAPI:
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
     app.state.acts, app.state.counts, app.state.sign_ins = acts, counts, sign_ins
+    app.state.readiness = health.ReadinessWatch()
     rules = read_rules()
     app.state.rules = RuleWatch(rules) if rules else None
     problems.install(app)

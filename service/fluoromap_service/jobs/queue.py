@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import math
+import time
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,6 +20,9 @@ RUN_STAGE = "fluoromap.run_stage"
 
 POLL_SECONDS = 0.02
 """Time between two looks into the folder of messages. A correction waits for it; a look takes 0.1 ms."""
+
+SILENCE_SECONDS = 5.0
+"""Time for which nobody waits again for a broker that did not answer."""
 
 DRAIN_SECONDS = 20
 """How long a worker that must end waits for its running stages before it gives them back."""
@@ -69,11 +74,19 @@ def celery_app() -> Celery:
     return app
 
 
+_silent_since = -math.inf
+"""When the broker last failed, by the monotonic clock."""
+
+
 def publish(stage_ids: list[int]) -> None:
     """Announce ready stages.
 
-    A failure is only logged: the committed rows are announced again until a worker claims them.
+    A failure is only logged: the committed rows are announced again until a worker claims them. A broker that accepts connections and
+    says nothing takes seconds to fail. So for a time after a failure nothing is announced, and the requests that start jobs go on.
     """
+    global _silent_since
+    if time.monotonic() - _silent_since < SILENCE_SECONDS:
+        return
     app = celery_app()
     if app.conf.task_always_eager:
         app.loader.import_default_modules()
@@ -84,6 +97,7 @@ def publish(stage_ids: list[int]) -> None:
         except Exception as error:
             # The rows are committed, so the request that made them must not fail.
             log.warning("broker_unreachable", error=type(error).__name__)
+            _silent_since = time.monotonic()
             return
 
 

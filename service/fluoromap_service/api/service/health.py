@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Literal
 
 import structlog
-from fastapi import Response
+from fastapi import Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import select
 
@@ -19,6 +23,11 @@ from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
 
 router = new_router(tags=["service"])
+
+ANSWER_SECONDS = 1.0
+"""Age up to which all callers get the same answer."""
+CHECK_SECONDS = 1.0
+"""Longest time that an answer waits for its checks; a check that takes longer has failed."""
 
 _stall = StallWatch()
 
@@ -118,27 +127,78 @@ async def health() -> Health:
     return Health()
 
 
+class ReadinessWatch:
+    """The readiness of this process, found by one thread at most once a second, whatever the number of callers.
+
+    A check that hangs goes on in its own thread and is not started again before it ends. So a part that is silent costs one
+    thread, and no caller waits for it longer than ``CHECK_SECONDS``.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "readiness")
+        self._lock = threading.Lock()
+        self._answer: Future[Readiness] | None = None
+        self._ended = 0.0
+        self._running: dict[CheckName, Future[str]] = {}
+
+    def answer(self) -> Future[Readiness]:
+        """Return the answer of this moment, which may still be on its way."""
+        with self._lock:
+            known = self._answer
+            if known is None or (known.done() and time.monotonic() - self._ended >= ANSWER_SECONDS):
+                self._answer = known = self._thread.submit(self._look)
+            return known
+
+    def _look(self) -> Readiness:
+        for name, (check, _) in _CHECKS.items():
+            if name not in self._running:
+                self._running[name] = _started(check)
+        wait(self._running.values(), CHECK_SECONDS)
+        checks = [self._result(name, failure) for name, (_, failure) in _CHECKS.items()]
+        self._ended = time.monotonic()
+        return Readiness(ready=all(check.ok for check in checks), checks=checks)
+
+    def _result(self, name: CheckName, failure: str) -> Check:
+        if not self._running[name].done():
+            log.warning("not_ready", check=name, error="TimeoutError")
+            return Check(name=name, ok=False, detail=failure)
+        ended = self._running.pop(name)
+        try:
+            detail = ended.result()
+        except Exception as error:
+            # Every error means the same here, and its text may contain an address or a password.
+            log.warning("not_ready", check=name, error=type(error).__name__)
+            detail = failure
+        return Check(name=name, ok=not detail, detail=detail)
+
+
+def _started(check: Callable[[], str]) -> Future[str]:
+    """Begin a check in a thread of its own, which the end of the service does not wait for."""
+    future: Future[str] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(check())
+        except Exception as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future
+
+
 @router.get(
     "/v1/ready",
     summary="Ready",
     response_model=Readiness,
     responses={503: {"model": Readiness, "description": "A part is missing; the checks name it."}},
 )
-def ready(response: Response) -> Readiness:
+async def ready(request: Request, response: Response) -> Readiness:
     """Report whether database, broker, files, a worker and the queue are ready.
 
-    It is open to all.
+    It is open to all. All callers within a second get the same answer.
     """
-    checks = []
-    for name, (check, failure) in _CHECKS.items():
-        try:
-            detail = check()
-        except Exception as error:
-            # Every error means the same here, and its text may contain an address or a password.
-            log.warning("not_ready", check=name, error=type(error).__name__)
-            detail = failure
-        checks.append(Check(name=name, ok=not detail, detail=detail))
-    answer = Readiness(ready=all(check.ok for check in checks), checks=checks)
+    watch: ReadinessWatch = request.app.state.readiness
+    answer = await asyncio.wrap_future(watch.answer())
     if not answer.ready:
         response.status_code = 503
     return answer

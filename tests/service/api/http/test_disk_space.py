@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 from finished_study import make_study
 from sqlalchemy.exc import OperationalError
 
+from fluoromap_service.api.service import health
 from fluoromap_service.store import disk, files
 from fluoromap_service.store.disk import NoSpace
 from fluoromap_service.store.engine import writing
@@ -22,6 +23,7 @@ def _files_check(service: TestClient) -> dict[str, Any]:
 
 
 def test_writing_stops_at_the_reserve(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health, "ANSWER_SECONDS", 0.0)
     study = make_study()
     assert _files_check(service)["ok"]
     monkeypatch.setattr(disk, "free_bytes", lambda: disk.reserve_bytes() - 1)

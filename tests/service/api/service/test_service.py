@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import functools
 import itertools
+import threading
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from finished_study import FinishedStudy
 
 from fluoromap import registry
 from fluoromap_service.api.service import health
+from fluoromap_service.api.service.health import ReadinessWatch
 from fluoromap_service.jobs import living_workers, queue
 from fluoromap_service.jobs.stall import StallWatch
 from fluoromap_service.settings import settings
@@ -45,6 +48,14 @@ def test_ready_with_jobs_running_inside_the_service(client: TestClient) -> None:
     assert [(check["name"], check["ok"]) for check in answer.json()["checks"]] == [
         ("database", True), ("broker", True), ("files", True), ("worker", True), ("queue", True),
     ]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def at_once(application: FastAPI, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each question is answered anew; no check is late, however busy the machine."""
+    application.state.readiness = ReadinessWatch()
+    monkeypatch.setattr(health, "ANSWER_SECONDS", 0.0)
+    monkeypatch.setattr(health, "CHECK_SECONDS", 60.0)
 
 
 def _checks(client: TestClient) -> tuple[int, dict[str, bool]]:
@@ -90,6 +101,33 @@ def test_not_ready_without_tables(client: TestClient, monkeypatch: pytest.Monkey
     settings.cache_clear()
     status, checks = _checks(client)
     assert (status, checks["database"]) == (503, False)
+
+
+def test_all_callers_share_one_answer(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health, "ANSWER_SECONDS", 3600.0)
+    looks: list[str] = []
+    monkeypatch.setitem(health._CHECKS, "files", (lambda: looks.append("look") or "", ""))
+    assert {client.get("/v1/ready").status_code for _ in range(20)} == {200}
+    assert looks == ["look"]
+
+
+def test_nobody_waits_for_a_silent_broker(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A broker that accepts connections and says nothing: one thread waits for it, and no caller."""
+    monkeypatch.setattr(health, "CHECK_SECONDS", 0.05)
+    speaks, asked = threading.Event(), []
+
+    def silent() -> str:
+        asked.append("ask")
+        speaks.wait(60)
+        return ""
+
+    monkeypatch.setattr(health, "_CHECKS", {"broker": (silent, "The message broker does not answer; check its URL.")})
+    assert [client.get("/v1/ready").status_code for _ in range(3)] == [503, 503, 503]
+    assert asked == ["ask"]
+    assert client.get("/v1/health").status_code == 200
+    monkeypatch.setattr(health, "CHECK_SECONDS", 60.0)
+    speaks.set()
+    assert client.get("/v1/ready").status_code == 200
 
 
 def test_every_route_is_documented(client: TestClient, study: FinishedStudy) -> None:
