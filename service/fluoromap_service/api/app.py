@@ -28,6 +28,7 @@ from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Doorkeeper, Reader
 from fluoromap_service.api.http.sign_in_limit import SignInLimit
 from fluoromap_service.api.jobs import events, jobs
+from fluoromap_service.api.jobs.job_watch import JobWatch
 from fluoromap_service.api.openapi import document
 from fluoromap_service.api.results import (
     archive,
@@ -131,7 +132,7 @@ def create_app() -> FastAPI:
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
     app.state.acts, app.state.counts, app.state.sign_ins = acts, counts, sign_ins
-    app.state.readiness = health.ReadinessWatch()
+    app.state.readiness, app.state.job_watch = health.ReadinessWatch(), JobWatch()
     rules = read_rules()
     app.state.rules = RuleWatch(rules) if rules else None
     problems.install(app)

@@ -81,8 +81,8 @@ _silent_since = -math.inf
 def publish(stage_ids: list[int]) -> None:
     """Announce ready stages.
 
-    A failure is only logged: the committed rows are announced again until a worker claims them. A broker that accepts connections and
-    says nothing takes seconds to fail. So for a time after a failure nothing is announced, and the requests that start jobs go on.
+    A failure is only logged: the committed rows are announced again until a worker claims them. A silent broker takes seconds to
+    fail. So for a time after a failure nothing is announced, and the requests that start jobs go on.
     """
     global _silent_since
     if time.monotonic() - _silent_since < SILENCE_SECONDS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import time
+from contextlib import suppress
 from typing import Annotated, Literal
 
 from fastapi import Query, Request, Response
@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from fluoromap_service.api.http import stopping
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.idempotency import OnceJson
 from fluoromap_service.api.http.paging import NewestFirst, Page, Pages
@@ -28,6 +27,7 @@ from fluoromap_service.api.jobs.job_answers import (
     job_summaries,
     read_job,
 )
+from fluoromap_service.api.jobs.job_watch import JobWatch
 from fluoromap_service.jobs import job_life, queue
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.results.finished import job_of
@@ -38,9 +38,6 @@ from fluoromap_service.study.freeze import PipelineRequest, freeze
 router = new_router(tags=["jobs"])
 
 _JOBS = NewestFirst(Job, *SUMMARY_COLUMNS)
-
-POLL_SECONDS = 0.25
-"""Time between two queries of the database while a client waits."""
 
 RETRY_SECONDS = 2
 
@@ -140,14 +137,16 @@ async def get_job(
     With `wait` the answer comes when the job's state changes, when the job has ended, or when the time is over. With `wait` and
     `If-None-Match` it comes at any change of the job.
     """
-    state, etag = first_state, _ = await run_in_threadpool(_state, job_id)
-    conditional = "if-none-match" in request.headers
-    end = time.monotonic() + wait
-    while state not in ENDED_JOB and time.monotonic() < end and not stopping.begun():
-        if (not is_known(request, etag)) if conditional else (state != first_state):
-            break
-        await asyncio.sleep(min(POLL_SECONDS, max(end - time.monotonic(), 0.0)))
-        state, etag = await run_in_threadpool(_state, job_id)
+    if wait > 0:
+        first_state, etag = await run_in_threadpool(_state, job_id)
+        conditional = "if-none-match" in request.headers
+        if first_state not in ENDED_JOB and (not conditional or is_known(request, etag)):
+            watch: JobWatch = request.app.state.job_watch
+            with suppress(TimeoutError), watch.following(job_id) as follower:
+                async with asyncio.timeout(wait):
+                    while (news := await follower.next()) is not None and not news.last:
+                        if (not is_known(request, news.etag)) if conditional else (news.state != first_state):
+                            break
     answer, etag = await run_in_threadpool(_answer, job_id)
     if is_known(request, etag):
         return not_modified(etag)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from finished_study import FinishedStudy
+from sql_statements import sql_statements
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
 
 from fluoromap_service.api.http import stopping
-from fluoromap_service.api.jobs import events as event_routes
+from fluoromap_service.api.jobs import job_watch
+from fluoromap_service.api.jobs.job_watch import Follower, JobWatch
 
 
 def _parse(text: str) -> list[dict[str, Any]]:
@@ -57,14 +63,13 @@ def test_the_stream_follows_a_running_job(
     client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked = threading.Event()
-    news = event_routes._new_events
+    deliver = job_watch._deliver
 
-    def noticed(job_id: str, after: int) -> Any:
-        found = news(job_id, after)
+    def noticed(news: Any) -> None:
+        deliver(news)
         looked.set()
-        return found
 
-    monkeypatch.setattr(event_routes, "_new_events", noticed)
+    monkeypatch.setattr(job_watch, "_deliver", noticed)
     received: list[list[dict[str, Any]]] = []
     following = threading.Thread(target=lambda: received.append(_stream(client, study)))
     following.start()
@@ -77,21 +82,34 @@ def test_the_stream_follows_a_running_job(
 
 
 def test_what_is_committed_late_is_not_lost(
-    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+    application: FastAPI, client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A lower id that appears after a higher one was sent, as two PostgreSQL transactions can make it."""
     study.finish()
-    news = event_routes._new_events
-    looks: list[int] = []
-
-    def delayed(job_id: str, after: int) -> Any:
-        ended, found = news(job_id, after)
-        looks.append(after)
-        return (False, found[1:]) if len(looks) == 1 else (ended, found)
-
     expected = {event["id"] for event in _stream(client, study)}
-    monkeypatch.setattr(event_routes, "_new_events", delayed)
+    marks, events_after = job_watch._marks, job_watch._events_after
+    looks: list[str] = []
+
+    def running(session: Session, jobs: list[str]) -> dict[str, Any]:
+        looks.append("look")
+        found = marks(session, jobs)
+        return (
+            {job: ("running", number, *mark[2:]) for number, (job, mark) in enumerate(found.items())}
+            if len(looks) == 1
+            else found
+        )
+
+    def delayed(session: Session, after: int, job_id: str | None = None) -> Any:
+        found = events_after(session, after, job_id)
+        return found[1:] if len(looks) == 1 else found
+
+    # A thread that has not ended yet has seen the event.
+    application.state.job_watch = JobWatch()
+    monkeypatch.setattr(job_watch, "_marks", running)
+    monkeypatch.setattr(job_watch, "_events_after", delayed)
+    monkeypatch.setattr(job_watch, "last_change", lambda: None)
     assert {event["id"] for event in _stream(client, study)} == expected
+    assert len(looks) > 1
 
 
 def test_the_stream_outlives_a_database_that_is_away_for_a_moment(
@@ -99,17 +117,46 @@ def test_the_stream_outlives_a_database_that_is_away_for_a_moment(
 ) -> None:
     study.finish()
     expected = _stream(client, study)
-    news = event_routes._new_events
-    looks: list[int] = []
+    marks = job_watch._marks
+    looks: list[str] = []
 
-    def away(job_id: str, after: int) -> Any:
-        looks.append(after)
+    def away(session: Session, jobs: list[str]) -> Any:
+        looks.append("look")
         if len(looks) < 3:
             raise OperationalError("SELECT", {}, Exception("the connection is closed"))
-        return news(job_id, after)
+        return marks(session, jobs)
 
-    monkeypatch.setattr(event_routes, "_new_events", away)
+    monkeypatch.setattr(job_watch, "_marks", away)
     assert _stream(client, study) == expected
+
+
+async def _statements(streams: int, job_id: str) -> tuple[int, int]:
+    """Return the number of statements of the first look, and of the next one."""
+    followers, looks = [Follower(job_id, 0) for _ in range(streams)], job_watch._Looks()
+    numbers = []
+    for _ in range(2):
+        with sql_statements() as found:
+            looks.look(followers)
+        numbers.append(len(found))
+    return numbers[0], numbers[1]
+
+
+@pytest.mark.parametrize("streams", [1, 300])
+def test_a_stream_costs_no_query(study: FinishedStudy, streams: int) -> None:
+    assert asyncio.run(_statements(streams, study.job_id)) == (4, 2)
+
+
+async def _follow(job_id: str, streams: int) -> set[str]:
+    watch, before = JobWatch(), set(threading.enumerate())
+    with ExitStack() as stack:
+        followers = [stack.enter_context(watch.following(job_id, 0)) for _ in range(streams)]
+        news = await asyncio.gather(*(follower.next() for follower in followers))
+        assert all(each is not None and each.state == "queued" for each in news)
+        return {thread.name for thread in threading.enumerate() if thread not in before}
+
+
+def test_a_stream_costs_no_thread(study: FinishedStudy) -> None:
+    assert asyncio.run(_follow(study.job_id, 300)) == {"job-watch"}
 
 
 def test_the_stream_of_a_running_job_ends_with_the_service(
