@@ -68,6 +68,13 @@ class Settings(BaseSettings):
     retention_days: float = Field(
         0.0, ge=0, description="Age at which a study without a change or job is deleted, in days; 0: never."
     )
+    audit_head_file: str = Field(
+        "", description="File to which the API appends the hash of the audit trail's newest entry; empty: none."
+    )
+    renderings_mib: int = Field(
+        4096, ge=0, description="Space for kept pictures, meshes and reports; the longest unused go first, in MiB."
+    )
+    downloads: int = Field(4, ge=1, description="Large files that one token may download at the same time.")
     workers: int = Field(
         len(os.sched_getaffinity(0)), ge=1, description="Stages that one worker runs at the same time."
     )

@@ -63,10 +63,12 @@ from fluoromap_service.jobs.pipeline import PIPELINE
 from fluoromap_service.jobs.rule_watch import RuleWatch
 from fluoromap_service.jobs.start_rules import read_rules
 from fluoromap_service.settings import settings
+from fluoromap_service.store.audit_head import HeadWatch
 from fluoromap_service.store.codec import prepare
 from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
+HEAD_SECONDS = 60.0
 CLEAN_UP_SECONDS = 60.0
 INDEX_SECONDS = 2.0
 RULE_SECONDS = 2.0
@@ -132,6 +134,7 @@ def create_app() -> FastAPI:
     )
     acts, counts, sign_ins = Acts(), RequestCounts(), SignInLimit()
     app.state.acts, app.state.counts, app.state.sign_ins = acts, counts, sign_ins
+    app.state.audit_heads = HeadWatch()
     app.state.readiness, app.state.job_watch = health.ReadinessWatch(), JobWatch()
     rules = read_rules()
     app.state.rules = RuleWatch(rules) if rules else None
@@ -139,8 +142,8 @@ def create_app() -> FastAPI:
     # The last one added is the outermost.
     app.add_middleware(BodyLimit)
     app.add_middleware(DiskSpace)
-    app.add_middleware(AuditTrail, acts=acts)
     app.add_middleware(Doorkeeper, sign_ins=sign_ins)
+    app.add_middleware(AuditTrail, acts=acts)
     if settings().cors_origins:
         # Before the doorkeeper: a browser asks for permission without a token, and reads refusals too.
         app.add_middleware(
@@ -184,6 +187,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     acts: Acts = app.state.acts
     tasks = [
         asyncio.create_task(_repeat("audit_not_written", acts.flush, FLUSH_SECONDS)),
+        asyncio.create_task(_repeat("audit_head_not_published", app.state.audit_heads.publish, HEAD_SECONDS)),
         asyncio.create_task(_repeat("clean_up_failed", clean_up, CLEAN_UP_SECONDS)),
         asyncio.create_task(_repeat("runs_not_indexed", index_some_runs, INDEX_SECONDS)),
     ]
@@ -204,7 +208,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             with suppress(asyncio.CancelledError):
                 await task
         try:
-            await run_in_threadpool(acts.flush)
+            await run_in_threadpool(acts.flush, ending=True)
         finally:
             file_pool.close()
 

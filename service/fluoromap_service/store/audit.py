@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from fluoromap_service.store.clock import db_now
-from fluoromap_service.store.models import AuditEntry, Job
+from fluoromap_service.store.models import AuditEntry, Instance, Job, StudyInstance
 
 START = "0" * 64
 """The hash before the first entry."""
@@ -38,6 +38,11 @@ class Act:
         Ids of the study and job concerned.
     status : int or None
         HTTP status of the answer.
+    dicom_study : str or None
+        Study Instance UID that a DICOMweb request names. The trail does not hold it: it has an entry for each mapping study with
+        runs of this DICOM study.
+    times : int
+        How often it happened.
     """
 
     who: str
@@ -45,14 +50,16 @@ class Act:
     study: str | None = None
     job: str | None = None
     status: int | None = None
+    dicom_study: str | None = None
+    times: int = 1
 
 
 class BrokenChain(Exception):
     """An entry does not fit to the entry before it; the message names it."""
 
 
-def append(session: Session, acts: Sequence[Act]) -> None:
-    """Add acts to the end of the trail, within the caller's transaction.
+def append(session: Session, acts: Sequence[Act]) -> list[AuditEntry]:
+    """Add acts to the end of the trail, within the caller's transaction, and return their entries.
 
     An act on a job is recorded with the job's study.
     """
@@ -63,13 +70,36 @@ def append(session: Session, acts: Sequence[Act]) -> None:
     studies = {row.id: row.study_id for row in rows}
     before = session.scalar(select(AuditEntry.hash).order_by(AuditEntry.id.desc()).limit(1)) or START
     now = session.scalars(select(db_now())).one()
+    held = _mapping_studies(session, {act.dicom_study for act in acts if act.dicom_study is not None})
+    added = []
     for act in acts:
-        study = act.study or studies.get(act.job or "")
-        entry = AuditEntry(at=now, who=act.who, what=act.what, study=study, job=act.job, status=act.status)
-        entry.hash = before = _hash(before, entry)
-        session.add(entry)
-        # One by one, so that the ids rise in the order of the chain.
-        session.flush()
+        own: list[str | None] = [act.study or studies.get(act.job or "")]
+        for study in held.get(act.dicom_study or "", own):
+            entry = AuditEntry(at=now, who=act.who, what=act.what, study=study, job=act.job, status=act.status)
+            entry.times = act.times if act.times > 1 else None
+            entry.hash = before = _hash(before, entry)
+            session.add(entry)
+            # One by one, so that the ids rise in the order of the chain.
+            session.flush()
+            added.append(entry)
+    return added
+
+
+def _mapping_studies(session: Session, dicom_studies: set[str]) -> dict[str, list[str | None]]:
+    """Return the mapping studies that hold runs of each DICOM study, by its UID."""
+    if not dicom_studies:
+        return {}
+    query = (
+        select(Instance.study_instance_uid, StudyInstance.study_id)
+        .join(StudyInstance, StudyInstance.sop_instance_uid == Instance.sop_instance_uid)
+        .where(Instance.study_instance_uid.in_(dicom_studies))
+        .distinct()
+        .order_by(StudyInstance.study_id)
+    )
+    found: dict[str, list[str | None]] = {}
+    for uid, study in session.execute(query):
+        found.setdefault(uid, []).append(study)
+    return found
 
 
 def entries(session: Session) -> Iterator[AuditEntry]:
@@ -82,14 +112,15 @@ def as_json(entry: AuditEntry) -> dict[str, Any]:
     return {"id": entry.id, **_content(entry), "hash": entry.hash}
 
 
-def verify(session: Session, head: str | None = None) -> tuple[int, str]:
+def verify(session: Session, heads: Iterable[str] = ()) -> tuple[int, str]:
     """Check the whole chain.
 
     Parameters
     ----------
     session : Session
-    head : str, optional
-        Hash of an entry that must be in the trail, from an earlier check. It shows that nobody has cut off the end.
+    heads : iterable of str
+        Hashes of entries that must be in the trail, from earlier checks or as the service published them. They show that nobody has
+        cut off the end, emptied the trail or written it anew.
 
     Returns
     -------
@@ -99,23 +130,25 @@ def verify(session: Session, head: str | None = None) -> tuple[int, str]:
     Raises
     ------
     BrokenChain
-        When an entry was changed, removed or inserted.
+        When an entry was changed, removed or inserted, or a hash is missing.
     """
-    before, count, found = START, 0, head is None
+    before, count, missing = START, 0, set(heads) - {START}
     for entry in entries(session):
         if entry.hash != _hash(before, entry):
             raise BrokenChain(f"Entry {entry.id} of the audit trail, or the entry before it, was changed or removed.")
         before, count = entry.hash, count + 1
-        found = found or entry.hash == head
-    if not found:
-        raise BrokenChain("The audit trail does not contain the given hash: its end was removed.")
+        missing.discard(entry.hash)
+    if missing:
+        raise BrokenChain(
+            f"The audit trail lacks {len(missing)} of the given hashes: its end was removed, or somebody wrote it anew."
+        )
     return count, before
 
 
 def _content(entry: AuditEntry) -> dict[str, Any]:
     return {
         "at": round(entry.at, 6), "who": entry.who, "what": entry.what, "study": entry.study, "job": entry.job,
-        "status": entry.status,
+        "status": entry.status, **({} if entry.times is None else {"times": entry.times}),
     }  # fmt: skip
 
 

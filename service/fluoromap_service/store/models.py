@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import (
     DDL,
     JSON,
+    BigInteger,
     Boolean,
     Float,
     ForeignKey,
@@ -355,6 +356,8 @@ class Rendering(Base):
     job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), index=True)
     key: Mapped[str] = mapped_column(String(64), unique=True)  # hash of the study and of all dependencies
     sha256: Mapped[str] = mapped_column(ForeignKey("file.sha256"), index=True)
+    bytes: Mapped[int | None] = mapped_column(BigInteger)  # None until the next clean-up in rows of earlier versions
+    used: Mapped[float | None] = mapped_column(default=db_now())  # to within an hour
 
 
 class DeliveryTarget(Base):
@@ -430,6 +433,16 @@ class Idempotency(Base):
     created: Mapped[float] = mapped_column(default=db_now(), index=True)
 
 
+class Deletion(Base):
+    """The certificate of a deleted study: what went, by ids and hashes. It holds no patient data and stays."""
+
+    __tablename__ = "deletion"
+    study: Mapped[str] = mapped_column(String(32), primary_key=True)
+    at: Mapped[float]
+    certificate: Mapped[Json]
+    audit_id: Mapped[int]  # the entry of the audit trail that holds the certificate's hash
+
+
 class Tally(Base):
     """A sum over the life of the installation, for the metrics."""
 
@@ -450,6 +463,7 @@ class AuditEntry(Base):
     job: Mapped[str | None] = mapped_column(String(32))
     status: Mapped[int | None]
     hash: Mapped[str] = mapped_column(String(64))
+    times: Mapped[int | None]  # None: once
 
 
 APPEND_ONLY = {

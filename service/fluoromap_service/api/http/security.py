@@ -55,6 +55,8 @@ class Doorkeeper:
         connection = HTTPConnection(scope)
         try:
             caller = await self._identify(connection)
+            # Before the check of its scopes, so that the audit trail names the caller of a refused request.
+            scope.setdefault("state", {})["caller"] = caller
             _demand(caller, _needed(scope))
         except Problem as problem:
             if problem.status == 401 and _opens_page(connection):
@@ -65,7 +67,6 @@ class Doorkeeper:
         except DATABASE_AWAY as error:
             await answer(database_away(error))(scope, receive, send)
             return
-        scope.setdefault("state", {})["caller"] = caller
         await self._app(scope, receive, send)
 
     async def _identify(self, connection: HTTPConnection) -> Caller:

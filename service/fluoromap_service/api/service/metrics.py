@@ -18,6 +18,7 @@ from fluoromap_service.api.http.security import METRICS, Monitor
 from fluoromap_service.jobs.job_life import SECONDS_BUCKETS
 from fluoromap_service.jobs.pipeline import STAGES
 from fluoromap_service.store import disk, tally
+from fluoromap_service.store.audit_head import HeadWatch
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import (
@@ -79,7 +80,11 @@ def metrics(request: Request, caller: Monitor) -> Response:
     with reading() as session:
         sums = tally.all_sums(session)
         shown = [*_work(session), *_sums(sums), *_deliveries(session, sums)]
-    shown += [*_disk(), *_requests(request.app.state.counts, request.app.state.sign_ins.failures)]
+    shown += [
+        *_audit(request.app.state.audit_heads),
+        *_disk(),
+        *_requests(request.app.state.counts, request.app.state.sign_ins.failures),
+    ]
     return Response("".join(f"{line}\n" for metric in shown for line in metric.lines()), media_type=MEDIA_TYPE)
 
 
@@ -152,6 +157,15 @@ def _deliveries(session: Session, sums: Mapping[str, float]) -> Iterable[Metric]
         failures.add(sums.get(f"delivery_failures|{target}", 0.0), target=target)
         objects.add(sums.get(f"delivered_objects|{target}", 0.0), target=target)
     return [waiting, oldest, ended, failures, objects]
+
+
+def _audit(heads: HeadWatch) -> Iterable[Metric]:
+    head = Metric("fluoromap_audit_head", "gauge", "Number of the newest entry of the audit trail, with its hash.")
+    if heads.published is not None:
+        head.add(heads.published.entry, hash=heads.published.hash)
+    breaks = Metric("fluoromap_audit_breaks_total", "counter", "Published hashes that left the audit trail.")
+    breaks.add(heads.breaks)
+    return [head, breaks]
 
 
 def _disk() -> Iterable[Metric]:

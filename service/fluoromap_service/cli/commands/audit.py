@@ -15,7 +15,7 @@ from fluoromap_service.cli.environment import apply_options
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir
 from fluoromap_service.store import audit as trail
-from fluoromap_service.store import schema
+from fluoromap_service.store import audit_head, schema
 from fluoromap_service.store.engine import reading
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
@@ -42,18 +42,38 @@ def export(
 
 @app.command()
 def verify(
-    head: Annotated[
-        str | None, typer.Option(help="Hash that an earlier check printed; it must still be in the trail.")
+    against: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--against",
+            "--head",
+            help="A hash that an earlier check printed, or a file with hashes that the service published: the file of "
+            "FLUOROMAP_AUDIT_HEAD_FILE or a log. They must still be in the trail.",
+        ),
     ] = None,
     data_dir: DataDir = None,
 ) -> None:
     """Check that nobody changed, removed or inserted an entry."""
     apply_options(data_dir=data_dir)
+    heads = [sha256 for given in against or () for sha256 in _heads(given)]
     with explain_database_failures():
         schema.upgrade()
         try:
             with reading() as session:
-                count, last = trail.verify(session, head)
+                count, last = trail.verify(session, heads)
         except trail.BrokenChain as broken:
             raise CommandFailed(f"{broken} Compare with an earlier export.") from broken
-    typer.echo(f"{count} entries, unbroken; the last hash is {last}")
+    compared = f"; {len(set(heads))} earlier hashes are in it" if heads else ""
+    typer.echo(f"{count} entries, unbroken; the last hash is {last}{compared}")
+
+
+def _heads(given: str) -> list[str]:
+    if audit_head.is_hash(given):
+        return [given]
+    try:
+        found = audit_head.published_hashes(Path(given))
+    except OSError as error:
+        raise CommandFailed(f"{given} is no hash of 64 digits and no readable file: {error.strerror}.") from error
+    if not found:
+        raise CommandFailed(f"{given} holds no hash of the audit trail; give the log of the API or its file of hashes.")
+    return found
