@@ -49,6 +49,7 @@ from fluoromap_service.api.study import (
     activation_times,
     catheter_types,
     cine,
+    deletions,
     electrodes,
     electrograms,
     epipolar,
@@ -65,16 +66,20 @@ from fluoromap_service.jobs.start_rules import read_rules
 from fluoromap_service.settings import settings
 from fluoromap_service.store.audit_head import HeadWatch
 from fluoromap_service.store.codec import prepare
+from fluoromap_service.study.orphans import remove_orphans
 from fluoromap_service.study.upkeep import clean_up
 
 SWEEP_SECONDS = 1.0
 HEAD_SECONDS = 60.0
 CLEAN_UP_SECONDS = 60.0
 INDEX_SECONDS = 2.0
+ORPHAN_SECONDS = 600.0
+"""With the age of an orphan this is less than an hour."""
 RULE_SECONDS = 2.0
 
 ROUTERS = (
     studies.router,
+    deletions.router,
     catheter_types.router,
     instances.router,
     frames.router,
@@ -188,6 +193,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     tasks = [
         asyncio.create_task(_repeat("audit_not_written", acts.flush, FLUSH_SECONDS)),
         asyncio.create_task(_repeat("audit_head_not_published", app.state.audit_heads.publish, HEAD_SECONDS)),
+        asyncio.create_task(_repeat("orphans_not_removed", remove_orphans, ORPHAN_SECONDS)),
         asyncio.create_task(_repeat("clean_up_failed", clean_up, CLEAN_UP_SECONDS)),
         asyncio.create_task(_repeat("runs_not_indexed", index_some_runs, INDEX_SECONDS)),
     ]

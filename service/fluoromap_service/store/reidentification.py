@@ -1,7 +1,7 @@
 """The secret of de-identified exports, and the lists that lead back from their UIDs. They stay in a private folder.
 
 ``<data folder>/reidentification/secret`` holds 32 random bytes. ``<study id>.csv`` beside it lists each replaced identifier of the
-study's exports. Neither is part of an export or of a backup.
+study's exports, and goes with the study. Neither is part of an export or of a backup.
 """
 
 from __future__ import annotations
@@ -41,6 +41,21 @@ def secret() -> bytes:
     return content
 
 
+def table_of(study_id: str) -> Path:
+    """Return the path of a study's list, which need not exist."""
+    return folder() / f"{study_id}.csv"
+
+
+def studies_with_table() -> set[str]:
+    """Return the ids of the studies that have a list."""
+    return {path.stem for path in folder().glob("*.csv")}
+
+
+def remove_table(study_id: str) -> None:
+    """Remove the list of a deleted study."""
+    table_of(study_id).unlink(missing_ok=True)
+
+
 def add_replacements(study_id: str, replaced: Mapping[str, str]) -> Path:
     """Add original identifiers and their replacements to the list of a study.
 
@@ -50,7 +65,7 @@ def add_replacements(study_id: str, replaced: Mapping[str, str]) -> Path:
         The list: a CSV file with the columns ``original`` and ``replacement``.
     """
     make_private_folder(folder())
-    path = folder() / f"{study_id}.csv"
+    path = table_of(study_id)
     make_private_file(path)
     with path.open("r+", newline="") as file:
         fcntl.flock(file, fcntl.LOCK_EX)

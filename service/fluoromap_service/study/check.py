@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import re
-import time
 from dataclasses import dataclass
 
 from sqlalchemy import delete, exists, or_, select
 
-from fluoromap_service.settings import settings
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Instance, Rendering, StageResult, StageRow
 from fluoromap_service.study.instances import unlink_unreferenced
-
-SETTLED_SECONDS = 3600.0
-"""Age from which a file without a row is an orphan; a younger one may belong to a transaction that has not ended."""
+from fluoromap_service.study.orphans import SETTLED_SECONDS, orphans
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +60,7 @@ def examine(settled_seconds: float = SETTLED_SECONDS) -> Findings:
         }
     return Findings(
         abandoned,
-        _orphans(rows, settled_seconds),
+        tuple(sorted(orphans(settled_seconds))),
         unused,
         tuple(sorted(runs[sha256] for sha256 in broken if sha256 in runs)),
         tuple(sha256 for sha256 in broken if sha256 not in runs),
@@ -95,16 +90,3 @@ def _has_its_hash(sha256: str) -> bool:
         return files.sha256_of(files.path_of(sha256)) == sha256
     except FileNotFoundError:
         return False
-
-
-def _orphans(rows: set[str], settled_seconds: float) -> tuple[str, ...]:
-    now, found = time.time(), []
-    for path in settings().files_dir.glob("[0-9a-f][0-9a-f]/*"):
-        if re.fullmatch(r"[0-9a-f]{64}", path.name) and path.name not in rows:
-            try:
-                if now - path.stat().st_ctime >= settled_seconds:
-                    found.append(path.name)
-            except FileNotFoundError:
-                # Its study was deleted meanwhile.
-                continue
-    return tuple(sorted(found))

@@ -8,12 +8,11 @@ from sqlalchemy import delete, func, select
 from fluoromap_service.auth import failures, sessions
 from fluoromap_service.problem import Problem
 from fluoromap_service.settings import settings
-from fluoromap_service.store import audit, disk, files
-from fluoromap_service.store.audit import Act
+from fluoromap_service.store import disk, files
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import empty_write_ahead_log, reading, writing
 from fluoromap_service.store.models import Idempotency, Job, Rendering, Study
-from fluoromap_service.study import dicom_index, studies
+from fluoromap_service.study import deletion, dicom_index
 from fluoromap_service.study.instances import unlink_unreferenced
 
 ANSWER_SECONDS = 24 * 3600.0
@@ -63,12 +62,11 @@ def delete_old_studies(days: float) -> int:
                 # Somebody may have changed it since the search.
                 if session.scalar(old.where(Study.id == study_id).with_for_update(of=Study)) is None:
                     continue
-                unreferenced = studies.remove(session, study_id)
-                audit.append(session, [Act("retention", "delete study", study=study_id)])
+                unreferenced = deletion.delete(session, study_id, "retention")
         except Problem:
             # Somebody deleted it meanwhile, or its job still runs.
             continue
-        unlink_unreferenced(unreferenced)
+        deletion.remove_files(study_id, unreferenced)
         log.info("study_deleted_by_age", study=study_id)
         deleted += 1
     return deleted

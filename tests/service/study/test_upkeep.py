@@ -21,7 +21,7 @@ from fluoromap_service.store import audit, disk, files
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Idempotency, Instance, Job, Rendering, StageResult, StageRow, Study
-from fluoromap_service.study import upkeep
+from fluoromap_service.study import deletion
 from fluoromap_service.study.check import examine, mend
 from fluoromap_service.study.upkeep import clean_up, delete_old_studies, delete_renderings
 
@@ -103,7 +103,7 @@ def test_old_studies_are_deleted_when_their_jobs_have_ended(service: TestClient)
     assert delete_old_studies(30) == 1
     with reading() as session:
         assert set(session.scalars(select(Study.label))) == {"rhythm", "new"}
-        assert [entry.what for entry in audit.entries(session)] == ["delete study"]
+        assert [(entry.who, entry.what[:12]) for entry in audit.entries(session)] == [("retention", "delete study")]
     running.finish()
     assert delete_old_studies(30) == 1
     with reading() as session:
@@ -140,11 +140,11 @@ def test_a_study_that_changes_during_the_deletion_stays(service: TestClient, mon
         service.post("/v1/studies", json={"label": label})
     _make_older(31)
 
-    def change_the_rest(hashes: object) -> None:
+    def change_the_rest(study_id: str, hashes: object) -> None:
         with writing() as session:
             session.execute(update(Study).values(updated=db_now()))
 
-    monkeypatch.setattr(upkeep, "unlink_unreferenced", change_the_rest)
+    monkeypatch.setattr(deletion, "remove_files", change_the_rest)
     assert delete_old_studies(30) == 1
 
 

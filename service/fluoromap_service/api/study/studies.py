@@ -20,7 +20,7 @@ from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_g
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
-from fluoromap_service.study import corrections, studies
+from fluoromap_service.study import corrections, deletion, studies
 from fluoromap_service.study.catheters import (
     StudyCatheter,
     catalogue_of,
@@ -28,7 +28,7 @@ from fluoromap_service.study.catheters import (
     catheters_of,
     set_catalogue,
 )
-from fluoromap_service.study.instances import runs_of, unlink_unreferenced
+from fluoromap_service.study.instances import runs_of
 
 router = new_router("/v1/studies", tags=["studies"])
 
@@ -185,8 +185,9 @@ def _check_corrections(session: Session, study: Study, catalogue: Catalogue) -> 
 def delete_study(study_id: StudyId, caller: Writer) -> None:
     """Delete a study with its jobs.
 
-    The files that nothing else refers to are deleted too. The answer is 409 while a job runs.
+    The files that nothing else refers to are deleted too, and the table that leads back from de-identified exports. The
+    answer is 409 while a job runs. `GET /v1/deletions/{study_id}` gives the certificate.
     """
     with writing() as session:
-        unreferenced = studies.remove(session, study_id)
-    unlink_unreferenced(unreferenced)
+        unreferenced = deletion.delete(session, study_id, caller)
+    deletion.remove_files(study_id, unreferenced)

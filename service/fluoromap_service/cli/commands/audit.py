@@ -14,9 +14,11 @@ from fluoromap_service.cli.database_failures import explain_database_failures
 from fluoromap_service.cli.environment import apply_options
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.options import DataDir
+from fluoromap_service.problem import Problem
 from fluoromap_service.store import audit as trail
 from fluoromap_service.store import audit_head, schema
 from fluoromap_service.store.engine import reading
+from fluoromap_service.study.deletion import certificate_of
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 
@@ -65,6 +67,22 @@ def verify(
             raise CommandFailed(f"{broken} Compare with an earlier export.") from broken
     compared = f"; {len(set(heads))} earlier hashes are in it" if heads else ""
     typer.echo(f"{count} entries, unbroken; the last hash is {last}{compared}")
+
+
+@app.command()
+def certificate(
+    study: Annotated[str, typer.Argument(help="Id of the deleted study.")],
+    data_dir: DataDir = None,
+) -> None:
+    """Write the certificate of a deleted study as JSON: what went, without patient data."""
+    apply_options(data_dir=data_dir)
+    with explain_database_failures():
+        schema.upgrade()
+        try:
+            with reading() as session:
+                typer.echo(json.dumps(certificate_of(session, study), indent=2))
+        except Problem as problem:
+            raise CommandFailed(problem.detail) from problem
 
 
 def _heads(given: str) -> list[str]:

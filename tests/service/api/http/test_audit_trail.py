@@ -40,8 +40,9 @@ def test_acts_are_recorded_with_caller_and_study(
     service.delete(study_path)
     service.get("/v1/plugins")
     service.get("/v1/health")
-    entries = _entries(service)
-    assert {entry["who"] for entry in entries} == {"open"}
+    deleted, *entries = _entries(service)
+    assert (deleted["what"][:12], deleted["study"]) == ("delete study", study_id)
+    assert {entry["who"] for entry in (deleted, *entries)} == {"open"}
     assert [(entry["what"], entry["study"], entry["status"]) for entry in entries] == [
         ("POST /v1/studies", study_id, 201),
         ("POST /v1/studies/{study_id}/instances", study_id, 201),
