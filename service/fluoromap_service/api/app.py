@@ -21,6 +21,7 @@ from fluoromap_service.api.http.middleware.access_log import AccessLog, RequestC
 from fluoromap_service.api.http.middleware.audit_trail import FLUSH_SECONDS, Acts, AuditTrail
 from fluoromap_service.api.http.middleware.body_limit import BodyLimit
 from fluoromap_service.api.http.middleware.disk_space import DiskSpace
+from fluoromap_service.api.http.middleware.download_limit import DownloadLimit
 from fluoromap_service.api.http.middleware.request_body import RequestBody
 from fluoromap_service.api.http.middleware.security_headers import SecurityHeaders
 from fluoromap_service.api.http.middleware.trusted_proxies import TrustedProxies
@@ -145,6 +146,7 @@ def create_app() -> FastAPI:
     app.state.rules = RuleWatch(rules) if rules else None
     problems.install(app)
     # The last one added is the outermost.
+    app.add_middleware(DownloadLimit)
     app.add_middleware(BodyLimit)
     app.add_middleware(DiskSpace)
     app.add_middleware(Doorkeeper, sign_ins=sign_ins)

@@ -1,8 +1,8 @@
 """Kept renderings: pictures, meshes, tables and pages that the service makes of a job's results once.
 
 The jobs of a study share them: a rendering is kept under the hash of the study and of everything that changes it. So a job whose
-map did not change has the pictures of the job before it. A rendering is deleted with the job that it was made for; another job
-that needs it makes it again.
+map did not change has the pictures of the job before it. A rendering is deleted with the job that it was made for, and when all
+together take more than their space and it is the longest unused. A request that needs it makes it again.
 """
 
 from __future__ import annotations
@@ -14,12 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select, update
 from sqlalchemy.exc import IntegrityError
 
-from fluoromap_service.store import files
+from fluoromap_service.store import disk, files
+from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Job, Rendering
+
+USED_SECONDS = 3600.0
+"""Time within which another use of a rendering is not noted, so that few reads write."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +61,22 @@ def kept_file(job_id: str, depends_on: dict[str, Any], write: Callable[[IO[bytes
         As :func:`kept_rendering`.
     write : callable
         Writes the content into an open file, piece by piece. It is called outside any transaction.
+
+    Raises
+    ------
+    NoSpace
+        When only the reserve of the disk is left. A kept one is returned nevertheless.
     """
     key = _key(job_id, depends_on)
     kept = _find(key)
     if kept is not None:
         return kept
+    disk.check_room()
     with files.incoming() as path:
         with path.open("wb") as file:
             write(file)
+        disk.check_room()
+        size = path.stat().st_size
         # Other writers wait for the transaction, so the hash of a long file is made before it.
         sha256 = files.sha256_of(path)
         try:
@@ -72,9 +84,9 @@ def kept_file(job_id: str, depends_on: dict[str, Any], write: Callable[[IO[bytes
                 files.keep(session, path, sha256=sha256, durable=False)
                 row = session.scalar(select(Rendering).where(Rendering.key == key))
                 if row is None:
-                    session.add(Rendering(job_id=job_id, key=key, sha256=sha256))
+                    session.add(Rendering(job_id=job_id, key=key, sha256=sha256, bytes=size))
                 else:
-                    row.sha256 = sha256
+                    row.sha256, row.bytes = sha256, size
         except IntegrityError:
             # Another request made the same rendering meanwhile: take that one.
             kept = _find(key)
@@ -96,8 +108,12 @@ def _key(job_id: str, depends_on: dict[str, Any]) -> str:
 
 
 def _find(key: str) -> KeptFile | None:
+    unused = func.coalesce(Rendering.used, 0.0) < db_now() - USED_SECONDS
     with reading() as session:
-        sha256 = session.scalar(select(Rendering.sha256).where(Rendering.key == key))
-    if sha256 is None or not files.is_whole(sha256):
+        row = session.execute(select(Rendering.sha256, unused).where(Rendering.key == key)).first()
+    if row is None or not files.is_whole(row[0]):
         return None
-    return KeptFile(sha256, files.path_of(sha256))
+    if row[1]:
+        with writing() as session:
+            session.execute(update(Rendering).where(Rendering.key == key).values(used=db_now()))
+    return KeptFile(row[0], files.path_of(row[0]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import structlog
-from sqlalchemy import delete, func, select
+from sqlalchemy import delete, func, select, update
 
 from fluoromap_service.auth import failures, sessions
 from fluoromap_service.problem import Problem
@@ -40,8 +40,9 @@ def clean_up() -> None:
     failures.remove_old()
     if settings().retention_days > 0:
         delete_old_studies(settings().retention_days)
-    if disk.free_bytes() < LOW_DISK_FACTOR * disk.reserve_bytes():
-        delete_renderings()
+    _measure_renderings()
+    low = disk.free_bytes() < LOW_DISK_FACTOR * disk.reserve_bytes()
+    delete_renderings(0 if low else settings().renderings_mib * 2**20)
     empty_write_ahead_log()
 
 
@@ -72,22 +73,43 @@ def delete_old_studies(days: float) -> int:
     return deleted
 
 
-def delete_renderings() -> int:
-    """Delete kept pictures, meshes and pages, and return how many.
+def delete_renderings(most_bytes: int = 0) -> int:
+    """Delete the longest unused pictures, meshes and pages until the others take ``most_bytes`` together.
 
-    The service makes them again on request.
+    Return how many went. The service makes them again on request.
     """
     deleted = 0
     while True:
         with writing() as session:
             files.lock(session)
-            rows = session.scalars(select(Rendering).order_by(Rendering.id).limit(_BATCH)).all()
-            if not rows:
-                return deleted
-            dicom_index.forget_results(session, {row.job_id for row in rows})
-            for row in rows:
+            excess = (session.scalar(select(func.sum(Rendering.bytes))) or 0) - most_bytes
+            oldest = select(Rendering).order_by(func.coalesce(Rendering.used, 0.0), Rendering.id).limit(_BATCH)
+            going = []
+            jobs = set()
+            for row in session.scalars(oldest):
+                if excess <= 0:
+                    break
+                going.append(row.sha256)
+                jobs.add(row.job_id)
+                excess -= row.bytes or 0
                 session.delete(row)
+            dicom_index.forget_results(session, jobs)
             session.flush()
-            unreferenced = [path.name for path in files.remove_unreferenced(session, [row.sha256 for row in rows])]
+            unreferenced = [path.name for path in files.remove_unreferenced(session, going)]
+        if not going:
+            return deleted
         unlink_unreferenced(unreferenced)
-        deleted += len(rows)
+        deleted += len(going)
+
+
+def _measure_renderings() -> None:
+    """Note the sizes of the renderings that an earlier version has made."""
+    with reading() as session:
+        unknown = session.execute(select(Rendering.id, Rendering.sha256).where(Rendering.bytes.is_(None))).all()
+    if not unknown:
+        return
+    with writing() as session:
+        for number, sha256 in unknown:
+            path = files.path_of(sha256)
+            size = path.stat().st_size if path.exists() else 0
+            session.execute(update(Rendering).where(Rendering.id == number).values(bytes=size))

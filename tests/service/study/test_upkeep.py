@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ from fluoromap_service.store import audit, disk, files
 from fluoromap_service.store.clock import db_now
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import File, Idempotency, Instance, Job, Rendering, StageResult, StageRow, Study
-from fluoromap_service.study import deletion
+from fluoromap_service.study import deletion, upkeep
 from fluoromap_service.study.check import examine, mend
 from fluoromap_service.study.upkeep import clean_up, delete_old_studies, delete_renderings
 
@@ -168,6 +169,36 @@ def test_a_low_disk_costs_pictures_only(service: TestClient, monkeypatch: pytest
         assert session.scalars(select(Rendering.id)).all() == []
     assert delete_renderings() == 0
     assert service.get(mesh).content == content
+
+
+def test_kept_renderings_have_a_space_and_the_longest_unused_go(
+    service: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = make_study()
+    study.finish()
+    addresses = [f"/v1/jobs/{study.job_id}/mesh.{kind}" for kind in ("ply", "stl", "glb")]
+    for address in addresses:
+        service.get(address).raise_for_status()
+    with writing() as session:
+        rows = session.scalars(select(Rendering).order_by(Rendering.id)).all()
+        sizes = [row.bytes for row in rows]
+        keys = [row.key for row in rows]
+        for age, row in enumerate(rows):
+            row.used = 1000.0 * age
+        rows[1].bytes = None  # as an earlier version leaves it
+    assert sizes == [files.path_of(row.sha256).stat().st_size for row in rows]
+    # The first is used again, so the second is now the longest unused.
+    service.get(addresses[0]).raise_for_status()
+    monkeypatch.setattr(
+        upkeep, "settings", lambda: SimpleNamespace(retention_days=0, renderings_mib=(sum(sizes) - 1) / 2**20)
+    )
+    clean_up()
+    with reading() as session:
+        assert list(session.scalars(select(Rendering.key).order_by(Rendering.id))) == [keys[0], keys[2]]
+    assert not files.path_of(rows[1].sha256).exists()
+    clean_up()
+    with reading() as session:
+        assert len(session.scalars(select(Rendering.id)).all()) == 2
 
 
 def test_the_check_finds_nothing_in_a_sound_store(service: TestClient) -> None:

@@ -11,6 +11,7 @@ from fastapi.responses import StreamingResponse
 from fluoromap_service.api.dicomweb.accept import Form, answer_form, json_type
 from fluoromap_service.api.dicomweb.descriptions import METADATA_ANSWERS, related_answers
 from fluoromap_service.api.dicomweb.stored import StoredInstance, existing, metadata_of_all
+from fluoromap_service.api.http.middleware.download_limit import LARGE_DOWNLOAD
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
@@ -50,20 +51,28 @@ def _metadata(request: Request, instances: list[StoredInstance]) -> Response:
     return Response(b"[" + b",".join(metadata_of_all(instances)) + b"]", media_type=media_type)
 
 
-@router.get("/studies/{study_uid}", response_class=Response, responses=_FILE_ANSWERS)
+@router.get("/studies/{study_uid}", response_class=Response, responses=_FILE_ANSWERS, dependencies=[LARGE_DOWNLOAD])
 def retrieve_study(study_uid: str, request: Request, caller: Reader) -> StreamingResponse:
     """Return the files of a study."""
     return _files(request, existing(study_uid))
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}", response_class=Response, responses=_FILE_ANSWERS)
+@router.get(
+    "/studies/{study_uid}/series/{series_uid}",
+    response_class=Response,
+    responses=_FILE_ANSWERS,
+    dependencies=[LARGE_DOWNLOAD],
+)
 def retrieve_series(study_uid: str, series_uid: str, request: Request, caller: Reader) -> StreamingResponse:
     """Return the files of a series."""
     return _files(request, existing(study_uid, series_uid))
 
 
 @router.get(
-    "/studies/{study_uid}/series/{series_uid}/instances/{uid}", response_class=Response, responses=_FILE_ANSWERS
+    "/studies/{study_uid}/series/{series_uid}/instances/{uid}",
+    response_class=Response,
+    responses=_FILE_ANSWERS,
+    dependencies=[LARGE_DOWNLOAD],
 )
 def retrieve_instance(study_uid: str, series_uid: str, uid: str, request: Request, caller: Reader) -> StreamingResponse:
     """Return the file of an instance."""

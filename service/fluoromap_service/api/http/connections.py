@@ -18,13 +18,20 @@ HEADER_SECONDS = 10.0
 """Longest time from the start of a connection, or of a further request on it, to the end of the request's header."""
 
 
-class TimedConnection(H11Protocol):
-    """A connection that closes when no whole request header arrives in time.
+WRITE_SECONDS = 60.0
+SLOWEST_BYTES = 480 * 2**10
+"""A client takes this much of a waiting answer in ``WRITE_SECONDS``, or what is left of it: 8 KiB a second."""
 
-    uvicorn limits the time between two requests only. A client could hold thousands of connections that never send one.
+
+class TimedConnection(H11Protocol):
+    """A connection that closes when no whole request header arrives in time, or when the client hardly takes the answer.
+
+    uvicorn limits the time between two requests only. A client could hold thousands of connections that never send one, or keep
+    answers, with the files and threads behind them, for days.
     """
 
     _deadline: asyncio.TimerHandle | None = None
+    _progress: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
         """Begin to wait for the first request."""
@@ -40,9 +47,20 @@ class TimedConnection(H11Protocol):
             self._stop_waiting()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the deadline."""
+        """Forget the deadlines."""
         self._stop_waiting()
+        self._stop_watching()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Stop the answer until the client has taken what waits, and watch that it does."""
+        super().pause_writing()
+        self._watch()
+
+    def resume_writing(self) -> None:
+        """Go on with the answer."""
+        self._stop_watching()
+        super().resume_writing()
 
     def send_400_response(self, msg: str) -> None:
         """Answer a request that is no HTTP."""
@@ -66,6 +84,23 @@ class TimedConnection(H11Protocol):
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
+
+    def _watch(self) -> None:
+        self._stop_watching()
+        left = self.transport.get_write_buffer_size()
+        self._progress = self.loop.call_later(WRITE_SECONDS, self._check_progress, left)
+
+    def _stop_watching(self) -> None:
+        if self._progress is not None:
+            self._progress.cancel()
+            self._progress = None
+
+    def _check_progress(self, left: int) -> None:
+        if left - self.transport.get_write_buffer_size() < SLOWEST_BYTES:
+            # Not close: that would wait until the client has taken the rest.
+            self.transport.abort()
+        else:
+            self._watch()
 
     def _give_up(self) -> None:
         self._deadline = None

@@ -11,12 +11,14 @@ from typing import IO, cast
 
 from fastapi.responses import StreamingResponse
 
+from fluoromap_service.api.http.middleware.download_limit import LARGE_DOWNLOAD
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.api.http.spooled_answers import PIECE_BYTES
 from fluoromap_service.api.results.archive_files import ArchiveFile, archive_files
+from fluoromap_service.store import disk
 
 router = new_router(tags=["results"])
 
@@ -29,6 +31,7 @@ _LEVEL = 1
 
 @router.get(
     "/v1/jobs/{job_id}/archive.zip",
+    dependencies=[LARGE_DOWNLOAD],
     summary="Everything in one file",
     response_class=StreamingResponse,
     responses={
@@ -47,6 +50,8 @@ def get_archive(job_id: JobId, caller: Reader) -> StreamingResponse:
     site, as far as the job has these results. Coordinates count from the reference catheter. The archive is sent while it is
     made, so its length is not known at the start.
     """
+    # Its pictures and tables are made on the way, and then it is too late for a problem.
+    disk.check_room()
     files = archive_files(job_id)
     # The first file before the status: a job that has not ended is a problem, not an archive.
     first = next(files)

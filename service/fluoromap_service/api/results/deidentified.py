@@ -19,6 +19,7 @@ from starlette.background import BackgroundTask
 
 from fluoromap_service.api.http.csv_answers import csv_text
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.middleware.download_limit import LARGE_DOWNLOAD
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
@@ -32,7 +33,7 @@ from fluoromap_service.dicom.objects.job_results import ResultOrigin, RunReferen
 from fluoromap_service.problem import Problem
 from fluoromap_service.results.finished import ended_job_of, snapshot_of
 from fluoromap_service.results.origins import Origin
-from fluoromap_service.store import files, reidentification
+from fluoromap_service.store import disk, files, reidentification
 from fluoromap_service.store.engine import reading
 from fluoromap_service.study.run_files import check_not_deleted
 from fluoromap_service.study.snapshot import SiteSnapshot
@@ -79,6 +80,7 @@ class ExportOptions:
 
 @router.get(
     "/v1/jobs/{job_id}/deidentified.zip",
+    dependencies=[LARGE_DOWNLOAD],
     summary="Runs and results without the patient's identity",
     response_class=StreamingResponse,
     responses={
@@ -137,6 +139,8 @@ def write_export(job_id: str, stream: IO[bytes], options: ExportOptions) -> Path
     ------
     Problem
         404 when there is no such job; 409 while the job runs, or where somebody deleted one of its runs.
+    NoSpace
+        When the export would fill the reserve of the disk.
     """
     with reading() as session:
         job = ended_job_of(session, job_id, "export")
@@ -145,6 +149,8 @@ def write_export(job_id: str, stream: IO[bytes], options: ExportOptions) -> Path
         tables = dict(_tables(job_id))
     planned = _planned(job_id)
     check_not_deleted(runs.values())
+    # The runs are copied, and the copies lie in the zip too.
+    disk.check_room(2 * sum(files.path_of(sha256).stat().st_size for sha256 in runs.values()))
     pseudonyms = Pseudonyms(
         reidentification.secret(), _patient(next(iter(runs.values()))), options.subject, options.dates
     )

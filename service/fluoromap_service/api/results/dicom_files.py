@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import Request, Response
 
 from fluoromap_service.api.http.etags import file_response
+from fluoromap_service.api.http.middleware.download_limit import LARGE_DOWNLOAD
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
@@ -16,6 +17,7 @@ router = new_router(tags=["results"])
 
 @router.get(
     "/v1/jobs/{job_id}/dicom",
+    dependencies=[LARGE_DOWNLOAD],
     summary="The results as DICOM objects",
     response_class=Response,
     responses={

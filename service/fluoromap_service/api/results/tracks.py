@@ -21,6 +21,7 @@ from fluoromap_service.api.http.csv_answers import (
     csv_pieces,
     wants_csv,
 )
+from fluoromap_service.api.http.middleware.download_limit import LARGE_DOWNLOAD
 from fluoromap_service.api.http.paths import JobId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
@@ -270,9 +271,10 @@ def tracks_table_of(job_id: str, job_version: int) -> KeptFile:
 
 @router.get(
     "/v1/jobs/{job_id}/tracks",
+    dependencies=[LARGE_DOWNLOAD],
     summary="Electrodes followed through one view",
     response_model=Tracks,
-    responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422)},
+    responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422, 429)},
 )
 def get_tracks(
     job_id: JobId,
@@ -296,9 +298,10 @@ def get_tracks(
 
 @router.get(
     "/v1/jobs/{job_id}/tracks.csv",
+    dependencies=[LARGE_DOWNLOAD],
     summary="Electrodes followed through one view, as CSV",
     response_class=Response,
-    responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422)},
+    responses={200: {"content": CSV_ENTRY}, **responses(401, 403, 404, 409, 422, 429)},
 )
 def get_tracks_csv(
     job_id: JobId,

@@ -6,7 +6,9 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import uvicorn
@@ -20,7 +22,13 @@ from fluoromap_service.api.http.connections import TimedConnection
 def address(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
     """The address of a real server whose deadline for a header is short."""
     monkeypatch.setattr(connections, "HEADER_SECONDS", 0.5)
-    config = uvicorn.Config(create_app(), http=TimedConnection, log_config=None, lifespan="off")
+    with _served(create_app()) as address:
+        yield address
+
+
+@contextmanager
+def _served(application: Any) -> Iterator[tuple[str, int]]:
+    config = uvicorn.Config(application, http=TimedConnection, log_config=None, lifespan="off")
     server = uvicorn.Server(config)
     listening = socket.create_server(("127.0.0.1", 0))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
@@ -72,3 +80,41 @@ def test_an_answer_before_the_end_of_the_body_arrives_and_closes(address: tuple[
     assert answer.startswith(b"HTTP/1.1 404")
     assert b"connection: close" in answer.lower()
     assert answer.endswith(b"}")
+
+
+LONG_BYTES = 64 * 2**20
+"""More than the buffers of both ends hold."""
+
+
+@contextmanager
+def _long_answer() -> Iterator[tuple[tuple[str, int], threading.Event]]:
+    """A server of one long answer, and whether the answer has ended."""
+    ended = threading.Event()
+
+    async def application(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        for _ in range(64):
+            await send({"type": "http.response.body", "body": bytes(LONG_BYTES // 64), "more_body": True})
+        await send({"type": "http.response.body", "body": b""})
+        ended.set()
+
+    with _served(application) as address:
+        yield address, ended
+
+
+def test_a_client_that_takes_nothing_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "WRITE_SECONDS", 0.2)
+    with _long_answer() as (address, ended), socket.create_connection(address) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert ended.wait(60)
+        content = b""
+        with suppress(ConnectionResetError):
+            content = _all(connection)
+        assert len(content) < LONG_BYTES
+
+
+def test_a_client_that_reads_gets_the_whole_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "WRITE_SECONDS", 5.0)
+    with _long_answer() as (address, _), socket.create_connection(address) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        assert len(_all(connection)) > LONG_BYTES

@@ -9,12 +9,16 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from finished_study import make_study
+from sqlalchemy import select
 from sqlalchemy.exc import OperationalError
 
+from fluoromap_service.api.http.spooled_answers import spooled_answer
 from fluoromap_service.api.service import health
+from fluoromap_service.settings import settings
 from fluoromap_service.store import disk, files
 from fluoromap_service.store.disk import NoSpace
-from fluoromap_service.store.engine import writing
+from fluoromap_service.store.engine import reading, writing
+from fluoromap_service.store.models import Instance
 
 
 def _files_check(service: TestClient) -> dict[str, Any]:
@@ -35,6 +39,44 @@ def test_writing_stops_at_the_reserve(service: TestClient, monkeypatch: pytest.M
     assert service.get("/v1/studies").status_code == 200
     assert service.post(f"/v1/jobs/{study.job_id}:cancel").status_code == 202
     assert service.delete(f"/v1/studies/{study.study_id}").status_code == 204
+
+
+READS_THAT_WRITE = ("mesh.ply", "map.png", "dicom", "archive.zip", "report.html", "deidentified.zip")
+
+
+def test_reads_that_write_stop_at_the_reserve(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = make_study()
+    study.finish()
+    kept = f"/v1/jobs/{study.job_id}/mesh.stl"
+    content = service.get(kept).content
+    before = sorted(path.name for path in settings().files_dir.glob("*/*"))
+    monkeypatch.setattr(disk, "free_bytes", lambda: disk.reserve_bytes() - 1)
+    for name in READS_THAT_WRITE:
+        answer = service.get(f"/v1/jobs/{study.job_id}/{name}")
+        assert (name, answer.status_code, answer.json()["code"]) == (name, 507, "no_space")
+    assert service.get(kept).content == content
+    assert sorted(path.name for path in settings().files_dir.glob("*/*")) == before
+
+
+def test_an_export_needs_room_for_all_that_it_writes(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = make_study()
+    study.finish()
+    with reading() as session:
+        runs = {
+            uid: files.path_of(sha256).stat().st_size
+            for uid, sha256 in session.execute(select(Instance.sop_instance_uid, Instance.sha256))
+        }
+    address = f"/v1/jobs/{study.job_id}/deidentified.zip"
+    monkeypatch.setattr(disk, "free_bytes", lambda: disk.reserve_bytes() + 2 * sum(runs.values()) - 1)
+    assert service.get(address).status_code == 507
+    assert list(files.incoming_folder().iterdir()) == []
+
+
+def test_a_long_table_stops_at_the_reserve(data_dir: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(disk, "free_bytes", lambda: disk.reserve_bytes())
+    assert spooled_answer([b"short"], "text/csv", {}).status_code == 200
+    with pytest.raises(NoSpace):
+        spooled_answer((bytes(2**18) for _ in range(8)), "text/csv", {})
 
 
 def test_a_body_that_would_fill_the_reserve_is_refused(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
