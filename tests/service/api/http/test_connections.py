@@ -107,14 +107,17 @@ def test_a_client_that_takes_nothing_is_disconnected(monkeypatch: pytest.MonkeyP
     with _long_answer() as (address, ended), socket.create_connection(address) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert ended.wait(60)
-        content = b""
+        length = 0
         with suppress(ConnectionResetError):
-            content = _all(connection)
-        assert len(content) < LONG_BYTES
+            while part := connection.recv(2**20):
+                length += len(part)
+        assert length < LONG_BYTES
 
 
-def test_a_client_that_reads_gets_the_whole_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "WRITE_SECONDS", 5.0)
+def test_a_client_that_reads_gets_the_whole_answer() -> None:
+    length = 0
     with _long_answer() as (address, _), socket.create_connection(address) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-        assert len(_all(connection)) > LONG_BYTES
+        while part := connection.recv(2**20):
+            length += len(part)
+    assert length > LONG_BYTES

@@ -62,12 +62,9 @@ def test_an_export_needs_room_for_all_that_it_writes(service: TestClient, monkey
     study = make_study()
     study.finish()
     with reading() as session:
-        runs = {
-            uid: files.path_of(sha256).stat().st_size
-            for uid, sha256 in session.execute(select(Instance.sop_instance_uid, Instance.sha256))
-        }
+        runs = [files.path_of(sha256).stat().st_size for sha256 in session.scalars(select(Instance.sha256))]
     address = f"/v1/jobs/{study.job_id}/deidentified.zip"
-    monkeypatch.setattr(disk, "free_bytes", lambda: disk.reserve_bytes() + 2 * sum(runs.values()) - 1)
+    monkeypatch.setattr(disk, "free_bytes", lambda: disk.reserve_bytes() + 2 * sum(runs) - 1)
     assert service.get(address).status_code == 507
     assert list(files.incoming_folder().iterdir()) == []
 
