@@ -59,9 +59,9 @@ class BrokenChain(Exception):
 
 
 def append(session: Session, acts: Sequence[Act]) -> list[AuditEntry]:
-    """Add acts to the end of the trail, within the caller's transaction, and return their entries.
+    """Add acts to the end of the trail, and return their entries.
 
-    An act on a job is recorded with the job's study.
+    It works within the caller's transaction. An act on a job is recorded with the job's study.
     """
     if session.get_bind().dialect.name == "postgresql":
         session.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
@@ -86,7 +86,7 @@ def append(session: Session, acts: Sequence[Act]) -> list[AuditEntry]:
 
 
 def _mapping_studies(session: Session, dicom_studies: set[str]) -> dict[str, list[str | None]]:
-    """Return the mapping studies that hold runs of each DICOM study, by its UID."""
+    """Return the mapping studies with runs of each DICOM study, by UID."""
     if not dicom_studies:
         return {}
     query = (

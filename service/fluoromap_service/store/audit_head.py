@@ -69,7 +69,9 @@ class HeadWatch:
 
 
 def published_hashes(path: Path) -> list[str]:
-    """Return the hashes of all heads in a file: the file of heads, or a log of the service.
+    """Return the hashes of all heads in a file.
+
+    It is the file of heads, or a log of the service.
 
     Raises
     ------

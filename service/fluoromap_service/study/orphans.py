@@ -42,10 +42,10 @@ def orphans(settled_seconds: float = SETTLED_SECONDS) -> Iterator[str]:
 
 
 def remove_orphans(settled_seconds: float = SETTLED_SECONDS) -> int:
-    """Remove the files without a row, and the re-identification tables of studies that no longer exist.
+    """Remove the files without a row, and tables of deleted studies.
 
-    Any process may call it at any time: each file is removed under the lock of the files, after another look at its row. Return how
-    many files and tables went.
+    These tables lead back from de-identified exports. Any process may call it at any time: each file is removed under the lock of
+    the files, after another look at its row. Return how many files and tables went.
     """
     found = list(orphans(settled_seconds))
     if found:

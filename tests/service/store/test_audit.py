@@ -84,7 +84,7 @@ def test_a_missing_end_is_found_with_an_earlier_hash(trail: list[str]) -> None:
 
 
 def _write_anew() -> None:
-    """Remove the second entry and make the chain fit again, as somebody with full access can."""
+    """Remove the second entry and make the chain fit again."""
     _without_triggers("DELETE FROM audit WHERE id = 2")
     with engine().execution_options(writes=True).begin() as connection:
         before = audit.START

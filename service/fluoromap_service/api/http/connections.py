@@ -53,12 +53,15 @@ class TimedConnection(H11Protocol):
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """Stop the answer until the client has taken what waits, and watch that it does."""
+        """Stop the answer until the client has taken the waiting part.
+
+        The connection watches that it does.
+        """
         super().pause_writing()
         self._watch()
 
     def resume_writing(self) -> None:
-        """Go on with the answer."""
+        """Continue the answer."""
         self._stop_watching()
         super().resume_writing()
 

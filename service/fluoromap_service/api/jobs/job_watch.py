@@ -92,7 +92,10 @@ class Follower:
         self.arrived: asyncio.Queue[News | None] = asyncio.Queue()
 
     async def next(self) -> News | None:
-        """Wait for the next news; the first ones come at once. None when the service ends."""
+        """Wait for the next news; None when the service ends.
+
+        The first ones come at once.
+        """
         return await self.arrived.get()
 
 

@@ -173,7 +173,10 @@ class ReadinessWatch:
 
 
 def _started(check: Callable[[], str]) -> Future[str]:
-    """Begin a check in a thread of its own, which the end of the service does not wait for."""
+    """Begin a check in a thread of its own.
+
+    The end of the service does not wait for it.
+    """
     future: Future[str] = Future()
 
     def run() -> None:

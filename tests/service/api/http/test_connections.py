@@ -88,7 +88,7 @@ LONG_BYTES = 64 * 2**20
 
 @contextmanager
 def _long_answer() -> Iterator[tuple[tuple[str, int], threading.Event]]:
-    """A server of one long answer, and whether the answer has ended."""
+    """Run a server of one long answer, and say when the answer has ended."""
     ended = threading.Event()
 
     async def application(scope: Any, receive: Any, send: Any) -> None:

@@ -67,7 +67,10 @@ class Acts:
         self._flushing = threading.Lock()
 
     def add(self, act: Act) -> None:
-        """Add an act; equal reads of one batch are one entry with their number."""
+        """Add an act.
+
+        Equal reads of one batch are one entry with their number.
+        """
         with self._lock:
             key = act, 0 if act.what.startswith("GET ") else next(self._serial)
             self._waiting[key] = self._waiting.get(key, 0) + 1
