@@ -97,7 +97,7 @@ def compile_kernels() -> None:
 def _start_helper() -> subprocess.Popen[bytes] | None:
     modules = sorted({each.function.py_func.__module__ for each in _kernels})
     with suppress(OSError):
-        return subprocess.Popen([sys.executable, "-m", __name__, *modules], stdin=subprocess.DEVNULL)
+        return subprocess.Popen([sys.executable, "-P", "-m", __name__, *modules], stdin=subprocess.DEVNULL)
     return None
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import typer.main
 from typer.core import TyperCommand, TyperGroup
 
-from fluoromap_service.cli.environment import limit_threads
+from fluoromap_service.cli.environment import limit_threads, use_safe_paths
 from fluoromap_service.cli.failures import sentence_of
 
 COMMANDS = {
@@ -70,6 +70,7 @@ program = CommandGroup(
 
 def main() -> None:
     """Run the program with the arguments of the process."""
+    use_safe_paths()
     # Before any command imports NumPy or numba.
     limit_threads()
     try:

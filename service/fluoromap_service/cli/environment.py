@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 from fluoromap_service.parent_process import end_with_parent
@@ -22,6 +23,28 @@ def end_with_supervisor() -> None:
     supervisor = os.environ.pop(SUPERVISOR, None)
     if supervisor is not None:
         end_with_parent(int(supervisor))
+
+
+def use_safe_paths() -> None:
+    """Keep the current folder out of the import paths of every process that this one starts.
+
+    Python adds that folder when it starts a child of :mod:`multiprocessing` or a module (``-m``). So a file ``numpy.py`` among
+    downloaded runs would become part of the program. An empty entry of ``PYTHONPATH`` means the same folder. A folder that the
+    user names there stays.
+
+    References
+    ----------
+    Python documentation, "Command line and environment", ``PYTHONSAFEPATH``.
+    """
+    os.environ["PYTHONSAFEPATH"] = "1"
+    given = os.environ.pop("PYTHONPATH", "").split(os.pathsep)
+    named = [entry for entry in given if entry]
+    if named:
+        os.environ["PYTHONPATH"] = os.pathsep.join(named)
+    if "" in given:
+        # Python has made the entries of the variable absolute.
+        unnamed = {"", os.path.abspath("")} - set(map(os.path.abspath, named))
+        sys.path[:] = [entry for entry in sys.path if entry not in unnamed]
 
 
 def limit_threads() -> None:

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import structlog
 from celery import Celery
+from celery.loaders.app import AppLoader
 
 from fluoromap_service.jobs import job_life, turns
 from fluoromap_service.settings import settings
@@ -46,12 +47,25 @@ def _transport_options(url: str) -> dict[str, Any]:
     return {"socket_timeout": 5, "socket_connect_timeout": 2}
 
 
+class InstalledModules(AppLoader):  # type: ignore[misc]
+    """A loader of tasks that imports installed modules only.
+
+    Celery's own looks into the current folder first, and leaves that folder in the import path of everything that the module
+    imports in turn.
+    """
+
+    def import_from_cwd(self, module: str, imp: Any = None, package: str | None = None) -> Any:
+        """Import an installed module."""
+        return self.import_module(module, package=package)
+
+
 @functools.cache
 def celery_app() -> Celery:
     """Return the process's Celery application, configured from the settings at the first call."""
     configured = settings()
     url = "memory://" if configured.eager else configured.broker_url or "filesystem://localhost/"
-    app = Celery("fluoromap", broker=url)
+    # No fixups: that of Django adds the current folder to the import path.
+    app = Celery("fluoromap", broker=url, loader=InstalledModules, fixups=[])
     app.conf.update(
         imports=("fluoromap_workers.tasks",),
         task_always_eager=configured.eager,
