@@ -106,32 +106,64 @@ def _shared(folder: Path, kind: str, start: Callable[[Path], tuple[str, dict[str
     return url
 
 
+@contextmanager
+def tls_server(kind: str, home: Path, options: list[str], port_option: str) -> Iterator[int]:
+    """Run a server of its own with more options and yield its port; it ends with the context.
+
+    ``kind`` is "postgresql" or "redis". ``home`` exists and holds the files that the options name. Clients of PostgreSQL find its
+    socket there.
+    """
+    if kind == "postgresql":
+        programs, environment, as_user = _cluster(home)
+        options = [*options, f"-cunix_socket_directories={home}", "-clisten_addresses=127.0.0.1"]
+        command, greeting = [programs / "postgres", "-D", home / "data", *options], _SSL_REQUEST
+    else:
+        environment, as_user, greeting = {"PATH": "/usr/bin:/bin", "HOME": str(home)}, {}, b""
+        command = [_redis_program(), "--bind", "127.0.0.1", "--dir", home, *options]
+    _, server = _launch(lambda port: [*command, port_option, str(port)], greeting, home, environment, as_user)
+    try:
+        yield int(server["command"][-1])
+    finally:
+        os.kill(server["pid"], signal.SIGINT)
+        _wait_until(lambda: not _alive(server["pid"]), f"the test server {kind} did not stop; end it by hand")
+
+
 def _start_postgresql(folder: Path) -> tuple[str, dict[str, Any]]:
     home = folder / "postgresql"
     home.mkdir()
+    programs, environment, as_user = _cluster(home)
+
+    def launch(port: int) -> list[Any]:
+        options = ("fsync=off", "max_connections=200", "listen_addresses=127.0.0.1", "unix_socket_directories=")
+        return [programs / "postgres", "-D", home / "data", "-p", str(port), *(f"-c{option}" for option in options)]
+
+    port, server = _launch(launch, _SSL_REQUEST, home, environment, as_user)
+    url = f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres"
+    wait_until_accepted(sqlalchemy.create_engine(url, poolclass=sqlalchemy.NullPool))
+    return url, server
+
+
+def _cluster(home: Path) -> tuple[Path, dict[str, str], dict[str, Any]]:
+    """Make an empty cluster in the folder ``data``.
+
+    Return the folder of PostgreSQL's programs, their environment, and the options of their process.
+    """
     programs = postgresql_programs()
     as_user: dict[str, Any] = {}
     if os.geteuid() == 0:  # PostgreSQL refuses to run as root
         nobody = pwd.getpwnam("nobody")
         as_user = {"user": nobody.pw_uid, "group": nobody.pw_gid, "extra_groups": []}
         programs = _reachable(programs, home)
-        os.chown(home, nobody.pw_uid, nobody.pw_gid)
+        for path in (home, *home.rglob("*")):
+            if "programs" not in path.parts:
+                os.chown(path, nobody.pw_uid, nobody.pw_gid)
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(home), "LC_ALL": "C"}
-    data = home / "data"
     subprocess.run(
         # Without -E the C locale would make an SQL_ASCII cluster, from which psycopg returns bytes.
-        [programs / "initdb", "-D", data, "-U", "postgres", "-A", "trust", "-E", "UTF8", "--locale=C", "--no-sync"],
+        [programs / "initdb", "-D", home / "data", "-U", "postgres", "-A", "trust", "-E", "UTF8", "--locale=C", "--no-sync"],
         check=True, capture_output=True, env=environment, cwd=home, **as_user,
     )  # fmt: skip
-
-    def launch(port: int) -> list[Any]:
-        options = ("fsync=off", "max_connections=200", "listen_addresses=127.0.0.1", "unix_socket_directories=")
-        return [programs / "postgres", "-D", data, "-p", str(port), *(f"-c{option}" for option in options)]
-
-    port, server = _launch(launch, _SSL_REQUEST, home, environment, as_user)
-    url = f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres"
-    _wait_until(lambda: _accepts(url), "the test server postgresql did not start in time; try its command by hand")
-    return url, server
+    return programs, environment, as_user
 
 
 def _start_redis(folder: Path) -> tuple[str, dict[str, Any]]:
@@ -180,19 +212,20 @@ def _launch(
 def _answers(port: int, greeting: bytes) -> bool:
     with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5) as connection:
         connection.sendall(greeting)
-        return bool(connection.recv(1))
+        # A server that wants a handshake first gets no greeting: its open port must do.
+        return not greeting or bool(connection.recv(1))
     return False
 
 
-def _accepts(url: str) -> bool:
-    """Return whether PostgreSQL accepts a session.
+def wait_until_accepted(server: sqlalchemy.Engine) -> None:
+    """Wait until PostgreSQL accepts a session; it answers its first bytes before it has started."""
 
-    It answers its first bytes before it has started.
-    """
-    server = sqlalchemy.create_engine(url, poolclass=sqlalchemy.NullPool)
-    with suppress(sqlalchemy.exc.OperationalError), server.connect():
-        return True
-    return False
+    def accepts() -> bool:
+        with suppress(sqlalchemy.exc.OperationalError), server.connect():
+            return True
+        return False
+
+    _wait_until(accepts, "the test server postgresql did not start in time; try its command by hand")
 
 
 def _alive(pid: int) -> bool:

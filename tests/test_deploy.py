@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -26,13 +27,14 @@ GROUPS = {
     "networking.k8s.io/v1": "io.k8s.api.networking.v1",
 }
 CUSTOMIZATIONS: dict[Path, dict[str, Any]] = {
-    folder: yaml.safe_load((folder / "kustomization.yaml").read_text()) for folder in (FOLDER, FOLDER / "dicom")
+    folder: yaml.safe_load((folder / "kustomization.yaml").read_text())
+    for folder in (FOLDER / "service", FOLDER / "dicom")
 }
 OBJECTS: list[dict[str, Any]] = [
     each
     for folder, customization in CUSTOMIZATIONS.items()
     for name in customization["resources"]
-    if name != "../"
+    if name != "../service"
     for each in yaml.safe_load_all((folder / name).read_text())
 ]
 PODS: dict[str, dict[str, Any]] = {
@@ -61,8 +63,27 @@ def test_a_wrong_manifest_would_be_noticed() -> None:
 def test_every_manifest_is_applied() -> None:
     for folder, customization in CUSTOMIZATIONS.items():
         files = {path.name for path in folder.glob("*.yaml")}
-        assert files == {*customization["resources"], "kustomization.yaml"} - {"../"}
-    assert "../" in CUSTOMIZATIONS[FOLDER / "dicom"]["resources"]
+        assert files == {*customization["resources"], "kustomization.yaml"} - {"../service"}
+    assert "../service" in CUSTOMIZATIONS[FOLDER / "dicom"]["resources"]
+
+
+def test_no_customization_is_a_cycle() -> None:
+    """Kustomize refuses a resource that is a folder around the customization itself."""
+    for folder, customization in CUSTOMIZATIONS.items():
+        for name in customization["resources"]:
+            resource = (folder / name).resolve()
+            assert resource.exists()
+            assert not folder.resolve().is_relative_to(resource)
+
+
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed; it builds the customizations")
+@pytest.mark.parametrize("folder", CUSTOMIZATIONS, ids=lambda folder: folder.name)
+def test_kubectl_builds_the_customization(folder: Path) -> None:
+    answer = subprocess.run(["kubectl", "kustomize", folder], capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr
+    built = {(each["kind"], each["metadata"]["name"]) for each in yaml.safe_load_all(answer.stdout)}
+    expected = {(each["kind"], each["metadata"]["name"]) for each in OBJECTS}
+    assert built == expected if folder.name == "dicom" else built < expected
 
 
 def test_all_parts_have_one_image() -> None:
@@ -75,7 +96,7 @@ def test_all_parts_have_one_image() -> None:
 def test_the_page_applies_the_customization() -> None:
     """With ``--filename`` the image of ``kustomization.yaml`` does not count, and the API refuses that file itself."""
     commands = re.findall(r"kubectl apply [^`\n]+", (FOLDER / "README.md").read_text())
-    assert commands == [f"kubectl apply --kustomize deploy/kubernetes/{folder}" for folder in ("", "dicom/")]
+    assert commands == [f"kubectl apply --kustomize deploy/kubernetes/{folder}" for folder in ("service/", "dicom/")]
 
 
 def test_the_page_makes_every_secret() -> None:
@@ -140,6 +161,71 @@ def test_commands_are_the_programs(pod: str, container: dict[str, Any]) -> None:
     _parse(container["args"])
 
 
+def _policies() -> list[dict[str, Any]]:
+    return [each["spec"] for each in OBJECTS if each["kind"] == "NetworkPolicy"]
+
+
+def _rules(pod: str, direction: str) -> list[dict[str, Any]]:
+    """Return the rules that let traffic of a direction ("ingress" or "egress") through to or from a pod."""
+    template = next(each for each in OBJECTS if each["metadata"]["name"] == pod and "template" in each.get("spec", {}))
+    labels = template["spec"]["template"]["metadata"]["labels"]
+    return [
+        rule
+        for policy in _policies()
+        if policy["podSelector"].get("matchLabels", {}).items() <= labels.items()
+        for rule in policy.get(direction, [])
+    ]
+
+
+def _peers(rules: list[dict[str, Any]], side: str) -> set[tuple[str, int]]:
+    """Return the pairs of place and port; a rule without places lets all through."""
+    return {
+        (place.get("namespaceSelector", {}).get("matchLabels", {}).get("kubernetes.io/metadata.name")
+         or place.get("ipBlock", {}).get("cidr", "anywhere"), port["port"])
+        for rule in rules
+        for place in rule.get(side, [{}])
+        for port in rule["ports"]
+    }  # fmt: skip
+
+
+def test_nothing_is_allowed_that_no_policy_names() -> None:
+    assert {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]} in _policies()
+    for policy in _policies():
+        assert all(rule.get("to") and rule.get("ports") for rule in policy.get("egress", []))
+        assert all(rule.get("ports") for rule in policy.get("ingress", []))
+
+
+STORES = {("kube-system", 53), ("databases", 5432), ("databases", 6379)}
+
+
+@pytest.mark.parametrize(
+    ("pod", "into", "out"),
+    [
+        ("api", {("ingress-nginx", 8000), ("monitoring", 8000)}, STORES),
+        ("worker", set(), STORES),
+        ("migrate", set(), STORES),
+        ("dicom-listener", {("anywhere", 11112)}, STORES),
+        ("sender", set(), STORES | {("192.0.2.0/24", port) for port in (104, 443, 2762, 11112)}),
+    ],
+)
+def test_each_part_talks_to_whom_it_must(pod: str, into: set[tuple[str, int]], out: set[tuple[str, int]]) -> None:
+    """Prometheus reaches the API; only the sender leaves the cluster; a worker, which reads hostile files, does not."""
+    assert _peers(_rules(pod, "ingress"), "from") == into
+    assert _peers(_rules(pod, "egress"), "to") == out
+    assert set(PODS) == {"api", "worker", "migrate", "dicom-listener", "sender"}
+
+
+def test_every_part_can_check_the_certificates_of_the_servers() -> None:
+    for _, container in _containers():
+        assert {"name": "authority", "mountPath": "/run/secrets/authority", "readOnly": True} in container[
+            "volumeMounts"
+        ]
+    page = (FOLDER / "README.md").read_text()
+    assert "sslmode=verify-full&sslrootcert=/run/secrets/authority/authority.pem" in page
+    assert "rediss://" in page
+    assert "ssl_cert_reqs=required&ssl_check_hostname=true&ssl_ca_certs=/run/secrets/authority/authority.pem" in page
+
+
 def test_a_worker_is_alive_as_in_docker_compose() -> None:
     compose = yaml.safe_load((TOP / "docker-compose.yml").read_text())["services"]["worker"]["healthcheck"]["test"]
     (container,) = PODS["worker"]["containers"]
@@ -154,9 +240,10 @@ def test_a_worker_s_stages_fit_into_its_container() -> None:
     assert stages * Settings.model_fields["worker_memory_mib"].default <= limit_mib
 
 
-def test_proxy_file_follows_the_specification() -> None:
+@pytest.mark.parametrize("folder", ["proxy", "tls"])
+def test_overlay_follows_the_specification(folder: str) -> None:
     checker = Path(sys.executable).parent / "check-jsonschema"
-    file = TOP / "deploy" / "proxy" / "docker-compose.yml"
+    file = TOP / "deploy" / folder / "docker-compose.yml"
     subprocess.run([checker, "--builtin-schema", "vendor.compose-spec", file], check=True, capture_output=True)
 
 
