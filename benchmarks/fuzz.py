@@ -1,8 +1,10 @@
 """Mutated inputs to the doors: DICOM files, tables and multipart bodies.
 
 Run ``python benchmarks/fuzz.py --inputs 10000``. It mutates the files of ``tests/corpus/`` with a fixed seed, sends them to the
-service in this process, and prints the crashes, the answers over 5 s, the 5xx and the growth of memory. Exit code 1 when one of
-them is not 0, or memory grew by more than 300 MiB. An input that failed is written to ``fuzz-failures/``.
+service in this process, and prints the crashes, the answers over 5 s, the 5xx and the growth of memory. Every second DICOM file
+gets a header of ``odd_headers.py`` in place of random changes. After each accepted file it asks for what reads the headers: the
+list of the runs, metadata, archive-wide searches with all fields, and a de-identified copy. Exit code 1 when a count is not 0, or
+memory grew by more than 300 MiB. An input that failed is written to ``fuzz-failures/``.
 """
 
 from __future__ import annotations
@@ -15,9 +17,15 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import psutil
+from odd_headers import odd_header
+
+if TYPE_CHECKING:
+    from fastapi.testclient import TestClient
 
 CORPUS = Path(__file__).parent.parent / "tests" / "corpus"
 FAILURES = Path("fuzz-failures")
@@ -122,14 +130,18 @@ def _campaign(inputs: int, chance: random.Random) -> int:
         before = 0.0
         for number in range(inputs):
             path, (method, address, kind) = seeds[number % len(seeds)]
-            content = mutated(chance, path.read_bytes())
+            odd = path.suffix == ".dcm" and chance.random() < 0.5
+            content = odd_header(chance, path.read_bytes()) if odd else mutated(chance, path.read_bytes())
             start = time.perf_counter()
             try:
-                status = client.request(method, address, content=content, headers={"Content-Type": kind}).status_code
+                answer = client.request(method, address, content=content, headers={"Content-Type": kind})
+                status, seconds = answer.status_code, time.perf_counter() - start
+                if path.suffix == ".dcm" and status in (200, 201):
+                    status = _ask(client, study, answer.json()["instances"], content, status)
             except Exception as error:
                 status, crashes = 599, crashes + 1
                 print(f"crash on a mutation of {path.name}: {type(error).__name__}: {error}", file=sys.stderr)
-            seconds = time.perf_counter() - start
+                seconds = time.perf_counter() - start
             slowest, slow = max(slowest, seconds), slow + (seconds > SLOW_SECONDS)
             statuses[f"{path.suffix} {status}"] += 1
             if status >= 500 or seconds > SLOW_SECONDS:
@@ -147,6 +159,49 @@ def _campaign(inputs: int, chance: random.Random) -> int:
         f"memory {growth:+.0f} MiB"
     )
     return int(bool(crashes or errors or slow or growth > MOST_GROWTH_MIB))
+
+
+def _ask(client: TestClient, study: str, stored: list[dict[str, Any]], content: bytes, status: int) -> int:
+    """Ask for everything that reads the header of a stored file, then delete it.
+
+    Return the status of the first answer that blames the service, else ``status``.
+    """
+    for item in stored:
+        uid = item["sop_instance_uid"]
+        paths = [
+            f"{study}/instances", f"{study}/instances/{uid}", f"{study}/sites",
+            *(f"/dicom-web/{level}?includefield=all" for level in ("studies", "series", "instances")),
+            "/dicom-web/studies?PatientID=somebody-else", "/dicom-web/instances?PatientName=*&StudyDate=20200101-20301231",
+        ]  # fmt: skip
+        answers = [client.get(path, headers={"Accept": "application/dicom+json, application/json"}) for path in paths]
+        found = client.get("/dicom-web/instances", params={"SOPInstanceUID": uid})
+        if found.status_code == 200:
+            place = f"/dicom-web/studies/{found.json()[0]['0020000D']['Value'][0]}/metadata"
+            answers.append(client.get(place, headers={"Accept": "application/dicom+json"}))
+        # One bad object may not change the answer about the others.
+        wrong = [answer.status_code for answer in answers if answer.status_code not in (200, 204)]
+        client.delete(f"{study}/instances/{uid}")
+        if wrong:
+            print(
+                f"answers {[(str(a.request.url.path), a.status_code) for a in answers if a.status_code not in (200, 204)]}",
+                file=sys.stderr,
+            )
+            return max(max(wrong), 500)
+    _deidentify(content)
+    return status
+
+
+def _deidentify(content: bytes) -> None:
+    """Make the copy that a de-identified export holds; a :class:`Problem` is an answer, anything else a crash."""
+    from fluoromap_service.dicom.deidentification.pseudonyms import Dates, Pseudonyms
+    from fluoromap_service.dicom.deidentification.run_file import deidentify_file
+    from fluoromap_service.problem import Problem
+
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "run.dcm"
+        source.write_bytes(content)
+        with suppress(Problem):
+            deidentify_file(source, Path(folder) / "copy.dcm", Pseudonyms(bytes(32), "fuzz", "", Dates.SHIFT))
 
 
 def _memory_mib(process: psutil.Process) -> float:
