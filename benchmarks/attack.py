@@ -2,7 +2,7 @@
 
 It starts a private service on a loopback address and tries the attacks of ``hostile_requests.py``: readers who want to stop it,
 strangers, damage, holes in the audit trail, hostile targets, and code in the current folder. For each it prints the name,
-whether it held, what was tried and what was seen. Exit code 1 when an
+whether it held, the attempt and the observation. Exit code 1 when an
 attack did not hold. ``--only NAME`` tries one. The supply of packages has no attack here: ``tests/test_release.py`` and
 ``tests/integration/test_tls.py`` hold it.
 """

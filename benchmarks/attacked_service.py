@@ -47,7 +47,7 @@ TRAPPED = (
 
 
 class Broken(Exception):
-    """An attack that reached its aim. The message says what was seen."""
+    """An attack that reached its aim. The message is the observation."""
 
 
 @dataclass
@@ -85,7 +85,7 @@ class AttackedService:
         )  # fmt: skip
 
     def another(self, name: str, *arguments: str, **settings: str) -> str:
-        """Start another API on an empty data folder, without a token, and return its address."""
+        """Start another API without data and tokens; return its address."""
         environment = self.environment | {"FLUOROMAP_DATA_DIR": str(self.folder / name)} | settings
         return _start_api(self.stack, environment, arguments)[0]
 
@@ -101,7 +101,7 @@ class AttackedService:
             return str(client.post("/v1/studies", json={"label": "attacked"}).raise_for_status().headers["location"])
 
     def run(self, study: str, **attributes: object) -> tuple[str, bytes]:
-        """Upload a new small run to a study; return its SOP Instance UID and the file."""
+        """Upload a new small run; return its SOP Instance UID and file."""
         self._runs += 1
         angle = -30.0 if self._runs % 2 else 60.0
         content = edited(small_run(self.folder, self._runs, angle), **attributes)
@@ -146,7 +146,7 @@ class AttackedService:
         return time.monotonic() - start
 
     def revive(self) -> bool:
-        """Start the API again when it has ended or gives no answer; return whether that was needed."""
+        """Start a dead or hanging API again; return whether it was."""
         with contextlib.suppress(httpx.HTTPError):
             if self.api.is_running():
                 self.health_seconds()
@@ -200,7 +200,7 @@ def _start_api(
 
 @contextmanager
 def _trapped(folder: Path) -> Iterator[None]:
-    """Work in a folder of traps."""
+    """Change into a folder of traps."""
     traps = folder / "downloads"
     traps.mkdir()
     for name in TRAPPED:

@@ -6,6 +6,7 @@ Each attack knows the service from the outside: its routes, its program and its 
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 import socket
@@ -23,6 +24,7 @@ from urllib.parse import urlsplit
 
 import httpx
 import psutil
+import pydicom
 from attacked_service import LONGEST_SECONDS, AttackedService, Broken
 
 BUSY_SECONDS = 2.0
@@ -34,7 +36,7 @@ MOST_GROWTH_MIB = 300.0
 
 @dataclass(frozen=True)
 class Attack:
-    """An attack: its name, what it tries, and the function that returns what was seen or raises ``Broken``."""
+    """An attack: its name, what it tries, and the function that returns its observation or raises ``Broken``."""
 
     name: str
     tried: str
@@ -64,7 +66,7 @@ def _hold(condition: bool, seen: str) -> str:
 
 @contextmanager
 def _watched_health(service: AttackedService) -> Iterator[list[float]]:
-    """Ask for the health of the service again and again; yield the durations of the answers in seconds."""
+    """Ask for the service's health repeatedly; yield the durations in seconds."""
     stop, seconds = threading.Event(), [0.0]
 
     def watch() -> None:
@@ -261,7 +263,7 @@ def _memory_mib(process: psutil.Process) -> float:
 
 
 def _unlinked_mib(process: psutil.Process) -> float:
-    """Return the size of files that only the open descriptors of a process keep, in MiB."""
+    """Return the size of a process's unlinked open files, in MiB."""
     total = 0
     for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
         try:
@@ -346,7 +348,9 @@ def guessed_tokens(service: AttackedService) -> str:
     statuses = []
     with httpx.Client(base_url=service.url, trust_env=False, timeout=30) as client:
         for number in range(40):
-            headers = {"Authorization": f"Bearer wrong{number}", "X-Forwarded-For": f"198.51.100.{number}"}
+            # The attacker writes the first address; the proxy that the service trusts adds the second.
+            chain = f"10.9.8.{number}, 198.51.100.7"
+            headers = {"Authorization": f"Bearer wrong{number}", "X-Forwarded-For": chain}
             statuses.append(client.get("/v1/studies", headers=headers).status_code)
         valid = client.get("/v1/studies", headers={"Authorization": f"Bearer {fresh}"}).status_code
         known = client.get("/v1/studies", headers={"Authorization": f"Bearer {service.tokens['reader']}"}).status_code
@@ -428,6 +432,13 @@ def foreign_host(service: AttackedService) -> str:
 # Damage and loss.
 
 
+def _place(content: bytes) -> str:
+    """Return the DICOMweb address of a run."""
+    run = pydicom.dcmread(io.BytesIO(content), stop_before_pixels=True)
+    study, series, uid = run.StudyInstanceUID, run.SeriesInstanceUID, run.SOPInstanceUID
+    return f"/dicom-web/studies/{study}/series/{series}/instances/{uid}"
+
+
 @_attack("a stored run that is damaged or missing, on every route that reads its file")
 def damaged_runs(service: AttackedService) -> str:
     wrong: list[str] = []
@@ -442,18 +453,17 @@ def damaged_runs(service: AttackedService) -> str:
             changed[-100] ^= 0xFF
             path.chmod(0o600)
             path.write_bytes(changed)
+        run, place = f"{study}/instances/{uid}", _place(content)
         with service.client("reader") as client:
-            run = f"{study}/instances/{uid}"
-            web = client.get("/dicom-web/instances", params={"SOPInstanceUID": uid}).json()[0]
-            place = "/".join(
-                f"{level}/{web[tag]['Value'][0]}"
-                for level, tag in (("studies", "0020000D"), ("series", "0020000E"), ("instances", "00080018"))
-            )
             for route in (
-                f"{run}/frames", f"{run}/frames/1.png", f"{run}/frames/1/preview", f"/dicom-web/{place}",
-                f"/dicom-web/{place}/frames/1", f"/dicom-web/{place}/frames/1/rendered", f"/dicom-web/{place}/rendered",
+                f"{run}/frames", f"{run}/frames/1.png", f"{run}/frames/1/preview", place, f"{place}/frames/1",
+                f"{place}/frames/1/rendered", f"{place}/rendered",
             ):  # fmt: skip
-                answer = client.get(route, headers={"Accept": "*/*"})
+                try:
+                    answer = client.get(route, headers={"Accept": "*/*"})
+                except httpx.RemoteProtocolError:
+                    wrong.append(f"an answer that broke off for a {kind} file from {route[-30:]}")
+                    continue
                 code = answer.json().get("code") if "json" in answer.headers.get("content-type", "") else None
                 if (answer.status_code, code) != (409, "run_broken"):
                     wrong.append(f"{answer.status_code} {code} for a {kind} file from {route.removeprefix(run)[-30:]}")
@@ -468,12 +478,8 @@ def lost_updates(service: AttackedService) -> str:
     results = []
     for way in ("in turn", "at once"):
         with service.client() as client:
-            current = client.get(route)
-            body = {"catheters": {"mapping": [{"u_px": 10.0, "v_px": 10.0}]}}
-            known = current.json()
-            if isinstance(known, dict) and known:
-                body = {key: value for key, value in known.items() if key in ("electrodes", "catheters", "absent")}
-            etag = current.headers.get("etag", '"0"')
+            etag = client.get(route).headers.get("etag", '"0"')
+        body = [{"catheter": "mapping", "electrode": 1, "u_px": 10.0, "v_px": 10.0}]
 
         def put(etag: str = etag, body: object = body) -> int:
             with service.client() as own:
@@ -517,15 +523,14 @@ def _trail(service: AttackedService) -> list[dict[str, object]]:
 @_attack("refused requests, downloads by DICOMweb and equal reads of two studies: each must be in the trail")
 def unseen_requests(service: AttackedService) -> str:
     first, second = service.study(), service.study()
-    uid, _ = service.run(first)
+    _, content = service.run(first)
     service.run(second)
     before = len(_trail(service))
     with service.client("reader") as client:
         client.get(first)
         client.get(second)
         client.patch(first, json={"label": "changed"})
-        web = client.get("/dicom-web/instances", params={"SOPInstanceUID": uid}).json()[0]
-        client.get(f"/dicom-web/studies/{web['0020000D']['Value'][0]}", headers={"Accept": "*/*"})
+        client.get(_place(content), headers={"Accept": "*/*"})
     entries = _trail(service)[before:]
     ids = [study.rsplit("/", 1)[1] for study in (first, second)]
     reads = {str(entry.get("study")) for entry in entries if entry.get("status") == 200}
@@ -585,7 +590,7 @@ def trail_without_a_witness(service: AttackedService) -> str:
 
 @contextmanager
 def _hostile_target(way: str) -> Iterator[tuple[str, list[int]]]:
-    """Serve a target that answers without end; yield its address and the numbers of bytes that each answer sent."""
+    """Serve an endless answer; yield the address and the bytes of each answer."""
     sent: list[int] = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -632,13 +637,20 @@ def endless_answers(service: AttackedService) -> str:
                 for name, url in (("huge", huge), ("dripping", dripping))
             )
         )
-        # The sender sends what ends after it knows its targets.
-        sender = service.start("sender", "--config", str(configuration))
-        time.sleep(4)
-        before = _memory_mib(sender)
         job = service.queued_job()
+        sender = service.start("sender", "--config", str(configuration))
+        before = _memory_mib(sender)
         with service.client() as client:
             client.post(f"{job}:cancel").raise_for_status()
+            # Until the sender has read its configuration, the service knows no such target.
+            start = time.monotonic()
+            wanted = {"huge", "dripping"}
+            while wanted and time.monotonic() - start < LONGEST_SECONDS:
+                wanted -= {
+                    name for name in wanted if client.post(f"{job}/deliveries", json={"target": name}).is_success
+                }
+                time.sleep(0.1)
+            before = _memory_mib(sender)
         end, most, attempt = time.monotonic() + 25, before, {}
         while time.monotonic() < end and not {"huge", "dripping"} <= attempt.keys():
             most = max(most, _memory_mib(sender))

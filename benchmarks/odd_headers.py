@@ -12,13 +12,14 @@ import struct
 from collections.abc import Callable
 
 import pydicom
-from pydicom.dataelem import RawDataElement
 from pydicom.dataset import Dataset
 from pydicom.encaps import encapsulate, generate_frames
-from pydicom.tag import Tag
 from pydicom.uid import generate_uid
 
-Change = Callable[[random.Random, Dataset], None]
+Element = tuple[int, str, bytes]
+"""Tag, value representation and value of an element that replaces the one in the file."""
+Change = Callable[[random.Random, Dataset], list[Element]]
+"""Changes a data set, and returns the elements that no writer would make."""
 CHARACTER_SETS = (
     "\\ISO 2022 IR 87", "", "ISO_IR 6", "ISO IR 192", "ISO_IR 192", "ISO_IR 100", "ISO 2022 IR 149", "\\ISO 2022 IR 149", "GB18030",
     "ISO_IR 13", "ISO 2022 IR 6\\ISO 2022 IR 87", "LATIN1", "utf-8", "ISO_IR 999",
@@ -54,53 +55,53 @@ ODD_TEXTS = {
 
 
 def odd_header(chance: random.Random, content: bytes) -> bytes:
-    """Return a run with one to three oddities in its header, as a new object of its study."""
+    """Return a new object with one to three oddities in its header."""
     dataset = pydicom.dcmread(io.BytesIO(content))
     dataset.SOPInstanceUID = dataset.file_meta.MediaStorageSOPInstanceUID = generate_uid(
         entropy_srcs=[str(chance.random())]
     )
-    patches: list[bytes] = []
-    for change in chance.choices(CHANGES, k=chance.choice((1, 1, 2, 3))):
-        change(chance, dataset)
-    for _ in range(chance.choice((0, 0, 1, 2))):
-        patches.append(_raw_element(chance))
+    changes = chance.choices(CHANGES, k=chance.choice((1, 1, 2, 3)))
+    elements = [element for change in changes for element in change(chance, dataset)]
+    strays = [_stray_bytes(chance) for _ in range(chance.choice((0, 0, 1, 2)))]
     stream = io.BytesIO()
     pydicom.dcmwrite(stream, dataset, enforce_file_format=True)
-    return _with_elements(stream.getvalue(), patches)
+    written = stream.getvalue()
+    for element in elements:
+        written = _with_element(written, element)
+    return _inserted(written, b"".join(strays), _STUDY_DATE)
 
 
-def _character_set(chance: random.Random, dataset: Dataset) -> None:
-    _raw(dataset, 0x00080005, "CS", chance.choice(CHARACTER_SETS).encode())
-    _raw(dataset, 0x00100010, "PN", chance.choice(NAMES))
+def _character_set(chance: random.Random, dataset: Dataset) -> list[Element]:
+    return [(0x00080005, "CS", chance.choice(CHARACTER_SETS).encode()), (0x00100010, "PN", chance.choice(NAMES))]
 
 
-def _without_type_2(chance: random.Random, dataset: Dataset) -> None:
+def _without_type_2(chance: random.Random, dataset: Dataset) -> list[Element]:
     for keyword in chance.sample(TYPE_2, chance.randrange(1, 5)):
         if keyword in dataset:
             delattr(dataset, keyword)
+    return []
 
 
-def _odd_text(chance: random.Random, dataset: Dataset) -> None:
+def _odd_text(chance: random.Random, dataset: Dataset) -> list[Element]:
     present = [each for each in dataset if each.VR in ODD_TEXTS and each.keyword not in KEPT]
-    if present:
-        element = chance.choice(present)
-        _raw(dataset, element.tag, element.VR, chance.choice(ODD_TEXTS[element.VR]))
+    element = chance.choice(present)
+    return [(int(element.tag), element.VR, chance.choice(ODD_TEXTS[element.VR]))]
 
 
-def _odd_number(chance: random.Random, dataset: Dataset) -> None:
+def _odd_number(chance: random.Random, dataset: Dataset) -> list[Element]:
     value = chance.choice((float("nan"), float("inf"), float("-inf"), -0.0, 1e308))
     tag, representation, form = chance.choice((
         (0x00189328, "FD", "<d"), (0x00181622, "FL", "<f"), (0x00189073, "FD", "<d"), (0x00280120, "FD", "<d"),
         (0x00189322, "FD", "<dd"),
     ))  # fmt: skip
     packed = struct.pack("<f", float(value) if abs(value) < 1e38 or value != value else float("inf"))
-    _raw(dataset, tag, representation, packed if form == "<f" else struct.pack("<d", value) * (len(form) - 1))
+    return [(tag, representation, packed if form == "<f" else struct.pack("<d", value) * (len(form) - 1))]
 
 
-def _offset_table(chance: random.Random, dataset: Dataset) -> None:
+def _offset_table(chance: random.Random, dataset: Dataset) -> list[Element]:
     if dataset.file_meta.TransferSyntaxUID.is_encapsulated:
         frames = list(generate_frames(dataset.PixelData, number_of_frames=int(dataset.get("NumberOfFrames", 1))))
-        pixels = bytearray(encapsulate(frames, has_bot=True))
+        pixels = bytearray(encapsulate([frame.ljust(2, b"\x00") for frame in frames], has_bot=True))
         entries = struct.unpack_from("<I", pixels, 4)[0] // 4
         for entry in range(entries):
             if chance.random() < 0.5:
@@ -108,17 +109,20 @@ def _offset_table(chance: random.Random, dataset: Dataset) -> None:
         dataset.PixelData = bytes(pixels)
         dataset["PixelData"].VR = "OB"
         dataset["PixelData"].is_undefined_length = True
+    return []
 
 
-def _overlay(chance: random.Random, dataset: Dataset) -> None:
-    _raw(dataset, 0x60000010, "US", struct.pack("<H", chance.choice((0, 1, 65535))))
-    _raw(dataset, 0x60000100, "US", struct.pack("<H", chance.choice((1, 12, 16, 0))))
-    _raw(dataset, 0x60000102, "US", struct.pack("<H", chance.choice((0, 12, 15, 99))))
+def _overlay(chance: random.Random, dataset: Dataset) -> list[Element]:
+    values = ((0x60000010, (0, 1, 65535)), (0x60000100, (1, 12, 16, 0)), (0x60000102, (0, 12, 15, 99)))
+    return [(tag, "US", struct.pack("<H", chance.choice(choices))) for tag, choices in values]
 
 
-def _private(chance: random.Random, dataset: Dataset) -> None:
-    _raw(dataset, 0x00090010, "LO", chance.choice((b"ODD DEVICE", b"", b"\xff\xff", b"A\\B")))
-    _raw(dataset, 0x00091001, chance.choice(("UN", "OB", "LT", "DS")), chance.randbytes(chance.choice((0, 2, 64))))
+def _private(chance: random.Random, dataset: Dataset) -> list[Element]:
+    content = chance.randbytes(chance.choice((0, 2, 64)))
+    return [
+        (0x00090010, "LO", chance.choice((b"ODD DEVICE", b"", b"\xff\xff", b"A\\B"))),
+        (0x00091001, chance.choice(("UN", "OB", "LT", "DS")), content),
+    ]
 
 
 CHANGES: tuple[Change, ...] = (
@@ -126,19 +130,8 @@ CHANGES: tuple[Change, ...] = (
 )  # fmt: skip
 
 
-def _raw(dataset: Dataset, tag: int, representation: str, value: bytes) -> None:
-    """Set an element to bytes that nobody has checked."""
-    padded = (
-        value + b" " * (len(value) % 2)
-        if representation not in ("OB", "UN", "UI")
-        else value + b"\x00" * (len(value) % 2)
-    )
-    little, implicit = True, dataset.original_encoding[0] or False
-    dataset._dict[Tag(tag)] = RawDataElement(Tag(tag), representation, len(padded), padded, 0, implicit, little)
-
-
-def _raw_element(chance: random.Random) -> bytes:
-    """Return the bytes of an element that no writer would make, in explicit little endian."""
+def _stray_bytes(chance: random.Random) -> bytes:
+    """Return an element that no writer would make, in explicit little endian."""
     return chance.choice((
         bytes.fromhex("feffdde000000000"),  # the end of a sequence that never began
         bytes.fromhex("feff0de000000000"),  # the end of an item that never began
@@ -153,9 +146,25 @@ def _raw_element(chance: random.Random) -> bytes:
 
 
 _STUDY_DATE = bytes.fromhex("08002000") + b"DA"
+_PIXELS = bytes.fromhex("e07f1000") + b"O"
+_LONG = ("OB", "UN")
+"""Of the representations above those with a length of four bytes (PS3.5 section 7.1.2)."""
 
 
-def _with_elements(content: bytes, elements: list[bytes]) -> bytes:
-    """Insert elements before the study's date, between two others of the same group."""
-    place = content.find(_STUDY_DATE)
-    return content if place < 0 else content[:place] + b"".join(elements) + content[place:]
+def _with_element(content: bytes, element: Element) -> bytes:
+    """Replace an element of the top level, or insert it before a later one."""
+    tag, representation, value = element
+    start = struct.pack("<HH", tag >> 16, tag & 0xFFFF)
+    value += (b"\x00" if representation in ("OB", "UN", "UI") else b" ") * (len(value) % 2)
+    length = b"\x00\x00" + struct.pack("<I", len(value)) if representation in _LONG else struct.pack("<H", len(value))
+    written = start + representation.encode() + length + value
+    place = content.find(start + representation.encode())
+    if place < 0:
+        return _inserted(content, written, _STUDY_DATE if tag < 0x00080020 else _PIXELS)
+    end = place + 8 + int.from_bytes(content[place + 6 : place + 8], "little")
+    return content[:place] + written + content[end:]
+
+
+def _inserted(content: bytes, more: bytes, before: bytes) -> bytes:
+    place = content.find(before)
+    return content if place < 0 else content[:place] + more + content[place:]

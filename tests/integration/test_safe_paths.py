@@ -63,7 +63,7 @@ def _call(folder: Path, environment: dict[str, str], *arguments: str) -> str:
 
 
 def _without_safe_path(data_dir: Path, **settings: str) -> dict[str, str]:
-    """Return an environment as a user has it who knows nothing of Python's safe path."""
+    """Return the environment of a user who never set the safe path."""
     environment = environment_of(data_dir, **settings)
     environment.pop("PYTHONSAFEPATH", None)
     return environment
@@ -133,7 +133,7 @@ def test_an_empty_entry_of_pythonpath_is_not_passed_on(folder: Path, tmp_path: P
 
 
 def test_compiling_helper_runs_nothing_of_the_folder(folder: Path, tmp_path: Path) -> None:
-    """Whoever uses the science alone starts the process that helps to compile kernels from any program."""
+    """A program that uses the science alone also starts the process that helps to compile kernels."""
     script = "from fluoromap.segmenter import kernels; raise SystemExit(kernels._start_helper().wait())"
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
     environment["NUMBA_CACHE_DIR"] = str(tmp_path)

@@ -26,7 +26,7 @@ def end_with_supervisor() -> None:
 
 
 def use_safe_paths() -> None:
-    """Keep the current folder out of the import paths of every process that this one starts.
+    """Keep the current folder out of the import paths of child processes.
 
     Python adds that folder when it starts a child of :mod:`multiprocessing` or a module (``-m``). So a file ``numpy.py`` among
     downloaded runs would become part of the program. An empty entry of ``PYTHONPATH`` means the same folder. A folder that the

@@ -41,6 +41,8 @@ def test_open_service_shows_its_pages(service: TestClient) -> None:
         assert service.get(path).status_code == 200
     assert service.get("/assets/../report.html.j2").status_code == 404
     assert service.get("/assets/missing.js").status_code == 404
+    for name in ("%00", "page.js%00", "a" * 5000 + ".js", "%2e%2e/report.html.j2", "shared/%00/api.js", "%ff.js"):
+        assert service.get(f"/assets/{name}").status_code == 404, name[:20]
 
 
 def test_pages_may_run_their_own_scripts_only(service: TestClient) -> None:
