@@ -108,7 +108,7 @@ def _shared(folder: Path, kind: str, start: Callable[[Path], tuple[str, dict[str
 
 @contextmanager
 def tls_server(kind: str, home: Path, options: list[str], port_option: str) -> Iterator[int]:
-    """Run a server of its own with more options and yield its port; it ends with the context.
+    """Run a server with more options and yield its port.
 
     ``kind`` is "postgresql" or "redis". ``home`` exists and holds the files that the options name. Clients of PostgreSQL find its
     socket there.
@@ -218,7 +218,7 @@ def _answers(port: int, greeting: bytes) -> bool:
 
 
 def wait_until_accepted(server: sqlalchemy.Engine) -> None:
-    """Wait until PostgreSQL accepts a session; it answers its first bytes before it has started."""
+    """Wait until PostgreSQL accepts a session."""
 
     def accepts() -> bool:
         with suppress(sqlalchemy.exc.OperationalError), server.connect():
