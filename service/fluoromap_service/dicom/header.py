@@ -463,7 +463,7 @@ def read_all_attributes(file: BufferedReader) -> tuple[Dataset, bool]:
 
 def _parse_all(reader: _BoundedReader, size: int) -> tuple[Dataset, bool]:
     stream = cast(Any, reader)
-    syntax, _ = _file_meta(reader)
+    syntax = _file_meta(reader).transfer_syntax
     start = reader.tell()
     implicit, little_endian = syntax == ImplicitVRLittleEndian, syntax != ExplicitVRBigEndian
 
