@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from fluoromap.contracts import Fuser, MonoplaneSolver, Segmenter, Triangulator
+from fluoromap.contracts import Fuser, MonoplaneSolver, Previewer, Segmenter, Triangulator
 
 Kind = Literal["segmenter", "triangulator", "monoplane", "fuser"]
 
@@ -131,6 +131,12 @@ def plugin(kind: Kind, name: str) -> Plugin:
 def build_segmenter(name: str, parameters: dict[str, Any]) -> Segmenter:
     """Return a segmenter with these parameters."""
     built: Segmenter = _build("segmenter", name, parameters)
+    return built
+
+
+def build_previewer() -> Previewer:
+    """Return the segmenter that shows the electrodes of one frame, with its default parameters."""
+    built: Previewer = _build("segmenter", DEFAULTS["segmenter"], {})
     return built
 
 

@@ -23,13 +23,14 @@ from fluoromap.contracts.matching import (
     RejectedSite,
 )
 from fluoromap.contracts.monoplane import MonoplaneView, StudyShares, Track
-from fluoromap.contracts.plugin_kinds import Fuser, MonoplaneSolver, NoParams, Segmenter, Triangulator
+from fluoromap.contracts.plugin_kinds import Fuser, MonoplaneSolver, NoParams, Previewer, Segmenter, Triangulator
 from fluoromap.contracts.segmentation import (
     Chain,
     FrameChains,
     FrameSource,
     Marks,
     PixelFacts,
+    Preview,
     Run,
     Segmentation,
     Shutter,
@@ -50,7 +51,7 @@ __all__ = [
     "CHI2_95_3D", "APriori", "Alternative", "Array", "BoolArray", "Calibration", "Chain", "ChamberMap",
     "ConductionVelocity", "Context", "ElectrodePoint", "ErrorBudget", "FrameChains", "FrameSource", "Fuser", "Grade",
     "IntArray", "LocatedSite", "MappedSite", "Marks", "MatchedRuns", "MatchedSite", "Matching", "MonoplaneSolver",
-    "MonoplaneView", "NamedChain", "NoParams", "Observation", "PhasePair", "PixelFacts", "Refusal", "RejectedSite", "Run",
+    "MonoplaneView", "NamedChain", "NoParams", "Observation", "PhasePair", "PixelFacts", "Preview", "Previewer", "Refusal", "RejectedSite", "Run",
     "Segmentation", "Segmenter", "Shutter", "Silent", "SiteCycle", "StageStopped", "StudyShares", "StudyVariation",
     "SurfaceSite", "Track", "Triangulation", "Triangulator", "View", "frozen", "grade_of", "grade_of_axis", "grades_of",
     "largest_semi_axes_mm",

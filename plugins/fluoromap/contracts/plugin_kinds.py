@@ -11,7 +11,7 @@ from fluoromap.contracts.context import Context
 from fluoromap.contracts.fusion import ChamberMap, MappedSite
 from fluoromap.contracts.matching import MatchedSite
 from fluoromap.contracts.monoplane import MonoplaneView, Track
-from fluoromap.contracts.segmentation import Marks, Run, Segmentation
+from fluoromap.contracts.segmentation import Marks, Preview, Run, Segmentation
 from fluoromap.contracts.triangulation import Triangulation
 
 
@@ -32,6 +32,13 @@ class Segmenter(Protocol):
     """Finds the catheters' electrodes in the frames of one run; does not name look-alikes."""
 
     def segment(self, run: Run, catalogue: Catalogue, marks: Marks, context: Context) -> Segmentation: ...
+
+
+@runtime_checkable
+class Previewer(Protocol):
+    """A segmenter that also shows the electrodes of one frame before the geometry of the run is complete."""
+
+    def preview(self, run: Run, catalogue: Catalogue, frame: int, scale_is_known: bool) -> Preview: ...
 
 
 @runtime_checkable

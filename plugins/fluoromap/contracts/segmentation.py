@@ -196,5 +196,20 @@ class Segmentation:
         object.__setattr__(self, "frame_times_ms", frozen(self.frame_times_ms, (n,), "frame_times_ms"))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Preview:
+    """Chains of one frame, for showing only.
+
+    px_per_mm : scale at the isocentre, None where neither the geometry nor the catalogue gives one; then there are no chains.
+    scale_found : whether the scale was found from the catalogue and not measured; it is right to about 20 %.
+    inverted : whether the grey levels were inverted although the header does not say so.
+    """
+
+    chains: tuple[Chain, ...]
+    px_per_mm: float | None
+    scale_found: bool
+    inverted: bool
+
+
 Marks = Mapping[int, tuple[Chain, ...]]
 """Chains set by hand: frame -> the chains of that frame."""

@@ -1,4 +1,4 @@
-"""Local activation time: the steepest negative deflection of the mapping electrogram minus the reference's.
+"""Local activation time: the steepest negative deflection of the mapping electrogram minus the reference's, in the same beat.
 
 The paper samples 1000 times a second; here the samples may have any times, as long as these ascend.
 """
@@ -12,51 +12,66 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fluoromap.contracts import Array
+from fluoromap.electrogram.artefacts import is_saturated, without_spikes
+from fluoromap.electrogram.beats import find_beats
+from fluoromap.electrogram.deflections import Channel, Deflection
+from fluoromap.electrogram.recording import UnusableElectrogram, read_recording
 
-_LEAST_SAMPLES = 20
-_WINDOW_MS = 5.0
-_WIDTHS = 1.25
-_WIDER = 1.5
-_WIDEST_MS = 12.0
-_LEAST_WINDOW = 7
-_SATURATED_SAMPLES = 5
-_ABRUPT = 0.05
-_BASELINE = 0.1
-_LEAST_SLOPE_TO_NOISE = 5.0
-_RIVAL = 0.8
-_PLACEMENT = 0.05
-_RIVAL_AWAY_MS = 10.0
-_QUARTILE_OF_NORMAL = 0.31863936396437514
-"""25th percentile of the absolute value of a standard normal variable."""
-
-
-class UnusableElectrogram(ValueError):
-    """An electrogram without an activation time; the message says why."""
+_LONGEST_CONDUCTION_MS = 250.0
+"""No two places of a chamber are activated further apart in one beat; flutter around a whole atrium takes about as long."""
+_SURE_ALONE_MS = 125.0
+"""Half of the shortest lasting cycle: within it a single beat cannot be taken for its neighbour."""
+_SAME_TIME_MS = 1.0
+"""Electric signals reach all channels at once; a sample's rounding is left."""
+_NEAR_HALF_CYCLE = 0.4
+_RIVAL = 0.5
+_SLOW_MS = 7.0
+"""A wider deflection is far field: that of tissue at a distance h is h / (1.7 v) wide, which is 12 mm at a speed v of 1 m/s."""
+_UPWARD = 1.5
+_NORMAL_MAD = 1.4826
+_LARGEST_DEVIATION = 3.5
+"""Deviation over the normal one beyond which a beat does not count (Iglewicz and Hoaglin 1993)."""
+_TOLERANCE_MS = 5.0, 10.0
+"""Least and most difference to the median at which a beat counts: experts differ by 6.8 ms (Alcaine 2014)."""
+_LEAST_SHARE = 2.0 / 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class ElectrogramResult:
     """The activation time of one site.
 
-    lat_ms : mapping minus reference. sd_ms : its standard deviation. reference_ms, mapping_ms : the deflections' times.
-    warnings : sentences about points to check.
+    lat_ms : mapping minus reference, the mean of the beats. sd_ms : its standard deviation. reference_ms, mapping_ms : the times of
+    a typical beat. beats : number of beats that count. warnings : sentences about points to check.
     """
 
     lat_ms: float
     sd_ms: float
     reference_ms: float
     mapping_ms: float
+    beats: int
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Beat:
+    reference: Deflection
+    mapping: Deflection
+    rivals: int
+
+    @property
+    def lat_ms(self) -> float:
+        return self.mapping.time_ms - self.reference.time_ms
 
 
 def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike) -> ElectrogramResult:
     """Return the local activation time of one site from its two electrograms.
 
-    The slope at each sample is that of a cubic fitted to the samples within 5 ms on each side (Savitzky and Golay,
-    Anal. Chem. 36 (1964) 1627, for samples at any spacing), which follows a deflection of a few ms. The steepest place
-    lies between samples where the cubic's curvature vanishes. The standard deviation follows from two things: the
-    sharpness of that minimum, and the curvatures that the same fits have in the quieter parts of the recording. So hum,
-    far field and filtered noise count with their real size, and not as independent errors of the samples.
+    1. Spikes of a stimulator are replaced by straight lines.
+    2. The deflections of the reference that have one shape are the beats.
+    3. In each beat the steepest negative deflection of the mapping electrogram counts that is less than half a cycle away.
+    4. Beats that differ from the median do not count. The time is the mean of the others.
+
+    The standard deviation follows from the scatter of the beats, and from the sharpness of their deflections in the noise.
 
     Parameters
     ----------
@@ -66,135 +81,145 @@ def activation_time(time_ms: ArrayLike, reference: ArrayLike, mapping: ArrayLike
     Raises
     ------
     UnusableElectrogram
-        When a signal is too short, not finite, flat, saturated or without a deflection above the noise; or when times
-        do not ascend. The message names the signal.
+        When a signal is too short, not finite, flat, saturated or without a deflection above the noise; when times do not ascend
+        or are not in ms; when the beats disagree. The message names the signal.
     """
-    times = np.asarray(time_ms, dtype=np.float64)
-    if times.ndim != 1 or len(times) < _LEAST_SAMPLES:
-        raise UnusableElectrogram(f"An electrogram needs at least {_LEAST_SAMPLES} samples.")
-    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-        raise UnusableElectrogram("The times of an electrogram must be numbers that ascend from sample to sample.")
+    recording = read_recording(time_ms, reference, mapping)
+    signals = *_, blanked, spikes = without_spikes(recording)
     warnings: list[str] = []
-    found = [
-        _deflection(times, np.asarray(signal, dtype=np.float64), name, warnings)
-        for name, signal in (("reference", reference), ("mapping", mapping))
-    ]
-    (reference_ms, reference_sd), (mapping_ms, mapping_sd) = found
-    return ElectrogramResult(
-        mapping_ms - reference_ms, math.hypot(reference_sd, mapping_sd), reference_ms, mapping_ms, tuple(warnings)
-    )
-
-
-def local_cubics(times: Array, signal: Array, window_ms: float) -> Array:
-    """Return the coefficients (n, 4) of a cubic fitted round each sample.
-
-    Each fit uses ``window_ms`` on each side. The coefficients are in powers of ms from the sample.
-    """
-    n = len(times)
-    index = np.arange(n)
-    first = np.searchsorted(times, times - window_ms - 1e-9)
-    last = np.searchsorted(times, times + window_ms + 1e-9)
-    # Where samples are sparse, a fit still needs three on each side.
-    first = np.minimum(first, np.maximum(index - _LEAST_WINDOW // 2, 0))
-    last = np.maximum(last, np.minimum(index + _LEAST_WINDOW // 2 + 1, n))
-    column = np.arange(int((last - first).max()))
-    sample = first[:, None] + column[None, :]
-    used = sample < last[:, None]
-    sample = np.minimum(sample, n - 1)
-    x = np.where(used, times[sample] - times[:, None], 0.0)
-    scale = np.abs(x).max(axis=1, keepdims=True)
-    x /= scale
-    design = used[..., None] * x[..., None] ** np.arange(4)
-    inverse = np.linalg.pinv(np.einsum("nki,nkj->nij", design, design), hermitian=True)
-    fitted = np.einsum("nij,nkj,nk->ni", inverse, design, np.where(used, signal[sample], 0.0))
-    coefficients: Array = fitted / scale ** np.arange(4)
-    return coefficients
-
-
-def _quiet_sd(values: Array) -> float:
-    """Return the standard deviation of the quieter half of a recording.
-
-    It follows from the lower quartile, so that deflections do not count.
-    """
-    return float(np.percentile(np.abs(values), 25)) / _QUARTILE_OF_NORMAL
-
-
-def _deflection(times: Array, signal: Array, name: str, warnings: list[str]) -> tuple[float, float]:
-    if signal.shape != times.shape:
-        raise UnusableElectrogram(f"The {name} electrogram must have one value for each time.")
-    if not np.isfinite(signal).all():
-        raise UnusableElectrogram(f"The {name} electrogram contains values that are not numbers.")
-    extent = float(np.ptp(signal))
-    if not extent > 0:
-        raise UnusableElectrogram(f"The {name} electrogram is flat; check the electrode's connection.")
-    for rail in (signal.min(), signal.max()):
-        at_baseline = abs(rail - np.median(signal)) <= _BASELINE * extent
-        if not at_baseline and _is_clipped(signal, float(rail)):
+    if spikes:
+        warnings.append(
+            f"{_count(spikes, 'stimulation artefact')} left out; check that tissue and not a stimulus was timed."
+        )
+    channels = []
+    for name, signal, step in zip(
+        ("reference", "mapping"), signals[:2], (recording.reference_step, recording.mapping_step), strict=True
+    ):
+        channel = Channel(signal, recording.start_ms, recording.spacing_ms, step, blanked)
+        if not len(channel.steep):
+            raise UnusableElectrogram(f"The {name} electrogram has no steep negative deflection above the noise.")
+        if is_saturated(signal, recording.spacing_ms):
             raise UnusableElectrogram(f"The {name} electrogram is saturated; lower the amplifier's gain.")
-    cubics = local_cubics(times, signal, _WINDOW_MS)
-    slopes = cubics[:, 1]
-    inner = slice(3, -3)
-    steepest = int(np.argmin(slopes[inner])) + 3
-    threshold = _LEAST_SLOPE_TO_NOISE * _quiet_sd(slopes[inner])
-    if not slopes[steepest] < -max(threshold, 1e-9 * extent):
-        raise UnusableElectrogram(f"The {name} electrogram has no steep negative deflection above the noise.")
-    rivals = (slopes < _RIVAL * slopes[steepest]) & (np.abs(times - times[steepest]) > _RIVAL_AWAY_MS)
-    if rivals[inner].any():
+        channels.append(channel)
+    beats = _beats(channels[0], channels[1], warnings)
+    used = _agreeing(beats, warnings)
+    return _result(used, warnings)
+
+
+def _beats(reference: Channel, mapping: Channel, warnings: list[str]) -> list[_Beat]:
+    """Return the beats in which both electrograms have a deflection."""
+    found = find_beats(reference)
+    if found.others:
         warnings.append(
-            f"The {name} electrogram has two negative deflections of almost equal steepness; check the annotation."
+            f"The reference electrogram has {found.others} more steep deflections of other shapes, which do not count; check that "
+            "the right beats were taken."
         )
-    if steepest <= 4 or steepest >= len(times) - 5:
+    places = [reference.deflection(int(sample)) for sample in found.samples]
+    cycle = float(np.median(np.diff([place.time_ms for place in places]))) if len(places) > 1 else math.inf
+    reach = min(_LONGEST_CONDUCTION_MS, cycle / 2.0)
+    beats = [beat for place in places if (beat := _beat(place, mapping, reach)) is not None]
+    if not beats:
+        raise UnusableElectrogram(
+            f"The mapping electrogram has no steep negative deflection within {reach:.0f} ms of the reference's; send a recording "
+            "that shows both in the same beat."
+        )
+    # At its edges a recording may lack one of the two.
+    inner = [
+        place
+        for place in places
+        if place.time_ms - reach >= mapping.start_ms
+        and place.time_ms + reach <= mapping.time_ms(len(mapping.signal) - 1)
+    ]
+    missing = len(inner) - sum(beat.reference in inner for beat in beats)
+    if missing > (1.0 - _LEAST_SHARE) * len(inner):
+        raise UnusableElectrogram(
+            f"The mapping electrogram has no steep negative deflection in {missing} of {len(inner)} beats; check the reference."
+        )
+    if missing:
+        warnings.append(f"The mapping electrogram has no steep negative deflection in {_count(missing, 'beat')}.")
+    _warn_of_doubts(beats, cycle, mapping.spacing_ms, warnings)
+    return beats
+
+
+def _beat(reference: Deflection, mapping: Channel, reach_ms: float) -> _Beat | None:
+    times = mapping.start_ms + mapping.spacing_ms * mapping.steep
+    within = mapping.steep[np.abs(times - reference.time_ms) <= reach_ms]
+    if not len(within):
+        return None
+    slopes = mapping.slopes[within]
+    steepest = int(np.argmin(slopes))
+    rivals = int((slopes <= _RIVAL * slopes[steepest]).sum()) - 1
+    return _Beat(reference, mapping.deflection(int(within[steepest])), rivals)
+
+
+def _warn_of_doubts(beats: list[_Beat], cycle_ms: float, spacing_ms: float, warnings: list[str]) -> None:
+    lat_ms = float(np.median([beat.lat_ms for beat in beats]))
+    if len(beats) == 1 and abs(lat_ms) > _SURE_ALONE_MS:
         warnings.append(
-            f"The deflection of the {name} electrogram lies at the edge of the recording; check the window."
+            "Only one beat was recorded, so the two deflections may belong to different beats; record several."
         )
-    return _steepest_place(times, signal, steepest, cubics[steepest])
+    if abs(lat_ms) <= max(_SAME_TIME_MS, spacing_ms):
+        warnings.append(
+            "Both deflections fall at the same time, as a stimulus and crosstalk do; check that tissue was timed in both."
+        )
+    if abs(lat_ms) > _NEAR_HALF_CYCLE * cycle_ms:
+        warnings.append(
+            f"The deflections are nearly half a cycle of {cycle_ms:.0f} ms apart, so they may belong to different beats."
+        )
+    if 2 * sum(beat.rivals > 0 for beat in beats) >= len(beats):
+        warnings.append(
+            "The mapping electrogram has several negative deflections of almost equal steepness; check the annotation."
+        )
+    for name in ("reference", "mapping"):
+        deflections: list[Deflection] = [getattr(beat, name) for beat in beats]
+        if np.median([deflection.width_ms for deflection in deflections]) > _SLOW_MS:
+            warnings.append(f"The deflection of the {name} electrogram is slow; it may be far field of other tissue.")
+        if np.median([deflection.rise for deflection in deflections]) > _UPWARD:
+            warnings.append(f"The {name} electrogram rises faster than it falls; check its polarity.")
 
 
-def _steepest_place(times: Array, signal: Array, steepest: int, cubic: Array) -> tuple[float, float]:
-    """Return the steepest place near a sample.
+def _agreeing(beats: list[_Beat], warnings: list[str]) -> list[_Beat]:
+    """Return the beats that differ little from the median.
 
-    The result is (time, standard deviation). The cubics are as wide as the deflection.
+    Raises
+    ------
+    UnusableElectrogram
+        When fewer than two of three beats, or than two of two, agree.
     """
-    spacing = float(np.median(np.diff(times)))
-    if cubic[3] <= 0:
-        return float(times[steepest]), 2.0 * spacing
-    # At its steepest place the derivative of a Gaussian of this standard deviation has such a slope and third power.
-    width = min(max(_WIDTHS * math.sqrt(-cubic[1] / (2.0 * cubic[3])), _WINDOW_MS), _WIDEST_MS)
-    near = np.flatnonzero(np.abs(times - times[steepest]) <= max(_WINDOW_MS, spacing))
-    places = []
-    for window in (_WIDER * width, width):
-        cubics = local_cubics(times, signal, window)
-        best = int(near[np.argmin(cubics[near, 1])])
-        curvature, sharpness = cubics[best, 2], 3.0 * cubics[best, 3]
-        # The steepest of many noisy places looks sharper than it is: assume one standard deviation less.
-        sure = sharpness - 3.0 * _quiet_sd(cubics[:, 3])
-        if sure <= 0:
-            return float(times[best]), 2.0 * spacing
-        before, behind = times[max(best - 1, 0)] - times[best], times[min(best + 1, len(times) - 1)] - times[best]
-        places.append(float(times[best] + np.clip(-curvature / sharpness, before, behind)))
-        noise_sd = _quiet_sd(cubics[:, 2]) / sure
-    # Signals under the deflection, above all far field, shift its steepest place, and shift it more for a wider fit.
-    drawn = places[0] - places[1]
-    return places[1], math.hypot(max(noise_sd, abs(drawn)), _PLACEMENT * spacing)
+    lats = np.array([beat.lat_ms for beat in beats])
+    away = np.abs(lats - np.median(lats))
+    tolerance = float(np.clip(_LARGEST_DEVIATION * _NORMAL_MAD * np.median(away), *_TOLERANCE_MS))
+    used = [beat for beat, deviation in zip(beats, away, strict=True) if deviation <= tolerance]
+    if len(used) < min(len(beats), max(2, math.ceil(_LEAST_SHARE * len(beats)))):
+        shown = ", ".join(f"{lat:.0f}" for lat in lats[:8])
+        raise UnusableElectrogram(
+            f"The beats disagree about the activation time ({shown} ms); send a recording of one regular rhythm."
+        )
+    if len(used) < len(beats):
+        warnings.append(
+            f"{_count(len(beats) - len(used), 'beat')} left out: the activation time differs from the others."
+        )
+    return used
 
 
-def _is_clipped(signal: Array, rail: float) -> bool:
-    """Return whether the signal stays at an extreme that it reaches at speed.
+def _result(used: list[_Beat], warnings: list[str]) -> ElectrogramResult:
+    lats: Array = np.array([beat.lat_ms for beat in used])
+    lat_ms, n = float(lats.mean()), len(lats)
+    noise = float(np.mean([beat.reference.noise_sd_ms**2 + beat.mapping.noise_sd_ms**2 for beat in used]))
+    drawn = float(np.median([beat.reference.drawn_sd_ms**2 + beat.mapping.drawn_sd_ms**2 for beat in used]))
+    # The scatter of few beats is itself uncertain: the variance of Student's distribution.
+    scatter = float(lats.var(ddof=1)) * ((n - 1) / (n - 3) if n > 3 else 1.0) if n > 1 else 0.0
+    typical = used[int(np.argmin(np.abs(lats - lat_ms)))]
+    reference_ms = typical.reference.time_ms
+    sd_ms = math.sqrt(max(scatter, noise) / n + drawn)
+    if sd_ms > _TOLERANCE_MS[1]:
+        raise UnusableElectrogram(
+            f"The activation time has a standard deviation of {sd_ms:.0f} ms; send a recording with clearer deflections."
+        )
+    if sd_ms > _TOLERANCE_MS[0]:
+        warnings.append("The activation time is uncertain; see its standard deviation.")
+    return ElectrogramResult(lat_ms, sd_ms, reference_ms, reference_ms + lat_ms, n, tuple(warnings))
 
-    A smooth plateau is reached slowly.
-    """
-    if _longest_hold(signal, rail) < _SATURATED_SAMPLES:
-        return False
-    held = np.concatenate([[True], signal == rail, [True]])
-    arrives = np.flatnonzero(~held[:-2] & held[1:-1])
-    leaves = np.flatnonzero(held[1:-1] & ~held[2:])
-    steps = [abs(signal[index] - signal[index - 1]) for index in arrives if index >= 1]
-    steps += [abs(signal[index + 1] - signal[index]) for index in leaves if index + 1 < len(signal)]
-    return bool(steps) and max(steps) > _ABRUPT * np.abs(np.diff(signal)).max()
 
-
-def _longest_hold(signal: Array, value: float) -> int:
-    """Return the longest run of samples that stay at ``value``."""
-    held = np.concatenate([[False], signal == value, [False]])
-    edges = np.flatnonzero(np.diff(held.astype(np.int8)))
-    return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing} was" if number == 1 else f"{number} {thing}s were"

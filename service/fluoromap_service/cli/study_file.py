@@ -17,6 +17,7 @@ from fluoromap_service.api.study.csv_input import LARGEST_LAT_MS
 from fluoromap_service.api.study.gantry import GantryPatch
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.problem import Problem
+from fluoromap_service.store.names import normal_name
 from fluoromap_service.study.catheters import catalogue_with_roles
 from fluoromap_service.study.freeze import PipelineRequest
 from fluoromap_service.study.sites import is_site_name
@@ -77,7 +78,7 @@ def read_study_file(path: Path) -> StudyFile:
         With each wrong key or value and the allowed ones.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        content = tomllib.loads(normal_name(path.read_text(encoding="utf-8-sig")))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CommandFailed(f"{path} is not a TOML file in UTF-8: {error}; correct the file.") from None
     try:

@@ -14,6 +14,7 @@ from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.failures import CommandFailed
 from fluoromap_service.cli.study_file import NAME, StudyFile, read_study_file
 from fluoromap_service.jobs.pipeline import PIPELINE
+from fluoromap_service.store.names import normal_name
 
 LISTED_NAMES = 10
 """Most file names that a message lists."""
@@ -63,7 +64,7 @@ class StudyFiles:
 
 def _name_below(folder: Path, run: Path) -> str:
     # A file name may have bytes that are no UTF-8; neither a request nor a terminal takes them.
-    return os.fsencode(run.relative_to(folder).as_posix()).decode("utf-8", "replace")
+    return normal_name(os.fsencode(run.relative_to(folder).as_posix()).decode("utf-8", "replace"))
 
 
 def _named_runs(folder: Path, runs: Sequence[Path], settings: StudyFile) -> Iterator[NamedRun]:

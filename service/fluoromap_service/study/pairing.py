@@ -22,6 +22,7 @@ from typing import Literal
 
 from fluoromap.geometry import direction_angle_deg, view_axes
 from fluoromap_service.dicom.facts import TableOrigin
+from fluoromap_service.store.names import normal_name
 
 PAIRING_ANGLE_DEG = 30.0
 """Smallest angle between the views of two runs that acquisition time pairs."""
@@ -300,13 +301,14 @@ class RunNames:
             if run.series_number is not None:
                 numbers[str(run.series_number)].append(run)
             if run.file_name is not None:
-                names[run.file_name].append(run)
-                base_names[_base_name(run.file_name)].append(run)
+                name = normal_name(run.file_name)
+                names[name].append(run)
+                base_names[_base_name(name)].append(run)
         self._tests = ((uids, str), (numbers, str), (names, str), (base_names, _base_name))
 
     def run(self, text: str) -> Run | None:
         """Return the run that a text names; None unless it fits just one run."""
-        text = text.strip()
+        text = normal_name(text.strip())
         for found, form in self._tests:
             runs = found.get(form(text))
             if runs:

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Run
 from fluoromap.matching.likely_names import likely_names
+from fluoromap.registry import build_previewer
 from fluoromap_service.dicom import InstanceFacts, frame_to_8bit, open_frames
 from fluoromap_service.dicom.facts import Pair
 
@@ -72,11 +73,9 @@ def preview_electrodes(
     px_per_mm : float or None
         At the isocentre; None while the geometry is incomplete.
     """
-    from fluoromap.segmenter.learned_chain.preview import preview
-
     frames = open_frames(path, facts)
     run = Run(frames, np.array(facts.frame_times_ms), px_per_mm or 1.0, facts.pixels, facts.r_wave_frames)
-    seen = preview(run, catalogue, frame, px_per_mm is not None)
+    seen = build_previewer().preview(run, catalogue, frame, px_per_mm is not None)
     scale = ScaleSource.UNKNOWN if seen.px_per_mm is None else ScaleSource.MEASURED
     if seen.scale_found:
         scale = ScaleSource.FOUND

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from simulated_recordings import draw_recording
 
 from fluoromap.electrogram import UnusableElectrogram, activation_time
 
@@ -108,3 +109,136 @@ def test_unusable_times_are_refused():
         activation_time(TIMES[:10], deflection(100)[:10], deflection(100)[:10])
     with pytest.raises(UnusableElectrogram, match="ascend"):
         activation_time(TIMES[::-1], deflection(100), deflection(100))
+
+
+def beats(at_ms, times, heights=None, width_ms=3.0):
+    heights = np.ones(len(at_ms)) if heights is None else heights
+    noise = np.random.default_rng(3).normal(0, 0.005, len(times))
+    return sum(deflection(at, times, width_ms, height) for at, height in zip(at_ms, heights, strict=True)) + noise
+
+
+LONG = np.arange(0.0, 900.0)
+
+
+def test_both_deflections_are_of_one_beat_although_the_steepest_are_not():
+    reference = beats((200, 640), LONG, (1.0, 1.5))
+    mapping = beats((241.3, 681.3), LONG, (1.5, 1.0))
+    found = activation_time(LONG, reference, mapping)
+    assert found.lat_ms == pytest.approx(41.3, abs=0.5)
+    assert (found.beats, found.warnings) == (2, ())
+
+
+def test_a_mapping_electrogram_may_come_first_in_every_beat():
+    found = activation_time(LONG + 5e6, beats((200, 640), LONG), beats((140, 580), LONG))
+    assert found.lat_ms == pytest.approx(-60, abs=0.5)
+    assert found.mapping_ms == pytest.approx(found.reference_ms + found.lat_ms)
+
+
+def stimulus(times, at_ms, height=8.0):
+    pulse = height * ((times >= at_ms) & (times < at_ms + 2)) - height * ((times >= at_ms + 2) & (times < at_ms + 4))
+    tail = np.where(times >= at_ms + 4, -0.5 * height * np.exp(-np.maximum(times - at_ms - 4, 0) / 30), 0.0)
+    return pulse + tail
+
+
+def test_a_pacing_artefact_in_both_electrograms_is_left_out_and_named():
+    times = np.arange(0.0, 400.0)
+    signals = [beats((at,), times) + stimulus(times, 80) for at in (120, 161.3)]
+    found = activation_time(times, *signals)
+    assert found.lat_ms == pytest.approx(41.3, abs=1)
+    assert "stimulation artefact" in found.warnings[0]
+
+
+@pytest.mark.parametrize("khz", [0.5, 1.0, 4.0])
+def test_a_stimulus_is_never_an_activation(khz):
+    times = np.arange(0, 400, 1 / khz)
+    pulse = 8.0 * ((times >= 80) & (times < 81.5))
+    noise = np.random.default_rng(0).normal(0, 0.01, (2, len(times)))
+    with pytest.raises(UnusableElectrogram, match=r"reference.*noise"):
+        activation_time(times, pulse + noise[0], pulse + noise[1])
+
+
+@pytest.mark.parametrize("sparse", [True, False])
+def test_a_dead_channel_is_refused_although_its_least_bit_flickers(sparse):
+    rng = np.random.default_rng(5)
+    times = np.arange(0.0, 400.0)
+    dead = np.zeros(400)
+    dead[rng.choice(400, 16 if sparse else 300, replace=False)] = 1.0
+    dead *= rng.choice([-1, 1], 400)
+    with pytest.raises(UnusableElectrogram, match=r"mapping.*noise"):
+        activation_time(times, beats((120,), times), dead)
+
+
+@pytest.mark.parametrize(("factor", "message"), [(1000.0, "milliseconds"), (0.001, "milliseconds"), (60.0, "apart")])
+def test_times_in_another_unit_are_refused(factor, message):
+    with pytest.raises(UnusableElectrogram, match=message):
+        activation_time(factor * TIMES, deflection(100), deflection(150))
+
+
+def test_missing_samples_are_refused_with_their_place():
+    kept = (TIMES < 50) | (TIMES > 70)
+    with pytest.raises(UnusableElectrogram, match="missing between 49 and 71 ms"):
+        activation_time(TIMES[kept], deflection(100)[kept], deflection(150)[kept])
+
+
+def test_a_recording_of_a_whole_procedure_is_refused():
+    times = np.arange(0.0, 3_700_000.0, 5.0)
+    with pytest.raises(UnusableElectrogram, match="3700 s"):
+        activation_time(times, np.sin(times), np.sin(times))
+
+
+def test_beats_that_disagree_are_refused():
+    times = np.arange(0.0, 1000.0)
+    with pytest.raises(UnusableElectrogram, match="disagree"):
+        activation_time(times, beats((200, 640), times), beats((240, 720), times))
+
+
+def test_a_beat_of_another_place_is_left_out_and_told():
+    times = np.arange(0.0, 3000.0)
+    at = np.array([200.0, 800, 1400, 2000, 2600])
+    mapping = at + 30
+    mapping[2] += 60
+    found = activation_time(times, beats(at, times), beats(mapping, times))
+    assert found.lat_ms == pytest.approx(30, abs=0.5)
+    assert found.beats == 4
+    assert any("1 beat was left out" in warning for warning in found.warnings)
+
+
+def test_the_deflection_of_another_beat_is_not_taken():
+    times = np.arange(0.0, 500.0)
+    with pytest.raises(UnusableElectrogram, match="within 250 ms"):
+        activation_time(times, beats((50,), times), beats((400,), times))
+
+
+def test_deflections_at_the_same_time_are_told():
+    found = activation_time(TIMES, deflection(120), 0.3 * deflection(120))
+    assert any("same time" in warning for warning in found.warnings)
+
+
+def test_a_reversed_polarity_is_told():
+    found = activation_time(TIMES, deflection(100), -deflection(150, width_ms=5))
+    assert any("polarity" in warning for warning in found.warnings)
+
+
+def test_far_field_alone_is_told():
+    found = activation_time(TIMES, deflection(100), deflection(150, width_ms=15))
+    assert any("far field" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("first", range(0, 200, 50))
+def test_no_simulated_recording_gives_a_wrong_time_in_silence(first):
+    errors, normalised, usable = [], [], 0
+    for seed in range(first, first + 50):
+        recording = draw_recording(np.random.default_rng(seed))
+        usable += recording.lat_ms is not None
+        try:
+            found = activation_time(recording.time_ms, recording.reference, recording.mapping)
+        except UnusableElectrogram:
+            continue
+        error = np.inf if recording.lat_ms is None else found.lat_ms - recording.lat_ms
+        assert abs(error) <= 10 or found.warnings, (seed, recording.kinds, error, found)
+        if abs(error) <= 10:
+            errors.append(abs(error))
+            normalised.append(abs(error) / found.sd_ms)
+    assert len(errors) > 0.8 * usable
+    assert np.percentile(errors, 95) < 2.5
+    assert np.mean(np.array(normalised) < 1.96) >= 0.9

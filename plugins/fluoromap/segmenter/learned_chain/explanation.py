@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import PixelFacts, Run
+from fluoromap.contracts import FrameChains, PixelFacts, Run
 from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
@@ -15,6 +15,8 @@ from fluoromap.segmenter.log_image import Image, LogTransform
 SCALES_PX_PER_MM = 2.3, 2.7, 3.1, 3.6, 4.1, 4.7, 5.4, 6.2, 7.1, 8.2, 9.4, 10.8
 """Scales of fluoroscopy at the isocentre, each 15 % above the one before: of 512 to 1024 pixels, and of printed figures."""
 
+_WIDEST_FIELD_MM = 350.0
+"""Longer side of the picture at the isocentre: the largest flat detectors have 400 mm, and a C-arm enlarges at least 1.15 times."""
 _FRAMES = 3
 _LEAST_ELECTRODES = 3.0
 _NEARLY_ALL = 0.75
@@ -49,15 +51,24 @@ def find_scale(
     returned. It is right to about 20 %: enough to find electrodes and to show them, not to locate them. ``trained`` : the
     shipped network by default.
 
+    The work is bounded. A scale at which the picture would be wider than any detector is not tried. A scale is left as soon as one
+    frame shows no clear chain at it. The other polarity is not tried where it cannot explain clearly more.
+
     Returns
     -------
     Explanation or None
         None where no scale explains three frames.
     """
-    header, other = (
-        _smallest_of_the_best(_explanations(run, pixels, catalogue, scales_px_per_mm, trained))
-        for pixels in (run.pixels, _inverted(run.pixels))
-    )
+    possible = [scale for scale in scales_px_per_mm if max(run.frames.shape) <= _WIDEST_FIELD_MM * scale]
+
+    def explain(pixels: PixelFacts) -> Explanation | None:
+        return _smallest_of_the_best(_explanations(run, pixels, catalogue, possible, trained, True))
+
+    header = explain(run.pixels)
+    most = float(sum(catheter.electrodes for catheter in catalogue.catheters))
+    if header is not None and most <= _MORE * header.electrodes:
+        return header
+    other = explain(_inverted(run.pixels))
     if header is None or other is None:
         return header or other
     return other if _explains_more(other, header) else header
@@ -122,16 +133,26 @@ def _smallest_of_the_best(tried: Sequence[Explanation]) -> Explanation | None:
 
 
 def _explanations(
-    run: Run, pixels: PixelFacts, catalogue: Catalogue, scales_px_per_mm: Sequence[float], trained: Trained | None
+    run: Run,
+    pixels: PixelFacts,
+    catalogue: Catalogue,
+    scales_px_per_mm: Sequence[float],
+    trained: Trained | None,
+    until_unsure: bool = False,
 ) -> list[Explanation]:
-    """Explain a few frames of a run at each scale."""
+    """Explain a few frames of a run at each scale.
+
+    ``until_unsure`` : a scale is left at the first frame without a clear chain.
+    """
     field = find_field(run.frames, pixels)
     transform = LogTransform.of_run(pixels, field.mean_level)
     frames = list(evenly_spaced_frames(len(run.frames)))
     images = [field.fill(transform(run.frames[frame])) for frame in frames[:: max(1, len(frames) // _FRAMES)][:_FRAMES]]
     network = read_weights(SHIPPED) if trained is None else trained
     alone = len(images) == 1
-    return [_explained(images, field, pixels, catalogue, scale, network, alone) for scale in scales_px_per_mm]
+    return [
+        _explained(images, field, pixels, catalogue, scale, network, alone, until_unsure) for scale in scales_px_per_mm
+    ]
 
 
 def _explained(
@@ -142,9 +163,14 @@ def _explained(
     px_per_mm: float,
     trained: Trained,
     alone: bool,
+    until_unsure: bool = False,
 ) -> Explanation:
     detector = electrode_chains(catalogue, field, pixels, px_per_mm, trained, alone)
-    entries = [detector.find_chains(x, number) for number, x in enumerate(images)]
+    entries: list[FrameChains] = []
+    for number, x in enumerate(images):
+        entries.append(detector.find_chains(x, number))
+        if until_unsure and entries[-1].manual_needed is not None:
+            break
     return Explanation(
         px_per_mm,
         pixels.monochrome1,

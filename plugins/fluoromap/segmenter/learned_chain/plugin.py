@@ -9,8 +9,9 @@ from typing import ClassVar
 from pydantic import BaseModel, Field
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Context, Marks, Run, Segmentation
+from fluoromap.contracts import Context, Marks, Preview, Run, Segmentation
 from fluoromap.segmenter.learned_chain.explanation import is_inverted
+from fluoromap.segmenter.learned_chain.preview import preview
 from fluoromap.segmenter.learned_chain.run_search import RunSearch
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.warm_up import prepare
@@ -60,3 +61,7 @@ class LearnedChain:
                 )
                 found = inverted
         return found
+
+    def preview(self, run: Run, catalogue: Catalogue, frame: int, scale_is_known: bool) -> Preview:
+        """Find the electrodes of one frame for showing; see :class:`~fluoromap.contracts.Previewer`."""
+        return preview(self, run, catalogue, frame, scale_is_known)

@@ -9,27 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.catheters import Catalogue
-from fluoromap.contracts import Chain, FrameSource, Run, Silent
+from fluoromap.contracts import FrameSource, Preview, Run, Segmenter, Silent
 from fluoromap.segmenter.learned_chain.explanation import SCALES_PX_PER_MM, find_scale
-from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 _NEIGHBOURS = 2
 """Frames before and after the shown one: chains that they confirm are accepted."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Preview:
-    """Chains of one frame, for showing only.
-
-    px_per_mm : scale at the isocentre, None where neither the geometry nor the catalogue gives one; then there are no chains.
-    scale_found : whether the scale was found from the catalogue and not measured; it is right to about 20 %.
-    inverted : whether the grey levels were inverted although the header does not say so.
-    """
-
-    chains: tuple[Chain, ...]
-    px_per_mm: float | None
-    scale_found: bool
-    inverted: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,13 +40,15 @@ class _Stretch:
         return (self[index] for index in range(self.count))
 
 
-def preview(run: Run, catalogue: Catalogue, frame: int, scale_is_known: bool) -> Preview:
+def preview(segmenter: Segmenter, run: Run, catalogue: Catalogue, frame: int, scale_is_known: bool) -> Preview:
     """Find the electrodes of one frame, for showing.
 
     The scale comes from the catalogue where the geometry gives none.
 
     Parameters
     ----------
+    segmenter : Segmenter
+        Of the frames around the shown one.
     run : Run
         Its ``px_per_mm`` counts only where ``scale_is_known``.
     catalogue : Catalogue
@@ -87,5 +73,5 @@ def preview(run: Run, catalogue: Catalogue, frame: int, scale_is_known: bool) ->
         pixels=replace(run.pixels, monochrome1=high_is_dark),
         r_wave_frames=(),
     )
-    chains = LearnedChain().segment(around, catalogue, {}, Silent()).frames[frame - first].chains
+    chains = segmenter.segment(around, catalogue, {}, Silent()).frames[frame - first].chains
     return Preview(chains, px_per_mm, not scale_is_known, high_is_dark != run.pixels.monochrome1)

@@ -1,17 +1,19 @@
 """Processes that read uploaded files and draw pictures: a hostile or huge file cannot harm the service.
 
-A decoder may crash, hang or take too much memory. Then only one process of this pool ends.
+A decoder may crash, hang or take too much memory. Then one process ends with its one task, and the others go on.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import queue
 import resource
 import threading
 from collections.abc import Callable
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from enum import StrEnum
 from typing import ParamSpec, TypeVar
 
@@ -26,6 +28,10 @@ LONGEST_SEARCH_SECONDS = 90.0
 """The first search of a process compiles its kernels."""
 START_SECONDS = 120.0
 LONGEST_WAIT_SECONDS = 60.0
+TOO_SLOW = "too_slow"
+"""Code of a task that exceeded its time limit."""
+SLOW_RETRY_SECONDS = 30
+"""When a client may repeat a task that took too long: other requests have had the process meanwhile."""
 _PRELOADED = ("fluoromap_service.dicom", "fluoromap_service.results.fusion")
 
 Arguments = ParamSpec("Arguments")
@@ -46,77 +52,101 @@ class Task(StrEnum):
         return LONGEST_SEARCH_SECONDS if self is Task.FIND_ELECTRODES else LONGEST_SECONDS
 
 
-_lock = threading.Lock()
-_free = threading.BoundedSemaphore(PROCESSES)
-_pool: ProcessPoolExecutor | None = None
+class _PoolProcess:
+    """One process of the pool, with one task at a time: when it is killed, only this task ends."""
 
+    def __init__(self) -> None:
+        self._executor: ProcessPoolExecutor | None = None
 
-def run_in_pool(
-    task: Task, function: Callable[Arguments, Answer], *arguments: Arguments.args, **keywords: Arguments.kwargs
-) -> Answer:  # fmt: skip
-    """Call a function of a module in the pool and wait for its answer.
+    def start(self) -> ProcessPoolExecutor:
+        """Return the running process; start it first where there is none.
 
-    Raises
-    ------
-    Problem
-        422 ``undecodable`` when the function breaks its process, or exceeds the time or memory limit. 429 ``busy`` when
-        too many requests wait for the pool. A ``Problem`` that the function raises passes unchanged.
-    """
-    # The time limit begins when a process is free, so that a request that waited long keeps its full time.
-    if not _free.acquire(timeout=LONGEST_WAIT_SECONDS):
-        raise _busy()
-    try:
-        for _ in range(2):
-            pool = _running()
-            try:
-                return pool.submit(function, *arguments, **keywords).result(task.longest_seconds)
-            except TimeoutError:
-                _discard(pool)
-                raise Problem(422, "undecodable", f"{task} takes too long; check the file.") from None
-            except (BrokenProcessPool, CancelledError, RuntimeError):
-                # Another request may have broken this pool: try once more, in a new pool.
-                _discard(pool)
-            except MemoryError:
-                break
-    finally:
-        _free.release()
-    detail = f"{task} breaks the decoder or needs more memory than the service allows; check the file."
-    raise Problem(422, "undecodable", detail)
-
-
-def start() -> None:
-    """Start the processes ahead of the first request."""
-    _running()
-
-
-def close() -> None:
-    """End the processes; the next request starts new ones."""
-    with _lock:
-        pool = _pool
-    if pool is not None:
-        _discard(pool)
-
-
-def _running() -> ProcessPoolExecutor:
-    global _pool
-    with _lock:
-        if _pool is None:
+        Raises
+        ------
+        Problem
+            429 ``busy`` when the process does not start in time.
+        """
+        if self._executor is None:
             # Not a plain fork: the API has threads, and a child would inherit their locks locked.
             context = multiprocessing.get_context("forkserver")
             context.set_forkserver_preload(list(_PRELOADED))
-            fresh = ProcessPoolExecutor(PROCESSES, context, _prepare_process, (settings().worker_memory_mib,))
+            fresh = ProcessPoolExecutor(1, context, _prepare_process, (settings().worker_memory_mib,))
             # Imports take seconds on a busy machine; the time limit of the first request begins after them.
             try:
                 fresh.submit(_do_nothing).result(START_SECONDS)
             except TimeoutError:
                 _kill(fresh)
                 raise _busy() from None
-            _pool = fresh
-        return _pool
+            self._executor = fresh
+        return self._executor
+
+    def end(self) -> None:
+        """Kill the process; the next task starts another one."""
+        executor, self._executor = self._executor, None
+        if executor is not None:
+            _kill(executor)
+
+
+_processes = tuple(_PoolProcess() for _ in range(PROCESSES))
+_idle: queue.LifoQueue[_PoolProcess] = queue.LifoQueue()
+"""The processes without a task. The latest to end one comes first: its kernels are compiled."""
+for _process in _processes:
+    _idle.put(_process)
+
+
+def run_in_pool(
+    task: Task, function: Callable[Arguments, Answer], *arguments: Arguments.args, **keywords: Arguments.kwargs
+) -> Answer:  # fmt: skip
+    """Call a function of a module in a process of the pool and wait for its answer.
+
+    Raises
+    ------
+    Problem
+        422 ``undecodable`` when the function breaks its process or exceeds the memory limit. 503 ``too_slow`` when it exceeds the
+        time limit. 429 ``busy`` when too many requests wait for the pool. A ``Problem`` that the function raises passes unchanged.
+    """
+    # The time limit begins when a process is free, so that a request that waited long keeps its full time.
+    try:
+        process = _idle.get(timeout=LONGEST_WAIT_SECONDS)
+    except queue.Empty:
+        raise _busy() from None
+    try:
+        for _ in range(2):
+            executor = process.start()
+            try:
+                return executor.submit(function, *arguments, **keywords).result(task.longest_seconds)
+            except TimeoutError:
+                process.end()
+                raise _too_slow(task) from None
+            except (BrokenProcessPool, CancelledError, RuntimeError):
+                # The process may have died while it had no task: try once more, in a new one.
+                process.end()
+            except MemoryError:
+                break
+    finally:
+        _idle.put(process)
+    detail = f"{task} breaks the decoder or needs more memory than the service allows; check the file."
+    raise Problem(422, "undecodable", detail)
+
+
+def start() -> None:
+    """Start a process ahead of the first request."""
+    with suppress(queue.Empty):
+        process = _idle.get_nowait()
+        try:
+            process.start()
+        finally:
+            _idle.put(process)
+
+
+def close() -> None:
+    """End the processes; the next request starts new ones."""
+    for process in _processes:
+        process.end()
 
 
 def _do_nothing() -> None:
-    """Do nothing; a fresh pool answers this as soon as it can work."""
+    """Do nothing; a fresh process answers this as soon as it can work."""
 
 
 def _busy() -> Problem:
@@ -124,18 +154,18 @@ def _busy() -> Problem:
     return Problem(429, "busy", detail, headers={"Retry-After": "5"})
 
 
-def _discard(pool: ProcessPoolExecutor) -> None:
-    global _pool
-    with _lock:
-        if _pool is pool:
-            _pool = None
-    _kill(pool)
+def _too_slow(task: Task) -> Problem:
+    detail = (
+        f"{task} did not end within {task.longest_seconds:g} s, so the service stopped it; the file may be whole. Send the "
+        "request again when the service has less to do."
+    )
+    return Problem(503, TOO_SLOW, detail, headers={"Retry-After": str(SLOW_RETRY_SECONDS)})
 
 
-def _kill(pool: ProcessPoolExecutor) -> None:
-    for process in list((pool._processes or {}).values()):
+def _kill(executor: ProcessPoolExecutor) -> None:
+    for process in list((executor._processes or {}).values()):
         process.kill()
-    pool.shutdown(wait=False, cancel_futures=True)
+    executor.shutdown(wait=False, cancel_futures=True)
 
 
 def _prepare_process(mib: int) -> None:

@@ -34,6 +34,7 @@ from fluoromap_service.results.origins import Origin, origin_in
 from fluoromap_service.results.tracks import RejectedView, tracks_of
 from fluoromap_service.store.engine import reading
 from fluoromap_service.store.models import Job
+from fluoromap_service.store.names import Name
 from fluoromap_service.store.renderings import KeptFile, kept_file
 
 router = new_router(tags=["results"])
@@ -133,7 +134,7 @@ CSV_ENTRY = csv_entry(
     "31.3,-8.0,12.9,271.3,240.8,B,\r\n",
 )
 
-SiteQuery = Annotated[str | None, Query(description="Only this site; without it all sites.", examples=["S03"])]
+SiteQuery = Annotated[Name | None, Query(description="Only this site; without it all sites.", examples=["S03"])]
 ViewQuery = Annotated[Literal["a", "b"] | None, Query(description="Only this view; without it all tracked views.")]
 
 Entry = tuple[Literal["tracks", "rejected"], dict[str, Any]]

@@ -7,9 +7,11 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, model_validator
 
 from fluoromap.catheters import CATHETER_TYPES, Catheter, catheter_type
+from fluoromap_service.store.names import NORMAL_FORM
 
 Line = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")]
 """Text of one line that is not blank."""
+CatheterName = Annotated[Line, NORMAL_FORM]
 MOST_CATHETERS = 6
 MOST_ELECTRODES = 20
 Millimetres = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
@@ -25,7 +27,7 @@ class CatheterIn(BaseModel):
     """A catheter by the name of its type, or as its maker describes it; electrode 1 is the tip."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": _EXAMPLES})
-    name: Line = Field(min_length=1, max_length=64)
+    name: CatheterName = Field(min_length=1, max_length=64)
     type: str | None = Field(
         None, max_length=64, description=f"Instead of electrodes and lengths, one of: {', '.join(CATHETER_TYPES)}."
     )

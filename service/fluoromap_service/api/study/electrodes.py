@@ -18,6 +18,7 @@ from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.results.detections import detected_electrodes
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Correction, Study
+from fluoromap_service.store.names import Name
 from fluoromap_service.study import corrections, instances, studies
 from fluoromap_service.study.catheters import catalogue_of
 from fluoromap_service.study.instances import StudyRun
@@ -33,7 +34,7 @@ class ElectrodeIn(BaseModel):
         extra="forbid",
         json_schema_extra={"examples": [{"catheter": "mapping", "electrode": 1, "u_px": 251.5, "v_px": 233.0}]},
     )
-    catheter: str = Field(max_length=64)
+    catheter: Name = Field(max_length=64)
     electrode: int = Field(ge=1, le=64, description="1 is the tip.")
     u_px: float = Field(allow_inf_nan=False, description="Column; 0 is the centre of the leftmost stored pixel.")
     v_px: float = Field(allow_inf_nan=False, description="Row; 0 is the centre of the topmost stored pixel.")

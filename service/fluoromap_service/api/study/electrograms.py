@@ -22,10 +22,17 @@ router = new_router("/v1/studies/{study_id}", tags=["sites"])
 class ElectrogramOut(BaseModel):
     """The activation time of a site by its electrograms."""
 
-    lat_ms: float = Field(description="Mapping minus reference.", examples=[41.0])
+    lat_ms: float = Field(
+        description="Mapping minus reference in the same beat, the mean of the beats.", examples=[41.0]
+    )
     sd_ms: float = Field(description="Its standard deviation.", examples=[1.2])
-    reference_ms: float = Field(description="Steepest negative deflection of the reference.", examples=[112.0])
-    mapping_ms: float = Field(description="Steepest negative deflection of the mapping catheter.", examples=[153.0])
+    reference_ms: float = Field(
+        description="Steepest negative deflection of the reference in a typical beat.", examples=[112.0]
+    )
+    mapping_ms: float = Field(
+        description="Steepest negative deflection of the mapping catheter in that beat.", examples=[153.0]
+    )
+    beats: int = Field(description="Number of beats that count.", examples=[3])
     warnings: list[str]
 
 
@@ -56,6 +63,7 @@ async def put_electrogram(
             sd_ms=result.sd_ms,
             reference_ms=result.reference_ms,
             mapping_ms=result.mapping_ms,
+            beats=result.beats,
             warnings=[str(warning) for warning in result.warnings],
         )
         with writing() as session:

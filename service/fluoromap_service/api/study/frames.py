@@ -59,7 +59,7 @@ class PreviewOut(BaseModel):
             "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
             "description": "The frame.",
         },
-        **responses(401, 403, 404, 409, 422, 429),
+        **responses(401, 403, 404, 409, 422, 429, 503),
     },
 )
 def get_frame(
@@ -98,7 +98,7 @@ def get_frame(
     )
 
 
-@router.get("/{uid}/frames/{n}/preview", responses=responses(401, 403, 404, 409, 422, 429))
+@router.get("/{uid}/frames/{n}/preview", responses=responses(401, 403, 404, 409, 422, 429, 503))
 def get_preview(study_id: StudyId, uid: InstanceUid, n: FrameNumber, caller: Reader) -> PreviewOut:
     """Find the electrodes of one frame without a job, for showing only.
 

@@ -24,6 +24,7 @@ from fluoromap_service.dicom.indexed_header import ReadRun, read_run
 from fluoromap_service.problem import Problem, not_found
 from fluoromap_service.store.engine import reading, writing
 from fluoromap_service.store.models import Study
+from fluoromap_service.store.names import Name
 from fluoromap_service.study import instances, sites, studies
 from fluoromap_service.study.binding import BoundSite, binding_of, views_of
 from fluoromap_service.study.instances import StudyRun
@@ -73,7 +74,7 @@ class InstancePatch(BaseModel):
         extra="forbid",
         json_schema_extra={"examples": [{"site": "S03", "gantry": {"source_detector_mm": 1000.0}}]},
     )
-    site: str | None = Field(
+    site: Name | None = Field(
         None, description="Moves the run to this site; null takes the run out of every site.", max_length=64
     )
     gantry: GantryPatch | None = Field(None, description="Overrides the header; null returns to the header's values.")
@@ -135,7 +136,7 @@ async def upload_instances(
     request: Request,
     once: OnceUpload,
     caller: Writer,
-    site: Annotated[str | None, Query(description=SITE, examples=["S03"])] = None,
+    site: Annotated[Name | None, Query(description=SITE, examples=["S03"])] = None,
 ) -> Response:
     """Send X-ray runs, one or many.
 
@@ -185,7 +186,8 @@ def _store(study_id: str, parts: list[Part], site: str | None, once: Once) -> Re
         documents = [document(problem) for problem in rejected]
         if not stored:
             first = rejected[0]
-            raise Problem(first.status, first.code, first.detail, first.errors, extra={"rejected": documents})
+            extra = {"rejected": documents}
+            raise Problem(first.status, first.code, first.detail, first.errors, headers=first.headers, extra=extra)
         if site is not None:
             sites.mention(session, study_id, site)
         body = {"instances": _shapes(session, study, stored), "rejected": documents}

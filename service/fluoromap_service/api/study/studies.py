@@ -15,7 +15,7 @@ from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader, Writer
 from fluoromap_service.api.http.timestamps import rfc3339
-from fluoromap_service.api.study.catheters import MOST_CATHETERS, CatheterIn, Line
+from fluoromap_service.api.study.catheters import MOST_CATHETERS, CatheterIn, CatheterName, Line
 from fluoromap_service.api.study.gantry import GantryOut, GantryPatch, changed_gantry, check_gantry
 from fluoromap_service.problem import Problem
 from fluoromap_service.store.engine import reading, writing
@@ -48,7 +48,7 @@ class StudyIn(BaseModel):
     catheters: list[CatheterIn] | None = Field(
         None, max_length=MOST_CATHETERS, description="Default: reference, pacing and mapping, 4 electrodes each."
     )
-    reference: Line | None = Field(
+    reference: CatheterName | None = Field(
         None,
         max_length=64,
         description="The catheter from which coordinates count; by default the catheter named 'reference'. A study with one "
@@ -64,7 +64,7 @@ class StudyPatch(BaseModel):
     label: Line | None = Field(None, min_length=1, max_length=200)
     chamber: Line | None = Field(None, max_length=100)
     catheters: list[CatheterIn] | None = Field(None, max_length=MOST_CATHETERS)
-    reference: Line | None = Field(None, max_length=64)
+    reference: CatheterName | None = Field(None, max_length=64)
     notes: str | None = Field(None, max_length=10_000)
     gantry: GantryPatch | None = Field(
         None, description="Values for all runs whose headers lack them; null removes these values."

@@ -20,6 +20,7 @@ from starlette.requests import ClientDisconnect
 from fluoromap_service.api.http.multipart import MultipartBody
 from fluoromap_service.problem import Problem
 from fluoromap_service.store import disk, files
+from fluoromap_service.store.names import normal_name
 
 PART_BYTES = 2 << 20
 """Bytes of a body that a thread writes at once: each change of threads costs time."""
@@ -104,7 +105,7 @@ class _Form(MultipartBody):
             self.files.append(self._arriving.finish())
         elif self._text is not None:
             try:
-                self.site = self._text.decode()
+                self.site = normal_name(self._text.decode())
             except UnicodeDecodeError:
                 raise Problem(
                     400, "malformed", "The field 'site' is not UTF-8; send it in UTF-8.", [("site", "not UTF-8")]
@@ -118,7 +119,7 @@ def arriving_file(stack: ExitStack, file_name: str | None) -> ArrivingPart:
     At its end ``stack`` removes the file unless the store kept it.
     """
     path = stack.enter_context(files.incoming())
-    return ArrivingPart(path, file_name and file_name[:1000], stack.enter_context(path.open("wb")))
+    return ArrivingPart(path, file_name and normal_name(file_name)[:1000], stack.enter_context(path.open("wb")))
 
 
 async def receive(request: Request, stack: ExitStack) -> tuple[list[Part], str | None]:

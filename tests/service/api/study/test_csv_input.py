@@ -9,6 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from fluoromap_service.api.study.csv_input import activation_times
+from fluoromap_service.problem import Problem
 
 GOOD = {
     "plain": "site,lat_ms\nA,1.5\nB,-20\n",
@@ -16,7 +17,16 @@ GOOD = {
     "crlf": "site,lat_ms\r\nA,1.5\r\nB,-20\r\n",
     "semicolon and decimal comma": "site;lat_ms\nA;1,5\nB;-20,0\n",
     "tab": "site\tlat_ms\nA\t1,5\nB\t-20\n",
-    "quotes": '"site","lat_ms"\n"A","1,5"\n"B","-20"\n',
+    "quotes": '"site","lat_ms"\n"A","1.5"\n"B","-20"\n',
+    "quotes and decimal comma": '"site";"lat_ms"\n"A";"1,5"\n"B";"-20"\n',
+    "minus sign of typography": "site,lat_ms\nA,1.5\nB,\N{MINUS SIGN}20\n",
+    "separator line": "sep=;\nsite;lat_ms\nA;1,5\nB;-20\n",
+    "separator line in quotes": '"sep=\t"\r\nsite\tlat_ms\r\nA\t1,5\r\nB\t-20\r\n',
+    "blank columns": "site,lat_ms,,\nA,1.5,,\nB,-20,,\n",
+    "blank columns in the header only": "site,lat_ms,,\nA,1.5\nB,-20\n",
+    "end of file of DOS": "site,lat_ms\r\nA,1.5\r\nB,-20\r\n\x1a",
+    "carriage returns": "site;lat_ms\rA;1,5\rB;-20\r",
+    "comments before the header": "# exported; by a recorder\n#\nsite,lat_ms\nA,1.5\nB,-2.0e1\n",
     "column order, case, spaces, blank lines": " LAT_MS , site \n\n 1.5 , A\n-2e1,B\n,\n",
     "views": "site,lat_ms,view_a,view_b\nA,1.5,,\nB,-20,3,4\n",
     "no line end": "site,lat_ms\nA,1.5\nB,-20",
@@ -58,6 +68,18 @@ BAD = {
     "no site": ("site,lat_ms\n,4\n", "row 2, column site"),
     "site with slash": ("site,lat_ms\na/b,4\n", "row 2, column site"),
     "decimal comma between commas": ("site,lat_ms\nA,1,5\n", "row 2"),
+    "thousands in quotes": ('site,lat_ms\nA,"1,234"\nB,"25.8"\n', "row 2, column lat_ms"),
+    "decimal comma in quotes between commas": ('site,lat_ms\nA,"1,5"\n', "row 2, column lat_ms"),
+    "both decimal signs": ("site;lat_ms\nA;1.234\nB;-25,8\n", "row 3, column lat_ms"),
+    "en dash": ("site,lat_ms\nA,\N{EN DASH}20\n", "row 2, column lat_ms"),
+    "no-break space": ("site;lat_ms\nA;1\N{NO-BREAK SPACE}234\n", "row 2, column lat_ms"),
+    "full-width digits": ("site,lat_ms\nA,\N{FULLWIDTH DIGIT ONE}2\n", "row 2, column lat_ms"),
+    "unit": ("site,lat_ms\nA,-25 ms\n", "row 2, column lat_ms"),
+    "percent": ("site,lat_ms\nA,25%\n", "row 2, column lat_ms"),
+    "unknown separator line": ("sep=|\nsite|lat_ms\nA|1\n", "row 1"),
+    "comment between rows": ("site,lat_ms\nA,1\n#B,2\nC,3\n", "row 3"),
+    "line break in a name": ('site,lat_ms\n"A\nB",1\n', "row 2, column site"),
+    "composed and decomposed name": ("site,lat_ms\nM\u00fcller,1\nMu\u0308ller,2\n", "row 3, column site"),
     "same view twice": ("site,lat_ms,view_a,view_b\nA,1,7,7\n", "row 2, column view_b"),
 }
 
@@ -71,9 +93,28 @@ def test_a_wrong_table_is_refused_as_a_whole(service: TestClient, study_path: st
     assert _times(service, study_path) == {"kept": 7}
 
 
-def test_every_mistake_is_reported_at_once() -> None:
-    from fluoromap_service.api.http.problems import Problem
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("site,lat_ms\nA,\N{EN DASH}20\n", "en dash (U+2013)"),
+        ("site;lat_ms\nA;1\N{NARROW NO-BREAK SPACE}234\n", "narrow no-break space (U+202F)"),
+        ("site;lat_ms\nA;1.5\nB;2,5\n", "row 2, column lat_ms has '.'"),
+        ('site,lat_ms\nA,"1,5"\n', "comma"),
+        ("site,lat_ms\nA,-25 ms\n", "unit"),
+        ("site,lat_ms\n#A,1\n", "'#'"),
+    ],
+)
+def test_the_message_names_the_thing(text: str, named: str) -> None:
+    with pytest.raises(Problem) as caught:
+        activation_times(text)
+    assert any(named in message for _, message in caught.value.errors), caught.value.errors
 
+
+def test_a_name_that_begins_with_the_comment_sign_is_read_in_quotes() -> None:
+    assert [one.site for one in activation_times('site,lat_ms\n"#1",2\n')] == ["#1"]
+
+
+def test_every_mistake_is_reported_at_once() -> None:
     with pytest.raises(Problem) as caught:
         activation_times("site,lat_ms\nA,x\nA,nan\n")
     assert [where for where, _ in caught.value.errors] == [
@@ -93,9 +134,10 @@ def test_every_mistake_is_reported_at_once() -> None:
         (b"site,lat_ms\nA,1\n", "text/csv; charset=latin-1", 415),
         ("site,lat_ms\nÄ,1\n".encode("latin-1"), "text/csv", 400),
         ("site,lat_ms\nA,1\n".encode("utf-16"), "text/csv", 400),
+        ("site,lat_ms\nA,1\n".encode("utf-16-le"), "text/csv", 400),
         (b'site,lat_ms\n"A,1\n', "text/csv", 400),
     ],
-    ids=["json", "charset", "latin-1", "utf-16", "open quote"],
+    ids=["json", "charset", "latin-1", "utf-16", "utf-16 without mark", "open quote"],
 )
 def test_bodies_that_are_no_table(service: TestClient, study_path: str, content: bytes, kind: str, status: int) -> None:
     assert _put(service, study_path, content, kind).status_code == status
