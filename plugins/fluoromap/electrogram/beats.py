@@ -42,8 +42,11 @@ def find_beats(reference: Channel) -> Beats:
             kept.append(sample)
     groups: list[list[int]] = []
     for sample in kept:
-        alike = [group for group in groups if _correlation(reference, group[0], sample) >= _ALIKE]
-        (alike[0] if alike else groups.append([]) or groups[-1]).append(sample)
+        alike = next((group for group in groups if _correlation(reference, group[0], sample) >= _ALIKE), None)
+        if alike is None:
+            groups.append([sample])
+        else:
+            alike.append(sample)
     if not groups:
         return Beats(np.zeros(0, np.int64), 0)
 
@@ -62,5 +65,6 @@ def _correlation(channel: Channel, first: int, second: int) -> float:
     n = len(channel.signal)
     before = min(reach, first, second)
     behind = min(reach, n - 1 - first, n - 1 - second)
-    shapes = [channel.signal[sample - before : sample + behind + 1] for sample in (first, second)]
-    return float(np.corrcoef(shapes)[0, 1])
+    a, b = (channel.signal[sample - before : sample + behind + 1] for sample in (first, second))
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300))

@@ -174,6 +174,34 @@ def test_an_electrogram_gives_the_activation_time(service: TestClient, study_pat
     assert _times(service, study_path) == {"S09": answer.json()["lat_ms"]}
 
 
+def _recording(time: Any, reference: Any, mapping: Any) -> str:
+    rows = zip(time, reference, mapping, strict=True)
+    return "time_ms,reference,mapping\n" + "".join(f"{t:.3f},{r:.5f},{m:.5f}\n" for t, r, m in rows)
+
+
+def test_a_recording_of_several_beats_is_timed_in_the_same_beat(service: TestClient, study_path: str) -> None:
+    time = np.arange(0, 900.0)
+    noise = np.random.default_rng(1).normal(0, 0.005, (2, len(time)))
+
+    def deflection(at: float) -> Any:
+        return -np.tanh((time - at) / 2) * np.exp(-(((time - at) / 5) ** 2))
+
+    reference = deflection(200) + 1.5 * deflection(640)
+    mapping = 1.5 * deflection(241.3) + deflection(681.3)
+    content = _recording(time, reference + noise[0], mapping + noise[1])
+    answer = service.put(f"{study_path}/electrograms/S1", content=content, headers={"Content-Type": "text/csv"}).json()
+    assert answer["lat_ms"] == pytest.approx(41.3, abs=1)
+    assert (answer["beats"], answer["warnings"]) == (2, [])
+    assert _times(service, study_path) == {"S1": answer["lat_ms"]}
+    in_microseconds = _recording(1000 * time, reference + noise[0], mapping + noise[1])
+    refused = service.put(
+        f"{study_path}/electrograms/S2", content=in_microseconds, headers={"Content-Type": "text/csv"}
+    )
+    assert (refused.status_code, refused.json()["code"]) == (422, "unusable_electrogram")
+    assert "milliseconds" in refused.json()["detail"]
+    assert list(_times(service, study_path)) == ["S1"]
+
+
 @pytest.mark.parametrize(
     ("content", "code"),
     [
