@@ -18,6 +18,8 @@ _ONE_SAMPLE = 1.1
 _SAME_TIME_MS = 1.0
 """A stimulus reaches all channels at once; a sample's rounding is left."""
 _ABOVE_NOISE = 12.0
+_HARMLESS = 0.2
+"""Part of a signal's extent below which a spike is less steep than its deflections, once cubics are fitted over 10 ms."""
 _SETTLED = 0.1
 """The spike has ended where the signal changes by less than this part of its height in a millisecond."""
 _LONGEST_SPIKE_MS = 12.0
@@ -67,9 +69,10 @@ def _narrow_peaks(signal: Array, step: float, spacing: float) -> dict[int, tuple
     """Return the width (ms) and the height of the narrow peaks of a signal, by sample."""
     # Of white noise, differences of neighbours show the noise alone, whatever the signal.
     noise = max(quiet_sd(np.diff(signal)) / np.sqrt(2.0), step)
+    least = max(_ABOVE_NOISE * noise, _HARMLESS * float(np.ptp(signal)))
     narrow: dict[int, tuple[float, float]] = {}
     for sign in (1.0, -1.0):
-        peaks, shape = find_peaks(sign * signal, prominence=_ABOVE_NOISE * noise, width=0.0, rel_height=0.5)
+        peaks, shape = find_peaks(sign * signal, prominence=least, width=0.0, rel_height=0.5)
         for peak, width, height in zip(peaks, shape["widths"] * spacing, shape["prominences"], strict=True):
             if width <= _PULSE_MS:
                 narrow[int(peak)] = float(width), float(height)

@@ -48,8 +48,10 @@ def test_a_view_names_a_file_as_macos_writes_it(service: TestClient, study_path:
 
 def test_catheters_have_one_name(service: TestClient) -> None:
     catheters = [{"name": DECOMPOSED, "type": "decapolar-2-5-2"}, {"name": "mapping", "type": "decapolar-2-5-2"}]
-    study = service.post("/v1/studies", json={"catheters": catheters, "reference": COMPOSED})
+    study = service.post("/v1/studies", json={"label": "x", "catheters": catheters, "reference": COMPOSED})
     assert study.status_code == 201, study.text
     assert study.json()["reference"] == COMPOSED
-    twice = service.post("/v1/studies", json={"catheters": [*catheters, catheters[0] | {"name": COMPOSED}]})
+    twice = service.post(
+        "/v1/studies", json={"label": "x", "catheters": [*catheters, catheters[0] | {"name": COMPOSED}]}
+    )
     assert twice.status_code == 422
