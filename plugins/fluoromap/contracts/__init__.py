@@ -51,8 +51,8 @@ __all__ = [
     "CHI2_95_3D", "APriori", "Alternative", "Array", "BoolArray", "Calibration", "Chain", "ChamberMap",
     "ConductionVelocity", "Context", "ElectrodePoint", "ErrorBudget", "FrameChains", "FrameSource", "Fuser", "Grade",
     "IntArray", "LocatedSite", "MappedSite", "Marks", "MatchedRuns", "MatchedSite", "Matching", "MonoplaneSolver",
-    "MonoplaneView", "NamedChain", "NoParams", "Observation", "PhasePair", "PixelFacts", "Preview", "Previewer", "Refusal", "RejectedSite",
-    "Run", "Segmentation", "Segmenter", "Shutter", "Silent", "SiteCycle", "StageStopped", "StudyShares", "StudyVariation",
+    "MonoplaneView", "NamedChain", "NoParams", "Observation", "PhasePair", "PixelFacts", "Preview", "Previewer", "Refusal",
+    "RejectedSite", "Run", "Segmentation", "Segmenter", "Shutter", "Silent", "SiteCycle", "StageStopped", "StudyShares", "StudyVariation",
     "SurfaceSite", "Track", "Triangulation", "Triangulator", "View", "frozen", "grade_of", "grade_of_axis", "grades_of",
     "largest_semi_axes_mm",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ from starlette.requests import ClientDisconnect
 from fluoromap_service.api.dicomweb.accept import DICOM_JSON
 from fluoromap_service.api.dicomweb.addresses import instance_url, study_url
 from fluoromap_service.api.dicomweb.descriptions import STORE_ANSWERS, STORE_BODY
-from fluoromap_service.api.http.file_pool import TOO_SLOW, Task, run_in_pool
+from fluoromap_service.api.http.file_pool import Task, run_in_pool
 from fluoromap_service.api.http.multipart import MultipartBody, malformed
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Writer
@@ -109,7 +109,7 @@ def _answer(parts: list[Part], caller: str, study_uid: str | None, base: str) ->
                 add_arrival(session, part.path, run, part.sha256, Act(caller, "STOW-RS"))
         except Problem as problem:
             # A part that takes too long must not hold up the others at each attempt.
-            if problem.status in (429, 503) and problem.code != TOO_SLOW:
+            if problem.status in (429, 503) and problem.code != "too_slow":
                 raise
             failed.append(
                 _failed_reference(part, facts) | {"00081197": {"vr": "US", "Value": [int(status_of(problem))]}}

@@ -28,8 +28,6 @@ LONGEST_SEARCH_SECONDS = 90.0
 """The first search of a process compiles its kernels."""
 START_SECONDS = 120.0
 LONGEST_WAIT_SECONDS = 60.0
-TOO_SLOW = "too_slow"
-"""Code of a task that exceeded its time limit."""
 SLOW_RETRY_SECONDS = 30
 """When a client may repeat a task that took too long: other requests have had the process meanwhile."""
 _PRELOADED = ("fluoromap_service.dicom", "fluoromap_service.results.fusion")
@@ -159,7 +157,7 @@ def _too_slow(task: Task) -> Problem:
         f"{task} did not end within {task.longest_seconds:g} s, so the service stopped it; the file may be whole. Send the "
         "request again when the service has less to do."
     )
-    return Problem(503, TOO_SLOW, detail, headers={"Retry-After": str(SLOW_RETRY_SECONDS)})
+    return Problem(503, "too_slow", detail, headers={"Retry-After": str(SLOW_RETRY_SECONDS)})
 
 
 def _kill(executor: ProcessPoolExecutor) -> None:
