@@ -74,7 +74,10 @@ class Electrode:
         return sosfilt(self.filters, voltage)
 
     def steepest_ms(self):
-        """Return when the filtered near field of a wave at 0 ms falls steepest, without noise."""
+        """Return when the near field of a wave at 0 ms falls steepest.
+
+        It is filtered and has no noise.
+        """
         ms = np.arange(-150, 150, 1 / FINE_KHZ)
         return float(ms[np.argmin(np.gradient(self.filtered(self.near(ms))))])
 

@@ -95,7 +95,7 @@ for _process in _processes:
 def run_in_pool(
     task: Task, function: Callable[Arguments, Answer], *arguments: Arguments.args, **keywords: Arguments.kwargs
 ) -> Answer:  # fmt: skip
-    """Call a function of a module in a process of the pool and wait for its answer.
+    """Call a function of a module in the pool and wait for it.
 
     Raises
     ------
