@@ -203,7 +203,7 @@ def _shown(name: str) -> str:
 def _numbers(table: _Table, columns: Sequence[str], errors: Errors) -> list[list[float | None]]:
     """Return the numbers of some columns, row by row.
 
-    None for a cell that is no number.     One table has one decimal sign. It is the point where a comma separates the columns.
+    None for a cell that is no number. One table has one decimal sign. It is the point where a comma separates the columns.
     """
     cells = [[cells[name].replace(_MINUS, "-") for name in columns] for _, cells in table.rows]
     decimal: tuple[str, str] | None = None
