@@ -53,6 +53,6 @@ __all__ = [
     "IntArray", "LocatedSite", "MappedSite", "Marks", "MatchedRuns", "MatchedSite", "Matching", "MonoplaneSolver",
     "MonoplaneView", "NamedChain", "NoParams", "Observation", "PhasePair", "PixelFacts", "Preview", "Previewer", "Refusal",
     "RejectedSite", "Run", "Segmentation", "Segmenter", "Shutter", "Silent", "SiteCycle", "StageStopped", "StudyShares",
-    "StudyVariation", "SurfaceSite", "Track", "Triangulation", "Triangulator", "View", "frozen", "grade_of", "grade_of_axis", "grades_of",
-    "largest_semi_axes_mm",
+    "StudyVariation", "SurfaceSite", "Track", "Triangulation", "Triangulator", "View", "frozen", "grade_of",
+    "grade_of_axis", "grades_of", "largest_semi_axes_mm",
 ]  # fmt: skip
