@@ -178,7 +178,10 @@ class _Decapolar:
 
 
 def _loop(number: int) -> GateRun:
-    """Return a run with a circular catheter, turned by 10 degrees more each time, 80 at most."""
+    """Return a run with a circular catheter.
+
+    Each number turns it by 10 degrees more, 80 at most.
+    """
     run, catalogue, truth = loop_run("circular-10", 10.0 * (number % 9), 100.0 + number, frames=6)
     return GateRun(run, catalogue, [{name: uv[k] for name, uv in truth.items()} for k in range(len(run.frames))])
 
@@ -209,7 +212,10 @@ def _rows(electrodes: int, numbered: Mapping[int, Array]) -> Array:
 
 
 def _vessels(given: argparse.Namespace) -> tuple[Callable[[int], GateRun], int]:
-    """Return the runs of the vessel phantom with each of three lists of catheters; there is none in them."""
+    """Return the runs of the vessel phantom with each of three lists.
+
+    No catheter is in them.
+    """
     empty = empty_runs(given)
 
     def draw(number: int) -> GateRun:

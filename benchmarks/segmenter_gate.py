@@ -105,7 +105,10 @@ def count_run(one: GateRun) -> Counts:
 
 
 def _tracks(found: Segmentation) -> dict[tuple[int, int], list[tuple[int, Chain]]]:
-    """Return frames and chains of each track; a chain without a track is one of its own."""
+    """Return frames and chains of each track.
+
+    A chain without a track is one of its own.
+    """
     tracks: dict[tuple[int, int], list[tuple[int, Chain]]] = {}
     for entry in found.frames:
         for number, chain in enumerate(entry.chains):
@@ -157,7 +160,10 @@ def _count_track(counts: Counts, chains: list[tuple[int, Chain]], one: GateRun) 
 
 
 def figures(runs: list[Counts]) -> dict[str, tuple[float, float, float]]:
-    """Return each figure of a stratum with its 95 % bootstrap interval over runs; NaN where nothing was counted."""
+    """Return each figure of a stratum with its interval.
+
+    The interval is the 95 % bootstrap interval over runs; NaN where nothing was counted.
+    """
     random = np.random.default_rng(0)
     drawn = random.integers(0, len(runs), (_RESAMPLES, len(runs)))
     shown = {}

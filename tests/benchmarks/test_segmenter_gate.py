@@ -20,7 +20,10 @@ def chain(uv: np.ndarray, name: str, probability: float, track: int) -> Chain:
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, *chains: Chain) -> segmenter_gate.Counts:
-    """Count a run of two frames with these chains in both; the mapping catheter is in the picture."""
+    """Count a run of two frames with these chains in both.
+
+    The mapping catheter is in the picture.
+    """
     frames = tuple(FrameChains(frame, chains) for frame in range(2))
     found = Segmentation(frames, None, (), np.zeros(2), np.array([0.0, 66.7]))
     monkeypatch.setattr(LearnedChain, "segment", lambda *_: found)

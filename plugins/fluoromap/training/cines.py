@@ -176,7 +176,10 @@ def as_video(pixels: Frames, step: float) -> Frames:
 
 
 def _catalogue(conditions: CineConditions) -> tuple[Catalogue, list[tuple[Catheter, str | None]]]:
-    """Return the study's list, and the catheters in the picture with their names in it; None for one that it lacks."""
+    """Return the study's list, and the catheters in the picture with their names.
+
+    The name of a catheter that the list lacks is None.
+    """
     listed = conditions.types if conditions.listed is None else conditions.listed
     catheters = tuple(catheter_type(kind, f"{kind} {number}") for number, kind in enumerate(listed))
     reference = catheters[0].name if len(catheters) > 1 else None
@@ -193,7 +196,10 @@ def _catalogue(conditions: CineConditions) -> tuple[Catalogue, list[tuple[Cathet
 def _moves(
     random: Generator, conditions: CineConditions, times_ms: Array, px_per_mm: float
 ) -> list[tuple[Array, Array]]:
-    """Draw the motion of a thing: in each frame a (2, 2) matrix about the picture's centre, and a shift in pixels."""
+    """Draw the motion of a thing.
+
+    Each frame has a (2, 2) matrix about the picture's centre, and a shift in pixels.
+    """
     still = chance(random, _AT_REST)
     swing = 0.05 if still else between(random, *_SWING_MM)
     turn, stretch = (0.0, 0.0) if still else (between(random, 0.0, 0.06), between(random, 0.0, 0.04))
@@ -216,7 +222,10 @@ def _moves(
 
 
 def _placed(layer: _Layer, frame: int, focus: float) -> Image:
-    """Return the layer's attenuation where it is in a frame; a thing at rest is where it was drawn."""
+    """Return the layer's attenuation where it is in a frame.
+
+    A thing at rest is where it was drawn.
+    """
     soft = np.maximum(gaussian(layer.depth, focus), 0.0)
     if not layer.moves:
         return soft
@@ -260,7 +269,10 @@ class _Shown:
         return np.asarray(shown, dtype=np.float32)
 
     def _photographed(self, grey: Image) -> Image:
-        """Return a photograph of a screen: its grid folds with that of the camera, and phones sharpen."""
+        """Return a photograph of a screen.
+
+        The grid of the screen folds with that of the camera, and phones sharpen.
+        """
         low, high = np.percentile(grey, [0.3, 99.7])
         levels = np.clip((grey - low) / (high - low), 0.0, 1.0)
         v, u = np.mgrid[: len(grey), : len(grey)]
@@ -287,7 +299,10 @@ def _display(random: Generator, conditions: CineConditions) -> _Shown:
 
 
 def _levels(random: Generator, grey: Sequence[Image]) -> Frames:
-    """Return 8 bit frames in the window of the first one, which some labs set wide."""
+    """Return 8 bit frames in the window of the first one.
+
+    Some laboratories set it wide.
+    """
     low, high = np.percentile(grey[0][::2, ::2], [0.3, 99.7])
     width = (high - low) * between(random, 1.0, 1.8) + 1e-9
     start = low - 0.5 * (width - (high - low))

@@ -25,7 +25,10 @@ def labsystem(counts: np.ndarray, newline: str = "\r\n", announced: int | None =
 
 
 def stored(folder: Path, **files: bytes) -> dict[str, Path]:
-    """Store files under names that say nothing; the keys are the recorder's names with underscores for dots."""
+    """Store files under names that say nothing.
+
+    The keys are the recorder's names.
+    """
     sources = {}
     for number, (name, content) in enumerate(files.items()):
         path = folder / str(number)

@@ -35,7 +35,9 @@ FORMATS = (
 
 
 def read_recording(sources: Sources) -> Recording:
-    """Recognise an export by its content, and read its header; its samples are read later.
+    """Recognise an export by its content, and read its header.
+
+    Its samples are read later.
 
     Parameters
     ----------

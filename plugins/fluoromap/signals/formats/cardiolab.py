@@ -83,7 +83,10 @@ def _first_line(path: Path) -> str:
 
 
 def _entries(text: str) -> tuple[dict[str, str], list[str]]:
-    """Return the entries by their keys in lower case, and the channels' names in the order of their columns."""
+    """Return the entries, and the channels' names in the order of their columns.
+
+    The keys of the entries are in lower case.
+    """
     entries: dict[str, str] = {}
     labels: list[str] = []
     in_table = False

@@ -28,7 +28,9 @@ def recognises(name: str, head: bytes) -> bool:
 
 
 def read(sources: Sources) -> Recording:
-    """Read the column names of an export, and its rate from the times of its first samples.
+    """Read the column names of an export.
+
+    The times of its first samples give the rate.
 
     Raises
     ------

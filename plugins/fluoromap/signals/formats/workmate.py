@@ -74,7 +74,10 @@ def read(sources: Sources) -> Recording:
 
 
 def _evenly(one: _File, count: int) -> Iterator[Samples]:
-    """Yield a channel's samples in pieces of one length, so that channels with long and short numbers keep together."""
+    """Yield a channel's samples in pieces of one length.
+
+    So channels with long and with short numbers keep together.
+    """
     rest = np.zeros(0)
     left = count
     for piece in one.table.pieces():
