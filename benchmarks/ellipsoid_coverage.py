@@ -38,7 +38,7 @@ from fluoromap.geometry import camera_from_gantry
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy, StudySpec, simulate_study
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
-from fluoromap.segmenter.quiet_frames import diastolic_frames
+from fluoromap.segmenter.picture.quiet_frames import diastolic_frames
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 

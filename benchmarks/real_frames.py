@@ -31,9 +31,9 @@ from scipy.optimize import linear_sum_assignment
 from fluoromap.catheters import CATHETER_TYPES, DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Segmenter, Silent
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
-from fluoromap.segmenter.field_mask import find_field
-from fluoromap.segmenter.lag import measure_lag
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
+from fluoromap.segmenter.picture.field_mask import find_field
+from fluoromap.segmenter.picture.lag import measure_lag
 from fluoromap_service.dicom import open_frames, read_instance
 
 Array = NDArray[np.float64]

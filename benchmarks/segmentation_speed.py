@@ -42,7 +42,6 @@ from fluoromap.contracts import PixelFacts, Run, Segmenter, Silent
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.phantom import Contrast, SimulatedRun, StudySpec, simulate_study
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain, blob_chains
-from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.four_step.blobs import find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.four_step.frame_chains import FourStepDetector, FourStepParams
@@ -51,7 +50,8 @@ from fluoromap.segmenter.four_step.morphology import disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
 from fluoromap.segmenter.four_step.plugin import FourStep
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
-from fluoromap.segmenter.log_image import Image, LogTransform
+from fluoromap.segmenter.picture.field_mask import find_field
+from fluoromap.segmenter.picture.log_image import Image, LogTransform
 from fluoromap_service.dicom import deterministic_uid, open_frames, read_instance, write_cine
 
 Work = Callable[[], object]

@@ -26,7 +26,7 @@ from fluoromap.phantom.motion import (
 )
 from fluoromap.phantom.shaft import Shaft, arc_lengths_mm
 from fluoromap.phantom.simulated_study import FRONTAL, LATERAL
-from fluoromap.segmenter.quiet_frames import diastolic_frames
+from fluoromap.segmenter.picture.quiet_frames import diastolic_frames
 
 NOISE_PX = 0.5
 GANTRIES = (LATERAL, FRONTAL)

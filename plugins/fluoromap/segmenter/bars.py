@@ -8,7 +8,7 @@ import numpy as np
 
 from fluoromap.contracts import Array
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 _STEP_MM, _BEYOND_MM, _AHEAD_MM = 0.25, 2.0, 2.0
 _MARGIN = 12

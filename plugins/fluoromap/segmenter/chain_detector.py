@@ -20,12 +20,10 @@ from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
-from fluoromap.segmenter.field_mask import FieldMask, are_in
 from fluoromap.segmenter.linking import (
     CandidateChain,
     CatheterFamily,
     PossibleChains,
-    ShaftImage,
     best_chains,
     catheter_families,
     chain_score,
@@ -33,9 +31,11 @@ from fluoromap.segmenter.linking import (
     link_candidates,
     possible_chains,
 )
-from fluoromap.segmenter.log_image import Image
 from fluoromap.segmenter.missing_electrodes import complete_chains
-from fluoromap.segmenter.moved_means import moved_means
+from fluoromap.segmenter.picture.field_mask import FieldMask, are_in
+from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.picture.moved_means import moved_means
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search

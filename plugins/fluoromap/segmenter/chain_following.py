@@ -10,8 +10,8 @@ import numpy as np
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
 from fluoromap.segmenter.chain_fitting import widen_covariance
-from fluoromap.segmenter.field_mask import are_in
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.field_mask import are_in
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.refinement import refine
 
 _CLEAR = 0.8

@@ -14,7 +14,7 @@ from numba import njit
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES, TURNING_ELECTRODES
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.row_shape import row_fit
 
 _SPACING_SD, _LOOP_SPACING_SD = 0.06, 0.12

@@ -6,21 +6,17 @@ electrodes more than what lies between them. The unexplained rest of an electrod
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import BoolArray, Chain, FrameSource
-from fluoromap.segmenter.field_mask import evenly_spaced_frames
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.grey_steps import usual_step
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.refinement import unexplained_sd
 
-_CODED_BITS = 8
-_ASKED = 3
 _OF_REST, _FOR_EACH_LEVEL = 1.7, 0.7
 """The least standard deviation over the unexplained rest where neighbouring pixels are alike, and how much less that is for each
 grey level by which they usually differ. Fitted to simulated cines that were made without knowledge of this project."""
@@ -48,31 +44,6 @@ def rest_gain(frames: FrameSource, inside: BoolArray, bits_stored: int) -> float
         0 where neighbouring pixels differ by two and a half grey levels and more: then noise says how sure the places are.
     """
     return max(_OF_REST - _FOR_EACH_LEVEL * usual_step(frames, inside, bits_stored), 0.0)
-
-
-def usual_step(frames: FrameSource, inside: BoolArray, bits_stored: int) -> float:
-    """Return by how many grey levels neighbouring pixels usually differ.
-
-    It is a median over the field, between whole levels too, and then over a few frames. Up to half a level most neighbours are
-    alike. Pixels at either end of a frame's levels do not count: they may be clipped. It is infinite for pixels of more than eight
-    bits, which are no video. The parameters are those of :func:`rest_gain`.
-    """
-    both = inside[:, 1:] & inside[:, :-1]
-    if bits_stored > _CODED_BITS or not both.any():
-        return math.inf
-    return float(np.median([_step_of(frames[index], both) for index in evenly_spaced_frames(len(frames), _ASKED)]))
-
-
-def _step_of(frame: NDArray[np.generic], both: BoolArray) -> float:
-    levels = frame.astype(np.int32)
-    first, second = levels[:, :-1][both], levels[:, 1:][both]
-    within = (np.minimum(first, second) > levels.min()) & (np.maximum(first, second) < levels.max())
-    steps = np.abs(second - first)[within]
-    if not len(steps):
-        return math.inf
-    # A step of n levels lies anywhere between n - 0.5 and n + 0.5.
-    shares = np.cumsum(np.bincount(steps)) / len(steps)
-    return float(np.interp(0.5, np.concatenate([[0.0], shares]), np.concatenate([[0.0], 0.5 + np.arange(len(shares))])))
 
 
 def widen_by_rest(

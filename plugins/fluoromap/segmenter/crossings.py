@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.shaft_ends import ray_depths
 
 _ANGLES_RAD = np.deg2rad(np.linspace(40.0, 140.0, 11))

@@ -22,7 +22,7 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_length_px, reached_rows
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _Degrees = tuple[tuple[int, int], ...]
 

@@ -13,7 +13,7 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.proposals import log_odds
 
 _EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
@@ -23,29 +23,9 @@ _LOST = 2.0
 _WORTH = 6.0
 _FLOOR_FALLS = 0.6
 _BEST, _LEAST_OF_FAMILY = 80, 20
-_SIDE_MM = 1.75
 _LARGEST_LOOP = 1.3
 """Size of the largest loop of a type, in that of the type."""
 _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ShaftImage:
-    """An image in which the dark shafts of catheters are visible.
-
-    smooth : the log image without most of its noise, ``reduction`` times smaller than the frame. clear : depth of a clearly
-    visible shaft, log units. px_per_mm : of the frame, at the isocentre.
-    """
-
-    smooth: Image
-    reduction: int
-    clear: float
-    px_per_mm: float
-
-    @property
-    def side_px(self) -> float:
-        """Distance beside a shaft at which its surroundings are measured, pixels of the frame."""
-        return max(2.0, _SIDE_MM * self.px_per_mm)
 
 
 @dataclass(frozen=True, slots=True)

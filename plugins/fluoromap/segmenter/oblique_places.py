@@ -13,7 +13,7 @@ from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.chain_fitting import are_hidden
 from fluoromap.segmenter.cylinder_fit import fit_cylinders
 from fluoromap.segmenter.linking import shape_fit
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.refinement import usual_radius_mm
 
 _OBLIQUE, _LEAST_ELECTRODES = 0.9, 3

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray, frozen
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 
 @dataclass(frozen=True, eq=False)

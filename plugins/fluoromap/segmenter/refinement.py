@@ -13,7 +13,7 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.chain_search import LONGEST, SHORTEST
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _STEP_PX = 0.5
 _REACH_PX = 3.5

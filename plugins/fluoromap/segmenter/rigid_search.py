@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.proposals import Likeness
 
 _TURNS_RAD = np.deg2rad([0.0, -4.0, 4.0, -8.0, 8.0])

@@ -15,15 +15,21 @@ from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, 
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
-from fluoromap.segmenter.field_mask import ExposedField, FieldMask, evenly_spaced_frames, exposed_field, field_mask
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
-from fluoromap.segmenter.lag import measure_lag, widen_by_lag
-from fluoromap.segmenter.log_image import Image, LogTransform
-from fluoromap.segmenter.moved_means import WINDOW_MS
 from fluoromap.segmenter.oblique_places import place_obliquely
-from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, still_frames
+from fluoromap.segmenter.picture.field_mask import (
+    ExposedField,
+    FieldMask,
+    evenly_spaced_frames,
+    exposed_field,
+    field_mask,
+)
+from fluoromap.segmenter.picture.lag import measure_lag, widen_by_lag
+from fluoromap.segmenter.picture.log_image import Image, LogTransform
+from fluoromap.segmenter.picture.moved_means import WINDOW_MS
+from fluoromap.segmenter.picture.quiet_frames import MotionMeter, diastolic_frames, still_frames
+from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.scale_of_ellipses import at_scale
-from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.shape_agreement import widen_by_shape
 from fluoromap.segmenter.shape_jitter import widen_by_jitter
 from fluoromap.segmenter.track_agreement import with_shape_of_track
@@ -108,7 +114,7 @@ class Detector(Protocol):
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first.
 
-        See :func:`~fluoromap.segmenter.moved_means.moved_means`.
+        See :func:`~fluoromap.segmenter.picture.moved_means.moved_means`.
 
         Parameters
         ----------
@@ -174,7 +180,7 @@ class ObliquePlaces:
 
 @dataclass(frozen=True, slots=True)
 class RunLag:
-    """The answer of :func:`~fluoromap.segmenter.lag.measure_lag`."""
+    """The answer of :func:`~fluoromap.segmenter.picture.lag.measure_lag`."""
 
     lag: float
 

@@ -14,7 +14,7 @@ import numpy as np
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 _FAN_RAD, _LOOP_FAN_RAD = np.deg2rad(np.linspace(-25.0, 25.0, 9)), np.deg2rad(np.linspace(-45.0, 45.0, 15))
 _NARROW_FAN_RAD, _NEAR_REACH_MM = np.deg2rad(np.linspace(-15.0, 15.0, 7)), (2.4, 5.0)

@@ -12,7 +12,7 @@ from PIL import Image as PillowImage
 from scipy.ndimage import affine_transform
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
 from fluoromap.training.drawing import Canvas, Image
 from fluoromap.training.randomness import between, chance, random_curve, scaled, smooth_field
 

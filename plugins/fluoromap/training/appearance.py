@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw
 
-from fluoromap.segmenter.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
 from fluoromap.training.drawing import Image
 from fluoromap.training.exposure import Exposure
 from fluoromap.training.printing import compressed, printed

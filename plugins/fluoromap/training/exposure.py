@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from fluoromap.segmenter.gaussian_blur import gaussian
-from fluoromap.segmenter.learned_chain.resampling import resampled
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.resampling import resampled
 from fluoromap.training.drawing import Image
 from fluoromap.training.randomness import between, chance, scaled
 

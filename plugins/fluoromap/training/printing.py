@@ -12,7 +12,7 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFilter
 from PIL.Image import Resampling
 
-from fluoromap.segmenter.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
 from fluoromap.training.drawing import Image
 from fluoromap.training.randomness import between, chance
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.segmenter.bars import ACROSS_MM, follows_bars, has_other_wall, products_beside
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX = 3.2
 START = np.array([120.0, 40.0])

@@ -6,7 +6,8 @@ from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.segmenter.chain_fitting import fit_chains
-from fluoromap.segmenter.linking import CandidateChain, ShaftImage, catheter_families
+from fluoromap.segmenter.linking import CandidateChain, catheter_families
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX_PER_MM = 3.5
 CATHETER = catheter_type("quadripolar-2-5-2", "reference")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.segmenter.crossings import are_crossings
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX = 3.2
 CHAIN = np.array([[60.0, 100.0], [80.0, 100.0], [110.0, 100.0], [130.0, 100.0]])

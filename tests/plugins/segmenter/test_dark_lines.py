@@ -15,7 +15,7 @@ from fluoromap.segmenter.dark_lines import (
     goes_on,
     is_dark_line,
 )
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX_PER_MM = 3.2
 DOUBT = np.zeros(6)

@@ -12,8 +12,8 @@ from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_r
 from fluoromap.segmenter.four_step.homomorphic import equivalent_sigma, homomorphic
 from fluoromap.segmenter.four_step.morphology import disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
-from fluoromap.segmenter.gaussian_blur import gaussian
-from fluoromap.segmenter.log_image import LogTransform
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.log_image import LogTransform
 
 
 def plain_homomorphic(x, low=0.5, high=2.0, slope=1.0, cutoff=8.0, mode="reflect"):

@@ -6,7 +6,6 @@ from fluoromap.segmenter.chain_search import find_paths
 from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.linking import (
     PossibleChains,
-    ShaftImage,
     best_chains,
     catheter_families,
     evidence,
@@ -14,6 +13,7 @@ from fluoromap.segmenter.linking import (
     link_candidates,
 )
 from fluoromap.segmenter.long_catheters import trace_rows
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.proposals import probability_of_contrast
 
 PX = 5.75

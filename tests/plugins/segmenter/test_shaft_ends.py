@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import catheter_type
-from fluoromap.segmenter.linking import ShaftImage
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends, shafts_at_ends
 
 PX = 3.2

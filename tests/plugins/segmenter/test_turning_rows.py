@@ -6,10 +6,11 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
 from fluoromap.segmenter.chain_fitting import widen_covariance
-from fluoromap.segmenter.field_mask import are_in
-from fluoromap.segmenter.linking import PossibleChains, ShaftImage, best_chains, catheter_families, possible_chains
+from fluoromap.segmenter.linking import PossibleChains, best_chains, catheter_families, possible_chains
 from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.missing_electrodes import complete_chains
+from fluoromap.segmenter.picture.field_mask import are_in
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.row_shape import next_place, place_covariance_mm2, row_fit, smooth_places
 
 PX = 3.5

@@ -10,7 +10,7 @@ from skimage.filters import threshold_otsu
 from skimage.measure import label
 
 from fluoromap.contracts import Array, BoolArray, frozen
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 MOST_FOREGROUND = 0.02
 """Above this share of the field the threshold has separated noise or contrast medium from the rest, not electrodes."""

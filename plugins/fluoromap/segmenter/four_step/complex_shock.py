@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from fluoromap.contracts import BoolArray
-from fluoromap.segmenter.log_image import Image, central_range
+from fluoromap.segmenter.picture.log_image import Image, central_range
 
 
 def to_grey_range(x: Image, inside: BoolArray) -> Image:

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import gaussian, reduce_by
+from fluoromap.segmenter.picture.log_image import Image
 
 _CORE_MM = 0.55
 _RING_MM = (1.5, 2.0)

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from fluoromap.segmenter.gaussian_blur import gaussian
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.log_image import Image
 
 
 def homomorphic(x: Image, low: float = 0.5, high: float = 2.0, slope: float = 1.0, cutoff: float = 8.0) -> Image:

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fluoromap.contracts import IntArray
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 Levels = NDArray[np.uint16]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from fluoromap.contracts import BoolArray
-from fluoromap.segmenter.log_image import Image, central_range
+from fluoromap.segmenter.picture.log_image import Image, central_range
 
 STABLE_STEP = 0.25
 """Limit of the time step of explicit four-neighbour diffusion: at this step a checkerboard never fades."""

@@ -11,7 +11,6 @@ from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.dark_lines import IN_FRAME
-from fluoromap.segmenter.field_mask import FieldMask
 from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, near_distance_mm
 from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
@@ -20,7 +19,8 @@ from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.orientations import ALL_ORIENTATIONS
 from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import Trust
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.field_mask import FieldMask
+from fluoromap.segmenter.picture.log_image import Image
 
 IN_A_RUN = Acceptance(
     least_clearness=0.1,

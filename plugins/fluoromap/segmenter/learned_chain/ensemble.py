@@ -8,7 +8,7 @@ import numpy as np
 
 from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork, Part
 from fluoromap.segmenter.learned_chain.layers import HEADS
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _OFFSETS = [HEADS.index(name) for name in ("offset_u", "offset_v")]
 _LOG_VARIANCE = HEADS.index("log_variance")

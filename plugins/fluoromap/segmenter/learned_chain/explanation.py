@@ -10,7 +10,8 @@ from fluoromap.contracts import FrameChains, PixelFacts, Run
 from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, Trained, read_weights
-from fluoromap.segmenter.log_image import Image, LogTransform
+from fluoromap.segmenter.picture.field_mask import FieldMask, evenly_spaced_frames, find_field
+from fluoromap.segmenter.picture.log_image import Image, LogTransform
 
 SCALES_PX_PER_MM = 2.3, 2.7, 3.1, 3.6, 4.1, 4.7, 5.4, 6.2, 7.1, 8.2, 9.4, 10.8
 """Scales of fluoroscopy at the isocentre, each 15 % above the one before: of 512 to 1024 pixels, and of printed figures."""

@@ -14,7 +14,7 @@ from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.learned_chain.layers import AROUND, CELL_PX, CONVOLUTIONS, HEADS, Convolution
 from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
 from fluoromap.segmenter.learned_chain.winograd import convolve, transformed_taps
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _STRIP_VALUES = 16384
 """Values of a part that a strip of answers reads: they stay in a cache of 1 MB with the products."""

@@ -10,7 +10,7 @@ from typing import Generic, Protocol, TypeVar
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.learned_chain.carried_network import CarriedNetwork, Motion
 from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence, NetworkResponse
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 OWN_CELLS = 1
 """How far from a place the network's answer for it lies, in cells, where the answer is for the same image."""

@@ -16,7 +16,7 @@ from fluoromap.segmenter.chain_following import follow_chains
 from fluoromap.segmenter.learned_chain.carried_network import Motion
 from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.tracks import reverse
 
 SHARED_MS = 21.0

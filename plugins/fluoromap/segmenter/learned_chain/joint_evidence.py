@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 
 _EVEN_SHARE = 0.5

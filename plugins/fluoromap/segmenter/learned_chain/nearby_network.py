@@ -18,9 +18,9 @@ from fluoromap.segmenter.learned_chain.network_response import (
     padded,
 )
 from fluoromap.segmenter.learned_chain.normalisation import normalise
-from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.picture.resampling import resampled
 from fluoromap.segmenter.proposals import Proposals
 
 _FIELD_PX = 13 * STRIDE_PX

@@ -9,13 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter.gaussian_blur import repeat_edge
 from fluoromap.segmenter.learned_chain.layers import CELL_PX, HEADS, STRIDE_PX
 from fluoromap.segmenter.learned_chain.normalisation import normalise
 from fluoromap.segmenter.learned_chain.orientations import mean_answer
-from fluoromap.segmenter.learned_chain.resampling import resampled
 from fluoromap.segmenter.learned_chain.weights import Trained
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import repeat_edge
+from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.picture.resampling import resampled
 from fluoromap.segmenter.proposals import Proposals
 
 NETWORK_PX_PER_MM = 3.0

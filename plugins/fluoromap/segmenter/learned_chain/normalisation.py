@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fluoromap.segmenter.gaussian_blur import gaussian
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.log_image import Image
 
 _NEIGHBOURHOOD_PX = 16.0
 _GLOBAL_SHARE = 0.3

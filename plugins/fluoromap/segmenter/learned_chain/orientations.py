@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fluoromap.segmenter.learned_chain.layers import HEADS
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 ALL_ORIENTATIONS = 8
 

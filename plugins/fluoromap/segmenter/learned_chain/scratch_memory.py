@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 
 class ScratchMemory(threading.local):

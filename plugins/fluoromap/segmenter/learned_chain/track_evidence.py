@@ -22,7 +22,7 @@ from fluoromap.segmenter.learned_chain.track_means import (
     in_sections,
 )
 from fluoromap.segmenter.learned_chain.weights import Trained
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
 from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.unlisted import EVEN_ODDS, Onwards, onwards

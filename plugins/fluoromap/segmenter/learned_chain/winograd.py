@@ -12,7 +12,7 @@ import numpy as np
 
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _TILE = 4
 _PLACES = 36

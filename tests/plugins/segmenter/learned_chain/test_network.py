@@ -18,8 +18,8 @@ from fluoromap.segmenter.learned_chain.network_response import (
     network_scale,
 )
 from fluoromap.segmenter.learned_chain.normalisation import normalise
-from fluoromap.segmenter.learned_chain.resampling import add_moved, resampled
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.picture.resampling import add_moved, resampled
 from fluoromap.segmenter.proposals import Proposals
 
 REFERENCE = Path(__file__).with_name("pytorch_answers.npz")

@@ -9,12 +9,12 @@ import pytest
 from fluoromap.contracts import Chain, PixelFacts
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.acceptance import UNSEEN
-from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
 from fluoromap.segmenter.learned_chain.track_means import SectionOdds, TrackMeans
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
-from fluoromap.segmenter.log_image import LogTransform
+from fluoromap.segmenter.picture.field_mask import find_field
+from fluoromap.segmenter.picture.log_image import LogTransform
 
 FRAMES = 8
 PX_PER_MM = 512 / 178 * 2

@@ -6,11 +6,11 @@ import numpy as np
 
 from fluoromap.contracts import PixelFacts
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
 from fluoromap.segmenter.learned_chain.track_means import TrackMeans
 from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
-from fluoromap.segmenter.log_image import LogTransform
+from fluoromap.segmenter.picture.field_mask import find_field
+from fluoromap.segmenter.picture.log_image import LogTransform
 from fluoromap.segmenter.proposals import log_odds
 
 PX_PER_MM = 512 / 178 * 2

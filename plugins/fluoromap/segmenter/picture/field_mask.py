@@ -12,10 +12,10 @@ from scipy import ndimage
 from skimage.measure import points_in_poly
 
 from fluoromap.contracts import Array, BoolArray, FrameSource, IntArray, PixelFacts, Shutter
-from fluoromap.segmenter.burnt_in import burnt_in_text
-from fluoromap.segmenter.collimator import within_collimator
-from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.burnt_in import burnt_in_text
+from fluoromap.segmenter.picture.collimator import within_collimator
+from fluoromap.segmenter.picture.gaussian_blur import gaussian, reduce_by
+from fluoromap.segmenter.picture.log_image import Image
 
 MARGIN_PX, EDGE_PX = 16, 5
 """Candidates closer than this to the edge of the field are ignored, pixels: at first, and where catheters lack or two are sure."""

@@ -9,9 +9,9 @@ from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
 from fluoromap.geometry import Gantry
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.lag import measure_lag, widen_by_lag
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
-from fluoromap.segmenter.shadowless_frames import ShadowlessFrames
+from fluoromap.segmenter.picture.lag import measure_lag, widen_by_lag
+from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
 
 PIXELS = PixelFacts(logarithmic=False, bits_stored=16, monochrome1=False)
 EVERYWHERE = np.ones((128, 128), np.bool_)

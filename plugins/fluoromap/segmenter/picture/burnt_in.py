@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import BoolArray, IntArray
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _SIZE = 512
 """Lengths in pixels below are those of a picture of this size."""

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource, PixelFacts
-from fluoromap.segmenter.coded_frames import usual_step
-from fluoromap.segmenter.gaussian_blur import reduce_by
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import reduce_by
+from fluoromap.segmenter.picture.grey_steps import usual_step
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.tracks import mean_shift
 
 _TRIPLES, _BLOCK_PX = 3, 16

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import gaussian, reduce_by
+from fluoromap.segmenter.picture.log_image import Image
 
 _SIZE = 128
 _STEEP = 0.12

@@ -8,9 +8,9 @@ from scipy import ndimage
 
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
-from fluoromap.segmenter.burnt_in import burnt_in_text
-from fluoromap.segmenter.field_mask import find_field
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
+from fluoromap.segmenter.picture.burnt_in import burnt_in_text
+from fluoromap.segmenter.picture.field_mask import find_field
 
 FACTS = PixelFacts(True, 8, False)
 LIKE_ELECTRODES = {(60, 60): "ID 0012345", (60, 90): "o o o o", (250, 380): "H H E E F F", (80, 300): "LIH 11.1.19"}

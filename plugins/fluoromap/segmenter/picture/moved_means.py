@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 WINDOW_MS = 70.0
 """Longest time between the middle frame and another frame of a mean. A catheter's velocity hardly changes in it."""

@@ -8,8 +8,8 @@ import numpy as np
 from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray, FrameChains
-from fluoromap.segmenter.gaussian_blur import gaussian, reduce_by
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import gaussian, reduce_by
+from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.tracks import chain_distance, farthest_px, reverse
 
 MOST_AVERAGED = 7

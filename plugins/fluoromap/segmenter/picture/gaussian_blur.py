@@ -13,7 +13,7 @@ import numpy as np
 
 from fluoromap.contracts import IntArray
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 _AT_ONCE = 3
 

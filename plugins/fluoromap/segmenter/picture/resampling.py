@@ -9,7 +9,7 @@ import numpy as np
 
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.log_image import Image
 
 
 def resampled(x: Image, scale: float) -> Image:

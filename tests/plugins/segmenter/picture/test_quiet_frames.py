@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fluoromap.segmenter.quiet_frames import MotionMeter, diastolic_frames, quiet_stretches
+from fluoromap.segmenter.picture.quiet_frames import MotionMeter, diastolic_frames, quiet_stretches
 
 
 def cycle(rate_hz, beat_s, beats, noise=0.0):

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.contracts import FrameSource
-from fluoromap.segmenter.gaussian_blur import gaussian
-from fluoromap.segmenter.log_image import Image
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.log_image import Image
 
 _AROUND_PX = 1.5
 _SAMPLED = np.s_[::4, ::4]
@@ -29,7 +29,7 @@ class ShadowlessFrames:
     ----------
     frames : FrameSource
     lag : float
-        See :func:`~fluoromap.segmenter.lag.measure_lag`, below 1.
+        See :func:`~fluoromap.segmenter.picture.lag.measure_lag`, below 1.
     bits_stored : int
         Significant bits of a pixel.
     """

@@ -6,8 +6,8 @@ from scipy import ndimage
 
 from fluoromap.contracts import PixelFacts, Shutter
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.collimator import within_collimator
-from fluoromap.segmenter.field_mask import find_field, inside_shutter
+from fluoromap.segmenter.picture.collimator import within_collimator
+from fluoromap.segmenter.picture.field_mask import find_field, inside_shutter
 from fluoromap_service.dicom import open_frames, read_instance
 
 FACTS = PixelFacts(False, 12, False)

@@ -1,0 +1,1 @@
+"""What a picture is before anybody looks for catheters: field, log image, lag, motion, means of frames."""
