@@ -19,6 +19,7 @@ from fluoromap.segmenter.chain_fitting import HIDING_MM, FittedChain, are_hidden
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
+from fluoromap.segmenter.electrodes.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.faded_ends import without_shorter_catheters
 from fluoromap.segmenter.linking import (
     CandidateChain,
@@ -36,7 +37,6 @@ from fluoromap.segmenter.picture.field_mask import FieldMask, are_in
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.moved_means import moved_means
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
 from fluoromap.segmenter.shared_metal import lies_on_metal

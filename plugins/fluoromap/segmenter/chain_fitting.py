@@ -69,7 +69,7 @@ def fit_chains(
     families : tuple of CatheterFamily
     noise : float
         Standard deviation of a pixel, log units, see
-        :attr:`~fluoromap.segmenter.proposals.ImageEvidence.position_noise`.
+        :attr:`~fluoromap.segmenter.electrodes.proposals.ImageEvidence.position_noise`.
     sure : int
         Number of candidates with a blob of their own; they come first. All by default.
     tip_logits_at : callable, optional

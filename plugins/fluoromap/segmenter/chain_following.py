@@ -50,7 +50,7 @@ def follow_chains(
         At the isocentre.
     noise : float
         Standard deviation of a pixel, log units, see
-        :attr:`~fluoromap.segmenter.proposals.ImageEvidence.position_noise`.
+        :attr:`~fluoromap.segmenter.electrodes.proposals.ImageEvidence.position_noise`.
     reach_px : float
         Largest distance of an electrode from its expected place.
     """

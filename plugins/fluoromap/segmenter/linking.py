@@ -13,8 +13,8 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.electrodes.proposals import log_odds
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.proposals import log_odds
 
 _EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
 _SHAFT_WEIGHT = 0.4

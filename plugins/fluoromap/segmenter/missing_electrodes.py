@@ -16,10 +16,10 @@ from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_search
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.electrodes.proposals import answers_for_each
 from fluoromap.segmenter.linking import CatheterFamily
 from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.picture.field_mask import are_in
-from fluoromap.segmenter.proposals import answers_for_each
 from fluoromap.segmenter.refinement import predict_on_curve
 
 _LEAST_KNOWN = 3

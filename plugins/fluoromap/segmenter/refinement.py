@@ -99,7 +99,7 @@ def refine(
         At the isocentre.
     noise : float
         Standard deviation of a pixel of the log image at half its size, log units, see
-        :attr:`~fluoromap.segmenter.proposals.ImageEvidence.position_noise`.
+        :attr:`~fluoromap.segmenter.electrodes.proposals.ImageEvidence.position_noise`.
     hidden : (n, electrodes)
         Electrodes behind another catheter. They are put on the curve through the others and get the mean misfit of the
         others.

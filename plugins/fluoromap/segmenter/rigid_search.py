@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.electrodes.proposals import Likeness
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.proposals import Likeness
 
 _TURNS_RAD = np.deg2rad([0.0, -4.0, 4.0, -8.0, 8.0])
 _MOST = 12.0

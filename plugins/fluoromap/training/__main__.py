@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from fluoromap.catheters import Catheter, catheter_type
-from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
-from fluoromap.segmenter.learned_chain.weights import SHIPPED
+from fluoromap.segmenter.electrodes.network.ensemble import NetworkEnsemble
+from fluoromap.segmenter.electrodes.network.weights import SHIPPED
 from fluoromap.training.anatomy import read_backgrounds
 from fluoromap.training.export import check_folded, halved, stacked, write_reference, write_weights
 from fluoromap.training.fitting import BATCH, STEPS_A_SHARD, Progress, fit

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork as SegmentersNetwork
-from fluoromap.segmenter.learned_chain.layers import CONVOLUTIONS
+from fluoromap.segmenter.electrodes.network.forward import ElectrodeNetwork as SegmentersNetwork
+from fluoromap.segmenter.electrodes.network.layers import CONVOLUTIONS
 from fluoromap.training.network import EPSILON, ElectrodeNetwork
 
 REFERENCE_SHAPE = 32, 40

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 -- the name that PyTorch's own documentation uses
 from torch import Tensor, nn
 
-from fluoromap.segmenter.learned_chain.layers import AROUND, CONVOLUTIONS, HEADS
+from fluoromap.segmenter.electrodes.network.layers import AROUND, CONVOLUTIONS, HEADS
 
 EPSILON = 1e-5
 
@@ -16,11 +16,11 @@ class ElectrodeNetwork(nn.Module):
 
     Features at a half, a quarter and an eighth of the size; what the eighth has seen of the surroundings (60 mm) is added to the
     quarter, which answers for the 2 x 2 cells of 2 px that it covers. Layers are those of
-    :data:`~fluoromap.segmenter.learned_chain.layers.CONVOLUTIONS`; all but the last two are followed by batch normalisation
+    :data:`~fluoromap.segmenter.electrodes.network.layers.CONVOLUTIONS`; all but the last two are followed by batch normalisation
     and a rectifier.
 
     In: (n, 1, rows, columns), rows and columns multiples of 8. Out: (n, 5, rows / 2, columns / 2), see
-    :data:`~fluoromap.segmenter.learned_chain.layers.HEADS`.
+    :data:`~fluoromap.segmenter.electrodes.network.layers.HEADS`.
     """
 
     def __init__(self) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from fluoromap.segmenter.learned_chain.layers import CELL_PX
-from fluoromap.segmenter.learned_chain.normalisation import normalise
+from fluoromap.segmenter.electrodes.network.layers import CELL_PX
+from fluoromap.segmenter.electrodes.network.normalisation import normalise
 from fluoromap.training.drawing import Image
 from fluoromap.training.randomness import chance
 from fluoromap.training.scenes import CLEAR, Scene

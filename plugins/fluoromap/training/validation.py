@@ -10,9 +10,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.electrodes.network.ensemble import NetworkEnsemble
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.training.scenes import CLEAR, Scene
 
 NEAR_PX = 4.0

@@ -9,8 +9,8 @@ from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.geometry import Gantry
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
+from fluoromap.segmenter.electrodes.blob_response import BlobResponse
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 
 CHI2_95_2D = 5.991464547107979

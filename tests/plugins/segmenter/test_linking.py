@@ -3,6 +3,7 @@ import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
 from fluoromap.segmenter.chain_search import find_paths
+from fluoromap.segmenter.electrodes.proposals import probability_of_contrast
 from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.linking import (
     PossibleChains,
@@ -14,7 +15,6 @@ from fluoromap.segmenter.linking import (
 )
 from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.proposals import probability_of_contrast
 
 PX = 5.75
 

@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, NoParams, Run, Segmentation
 from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
+from fluoromap.segmenter.electrodes.blob_response import BlobResponse
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.run_segmentation import segment_run

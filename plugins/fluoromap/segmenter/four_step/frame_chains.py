@@ -12,6 +12,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_fitting import fit_chains
+from fluoromap.segmenter.electrodes.proposals import probability_of_contrast
 from fluoromap.segmenter.four_step.blobs import MOST_FOREGROUND, Blobs, find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
 from fluoromap.segmenter.four_step.contrast import Contrast
@@ -23,7 +24,6 @@ from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.gaussian_blur import reduce_by
 from fluoromap.segmenter.picture.log_image import Image, pixel_noise
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.proposals import probability_of_contrast
 
 MOST_BLOBS = 40
 """With more blobs than this the threshold has separated noise from the rest, not electrodes."""

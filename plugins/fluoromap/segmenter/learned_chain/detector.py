@@ -8,16 +8,16 @@ from dataclasses import replace
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import PixelFacts
 from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.dark_lines import IN_FRAME
-from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
+from fluoromap.segmenter.electrodes.blob_response import BlobResponse
+from fluoromap.segmenter.electrodes.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
+from fluoromap.segmenter.electrodes.joint_evidence import FAINT_LOG_ODDS, JointEvidence
+from fluoromap.segmenter.electrodes.network.nearby_network import NearbyNetwork
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.network.orientations import ALL_ORIENTATIONS
+from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, near_distance_mm
-from fluoromap.segmenter.learned_chain.joint_evidence import FAINT_LOG_ODDS, JointEvidence
-from fluoromap.segmenter.learned_chain.nearby_network import NearbyNetwork
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.learned_chain.orientations import ALL_ORIENTATIONS
-from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.linking import Trust
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.log_image import Image

@@ -13,9 +13,9 @@ from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_detector import ChainDetector, SearchedImage
 from fluoromap.segmenter.chain_following import follow_chains
-from fluoromap.segmenter.learned_chain.carried_network import Motion
-from fluoromap.segmenter.learned_chain.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.frame_answers import OWN_CELLS, LatestBlobs, LatestNetwork, StoredAnswers
+from fluoromap.segmenter.electrodes.network.carried_network import Motion
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.tracks import reverse
 

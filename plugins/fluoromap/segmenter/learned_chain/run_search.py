@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
+from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.learned_chain.absent_catheters import AbsentCatheters, absent_catheters, without_absent
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
 from fluoromap.segmenter.learned_chain.explanation import frame_electrodes, promising_scales
@@ -22,7 +23,6 @@ from fluoromap.segmenter.learned_chain.unlisted_catheters import (
     run_shows_more,
     with_usual_types,
 )
-from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.run_segmentation import recall_for
 
 T = TypeVar("T")

@@ -14,6 +14,7 @@ from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import follows_bars, has_other_wall
 from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.dark_lines import DarkLineLimits, ends_on_coil, gap_share, goes_on, is_dark_line
+from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.learned_chain.track_means import (
     SectionOdds,
     TrackMeans,
@@ -21,7 +22,6 @@ from fluoromap.segmenter.learned_chain.track_means import (
     first_and_last,
     in_sections,
 )
-from fluoromap.segmenter.learned_chain.weights import Trained
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
 from fluoromap.segmenter.tracks import Verdict

@@ -15,13 +15,13 @@ import numpy as np
 from fluoromap.contracts import Array, IntArray
 from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, products_beside
 from fluoromap.segmenter.dark_lines import depths_along, depths_beyond
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse, network_scale
-from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse, network_scale
+from fluoromap.segmenter.electrodes.network.weights import Trained
+from fluoromap.segmenter.electrodes.proposals import log_odds
 from fluoromap.segmenter.picture.gaussian_blur import gaussian
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.resampling import add_moved, resampled
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.proposals import log_odds
 from fluoromap.segmenter.shaft_ends import shafts_at_ends
 from fluoromap.segmenter.unlisted import EVEN_ODDS
 

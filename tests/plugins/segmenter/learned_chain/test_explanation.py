@@ -9,10 +9,10 @@ from frame_sources import Frames
 from fluoromap.catheters import DEFAULT_CATALOGUE
 from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
+from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
 from fluoromap.segmenter.learned_chain import explanation
 from fluoromap.segmenter.learned_chain.explanation import Explanation, find_scale, is_inverted, promising_scales
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
-from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 
 PX_PER_MM = 512 / 178 * 2
 HIGHEST = 4095

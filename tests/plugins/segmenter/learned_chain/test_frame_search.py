@@ -7,12 +7,12 @@ import numpy as np
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
+from fluoromap.segmenter.electrodes.blob_response import BlobResponse
+from fluoromap.segmenter.electrodes.frame_answers import LatestBlobs, LatestNetwork, StoredByFrame
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.proposals import Likeness, Proposals
 from fluoromap.segmenter.learned_chain import frame_search
-from fluoromap.segmenter.learned_chain.frame_answers import LatestBlobs, LatestNetwork, StoredByFrame
 from fluoromap.segmenter.learned_chain.frame_search import FrameSearch
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.proposals import Likeness, Proposals
 from fluoromap.segmenter.tracks import reverse
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])

@@ -6,12 +6,12 @@ import numpy as np
 
 from fluoromap.contracts import PixelFacts
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
+from fluoromap.segmenter.electrodes.proposals import log_odds
 from fluoromap.segmenter.learned_chain.track_means import TrackMeans
-from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
 from fluoromap.segmenter.picture.field_mask import find_field
 from fluoromap.segmenter.picture.log_image import LogTransform
-from fluoromap.segmenter.proposals import log_odds
 
 PX_PER_MM = 512 / 178 * 2
 FACTS = PixelFacts(False, 12, False)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluoromap.segmenter.learned_chain.joint_evidence import JointEvidence
-from fluoromap.segmenter.proposals import Proposals
+from fluoromap.segmenter.electrodes.joint_evidence import JointEvidence
+from fluoromap.segmenter.electrodes.proposals import Proposals
 
 
 class Says:

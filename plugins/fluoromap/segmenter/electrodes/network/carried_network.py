@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence
-from fluoromap.segmenter.proposals import Proposals
+from fluoromap.segmenter.electrodes.network.network_response import NetworkEvidence
+from fluoromap.segmenter.electrodes.proposals import Proposals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarriedNetwork:
-    """Answers of the network to an earlier frame, see :class:`~fluoromap.segmenter.learned_chain.network_response.NetworkResponse`.
+    """Answers of the network to an earlier frame, see :class:`~fluoromap.segmenter.electrodes.network.network_response.NetworkResponse`.
 
     Points are asked about at the places that they had in the earlier frame.
     """

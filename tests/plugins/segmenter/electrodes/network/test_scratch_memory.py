@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
+from fluoromap.segmenter.electrodes.network.scratch_memory import ScratchMemory
 
 
 def test_a_name_gets_the_same_memory_again_in_any_shape():

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fluoromap.segmenter.learned_chain.carried_network import CarriedNetwork, Motion
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.proposals import Proposals
+from fluoromap.segmenter.electrodes.network.carried_network import CarriedNetwork, Motion
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.proposals import Proposals
 
 NONE_FOUND = Proposals(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)))
 THEN, NOW = np.array([[20.0, 20.0], [60.0, 20.0]]), np.array([[32.0, 26.0], [60.0, 40.0]])

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import affine_transform
 
-from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork, Part
-from fluoromap.segmenter.learned_chain.layers import AROUND, CONVOLUTIONS, HEADS
-from fluoromap.segmenter.learned_chain.network_response import (
+from fluoromap.segmenter.electrodes.network.ensemble import NetworkEnsemble
+from fluoromap.segmenter.electrodes.network.forward import ElectrodeNetwork, Part
+from fluoromap.segmenter.electrodes.network.layers import AROUND, CONVOLUTIONS, HEADS
+from fluoromap.segmenter.electrodes.network.network_response import (
     NETWORK_PX_PER_MM,
     NetworkResponse,
     answer,
     network_scale,
 )
-from fluoromap.segmenter.learned_chain.normalisation import normalise
-from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.electrodes.network.normalisation import normalise
+from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
+from fluoromap.segmenter.electrodes.proposals import Proposals
 from fluoromap.segmenter.picture.resampling import add_moved, resampled
-from fluoromap.segmenter.proposals import Proposals
 
 REFERENCE = Path(__file__).with_name("pytorch_answers.npz")
 """Made by ``python -m fluoromap.training --reference``."""

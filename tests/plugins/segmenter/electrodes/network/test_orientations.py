@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from fluoromap.segmenter.learned_chain.layers import CELL_PX, HEADS
-from fluoromap.segmenter.learned_chain.orientations import ALL_ORIENTATIONS, mean_answer
-from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
+from fluoromap.segmenter.electrodes.network.layers import CELL_PX, HEADS
+from fluoromap.segmenter.electrodes.network.orientations import ALL_ORIENTATIONS, mean_answer
+from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
 
 OFFSET_U, OFFSET_V = HEADS.index("offset_u"), HEADS.index("offset_v")
 

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
-from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence
+from fluoromap.segmenter.electrodes.blob_response import BlobResponse
+from fluoromap.segmenter.electrodes.network.network_response import NetworkEvidence
+from fluoromap.segmenter.electrodes.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 
 _EVEN_SHARE = 0.5
 _LEAST_PROBABILITY = 0.05
@@ -31,7 +31,7 @@ FAINT_LOG_ODDS = 4.5
 
 @dataclass(slots=True, eq=False)
 class JointEvidence:
-    """Network and blobs of one log image, see :class:`~fluoromap.segmenter.proposals.ImageEvidence`.
+    """Network and blobs of one log image, see :class:`~fluoromap.segmenter.electrodes.proposals.ImageEvidence`.
 
     network : may be that of the frame before. least_noise : of a pixel, for pictures of 8 bits. faint_log_odds :
     what little contrast adds to the network's log-odds in the scores. reach_cells : how far from a

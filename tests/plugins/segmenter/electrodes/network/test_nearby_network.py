@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from fluoromap.segmenter.learned_chain import nearby_network
-from fluoromap.segmenter.learned_chain.nearby_network import NearbyNetwork
-from fluoromap.segmenter.learned_chain.network_response import NetworkResponse
-from fluoromap.segmenter.learned_chain.weights import SHIPPED, read_weights
-from fluoromap.segmenter.proposals import log_odds
+from fluoromap.segmenter.electrodes.network import nearby_network
+from fluoromap.segmenter.electrodes.network.nearby_network import NearbyNetwork
+from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
+from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
+from fluoromap.segmenter.electrodes.proposals import log_odds
 
 CHAIN = np.array([[0.0, 0], [30, 10], [60, 15]])
 

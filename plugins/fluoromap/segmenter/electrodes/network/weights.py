@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoromap.segmenter.learned_chain.ensemble import NetworkEnsemble
+from fluoromap.segmenter.electrodes.network.ensemble import NetworkEnsemble
 
 SHIPPED = Path(__file__).with_name("weights.npz")
 """Made by ``python -m fluoromap.training``; ``weights.json`` beside it has its SHA-256, command, seed and figures."""

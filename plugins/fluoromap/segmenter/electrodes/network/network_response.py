@@ -9,14 +9,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter.learned_chain.layers import CELL_PX, HEADS, STRIDE_PX
-from fluoromap.segmenter.learned_chain.normalisation import normalise
-from fluoromap.segmenter.learned_chain.orientations import mean_answer
-from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.electrodes.network.layers import CELL_PX, HEADS, STRIDE_PX
+from fluoromap.segmenter.electrodes.network.normalisation import normalise
+from fluoromap.segmenter.electrodes.network.orientations import mean_answer
+from fluoromap.segmenter.electrodes.network.weights import Trained
+from fluoromap.segmenter.electrodes.proposals import Proposals
 from fluoromap.segmenter.picture.gaussian_blur import repeat_edge
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.resampling import resampled
-from fluoromap.segmenter.proposals import Proposals
 
 NETWORK_PX_PER_MM = 3.0
 """The scale at which the networks know most electrodes.
@@ -64,7 +64,7 @@ class NetworkResponse:
 
     probability : (rows, columns) float32 of an electrode's centre in each cell. answers : (rows, columns, heads) float32.
     found : electrodes in the whole image. cell_px, first_px : frame pixels from cell to cell, and where the first lies.
-    variance_gain : see :class:`~fluoromap.segmenter.learned_chain.weights.Trained`.
+    variance_gain : see :class:`~fluoromap.segmenter.electrodes.network.weights.Trained`.
     """
 
     probability: Image
@@ -83,7 +83,7 @@ class NetworkResponse:
     def of_image(cls, x: Image, trained: Trained, px_per_mm: float, orientations: int = 1) -> NetworkResponse:
         """Ask the network about a log image, reduced to the network's scale.
 
-        ``orientations`` : see :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
+        ``orientations`` : see :func:`~fluoromap.segmenter.electrodes.network.orientations.mean_answer`.
         """
         scale = network_scale(px_per_mm)
         return cls.of_reduced(resampled(x, scale), trained, scale, orientations)
@@ -93,7 +93,7 @@ class NetworkResponse:
         """Ask the network about a reduced log image.
 
         It has ``scale`` times the size of the frame. ``orientations`` : see
-        :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
+        :func:`~fluoromap.segmenter.electrodes.network.orientations.mean_answer`.
         """
         answers = answer(trained, normalise(small), orientations)
         probability = electrode_probability(trained, answers)
@@ -267,7 +267,7 @@ def network_scale(px_per_mm: float) -> float:
 def answer(trained: Trained, picture: Image, orientations: int = 1) -> Image:
     """Return the network's answers to a normalised picture of any size, (rows / 2, columns / 2, heads), both rounded up.
 
-    ``orientations`` : see :func:`~fluoromap.segmenter.learned_chain.orientations.mean_answer`.
+    ``orientations`` : see :func:`~fluoromap.segmenter.electrodes.network.orientations.mean_answer`.
     """
     rows, columns = picture.shape
     answers = mean_answer(trained.ensemble, padded(picture), orientations)

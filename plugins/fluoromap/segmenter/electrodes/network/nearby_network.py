@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.learned_chain.forward import Part
-from fluoromap.segmenter.learned_chain.layers import CELL_PX, STRIDE_PX
-from fluoromap.segmenter.learned_chain.network_response import (
+from fluoromap.segmenter.electrodes.network.forward import Part
+from fluoromap.segmenter.electrodes.network.layers import CELL_PX, STRIDE_PX
+from fluoromap.segmenter.electrodes.network.network_response import (
     NetworkResponse,
     cell_grid,
     electrode_probability,
@@ -17,11 +17,11 @@ from fluoromap.segmenter.learned_chain.network_response import (
     network_scale,
     padded,
 )
-from fluoromap.segmenter.learned_chain.normalisation import normalise
-from fluoromap.segmenter.learned_chain.weights import Trained
+from fluoromap.segmenter.electrodes.network.normalisation import normalise
+from fluoromap.segmenter.electrodes.network.weights import Trained
+from fluoromap.segmenter.electrodes.proposals import Proposals
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.resampling import resampled
-from fluoromap.segmenter.proposals import Proposals
 
 _FIELD_PX = 13 * STRIDE_PX
 """How far from a cell the farthest pixel lies that its answer depends on, at most."""
@@ -45,7 +45,7 @@ class _Cells:
 class NearbyNetwork:
     """Answers of the network to one log image: near places that are asked about, or to all of it.
 
-    The answers are those of :class:`~fluoromap.segmenter.learned_chain.network_response.NetworkResponse` up to rounding.
+    The answers are those of :class:`~fluoromap.segmenter.electrodes.network.network_response.NetworkResponse` up to rounding.
     """
 
     x: Image

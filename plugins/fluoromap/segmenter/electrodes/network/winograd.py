@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fluoromap.segmenter.electrodes.network.scratch_memory import ScratchMemory
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
 from fluoromap.segmenter.picture.log_image import Image
 
 _TILE = 4

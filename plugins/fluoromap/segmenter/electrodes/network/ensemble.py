@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.segmenter.learned_chain.forward import ElectrodeNetwork, Part
-from fluoromap.segmenter.learned_chain.layers import HEADS
+from fluoromap.segmenter.electrodes.network.forward import ElectrodeNetwork, Part
+from fluoromap.segmenter.electrodes.network.layers import HEADS
 from fluoromap.segmenter.picture.log_image import Image
 
 _OFFSETS = [HEADS.index(name) for name in ("offset_u", "offset_v")]

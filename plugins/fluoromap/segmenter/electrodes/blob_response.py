@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fluoromap.contracts import Array, BoolArray, IntArray
+from fluoromap.segmenter.electrodes.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.picture.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.picture.log_image import Image, pixel_noise, robust_sd
-from fluoromap.segmenter.proposals import Likeness, Proposals, log_odds, probability_of_contrast
 
 _SCALES_MM = 0.52, 0.73, 1.04
 _LEAST_RING_PX = 5.0

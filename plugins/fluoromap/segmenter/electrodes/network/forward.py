@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.blas import sgemm
 
+from fluoromap.segmenter.electrodes.network.layers import AROUND, CELL_PX, CONVOLUTIONS, HEADS, Convolution
+from fluoromap.segmenter.electrodes.network.scratch_memory import ScratchMemory
+from fluoromap.segmenter.electrodes.network.winograd import convolve, transformed_taps
 from fluoromap.segmenter.kernels import kernel
-from fluoromap.segmenter.learned_chain.layers import AROUND, CELL_PX, CONVOLUTIONS, HEADS, Convolution
-from fluoromap.segmenter.learned_chain.scratch_memory import ScratchMemory
-from fluoromap.segmenter.learned_chain.winograd import convolve, transformed_taps
 from fluoromap.segmenter.picture.log_image import Image
 
 _STRIP_VALUES = 16384
@@ -27,7 +27,7 @@ class Layer:
     """One convolution ready to use: of single pixels, or of a window, with a step of 2 or rectified.
 
     taps : (width * width, inputs, outputs) float32, row by row of the window; for a window without steps (36, inputs, outputs),
-    see :func:`~fluoromap.segmenter.learned_chain.winograd.transformed_taps`. bias : (outputs,) float32. Batch normalisation is
+    see :func:`~fluoromap.segmenter.electrodes.network.winograd.transformed_taps`. bias : (outputs,) float32. Batch normalisation is
     folded into both.
     """
 
@@ -202,7 +202,7 @@ class ElectrodeNetwork:
 
         Returns
         -------
-        (rows of cells, columns of cells, 5) float32, see :data:`~fluoromap.segmenter.learned_chain.layers.HEADS`.
+        (rows of cells, columns of cells, 5) float32, see :data:`~fluoromap.segmenter.electrodes.network.layers.HEADS`.
         """
         half = self._answer("at_half", picture[..., None])
         quarter = self._answer("at_quarter_again", self._answer("at_quarter", half))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fluoromap.segmenter.learned_chain.layers import HEADS
+from fluoromap.segmenter.electrodes.network.layers import HEADS
 from fluoromap.segmenter.picture.log_image import Image
 
 ALL_ORIENTATIONS = 8
@@ -27,7 +27,7 @@ def mean_answer(network: Callable[[Image], Image], picture: Image, orientations:
 
     Parameters
     ----------
-    network : as :class:`~fluoromap.segmenter.learned_chain.forward.ElectrodeNetwork`
+    network : as :class:`~fluoromap.segmenter.electrodes.network.forward.ElectrodeNetwork`
     picture : (rows, columns) float32
     orientations : int
         1 to 8.

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
-from fluoromap.segmenter.catheter_chain.blob_response import BlobResponse
-from fluoromap.segmenter.learned_chain.carried_network import CarriedNetwork, Motion
-from fluoromap.segmenter.learned_chain.network_response import NetworkEvidence, NetworkResponse
+from fluoromap.segmenter.electrodes.blob_response import BlobResponse
+from fluoromap.segmenter.electrodes.network.carried_network import CarriedNetwork, Motion
+from fluoromap.segmenter.electrodes.network.network_response import NetworkEvidence, NetworkResponse
 from fluoromap.segmenter.picture.log_image import Image
 
 OWN_CELLS = 1

@@ -1,0 +1,1 @@
+"""Single electrodes: what proposers say about one picture, blobs and network."""

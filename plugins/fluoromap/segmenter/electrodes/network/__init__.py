@@ -1,0 +1,1 @@
+"""The network that proposes electrodes: its layers, how it is run, its weights, its answers."""
