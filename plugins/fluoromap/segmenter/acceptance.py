@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.dark_lines import IN_FRAME, DarkLineLimits
 from fluoromap.segmenter.linking import ONE_BY_ONE, Trust
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 UNSEEN = 0.0

@@ -16,7 +16,6 @@ from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import UNSEEN, Acceptance, shows_enough
 from fluoromap.segmenter.bars import follows_bars, products_beside
 from fluoromap.segmenter.chain_fitting import HIDING_MM, FittedChain, are_hidden, fit_chains, widen_covariance
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.crossings import are_crossings
 from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.electrodes.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
@@ -39,8 +38,9 @@ from fluoromap.segmenter.picture.moved_means import moved_means
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.rigid_search import rigid_search
+from fluoromap.segmenter.shape.chain_comparison import is_same_shape
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.shared_metal import lies_on_metal
-from fluoromap.segmenter.track_agreement import is_same_shape
 from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6

@@ -9,13 +9,15 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, IntArray
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES, TURNING_ELECTRODES
 from fluoromap.segmenter.cylinder_fit import compare_catheters
-from fluoromap.segmenter.linking import CandidateChain, CatheterFamily, kind_probabilities, shaft_evidence, shape_fit
+from fluoromap.segmenter.linking import CandidateChain, CatheterFamily, kind_probabilities, shaft_evidence
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, predict_on_curve, refine, usual_radius_mm
+from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, refine, usual_radius_mm
 from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
+from fluoromap.segmenter.shape.curve import predict_on_curve
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES, TURNING_ELECTRODES
+from fluoromap.segmenter.shape.spacings import shape_fit
 
 _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0

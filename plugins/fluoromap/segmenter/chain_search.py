@@ -12,18 +12,8 @@ import numpy as np
 
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter.kernels import kernel
-
-SHORTEST, LONGEST = 0.35, 1.12
-"""Limits of the ratio between the spacing in the image and the same spacing across the rays at the isocentre.
-
-A foreshortened catheter has a smaller ratio, a catheter nearer to the source a larger one.
-"""
-
-MANY_ELECTRODES = 6
-"""From here on a catheter is long. Of a shorter one, more than one electrode is rarely missing."""
-
-TURNING_ELECTRODES = 8
-"""From here on a row is known even where it turns through the viewing direction and a part of its electrodes merge."""
+from fluoromap.segmenter.shape.limits import LONGEST, MANY_ELECTRODES, SHORTEST
+from fluoromap.segmenter.shape.loops import off_ellipse
 
 _END_SLACK, _RING_MM = (0.55, 1.1), 0.7
 """Of a single gap: shares of the limits, and how much longer makers' rings may make it than the catalogue's rings do."""
@@ -84,25 +74,6 @@ def find_paths(
     mean = ratios.mean(axis=1)
     possible: IntArray = kept[(mean >= SHORTEST) & (mean <= LONGEST)]
     return possible
-
-
-def off_ellipse(places: Array, angles_rad: Array) -> Array:
-    """Return the sums of the squared distances of places from their best ellipses, (n,) pixels².
-
-    The image of a circle is ``c + a cos + b sin`` of the angles on the circle, with the same angles from every side.
-
-    Parameters
-    ----------
-    places : (n, electrodes, 2)
-        Pixels.
-    angles_rad : (electrodes,)
-        Places on the circle.
-    """
-    basis = np.linalg.qr(np.column_stack([np.ones(len(angles_rad)), np.cos(angles_rad), np.sin(angles_rad)]))[0]
-    centred = places - places.mean(axis=1, keepdims=True)
-    on_ellipse = basis.T @ centred
-    off: Array = (centred * centred).sum(axis=(1, 2)) - (on_ellipse * on_ellipse).sum(axis=(1, 2))
-    return off
 
 
 def _least_cosines(spacing_mm: Array) -> Array:

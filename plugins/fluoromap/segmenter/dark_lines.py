@@ -10,8 +10,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 _ON_MM, _BESIDE_MM, _AROUND_MM = (-0.3, 0.0, 0.3), (1.0, 1.25, 1.5), (2.75, 3.4, 4.0)
 """Distances from a chain's line: on it, beside the widest catheter of 8 French, and beside a cable."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Chain, FrameChains
-from fluoromap.segmenter.tracks import chain_distance
+from fluoromap.segmenter.shape.chain_comparison import chain_distance
 
 _SEARCHED_AT = 0.25, 0.625, 0.875
 """Where in the run catheters are searched: at three moments of different motion."""

@@ -12,9 +12,10 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_scores, chain_search
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.electrodes.proposals import log_odds
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
+from fluoromap.segmenter.shape.spacings import searched_spacing_px, spacing_px_of
 
 _EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
 _SHAFT_WEIGHT = 0.4
@@ -23,8 +24,6 @@ _LOST = 2.0
 _WORTH = 6.0
 _FLOOR_FALLS = 0.6
 _BEST, _LEAST_OF_FAMILY = 80, 20
-_LARGEST_LOOP = 1.3
-"""Size of the largest loop of a type, in that of the type."""
 _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
 
 
@@ -188,7 +187,7 @@ def possible_chains(
     for index, family in enumerate(families):
         paths, scores = np.zeros((0, family.catheter.electrodes), np.int64), np.zeros(0)
         if len(points) >= family.catheter.electrodes:
-            spacing_px = _spacing_px(family.catheter, shaft_image.px_per_mm)
+            spacing_px = spacing_px_of(family.catheter, shaft_image.px_per_mm)
             searched = sure if completed else len(points)
             longest_px = searched_spacing_px(family.catheter, shaft_image.px_per_mm)
             paths = chain_search.find_paths(
@@ -331,23 +330,11 @@ def chain_score(
     return float(
         chain_scores.score_paths(
             np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,
-            _spacing_px(family.catheter, shaft_image.px_per_mm), family.catheter.tip_mm,
+            spacing_px_of(family.catheter, shaft_image.px_per_mm), family.catheter.tip_mm,
             family.catheter.curvature_per_mm, shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction,
             shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, -np.inf,
         )[0]
     )  # fmt: skip
-
-
-def shape_fit(points_uv: Array, variance_px2: Array, catheter: Catheter, px_per_mm: float) -> Array:
-    """Return the log-likelihood of each chain's shape for this catheter, (n,).
-
-    That is the shape of its spacings, and of a loop's bends. One foreshortening is free. The likelihood lacks a constant.
-    ``points_uv`` are (n, electrodes, 2).
-    """
-    spacing_px, curvature = _spacing_px(catheter, px_per_mm), catheter.curvature_per_mm
-    fit = chain_scores.spacing_fit(points_uv, spacing_px, variance_px2, curvature, px_per_mm)
-    fit += chain_scores.loop_fit(points_uv, spacing_px, curvature, px_per_mm)
-    return fit
 
 
 def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage) -> Array:
@@ -360,18 +347,6 @@ def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage
         points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,
         shaft_image.reduction, shaft_image.clear, shaft_image.side_px,
     )  # fmt: skip
-
-
-def searched_spacing_px(catheter: Catheter, px_per_mm: float) -> Array:
-    """Return the spacings for which chains are searched, (electrodes - 1,) pixels at the isocentre.
-
-    A loop may be larger than its type says: loops are made in several sizes.
-    """
-    return _spacing_px(catheter, px_per_mm) * (_LARGEST_LOOP if catheter.is_circular else 1.0)
-
-
-def _spacing_px(catheter: Catheter, px_per_mm: float) -> Array:
-    return np.asarray(catheter.spacing_mm, dtype=np.float64) * px_per_mm
 
 
 def kind_probabilities(

@@ -11,10 +11,10 @@ import numpy as np
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter.chain_search import LONGEST, TURNING_ELECTRODES
-from fluoromap.segmenter.linking import searched_spacing_px
 from fluoromap.segmenter.picture.field_mask import are_in
-from fluoromap.segmenter.row_shape import next_place, smooth_places
+from fluoromap.segmenter.shape.limits import LONGEST, TURNING_ELECTRODES
+from fluoromap.segmenter.shape.row_shape import next_place, smooth_places
+from fluoromap.segmenter.shape.spacings import searched_spacing_px
 
 _FOLLOWED = 150
 _MOST_MISSING = 0.34

@@ -15,12 +15,12 @@ import numpy as np
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
 from fluoromap.segmenter import chain_search
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.electrodes.proposals import answers_for_each
 from fluoromap.segmenter.linking import CatheterFamily
 from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.picture.field_mask import are_in
-from fluoromap.segmenter.refinement import predict_on_curve
+from fluoromap.segmenter.shape.curve import predict_on_curve
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 _LEAST_KNOWN = 3
 _INNER_SD_MM, _END_SD_MM, _TRACED_SD_MM, _MERGED_SD_MM = 0.4, 0.7, 0.9, 0.5

@@ -12,9 +12,9 @@ from fluoromap.contracts import Array, Chain
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.chain_fitting import are_hidden
 from fluoromap.segmenter.cylinder_fit import fit_cylinders
-from fluoromap.segmenter.linking import shape_fit
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.refinement import usual_radius_mm
+from fluoromap.segmenter.shape.spacings import shape_fit
 
 _OBLIQUE, _LEAST_ELECTRODES = 0.9, 3
 """Visible over true length of a gap below which openings show, and how many electrodes have a line."""

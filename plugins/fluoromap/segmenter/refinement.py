@@ -11,9 +11,10 @@ import numpy as np
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray
-from fluoromap.segmenter.chain_search import LONGEST, SHORTEST
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.shape.curve import predict_on_curve
+from fluoromap.segmenter.shape.limits import LONGEST, SHORTEST
 
 _STEP_PX = 0.5
 _REACH_PX = 3.5
@@ -46,7 +47,6 @@ _CLEAR_PX, _LEAST_WINDOW_PX = 2.0, 2.0
 _LEAST_HALF_PX = 0.75
 _COVERED_PX = 30.0
 _HIDDEN_MM = 0.25
-_STIFFNESS = 6.0
 _LOCAL, _LEAST_SHORTENING = 0.75, 0.15
 
 
@@ -204,19 +204,6 @@ def unexplained_sd(
     along = axes[0]
     sd = np.where(unit_sd[0] > _NO_BAND_SD, np.inf, rests[0])
     return np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1), sd
-
-
-def predict_on_curve(points: Array, is_hidden: BoolArray, arc_mm: Array) -> Array:
-    """Return the positions of the hidden electrodes on a curve through the others.
-
-    The curve is a parabola in arc length with low curvature.
-    """
-    middle = arc_mm.mean()
-    design = np.stack([np.ones(len(arc_mm)), arc_mm - middle, (arc_mm - middle) ** 2], axis=1)
-    known = np.concatenate([design[~is_hidden], [[0.0, 0.0, _STIFFNESS]]])
-    answer = np.linalg.lstsq(known, np.concatenate([points[~is_hidden], np.zeros((1, points.shape[1]))]), rcond=None)[0]
-    predicted: Array = design[is_hidden] @ answer
-    return predicted
 
 
 def usual_radius_mm(catheter: Catheter) -> float:

@@ -13,7 +13,6 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.oblique_places import place_obliquely
@@ -30,11 +29,13 @@ from fluoromap.segmenter.picture.moved_means import WINDOW_MS
 from fluoromap.segmenter.picture.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.scale_of_ellipses import at_scale
+from fluoromap.segmenter.shape.chain_comparison import chain_distance, kind_overlap, overlaps, reverse
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.shape_agreement import widen_by_shape
 from fluoromap.segmenter.shape_jitter import widen_by_jitter
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict, chain_distance, kind_overlap, overlaps, reverse
+from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict
 
 T = TypeVar("T")
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.chain_axes import axes_of_chain
-from fluoromap.segmenter.row_shape import shape_covariance_mm2
+from fluoromap.segmenter.shape.chain_axes import axes_of_chain
+from fluoromap.segmenter.shape.row_shape import shape_covariance_mm2
 
 _FEWEST = 3
 _PLACE_SD_MM = 0.05

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fluoromap.contracts import Array, Chain, FrameChains
-from fluoromap.segmenter.chain_axes import axes_of_chain
+from fluoromap.segmenter.shape.chain_axes import axes_of_chain
 
 _FEWEST, _LEAST_TRIPLES = 3, 3
 _MEDIAN_CHI2 = 0.4549

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fluoromap.contracts import Array, Chain
+from fluoromap.segmenter.shape.chain_comparison import compare_shapes, is_same_shape
 
 _FEWEST_FRAMES, _COMPARED = 3, 60
-_SAME_PX, _DISPLACED_PX = 1.5, 4.0
 _JUMP_PX = 2.5
-_SHARED_AT_LEAST = 0.5
 _SUPPORTED_AT_LEAST = 0.8
 _REACH_PX = 3.0
 
@@ -57,7 +56,7 @@ def with_common_shape(chains: Mapping[int, Chain], search: ShapeSearch) -> dict[
     frames = np.array(sorted(chains))
     places = _places([chains[frame] for frame in frames.tolist()])
     others = np.arange(len(frames))[:: max(1, len(frames) // _COMPARED)]
-    same, displaced = _compare(places, places[others])
+    same, displaced = compare_shapes(places, places[others])
     support = same.sum(axis=1)
     smooth = _smooth_parts(places)
     displaced &= smooth[:, None] != smooth[others]
@@ -88,15 +87,6 @@ def _smooth_parts(places: Array) -> NDArray[np.int64]:
     rest = steps[~jumps] - np.nanmedian(steps[~jumps], axis=1, keepdims=True)
     jumps[~jumps] = np.nanmax(np.linalg.norm(rest, axis=2), axis=1) >= _JUMP_PX
     return np.concatenate([[0], np.cumsum(jumps)])
-
-
-def is_same_shape(points_uv: Array, others_uv: Array) -> bool:
-    """Return whether two chains have the same shape.
-
-    Both are (n, 2), of the same electrodes. A common shift does not count.
-    """
-    same, _ = _compare(points_uv[None], others_uv[None])
-    return bool(same[0, 0])
 
 
 def with_shape_of_track(
@@ -136,23 +126,3 @@ def _places(chains: Sequence[Chain]) -> Array:
     for row, chain in enumerate(chains):
         places[row, [numbers.index(number) for number in chain.electrodes]] = chain.pixels_uv
     return places
-
-
-def _compare(places: Array, others: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which pairs have one shape, and which differ in some electrodes.
-
-    Both are (chains, others). Two chains differ in some electrodes where half of them agree after the median shift.
-    """
-    # Electrodes come first: NumPy reduces long stretches of memory fast. (electrodes, 2, chains, others).
-    mine, theirs = (np.ascontiguousarray(np.moveaxis(side, 0, -1)) for side in (places, others))
-    difference = mine[..., :, None] - theirs[..., None, :]
-    shared = np.isfinite(difference[:, 0])
-    count = shared.sum(axis=0)
-    # A sort puts NaN last.
-    middle = (np.maximum(count - 1, 0) // 2)[None, None]
-    rest = difference - np.take_along_axis(np.sort(difference, axis=0), middle, axis=0)
-    away = np.sqrt(rest[:, 0] ** 2 + rest[:, 1] ** 2)
-    farthest = np.where(shared, away, 0.0).max(axis=0)
-    agreeing = (away <= _SAME_PX).sum(axis=0)
-    enough = count >= _SHARED_AT_LEAST * places.shape[1]
-    return enough & (farthest < _DISPLACED_PX), enough & (farthest >= _DISPLACED_PX) & (2 * agreeing >= count)

@@ -7,19 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.shape.chain_comparison import mean_shift, overlaps
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.track_names import surplus
-from fluoromap.segmenter.tracks import (
-    KEPT_VELOCITY,
-    ChainSearch,
-    Track,
-    TrackJudge,
-    farthest_px,
-    is_believed,
-    mean_shift,
-    meet,
-    overlaps,
-)
+from fluoromap.segmenter.tracks import KEPT_VELOCITY, ChainSearch, Track, TrackJudge, farthest_px, is_believed, meet
 
 _NOT_SEEN_MS = 20.0
 """How long noise may hide a catheter before the search ends."""

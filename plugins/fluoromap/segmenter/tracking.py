@@ -12,25 +12,27 @@ from scipy.optimize import linear_sum_assignment
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.acceptance import UNSEEN
+from fluoromap.segmenter.shape.chain_comparison import (
+    SAME_PLACE_PX,
+    chain_distance,
+    count_shared,
+    kind_overlap,
+    mean_shift,
+    overlaps,
+    reverse,
+)
 from fluoromap.segmenter.track_agreement import ShapeSearch, with_common_kinds, with_common_shape
 from fluoromap.segmenter.track_completion import completed
 from fluoromap.segmenter.track_names import surplus
 from fluoromap.segmenter.tracks import (
     KEPT_VELOCITY,
-    SAME_PLACE_PX,
     ChainSearch,
     Track,
     TrackJudge,
-    chain_distance,
-    count_shared,
     farthest_px,
     is_believed,
-    kind_overlap,
-    mean_shift,
     meet,
     needs_no_other,
-    overlaps,
-    reverse,
 )
 
 _BEND_PX, _BEND_PX_PER_MS, _MOST_BEND_PX = 8.0, 0.15, 14.0

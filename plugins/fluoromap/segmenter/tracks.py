@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
+from fluoromap.segmenter.shape.chain_comparison import overlaps
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.unlisted import Onwards
 
 KEPT_VELOCITY = 0.6
 """Share of a track's last velocity that is expected to last."""
-SAME_PLACE_PX = 4.0
-"""Distance below which electrodes of two chains are one."""
 
 _SPEED_PX_PER_MS = 13.0 / 16.7
 _FARTHEST_PX = 45.0
 _NEAREST_PX = 13.0
-_DISPLACED_WEIGHT = 0.5
 _LESS_CLEAR, _CLEAR_ROW = 2.0, 0.6
 """How much less clear than the run's other catheters a catheter may be, and what is clear in a long row in itself, log-odds."""
 
@@ -87,74 +84,6 @@ class Track:
     verdict: Verdict | None = None
 
 
-def chain_distance(one: Chain, other: Chain, shift: Array | None = None) -> tuple[float, float]:
-    """Return mean shift and largest remaining distance between two chains, pixels.
-
-    Only electrodes that both chains have are compared. Both numbers are infinite where there are none. The worst fifth of six or
-    more electrodes counts half: clutter and merged pairs displace some of a long catheter.
-    """
-    mine, theirs = _common_places(one, other)
-    count = len(mine)
-    if not count:
-        return math.inf, math.inf
-    du, dv = (0.0, 0.0) if shift is None else shift.tolist()
-    # NumPy takes longer for each of a dozen steps than for numbers of so few electrodes.
-    moved = [
-        (u - own_u - du, v - own_v - dv) for (own_u, own_v), (u, v) in zip(mine.tolist(), theirs.tolist(), strict=True)
-    ]
-    mean_u, mean_v = sum(u for u, _ in moved) / count, sum(v for _, v in moved) / count
-    away = sorted(math.sqrt((u - mean_u) ** 2 + (v - mean_v) ** 2) for u, v in moved)
-    farthest = away[-1]
-    if count >= MANY_ELECTRODES:
-        worst = count // 5
-        farthest = max(away[-worst - 1], _DISPLACED_WEIGHT * farthest)
-    return math.sqrt(mean_u**2 + mean_v**2), farthest
-
-
-def kind_overlap(one: Chain, other: Chain) -> float:
-    """Return how well the kinds of two chains agree.
-
-    0 : they cannot be the same catheter. 1 : their probabilities agree as far as they can.
-    """
-    theirs = dict(other.kinds)
-    agreement = sum(probability * theirs.get(name, 0.0) for name, probability in one.kinds)
-    squares = [sum(probability**2 for _, probability in chain.kinds) for chain in (one, other)]
-    return agreement / max(*squares, 1e-9)
-
-
-def mean_shift(one: Chain, other: Chain) -> Array:
-    """Return the mean shift (2,) between two chains, pixels; 0 where none is shared."""
-    mine, theirs = _common_places(one, other)
-    if not len(mine):
-        return np.zeros(2)
-    moved: Array = (theirs - mine).sum(axis=0) / len(mine)
-    return moved
-
-
-def _common_places(one: Chain, other: Chain) -> tuple[Array, Array]:
-    """Return the places in two chains of the electrodes that both have, (n, 2)."""
-    if one.electrodes == other.electrodes:
-        return one.pixels_uv, other.pixels_uv
-    common = sorted(set(one.electrodes) & set(other.electrodes))
-    mine, theirs = (chain.pixels_uv[[chain.electrodes.index(number) for number in common]] for chain in (one, other))
-    return mine, theirs
-
-
-def overlaps(chain: Chain, others: Sequence[Chain]) -> bool:
-    """Return whether two or more electrodes lie on electrodes of another chain."""
-    return any(count_shared(chain, other) >= 2 for other in others)
-
-
-def count_shared(chain: Chain, other: Chain) -> int:
-    """Count the electrodes of a chain that lie on electrodes of another."""
-    left, upper, right, lower = chain.extent_px
-    other_left, other_upper, other_right, other_lower = other.extent_px
-    if max(left - other_right, other_left - right, upper - other_lower, other_upper - lower) >= SAME_PLACE_PX:
-        return 0
-    apart = chain.pixels_uv[:, None, :] - other.pixels_uv[None, :, :]
-    return int(np.count_nonzero((apart * apart).sum(axis=2).min(axis=1) < SAME_PLACE_PX**2))
-
-
 def meet(track: Track, other: Track) -> bool:
     """Return whether two tracks share electrodes in a frame."""
     return any(overlaps(chain, [other.chains[frame]]) for frame, chain in track.chains.items() if frame in other.chains)
@@ -163,11 +92,6 @@ def meet(track: Track, other: Track) -> bool:
 def farthest_px(elapsed_ms: float) -> float:
     """Return how far from its expected place a catheter may be after a time."""
     return min(max(_NEAREST_PX, _SPEED_PX_PER_MS * elapsed_ms), _FARTHEST_PX)
-
-
-def reverse(chain: Chain) -> Chain:
-    """Return the same chain with its tip at the other end."""
-    return replace(chain.from_other_end(chain.electrodes[-1]), electrodes=chain.electrodes)
 
 
 def is_believed(track: Track, tracks: Sequence[Track]) -> bool:

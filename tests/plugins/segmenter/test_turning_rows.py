@@ -11,7 +11,7 @@ from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.missing_electrodes import complete_chains
 from fluoromap.segmenter.picture.field_mask import are_in
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.row_shape import next_place, place_covariance_mm2, row_fit, smooth_places
+from fluoromap.segmenter.shape.row_shape import next_place, place_covariance_mm2, row_fit, smooth_places
 
 PX = 3.5
 CATHETER = catheter_type("decapolar-2-5-2", "cs")

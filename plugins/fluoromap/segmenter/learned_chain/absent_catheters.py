@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Segmentation
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 
 @dataclass(frozen=True, slots=True)

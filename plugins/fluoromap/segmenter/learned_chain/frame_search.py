@@ -17,7 +17,7 @@ from fluoromap.segmenter.electrodes.frame_answers import OWN_CELLS, LatestBlobs,
 from fluoromap.segmenter.electrodes.network.carried_network import Motion
 from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.tracks import reverse
+from fluoromap.segmenter.shape.chain_comparison import reverse
 
 SHARED_MS = 21.0
 """Time between frames up to which the network's answer for one frame says where electrodes are in the next."""

@@ -15,8 +15,8 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import FrameChains, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.learned_chain.added_catheters import add_catheters
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 OTHER_SCALES = 1.18, 1.39, 0.85
 """Over the stated one."""

@@ -12,7 +12,6 @@ import numpy as np
 from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.bars import follows_bars, has_other_wall
-from fluoromap.segmenter.chain_search import MANY_ELECTRODES
 from fluoromap.segmenter.dark_lines import DarkLineLimits, ends_on_coil, gap_share, goes_on, is_dark_line
 from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.learned_chain.track_means import (
@@ -24,6 +23,7 @@ from fluoromap.segmenter.learned_chain.track_means import (
 )
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.run_segmentation import Recall, compute_always
+from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.tracks import Verdict
 from fluoromap.segmenter.unlisted import EVEN_ODDS, Onwards, onwards
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE

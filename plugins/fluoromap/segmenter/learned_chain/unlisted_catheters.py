@@ -17,7 +17,8 @@ from fluoromap.contracts import Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.added_catheters import tracks_of
 from fluoromap.segmenter.learned_chain.other_scales import expected_electrodes
-from fluoromap.segmenter.tracks import Track, overlaps
+from fluoromap.segmenter.shape.chain_comparison import overlaps
+from fluoromap.segmenter.tracks import Track
 
 USUAL_TYPES = "quadripolar-2-5-2", "decapolar-2-5-2"
 

@@ -12,7 +12,7 @@ from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSourc
 from fluoromap.segmenter.picture.gaussian_blur import reduce_by
 from fluoromap.segmenter.picture.grey_steps import usual_step
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.tracks import mean_shift
+from fluoromap.segmenter.shape.chain_comparison import mean_shift
 
 _TRIPLES, _BLOCK_PX = 3, 16
 _STILL_SHARE = 0.6

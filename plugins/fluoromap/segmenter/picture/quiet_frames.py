@@ -10,7 +10,8 @@ from scipy import ndimage
 from fluoromap.contracts import Array, BoolArray, FrameChains
 from fluoromap.segmenter.picture.gaussian_blur import gaussian, reduce_by
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.tracks import chain_distance, farthest_px, reverse
+from fluoromap.segmenter.shape.chain_comparison import chain_distance, reverse
+from fluoromap.segmenter.tracks import farthest_px
 
 MOST_AVERAGED = 7
 

@@ -13,7 +13,7 @@ from fluoromap.segmenter.electrodes.network.network_response import NetworkRespo
 from fluoromap.segmenter.electrodes.proposals import Likeness, Proposals
 from fluoromap.segmenter.learned_chain import frame_search
 from fluoromap.segmenter.learned_chain.frame_search import FrameSearch
-from fluoromap.segmenter.tracks import reverse
+from fluoromap.segmenter.shape.chain_comparison import reverse
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 X = np.zeros((32, 32), np.float32)

@@ -34,7 +34,9 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarriedNetwork:
-    """Answers of the network to an earlier frame, see :class:`~fluoromap.segmenter.electrodes.network.network_response.NetworkResponse`.
+    """Answers of the network to an earlier frame.
+
+    See :class:`~fluoromap.segmenter.electrodes.network.network_response.NetworkResponse`.
 
     Points are asked about at the places that they had in the earlier frame.
     """

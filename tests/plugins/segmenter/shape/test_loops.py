@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
-from fluoromap.segmenter.chain_scores import loop_fit
-from fluoromap.segmenter.chain_search import find_paths, off_ellipse
-from fluoromap.segmenter.linking import catheter_families, searched_spacing_px
+from fluoromap.segmenter.chain_search import find_paths
+from fluoromap.segmenter.linking import catheter_families
+from fluoromap.segmenter.shape.loops import loop_fit, off_ellipse
+from fluoromap.segmenter.shape.spacings import searched_spacing_px
 
 PX = 3.2
 LOOPS = ["circular-10", "circular-20", "circular-20-2-6-2"]

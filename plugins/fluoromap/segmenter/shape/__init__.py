@@ -1,0 +1,1 @@
+"""Shapes of catheters in a picture: rows, loops, spacings, bends, and how two chains compare."""
