@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.chains.linking import ONE_BY_ONE, Trust
 from fluoromap.segmenter.dark_lines import IN_FRAME, DarkLineLimits
-from fluoromap.segmenter.linking import ONE_BY_ONE, Trust
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
@@ -54,18 +54,18 @@ class ScoreLimits:
 class Acceptance:
     """How sure chains have to be, in the measures of one proposer.
 
-    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.refinement.ElectrodeFit.clearness`, of a chain found in its
-    image and of one of another frame. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter
-    beside those of the catalogue is reported from here on. scores : limits for a chain. scores_beside : limits for a chain in an
-    image that shows another catheter; the same by default. unseen_evidence : an electrode that was not
-    proposed is predicted only where there is more :func:`~fluoromap.segmenter.linking.evidence` than this. strict : a chain is
-    not accepted as a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line.
-    row_chain_score, row_score : a catheter of six or more electrodes is accepted without ``scores``
-    where its chain's score and the median of its scores are at least these and a pair is seen at both ends: anatomy rarely has
-    so long a row with the right spacings, and a row that is displaced along its catheter ends where nothing is. hidden_pair :
-    limits for such a catheter that does without a pair, which something may hide.
-    trust : see :class:`~fluoromap.segmenter.linking.Trust`. faded_price : if ``strict``, what the score of a chain of six or more
-    loses for each place at its ends that shows no electrode. dark_lines : chains on such lines are not accepted, if ``strict``.
+    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.refinement.ElectrodeFit.clearness`, of a chain found in
+    its image and of one of another frame. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter
+    beside those of the catalogue is reported from here on. scores : limits for a chain. scores_beside : limits for a chain in
+    an image that shows another catheter; the same by default. unseen_evidence : an electrode that was not proposed is predicted
+    only where there is more :func:`~fluoromap.segmenter.chains.linking.evidence` than this. strict : a chain is not accepted as
+    a catheter of the catalogue where sure proposals lie between its electrodes, or go on in its line. row_chain_score,
+    row_score : a catheter of six or more electrodes is accepted without ``scores`` where its chain's score and the median of
+    its scores are at least these and a pair is seen at both ends: anatomy rarely has so long a row with the right spacings, and
+    a row that is displaced along its catheter ends where nothing is. hidden_pair : limits for such a catheter that does without
+    a pair, which something may hide. trust : see :class:`~fluoromap.segmenter.chains.linking.Trust`. faded_price : if
+    ``strict``, what the score of a chain of six or more loses for each place at its ends that shows no electrode. dark_lines :
+    chains on such lines are not accepted, if ``strict``.
     """
 
     least_clearness: float
@@ -91,7 +91,7 @@ class Acceptance:
         scores : (..., electrodes)
             Of the electrodes, in the proposer's measure; NaN outside the field.
         chain_scores : (...)
-            Of the chains, see :func:`~fluoromap.segmenter.linking.possible_chains`.
+            Of the chains, see :func:`~fluoromap.segmenter.chains.linking.possible_chains`.
         beside : bool
             Whether the image shows another catheter.
         """

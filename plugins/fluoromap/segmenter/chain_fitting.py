@@ -9,8 +9,10 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, IntArray
+from fluoromap.segmenter.chains.families import CatheterFamily
+from fluoromap.segmenter.chains.linking import CandidateChain, shaft_evidence
 from fluoromap.segmenter.cylinder_fit import compare_catheters
-from fluoromap.segmenter.linking import CandidateChain, CatheterFamily, kind_probabilities, shaft_evidence
+from fluoromap.segmenter.judge.names import kind_probabilities
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, refine, usual_radius_mm

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from fluoromap.contracts import Array, IntArray
-from fluoromap.segmenter.linking import CatheterFamily, PossibleChains
+from fluoromap.segmenter.chains.families import CatheterFamily
+from fluoromap.segmenter.chains.linking import PossibleChains
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 _FADED, _LEAST_CONTRAST = 0.5, 8.0

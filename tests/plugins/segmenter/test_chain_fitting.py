@@ -6,7 +6,8 @@ from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.segmenter.chain_fitting import fit_chains
-from fluoromap.segmenter.linking import CandidateChain, catheter_families
+from fluoromap.segmenter.chains.families import catheter_families
+from fluoromap.segmenter.chains.linking import CandidateChain
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX_PER_MM = 3.5

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
+from fluoromap.segmenter.chains.families import catheter_families
+from fluoromap.segmenter.chains.linking import PossibleChains
 from fluoromap.segmenter.faded_ends import count_faded, without_shorter_catheters
-from fluoromap.segmenter.linking import PossibleChains, catheter_families
 
 CLEAR, NOTHING = (20.0, 2.0), (2.0, -2.0)
 

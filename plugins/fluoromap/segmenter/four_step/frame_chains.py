@@ -12,6 +12,8 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.chain_fitting import fit_chains
+from fluoromap.segmenter.chains.families import catheter_families
+from fluoromap.segmenter.chains.linking import evidence, link_candidates
 from fluoromap.segmenter.electrodes.proposals import probability_of_contrast
 from fluoromap.segmenter.four_step.blobs import MOST_FOREGROUND, Blobs, find_blobs
 from fluoromap.segmenter.four_step.complex_shock import complex_shock, to_grey_range
@@ -19,7 +21,6 @@ from fluoromap.segmenter.four_step.contrast import Contrast
 from fluoromap.segmenter.four_step.homomorphic import homomorphic
 from fluoromap.segmenter.four_step.morphology import disk_morphology
 from fluoromap.segmenter.four_step.perona_malik import edge_scale, perona_malik
-from fluoromap.segmenter.linking import catheter_families, evidence, link_candidates
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.gaussian_blur import reduce_by
 from fluoromap.segmenter.picture.log_image import Image, pixel_noise

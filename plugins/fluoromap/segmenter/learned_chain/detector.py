@@ -9,6 +9,7 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import PixelFacts
 from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector
+from fluoromap.segmenter.chains.linking import Trust
 from fluoromap.segmenter.dark_lines import IN_FRAME
 from fluoromap.segmenter.electrodes.blob_response import BlobResponse
 from fluoromap.segmenter.electrodes.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
@@ -18,7 +19,6 @@ from fluoromap.segmenter.electrodes.network.network_response import NetworkRespo
 from fluoromap.segmenter.electrodes.network.orientations import ALL_ORIENTATIONS
 from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, near_distance_mm
-from fluoromap.segmenter.linking import Trust
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.log_image import Image
 

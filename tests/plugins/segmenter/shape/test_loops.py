@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
-from fluoromap.segmenter.chain_search import find_paths
-from fluoromap.segmenter.linking import catheter_families
+from fluoromap.segmenter.chains.families import catheter_families
+from fluoromap.segmenter.chains.path_search import find_paths
 from fluoromap.segmenter.shape.loops import loop_fit, off_ellipse
 from fluoromap.segmenter.shape.spacings import searched_spacing_px
 

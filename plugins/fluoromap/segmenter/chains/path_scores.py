@@ -57,7 +57,7 @@ def score_paths(
     rows = np.flatnonzero(hopeful)
     if rows.size:
         widest = int(np.argmax(spacing_px))
-        shafts = shaft_evidence(places[rows], widest, tip_mm, px_per_mm, smooth, reduction, clear, side)
+        shafts = shafts_of_paths(places[rows], widest, tip_mm, px_per_mm, smooth, reduction, clear, side)
         out[rows] += shaft_weight * shafts
         out[out < least] = -np.inf
     return out
@@ -111,7 +111,7 @@ def _score_shapes(  # type: ignore[no-untyped-def]  # pragma: no cover
         out[row] = score if 2 * unsure <= m else -np.inf
 
 
-def shaft_evidence(
+def shafts_of_paths(
     places: Array, widest: int, tip_mm: float, px_per_mm: float, smooth: Image, reduction: int, clear: float, side: float
 ) -> Array:  # fmt: skip
     """Return how clearly each path shows a shaft, -3 to 3, (n,).

@@ -34,7 +34,7 @@ def trace_rows(
     points_uv : (n, 2)
         Candidates, pixels.
     weights : (n,)
-        Their :func:`~fluoromap.segmenter.linking.evidence`.
+        Their :func:`~fluoromap.segmenter.chains.linking.evidence`.
     catheter : Catheter
     px_per_mm : float
         At the isocentre.

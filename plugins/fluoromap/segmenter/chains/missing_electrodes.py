@@ -14,10 +14,10 @@ import numpy as np
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter import chain_search
+from fluoromap.segmenter.chains.families import CatheterFamily
+from fluoromap.segmenter.chains.path_search import find_paths
+from fluoromap.segmenter.chains.row_tracing import trace_rows
 from fluoromap.segmenter.electrodes.proposals import answers_for_each
-from fluoromap.segmenter.linking import CatheterFamily
-from fluoromap.segmenter.long_catheters import trace_rows
 from fluoromap.segmenter.picture.field_mask import are_in
 from fluoromap.segmenter.shape.curve import predict_on_curve
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
@@ -77,7 +77,7 @@ def complete_chains(
     Parameters
     ----------
     points_uv, weights, variance_px2 : (n, 2), (n,), (n,)
-        As in :func:`~fluoromap.segmenter.linking.link_candidates`.
+        As in :func:`~fluoromap.segmenter.chains.linking.link_candidates`.
     evidence_at : callable
         (k, 2) pixels -> (k,) evidence.
     least_evidence : float
@@ -141,7 +141,7 @@ def _incomplete_chains(
     elif electrodes > _LEAST_KNOWN and len(points) >= electrodes - 1:
         for number in range(electrodes):
             arc_mm = np.delete(catheter.arc_lengths_mm, number)
-            paths = chain_search.find_paths(points, weights, np.diff(arc_mm) * px_per_mm, px_per_mm)
+            paths = find_paths(points, weights, np.diff(arc_mm) * px_per_mm, px_per_mm)
             places_uv = _curve_weights(catheter, number) @ points[paths]
             found.append(_IncompleteChains(paths, np.array([number]), places_uv, np.array([-1])))
     return found

@@ -6,9 +6,10 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
 from fluoromap.segmenter.chain_fitting import widen_covariance
-from fluoromap.segmenter.linking import PossibleChains, best_chains, catheter_families, possible_chains
-from fluoromap.segmenter.long_catheters import trace_rows
-from fluoromap.segmenter.missing_electrodes import complete_chains
+from fluoromap.segmenter.chains.families import catheter_families
+from fluoromap.segmenter.chains.linking import PossibleChains, best_chains, possible_chains
+from fluoromap.segmenter.chains.missing_electrodes import complete_chains
+from fluoromap.segmenter.chains.row_tracing import trace_rows
 from fluoromap.segmenter.picture.field_mask import are_in
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.shape.row_shape import next_place, place_covariance_mm2, row_fit, smooth_places

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.catheters import Catalogue, Catheter
+from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter import chain_scores, chain_search
+from fluoromap.segmenter.chains.families import CatheterFamily
+from fluoromap.segmenter.chains.path_scores import score_paths, shafts_of_paths
+from fluoromap.segmenter.chains.path_search import best_set, count_shared, find_paths
 from fluoromap.segmenter.electrodes.proposals import log_odds
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
@@ -21,37 +21,8 @@ _EVIDENCE_LEAST, _EVIDENCE_MOST = -1.0, 2.2
 _SHAFT_WEIGHT = 0.4
 _SHARED = 1.5
 _LOST = 2.0
-_WORTH = 6.0
-_FLOOR_FALLS = 0.6
 _BEST, _LEAST_OF_FAMILY = 80, 20
 _SAME_PLACE_MM, _SAME_PLACES = 1.3, 3
-
-
-@dataclass(frozen=True, slots=True)
-class CatheterFamily:
-    """Catheters that look alike in fluoroscopy.
-
-    At most ``len(names)`` chains of one frame belong to a family.
-    """
-
-    names: tuple[str, ...]
-    catheter: Catheter
-
-    @property
-    def floor(self) -> float:
-        """Score below which a chain may be anatomy.
-
-        The floor is higher for two electrodes: there is no second spacing to check. It is lower for more than four: bends and
-        spacings cost a long catheter more, and its row is rarer in anatomy.
-        """
-        if self.catheter.electrodes == 2:
-            return 3.0
-        return 1.0 - _FLOOR_FALLS * max(self.catheter.electrodes - 4, 0)
-
-    @property
-    def worth(self) -> float:
-        """What a chain of this family adds to the value of a set, besides its score."""
-        return _WORTH * max(1.0, self.catheter.electrodes / 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,20 +54,6 @@ class PossibleChains:
             tuple(rows[kept] for rows, kept in zip(self.rows, allowed, strict=True)),
             tuple(scores[kept] for scores, kept in zip(self.scores, allowed, strict=True)),
         )
-
-
-@functools.lru_cache(maxsize=32)
-def catheter_families(catalogue: Catalogue) -> tuple[CatheterFamily, ...]:
-    """Group the catalogue's catheters by :meth:`~fluoromap.catheters.Catheter.looks_like`."""
-    groups: list[list[Catheter]] = []
-    for catheter in catalogue.catheters:
-        for group in groups:
-            if group[0].looks_like(catheter):
-                group.append(catheter)
-                break
-        else:
-            groups.append([catheter])
-    return tuple(CatheterFamily(tuple(member.name for member in group), group[0]) for group in groups)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +147,7 @@ def possible_chains(
             spacing_px = spacing_px_of(family.catheter, shaft_image.px_per_mm)
             searched = sure if completed else len(points)
             longest_px = searched_spacing_px(family.catheter, shaft_image.px_per_mm)
-            paths = chain_search.find_paths(
+            paths = find_paths(
                 points[:searched],
                 weights[:searched],
                 longest_px,
@@ -199,7 +156,7 @@ def possible_chains(
             )
             if completed:
                 paths = np.concatenate([paths, completed[index]])
-            scores = chain_scores.score_paths(
+            scores = score_paths(
                 paths, points, weights, variance_px2, sure, _LOST, spacing_px, family.catheter.tip_mm,
                 family.catheter.curvature_per_mm, shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction,
                 shaft_image.clear, shaft_image.side_px, _SHAFT_WEIGHT, family.floor - slack,
@@ -223,7 +180,7 @@ def best_chains(
     weaker catheter is not dropped, nor a part of a long one preferred. The first ``sure`` candidates were proposed,
     all by default; of the others only those count that a chain needs, see :func:`_needless`, and none that ``is_merged``.
     Crossing catheters may share one candidate at a price, but two chains must not exclude each other, see
-    :func:`~fluoromap.segmenter.chain_search.count_shared`. A set has at most as many chains of a family as the catalogue has
+    :func:`~fluoromap.segmenter.chains.path_search.count_shared`. A set has at most as many chains of a family as the catalogue has
     catheters.
     """
     points = np.ascontiguousarray(points_uv, dtype=np.float64)
@@ -284,9 +241,9 @@ def _best_set(
     values = scores + of_each * electrodes
     order = np.argsort(-values, kind="stable")
     within, family, scores = within[order], family[order], scores[order]
-    chosen = chain_search.best_set(
+    chosen = best_set(
         values[order],
-        chain_search.count_shared(within, points, _SAME_PLACE_MM * px_per_mm, _SAME_PLACES),
+        count_shared(within, points, _SAME_PLACE_MM * px_per_mm, _SAME_PLACES),
         family,
         np.array([len(each.names) for each in families]),
         _SHARED,
@@ -328,7 +285,7 @@ def chain_score(
 ) -> float:
     """Return the score of the points in this order, as in :func:`possible_chains`."""
     return float(
-        chain_scores.score_paths(
+        score_paths(
             np.arange(len(points_uv))[None, :], points_uv, weights, variance_px2, len(points_uv), _LOST,
             spacing_px_of(family.catheter, shaft_image.px_per_mm), family.catheter.tip_mm,
             family.catheter.curvature_per_mm, shaft_image.px_per_mm, shaft_image.smooth, shaft_image.reduction,
@@ -343,57 +300,7 @@ def shaft_evidence(points_uv: Array, catheter: Catheter, shaft_image: ShaftImage
     The result (n,) lies between -3 and 3. Dark pixels in the widest gap and behind the last electrode count for a
     shaft, dark pixels before the tip against it.
     """
-    return chain_scores.shaft_evidence(
+    return shafts_of_paths(
         points_uv, int(np.argmax(catheter.spacing_mm)), catheter.tip_mm, shaft_image.px_per_mm, shaft_image.smooth,
         shaft_image.reduction, shaft_image.clear, shaft_image.side_px,
     )  # fmt: skip
-
-
-def kind_probabilities(
-    log_likelihoods: Array, families: Sequence[CatheterFamily]
-) -> tuple[tuple[tuple[str, float], ...], ...]:
-    """Return the probability of each catheter for each chain of one frame.
-
-    Each catheter has at most one chain.
-
-    Parameters
-    ----------
-    log_likelihoods : (chains, families)
-        How well each chain fits each family; -inf where it cannot belong to it.
-    families : sequence of CatheterFamily
-
-    Returns
-    -------
-    tuple
-        One ``kinds`` for each chain as in :class:`~fluoromap.contracts.Chain`: probabilities over all assignments that the
-        catalogue allows. Look-alikes share their probability equally.
-    """
-    chains, count = log_likelihoods.shape
-    marginal = np.zeros((chains, count))
-    relative = np.exp(log_likelihoods - log_likelihoods.max(axis=1, keepdims=True))
-
-    def assign(chain: int, left: list[int], weight: float, taken: tuple[int, ...]) -> None:
-        if weight <= 0:
-            return
-        if chain == chains:
-            for index, family in enumerate(taken):
-                marginal[index, family] += weight
-            return
-        for family in range(count):
-            if left[family]:
-                # Each free look-alike is one more way to assign this family.
-                left[family] -= 1
-                assign(chain + 1, left, weight * relative[chain, family] * (left[family] + 1), (*taken, family))
-                left[family] += 1
-
-    assign(0, [len(family.names) for family in families], 1.0, ())
-    marginal /= np.maximum(marginal.sum(axis=1, keepdims=True), math.ulp(0.0))
-    return tuple(
-        tuple(
-            (name, float(row[index]) / len(family.names))
-            for index, family in enumerate(families)
-            for name in family.names
-            if row[index] > 1e-6
-        )
-        for row in marginal
-    )

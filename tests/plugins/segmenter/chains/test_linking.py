@@ -2,18 +2,13 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter, catheter_type
-from fluoromap.segmenter.chain_search import find_paths
+from fluoromap.segmenter.chains.families import catheter_families
+from fluoromap.segmenter.chains.linking import PossibleChains, best_chains, evidence, link_candidates
+from fluoromap.segmenter.chains.path_search import find_paths
+from fluoromap.segmenter.chains.row_tracing import trace_rows
 from fluoromap.segmenter.electrodes.proposals import probability_of_contrast
 from fluoromap.segmenter.four_step.contrast import Contrast
-from fluoromap.segmenter.linking import (
-    PossibleChains,
-    best_chains,
-    catheter_families,
-    evidence,
-    kind_probabilities,
-    link_candidates,
-)
-from fluoromap.segmenter.long_catheters import trace_rows
+from fluoromap.segmenter.judge.names import kind_probabilities
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX = 5.75

@@ -1,6 +1,6 @@
 """Search for paths through candidates, and for their best set.
 
-The kernels here and in :mod:`~fluoromap.segmenter.chain_scores` are written for a short compile time: they call no
+The kernels here and in :mod:`~fluoromap.segmenter.chains.path_scores` are written for a short compile time: they call no
 kernel, sort nothing and assign no whole rows or arrays. Each of these would add seconds to the first start of a worker.
 """
 
@@ -43,7 +43,7 @@ def find_paths(
     points : (n, 2)
         Candidates, pixels.
     weights : (n,)
-        Their :func:`~fluoromap.segmenter.linking.evidence`.
+        Their :func:`~fluoromap.segmenter.chains.linking.evidence`.
     spacing_px : (electrodes - 1,)
         Spacings from the tip on, at the isocentre, not foreshortened.
     px_per_mm : float
