@@ -13,8 +13,6 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.acceptance import UNSEEN, Acceptance, shows_enough
-from fluoromap.segmenter.bars import follows_bars, products_beside
 from fluoromap.segmenter.chain_fitting import HIDING_MM, FittedChain, are_hidden, fit_chains, widen_covariance
 from fluoromap.segmenter.chains.families import CatheterFamily, catheter_families
 from fluoromap.segmenter.chains.linking import (
@@ -28,10 +26,21 @@ from fluoromap.segmenter.chains.linking import (
 )
 from fluoromap.segmenter.chains.missing_electrodes import complete_chains
 from fluoromap.segmenter.chains.rigid_search import rigid_search
-from fluoromap.segmenter.crossings import are_crossings
-from fluoromap.segmenter.dark_lines import depths_along, is_dark_line
 from fluoromap.segmenter.electrodes.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
-from fluoromap.segmenter.faded_ends import without_shorter_catheters
+from fluoromap.segmenter.judge.acceptance import UNSEEN, Acceptance, shows_enough
+from fluoromap.segmenter.judge.features.bars import follows_bars, products_beside
+from fluoromap.segmenter.judge.features.crossings import are_crossings
+from fluoromap.segmenter.judge.features.dark_lines import depths_along, is_dark_line
+from fluoromap.segmenter.judge.features.faded_ends import without_shorter_catheters
+from fluoromap.segmenter.judge.features.shared_metal import lies_on_metal
+from fluoromap.segmenter.judge.features.unexplained_rows import (
+    EVEN_ODDS,
+    SURE,
+    continues,
+    not_on,
+    shows_row,
+    unexplained_between,
+)
 from fluoromap.segmenter.picture.field_mask import FieldMask, are_in
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.moved_means import moved_means
@@ -39,8 +48,6 @@ from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.refinement import refine
 from fluoromap.segmenter.shape.chain_comparison import is_same_shape
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
-from fluoromap.segmenter.shared_metal import lies_on_metal
-from fluoromap.segmenter.unlisted import EVEN_ODDS, SURE, continues, not_on, shows_row, unexplained_between
 
 _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5

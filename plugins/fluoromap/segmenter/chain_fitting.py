@@ -12,11 +12,11 @@ from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.chains.families import CatheterFamily
 from fluoromap.segmenter.chains.linking import CandidateChain, shaft_evidence
 from fluoromap.segmenter.cylinder_fit import compare_catheters
+from fluoromap.segmenter.judge.features.shaft_ends import shaft_beyond_ends
 from fluoromap.segmenter.judge.names import kind_probabilities
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, refine, usual_radius_mm
-from fluoromap.segmenter.shaft_ends import shaft_beyond_ends
 from fluoromap.segmenter.shape.curve import predict_on_curve
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES, TURNING_ELECTRODES
 from fluoromap.segmenter.shape.spacings import shape_fit

@@ -9,9 +9,9 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.chain_fitting import are_hidden
 from fluoromap.segmenter.cylinder_fit import fit_cylinders
+from fluoromap.segmenter.judge.acceptance import UNSEEN
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.refinement import usual_radius_mm
 from fluoromap.segmenter.shape.spacings import shape_fit

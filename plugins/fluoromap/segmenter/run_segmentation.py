@@ -6,7 +6,7 @@ import functools
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, 
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
+from fluoromap.segmenter.judge.verdict import TrackJudge, Verdict
 from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.picture.field_mask import (
     ExposedField,
@@ -28,6 +29,7 @@ from fluoromap.segmenter.picture.log_image import Image, LogTransform
 from fluoromap.segmenter.picture.moved_means import WINDOW_MS
 from fluoromap.segmenter.picture.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
+from fluoromap.segmenter.recall import Recall, recall_for
 from fluoromap.segmenter.scale_of_ellipses import at_scale
 from fluoromap.segmenter.shape.chain_comparison import chain_distance, kind_overlap, overlaps, reverse
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
@@ -35,9 +37,7 @@ from fluoromap.segmenter.shape_agreement import widen_by_shape
 from fluoromap.segmenter.shape_jitter import widen_by_jitter
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import ChainSearch, TrackJudge, Verdict
-
-T = TypeVar("T")
+from fluoromap.segmenter.tracks import ChainSearch
 
 _SAME_PLACE_MM = 2.5
 _SAME_TRACK_PX = 12.0
@@ -47,8 +47,6 @@ _LEAST_MOVED = 5
 _SURE_ROW = 1.0
 """Log-odds of the middle electrode of a long row that is not judged again."""
 
-Recall = Callable[[type[T], tuple[object, ...], Callable[[], T]], T]
-"""(dataclass, all inputs besides the run and the catalogue, function that computes it) -> partial result."""
 
 RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], Verdict]
 """(frame -> chain of one track, frame -> log image, recall) -> whether the run shows a catheter there."""
@@ -191,23 +189,6 @@ class ExtraCatheter:
     """The answer of :meth:`Detector.shows_extra_catheter` for the mean image."""
 
     is_shown: bool
-
-
-def compute_always(kind: type[T], inputs: tuple[object, ...], compute: Callable[[], T]) -> T:
-    """Compute a partial result; the :data:`Recall` where nothing is stored."""
-    return compute()
-
-
-def recall_for(run: Run, catalogue: Catalogue, context: Context) -> Recall[Any]:
-    """Return :meth:`Context.recall` for partial results of one run.
-
-    A run without a hash of its content has none.
-    """
-    if run.content is None:
-        return compute_always
-    # One tuple for all answers: the context computes its hash once.
-    shown = (run.content, run.frame_times_ms, run.px_per_mm, run.pixels, run.r_wave_frames, catalogue)
-    return lambda kind, inputs, compute: context.recall(kind, (shown, *inputs), compute)
 
 
 def segment_run(

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from fluoromap.contracts import Array
+from fluoromap.segmenter.judge.verdict import TrackJudge, is_believed
 from fluoromap.segmenter.shape.chain_comparison import mean_shift, overlaps
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 from fluoromap.segmenter.track_names import surplus
-from fluoromap.segmenter.tracks import KEPT_VELOCITY, ChainSearch, Track, TrackJudge, farthest_px, is_believed, meet
+from fluoromap.segmenter.tracks import KEPT_VELOCITY, ChainSearch, Track, farthest_px, meet
 
 _NOT_SEEN_MS = 20.0
 """How long noise may hide a catheter before the search ends."""

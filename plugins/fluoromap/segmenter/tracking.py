@@ -11,7 +11,8 @@ from scipy.optimize import linear_sum_assignment
 
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.acceptance import UNSEEN
+from fluoromap.segmenter.judge.acceptance import UNSEEN
+from fluoromap.segmenter.judge.verdict import TrackJudge, is_believed, needs_no_other
 from fluoromap.segmenter.shape.chain_comparison import (
     SAME_PLACE_PX,
     chain_distance,
@@ -24,16 +25,7 @@ from fluoromap.segmenter.shape.chain_comparison import (
 from fluoromap.segmenter.track_agreement import ShapeSearch, with_common_kinds, with_common_shape
 from fluoromap.segmenter.track_completion import completed
 from fluoromap.segmenter.track_names import surplus
-from fluoromap.segmenter.tracks import (
-    KEPT_VELOCITY,
-    ChainSearch,
-    Track,
-    TrackJudge,
-    farthest_px,
-    is_believed,
-    meet,
-    needs_no_other,
-)
+from fluoromap.segmenter.tracks import KEPT_VELOCITY, ChainSearch, Track, farthest_px, meet
 
 _BEND_PX, _BEND_PX_PER_MS, _MOST_BEND_PX = 8.0, 0.15, 14.0
 """How far an electrode may move against its chain between two frames: at least, in time, and at most."""

@@ -8,14 +8,14 @@ from scipy.ndimage import maximum_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains
-from fluoromap.segmenter.acceptance import UNSEEN, ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector, with_whole_places
 from fluoromap.segmenter.chains.families import catheter_families
 from fluoromap.segmenter.chains.linking import PossibleChains, best_chains
 from fluoromap.segmenter.electrodes.proposals import Likeness, Proposals, log_odds
+from fluoromap.segmenter.judge.acceptance import UNSEEN, ScoreLimits
+from fluoromap.segmenter.judge.features.unexplained_rows import continues
 from fluoromap.segmenter.learned_chain.detector import IN_A_RUN
 from fluoromap.segmenter.picture.field_mask import FieldMask, are_in
-from fluoromap.segmenter.unlisted import continues
 
 PX = 4.0
 SIZE = 360

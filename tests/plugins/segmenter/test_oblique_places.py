@@ -8,8 +8,8 @@ from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.cylinder_fit import fit_cylinders
+from fluoromap.segmenter.judge.acceptance import UNSEEN
 from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.refinement import refine, usual_radius_mm
 

@@ -8,9 +8,9 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
 from fluoromap.segmenter import run_segmentation
+from fluoromap.segmenter.judge.verdict import Verdict
 from fluoromap.segmenter.run_segmentation import segment_run
 from fluoromap.segmenter.shape.chain_comparison import reverse
-from fluoromap.segmenter.tracks import Verdict
 
 CATALOGUE = Catalogue((catheter_type("quadripolar-2-5-2", "reference"),), None, "reference")
 LONG = Catalogue((catheter_type("decapolar-2-5-2", "cs"), catheter_type("hexapolar-2-5-2", "his")), "cs", "his")

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from fluoromap.contracts import Chain, FrameChains
+from fluoromap.segmenter.judge.verdict import Verdict
 from fluoromap.segmenter.track_names import surplus
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import Track, Verdict
+from fluoromap.segmenter.tracks import Track
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 

@@ -5,10 +5,10 @@ import pytest
 
 from fluoromap.contracts import Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.acceptance import UNSEEN
+from fluoromap.segmenter.judge.acceptance import UNSEEN
+from fluoromap.segmenter.judge.features.unexplained_rows import Onwards
+from fluoromap.segmenter.judge.verdict import Verdict
 from fluoromap.segmenter.tracking import track_chains
-from fluoromap.segmenter.tracks import Verdict
-from fluoromap.segmenter.unlisted import Onwards
 
 POINTS = np.array([[0.0, 0], [20, 0], [50, 5], [70, 10]])
 

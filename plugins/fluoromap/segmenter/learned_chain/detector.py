@@ -7,10 +7,8 @@ from dataclasses import replace
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import PixelFacts
-from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.chains.linking import Trust
-from fluoromap.segmenter.dark_lines import IN_FRAME
 from fluoromap.segmenter.electrodes.blob_response import BlobResponse
 from fluoromap.segmenter.electrodes.frame_answers import LatestBlobs, LatestNetwork, StoredAnswers
 from fluoromap.segmenter.electrodes.joint_evidence import FAINT_LOG_ODDS, JointEvidence
@@ -18,6 +16,8 @@ from fluoromap.segmenter.electrodes.network.nearby_network import NearbyNetwork
 from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
 from fluoromap.segmenter.electrodes.network.orientations import ALL_ORIENTATIONS
 from fluoromap.segmenter.electrodes.network.weights import Trained
+from fluoromap.segmenter.judge.acceptance import Acceptance, ScoreLimits
+from fluoromap.segmenter.judge.features.dark_lines import IN_FRAME
 from fluoromap.segmenter.learned_chain.frame_search import SHARED_MS, FrameSearch, near_distance_mm
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.log_image import Image

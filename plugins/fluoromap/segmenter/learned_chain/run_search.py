@@ -23,7 +23,7 @@ from fluoromap.segmenter.learned_chain.unlisted_catheters import (
     run_shows_more,
     with_usual_types,
 )
-from fluoromap.segmenter.run_segmentation import recall_for
+from fluoromap.segmenter.recall import recall_for
 
 T = TypeVar("T")
 

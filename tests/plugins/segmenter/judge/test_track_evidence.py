@@ -8,11 +8,11 @@ import pytest
 
 from fluoromap.contracts import Chain, PixelFacts
 from fluoromap.phantom import StudySpec, simulate_study
-from fluoromap.segmenter.acceptance import UNSEEN
 from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
 from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
-from fluoromap.segmenter.learned_chain.track_evidence import TrackEvidence
-from fluoromap.segmenter.learned_chain.track_means import SectionOdds, TrackMeans
+from fluoromap.segmenter.judge.acceptance import UNSEEN
+from fluoromap.segmenter.judge.features.track_means import SectionOdds, TrackMeans
+from fluoromap.segmenter.judge.track_evidence import TrackEvidence
 from fluoromap.segmenter.picture.field_mask import find_field
 from fluoromap.segmenter.picture.log_image import LogTransform
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoromap.segmenter.bars import ACROSS_MM, follows_bars, has_other_wall, products_beside
+from fluoromap.segmenter.judge.features.bars import ACROSS_MM, follows_bars, has_other_wall, products_beside
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX = 3.2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from fluoromap.segmenter.dark_lines import (
+from fluoromap.segmenter.judge.features.dark_lines import (
     IN_FRAME,
     depths_along,
     depths_beyond,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.unlisted import onwards
+from fluoromap.segmenter.judge.features.unexplained_rows import onwards
 
 PX = 3.0
 ROW_MM = np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 0.0], [12.0, 0.0]])

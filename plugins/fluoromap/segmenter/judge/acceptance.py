@@ -8,9 +8,9 @@ import numpy as np
 
 from fluoromap.contracts import Array, BoolArray
 from fluoromap.segmenter.chains.linking import ONE_BY_ONE, Trust
-from fluoromap.segmenter.dark_lines import IN_FRAME, DarkLineLimits
+from fluoromap.segmenter.judge.features.dark_lines import IN_FRAME, DarkLineLimits
+from fluoromap.segmenter.judge.visible_part import LEAST_VISIBLE
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
-from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 UNSEEN = 0.0
 """Score of an electrode outside the field: the others say where it is."""

@@ -9,7 +9,7 @@ from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
 from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
 from fluoromap.segmenter.electrodes.proposals import log_odds
-from fluoromap.segmenter.learned_chain.track_means import TrackMeans
+from fluoromap.segmenter.judge.features.track_means import TrackMeans
 from fluoromap.segmenter.picture.field_mask import find_field
 from fluoromap.segmenter.picture.log_image import LogTransform
 

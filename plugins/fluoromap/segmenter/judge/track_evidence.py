@@ -10,23 +10,23 @@ from dataclasses import InitVar, dataclass, field
 import numpy as np
 
 from fluoromap.contracts import Array, BoolArray, Chain, IntArray
-from fluoromap.segmenter.acceptance import UNSEEN
-from fluoromap.segmenter.bars import follows_bars, has_other_wall
-from fluoromap.segmenter.dark_lines import DarkLineLimits, ends_on_coil, gap_share, goes_on, is_dark_line
 from fluoromap.segmenter.electrodes.network.weights import Trained
-from fluoromap.segmenter.learned_chain.track_means import (
+from fluoromap.segmenter.judge.acceptance import UNSEEN
+from fluoromap.segmenter.judge.features.bars import follows_bars, has_other_wall
+from fluoromap.segmenter.judge.features.dark_lines import DarkLineLimits, ends_on_coil, gap_share, goes_on, is_dark_line
+from fluoromap.segmenter.judge.features.track_means import (
     SectionOdds,
     TrackMeans,
     all_along,
     first_and_last,
     in_sections,
 )
+from fluoromap.segmenter.judge.features.unexplained_rows import EVEN_ODDS, Onwards, onwards
+from fluoromap.segmenter.judge.verdict import Verdict
+from fluoromap.segmenter.judge.visible_part import LEAST_VISIBLE
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.run_segmentation import Recall, compute_always
+from fluoromap.segmenter.recall import Recall, compute_always
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
-from fluoromap.segmenter.tracks import Verdict
-from fluoromap.segmenter.unlisted import EVEN_ODDS, Onwards, onwards
-from fluoromap.segmenter.visible_part import LEAST_VISIBLE
 
 _Said = tuple[float, Array]
 """Log-odds of the middle electrode of a track, and of each one (n,), in some means."""
@@ -50,7 +50,7 @@ _DENIED, _DENIED_LONG = -3.0, -4.0
 _DARK_LINES = DarkLineLimits(thinnest=0.6, sure=0.5, sure_long=2.0)
 """In the means along a track, which have less noise than a frame."""
 _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
-"""How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.dark_lines.gap_share`. Gaps of a loop are
+"""How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.judge.features.dark_lines.gap_share`. Gaps of a loop are
 not measured: seen on edge, both of its sides are one line."""
 _LINE_GAPS, _MOST_OF_SHAFT = 0.8, 1
 """How dark gaps on one line are, as a share of the electrodes' depth, and how many places on it may be improbable. Else two
@@ -156,8 +156,8 @@ class _Seen:
     frames : those that show most of its electrodes. paths_uv : (frames, electrodes, 2) places in them. inside : (electrodes,)
     whether they lie in the field. middles, pictures : of each mean, the frame in its middle, as an index, and the evidence of its
     sections. odds : (pictures, electrodes inside). depths : of each section, see
-    :func:`~fluoromap.segmenter.dark_lines.depths_along`. has_long_tip, is_likely_loop : whether it is likely a catheter with a
-    long tip, or a circular one. moves : whether it does, in the run.
+    :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_along`. has_long_tip, is_likely_loop : whether it is likely a
+    catheter with a long tip, or a circular one. moves : whether it does, in the run.
     """
 
     frames: Sequence[int]
@@ -200,7 +200,7 @@ class _Seen:
 
     @property
     def gaps(self) -> float:
-        """How dark the gaps are, see :func:`~fluoromap.segmenter.dark_lines.gap_share`."""
+        """How dark the gaps are, see :func:`~fluoromap.segmenter.judge.features.dark_lines.gap_share`."""
         return 0.5 * (_CLEAR_GAPS + _DARK_GAPS) if self.is_loop else gap_share(self.depths)
 
     @property
@@ -386,7 +386,8 @@ class TrackEvidence:
     def _least(self, path_uv: Array, least: _Least, gaps: float) -> float:
         """Return the least log-odds of a track with these places.
 
-        path_uv : (frames, electrodes, 2). gaps : how dark they are, see :func:`~fluoromap.segmenter.dark_lines.gap_share`.
+        path_uv : (frames, electrodes, 2). gaps : how dark they are, see
+        :func:`~fluoromap.segmenter.judge.features.dark_lines.gap_share`.
         """
         if self._is_still(path_uv):
             return least.waiting.at(gaps) if self._is_waiting(path_uv) else least.still

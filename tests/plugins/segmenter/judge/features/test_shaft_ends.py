@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import catheter_type
+from fluoromap.segmenter.judge.features.shaft_ends import shaft_beyond_ends, shafts_at_ends
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.shaft_ends import shaft_beyond_ends, shafts_at_ends
 
 PX = 3.2
 ABLATION = catheter_type("ablation-4", "ablation")

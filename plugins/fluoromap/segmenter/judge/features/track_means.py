@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fluoromap.contracts import Array, IntArray
-from fluoromap.segmenter.bars import ACROSS_MM, BESIDE_MM, products_beside
-from fluoromap.segmenter.dark_lines import depths_along, depths_beyond
 from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse, network_scale
 from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.electrodes.proposals import log_odds
+from fluoromap.segmenter.judge.features.bars import ACROSS_MM, BESIDE_MM, products_beside
+from fluoromap.segmenter.judge.features.dark_lines import depths_along, depths_beyond
+from fluoromap.segmenter.judge.features.shaft_ends import shafts_at_ends
+from fluoromap.segmenter.judge.features.unexplained_rows import EVEN_ODDS
 from fluoromap.segmenter.picture.gaussian_blur import gaussian
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.resampling import add_moved, resampled
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.shaft_ends import shafts_at_ends
-from fluoromap.segmenter.unlisted import EVEN_ODDS
 
 _AVERAGED = 8
 _ORIENTATIONS = 2
@@ -42,10 +42,10 @@ _SHAFT = 0.03
 class SectionOdds:
     """The evidence for a part of a track, in the mean of some frames.
 
-    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.bars.products_beside`, for its two sets of
-    distances. depths : see :func:`~fluoromap.segmenter.dark_lines.depths_along`. shafts : see
-    :func:`~fluoromap.segmenter.shaft_ends.shafts_at_ends`. beyond : see
-    :func:`~fluoromap.segmenter.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first and the last
+    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.judge.features.bars.products_beside`, for its two sets of
+    distances. depths : see :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_along`. shafts : see
+    :func:`~fluoromap.segmenter.judge.features.shaft_ends.shafts_at_ends`. beyond : see
+    :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first and the last
     electrode. near_uv, near_odds : (m, 2) places and (m,) log-odds of all electrodes of the picture, in the frame of its places.
     """
 

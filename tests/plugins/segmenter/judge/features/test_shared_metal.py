@@ -5,7 +5,7 @@ import pytest
 
 from fluoromap.catheters import catheter_type
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.shared_metal import lies_on_metal
+from fluoromap.segmenter.judge.features.shared_metal import lies_on_metal
 
 PX_PER_MM = 5.0
 ABLATION = catheter_type("ablation-8", "ablation")

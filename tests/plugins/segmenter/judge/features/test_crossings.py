@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoromap.segmenter.crossings import are_crossings
+from fluoromap.segmenter.judge.features.crossings import are_crossings
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
 
 PX = 3.2

@@ -1,6 +1,6 @@
 import numpy as np
 
-from fluoromap.segmenter.acceptance import Acceptance, ScoreLimits
+from fluoromap.segmenter.judge.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.learned_chain.detector import ALONE, IN_A_RUN
 
 

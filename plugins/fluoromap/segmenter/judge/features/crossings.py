@@ -6,8 +6,8 @@ import numpy as np
 from scipy import ndimage
 
 from fluoromap.contracts import Array, BoolArray
+from fluoromap.segmenter.judge.features.shaft_ends import ray_depths
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.shaft_ends import ray_depths
 
 _ANGLES_RAD = np.deg2rad(np.linspace(40.0, 140.0, 11))
 _REACH_MM = 2.0, 5.5

@@ -6,7 +6,7 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.segmenter.chains.families import catheter_families
 from fluoromap.segmenter.chains.linking import PossibleChains
-from fluoromap.segmenter.faded_ends import count_faded, without_shorter_catheters
+from fluoromap.segmenter.judge.features.faded_ends import count_faded, without_shorter_catheters
 
 CLEAR, NOTHING = (20.0, 2.0), (2.0, -2.0)
 

@@ -1,0 +1,1 @@
+"""What is measured of a chain or a track before it is judged."""
