@@ -13,7 +13,6 @@ import numpy as np
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_fitting import HIDING_MM, FittedChain, are_hidden, fit_chains, widen_covariance
 from fluoromap.segmenter.chains.families import CatheterFamily, catheter_families
 from fluoromap.segmenter.chains.linking import (
     CandidateChain,
@@ -45,7 +44,9 @@ from fluoromap.segmenter.picture.field_mask import FieldMask, are_in
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.moved_means import moved_means
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.refinement import refine
+from fluoromap.segmenter.places import ellipse
+from fluoromap.segmenter.places.chain_fitting import HIDING_MM, FittedChain, are_hidden, fit_chains
+from fluoromap.segmenter.places.refinement import refine
 from fluoromap.segmenter.shape.chain_comparison import is_same_shape
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
@@ -53,13 +54,8 @@ _LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
 _AGAIN_SLACK = 2.5
 _CONFIRMED_CONTRAST = 3.0
-_STRAY_PX = 5.0
 _LEAST_FREE = 2
 _WORST_FIT = 2.0
-_LESS_SURE = 2.2
-"""Factor of the covariance of a chain that was found again: frames that show it less well are searched this way. It is no
-doubt about the catheter's shape."""
-_BENDING, _LEAST_REACH_PX, _SMOOTH_PX = 0.12, 6.5, 35.0
 _BESIDE_MM = 2.0
 _WEAKER = 0.25
 _LEAST_MOVING_ODDS, _LEAST_ROW_ODDS, _FAINT_CONTRAST = 0.2, -0.2, 11.0
@@ -406,7 +402,7 @@ class ChainDetector:
             if self.acceptance.accepts(scores, chain.scores[0], beside) or self._hides_a_pair(
                 one.judged, scores, proposed
             ):
-                covariance = widen_covariance(chain, others, self.px_per_mm)
+                covariance = ellipse.beside_other_electrodes(chain, others, self.px_per_mm)
                 shown = np.where(np.isnan(scores), UNSEEN, scores)
                 accepted.append((one.candidates, replace(chain, covariance_px2=covariance, scores=shown)))
                 judged.append(replace(one.judged, scores=shown))
@@ -599,14 +595,9 @@ class ChainDetector:
             hidden[None],
             np.zeros((1, len(guess)), np.bool_),
         )
-        found = place.points_uv[0]
-        is_stray = np.linalg.norm(found - guess, axis=1) > _STRAY_PX
-        covariance = np.where(is_stray[:, None, None], (4 * _STRAY_PX) ** 2 * np.eye(2), place.covariance_px2[0])
-        expected = chain.covariance_px2 / _LESS_SURE + _bending_px(reach_px) ** 2 * np.eye(2)
-        gain = expected @ np.linalg.inv(expected + covariance)
-        points = guess + np.einsum("nij,nj->ni", gain, found - guess)
-        covariance = gain @ covariance
-        covariance = 0.5 * _LESS_SURE * (covariance + covariance.transpose(0, 2, 1))
+        points, covariance = ellipse.weighed_with_shape(
+            guess, place.points_uv[0], place.covariance_px2[0], chain.covariance_px2, reach_px
+        )
         # Shape and clearness come before the scores: they need no pass of a network.
         is_seen = self._is_seen(points)
         if not shows_enough(is_seen) or place.clearness[0] < self.acceptance.again_clearness:
@@ -627,7 +618,7 @@ class ChainDetector:
         again = replace(
             chain, pixels_uv=points, covariance_px2=covariance, scores=scores, manual=False, tip_odds=None
         )  # fmt: skip
-        return replace(again, covariance_px2=widen_covariance(again, taken, self.px_per_mm))
+        return replace(again, covariance_px2=ellipse.beside_other_electrodes(again, taken, self.px_per_mm))
 
     def find_moving(self, images: Sequence[Image], times_ms: Array, middle: int, frame: int) -> tuple[Chain, ...]:
         """Return the chains that moved means show, most probable first.
@@ -698,14 +689,6 @@ def _is_doubtful(chain: Chain, seen: ImageEvidence) -> bool:
     """Return whether a long chain has a place that is clearly no electrode."""
     places = chain.pixels_uv[chain.scores > UNSEEN]
     return len(chain.electrodes) >= MANY_ELECTRODES and bool((seen.kind_odds_at(places) < _NO_ELECTRODE).any())
-
-
-def _bending_px(reach_px: float) -> float:
-    """Return the standard deviation of a place from the shape of an earlier frame, pixels.
-
-    Catheters bend smoothly: from one frame of a fast run to the next the shape hardly changes.
-    """
-    return _BENDING * min(reach_px, max(_LEAST_REACH_PX, reach_px * reach_px / _SMOOTH_PX))
 
 
 def _away(points_uv: Array, from_uv: Array) -> Array:

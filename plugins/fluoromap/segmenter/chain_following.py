@@ -9,10 +9,10 @@ import numpy as np
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, Chain
-from fluoromap.segmenter.chain_fitting import widen_covariance
 from fluoromap.segmenter.picture.field_mask import are_in
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.refinement import refine
+from fluoromap.segmenter.places import ellipse
+from fluoromap.segmenter.places.refinement import refine
 
 _CLEAR = 0.8
 """Clearness from which on the fit itself shows a catheter: the template explains about half of each profile."""
@@ -75,12 +75,11 @@ def follow_chains(
                 expected[index], pixels_uv=fit.points_uv[row], covariance_px2=fit.covariance_px2[row]
             )
     chains = [chain for chain in found if chain is not None]
-    return tuple(
-        replace(
-            chain, covariance_px2=widen_covariance(chain, [other for other in chains if other is not chain], px_per_mm)
-        )
-        for chain in chains
-    )
+    widened = []
+    for chain in chains:
+        others = [other for other in chains if other is not chain]
+        widened.append(replace(chain, covariance_px2=ellipse.beside_other_electrodes(chain, others, px_per_mm)))
+    return tuple(widened)
 
 
 def _lie_alone(places: Sequence[Array], distance_px: float) -> bool:

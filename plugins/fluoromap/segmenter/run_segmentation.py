@@ -13,10 +13,8 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, Context, FrameChains, Marks, Run, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
 from fluoromap.segmenter.hidden_catheters import MovingSearch, add_hidden_catheters
 from fluoromap.segmenter.judge.verdict import TrackJudge, Verdict
-from fluoromap.segmenter.oblique_places import place_obliquely
 from fluoromap.segmenter.picture.field_mask import (
     ExposedField,
     FieldMask,
@@ -24,17 +22,17 @@ from fluoromap.segmenter.picture.field_mask import (
     exposed_field,
     field_mask,
 )
-from fluoromap.segmenter.picture.lag import measure_lag, widen_by_lag
+from fluoromap.segmenter.picture.lag import measure_lag
 from fluoromap.segmenter.picture.log_image import Image, LogTransform
 from fluoromap.segmenter.picture.moved_means import WINDOW_MS
 from fluoromap.segmenter.picture.quiet_frames import MotionMeter, diastolic_frames, still_frames
 from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
+from fluoromap.segmenter.places.ellipse import at_scale, rest_gain, with_jitter, with_lag, with_shape
+from fluoromap.segmenter.places.oblique_places import place_obliquely
+from fluoromap.segmenter.places.refinement import with_unexplained_profile
 from fluoromap.segmenter.recall import Recall, recall_for
-from fluoromap.segmenter.scale_of_ellipses import at_scale
 from fluoromap.segmenter.shape.chain_comparison import chain_distance, kind_overlap, overlaps, reverse
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
-from fluoromap.segmenter.shape_agreement import widen_by_shape
-from fluoromap.segmenter.shape_jitter import widen_by_jitter
 from fluoromap.segmenter.track_agreement import with_shape_of_track
 from fluoromap.segmenter.tracking import track_chains
 from fluoromap.segmenter.tracks import ChainSearch
@@ -52,7 +50,7 @@ RunJudge = Callable[[Mapping[int, Chain], Callable[[int], Image], Recall[Any]], 
 """(frame -> chain of one track, frame -> log image, recall) -> whether the run shows a catheter there."""
 
 PlaceObliquely = Callable[[int, tuple[Chain, ...]], tuple[Chain, ...]]
-"""(frame, its chains) -> the chains at the places of :func:`~fluoromap.segmenter.oblique_places.place_obliquely`."""
+"""(frame, its chains) -> the chains at the places of :func:`~fluoromap.segmenter.places.oblique_places.place_obliquely`."""
 
 
 class Detector(Protocol):
@@ -172,7 +170,7 @@ class FoundMoving:
 
 @dataclass(frozen=True, eq=False)
 class ObliquePlaces:
-    """The answer of :func:`~fluoromap.segmenter.oblique_places.place_obliquely` for a frame."""
+    """The answer of :func:`~fluoromap.segmenter.places.oblique_places.place_obliquely` for a frame."""
 
     chains: tuple[Chain, ...]
 
@@ -228,7 +226,7 @@ def segment_run(
     shows_catheter : RunJudge, optional
         Decides about each track. Then a diastolic chain needs an accepted track. All are accepted by default.
     oblique : bool
-        Whether the chains get the places of :func:`~fluoromap.segmenter.oblique_places.place_obliquely` in the end.
+        Whether the chains get the places of :func:`~fluoromap.segmenter.places.oblique_places.place_obliquely` in the end.
     """
     context.check()
     # Marks change the tracks, but not what the images show.
@@ -316,7 +314,7 @@ def segment_run(
     gain = rest_gain(frames, field.inside, run.pixels.bits_stored)
 
     def widened(x: Image, chains: tuple[Chain, ...]) -> tuple[Chain, ...]:
-        return widen_by_rest(x, chains, catalogue, run.px_per_mm, gain)
+        return with_unexplained_profile(x, chains, catalogue, run.px_per_mm, gain)
 
     if gain:
         entries = tuple(
@@ -324,10 +322,10 @@ def segment_run(
             for entry in entries
         )
         chains = widened(mean_x, chains)
-    entries, chains = widen_by_jitter(entries, chains, run.px_per_mm)
-    entries = widen_by_lag(entries, lag, run.px_per_mm)
-    entries = tuple(replace(entry, chains=widen_by_shape(entry.chains, catalogue, run.px_per_mm)) for entry in entries)
-    chains = widen_by_shape(chains, catalogue, run.px_per_mm)
+    entries, chains = with_jitter(entries, chains, run.px_per_mm)
+    entries = with_lag(entries, lag, run.px_per_mm)
+    entries = tuple(replace(entry, chains=with_shape(entry.chains, catalogue, run.px_per_mm)) for entry in entries)
+    chains = with_shape(chains, catalogue, run.px_per_mm)
     diastole = FrameChains(averaged[len(averaged) // 2], chains, reason)
     context.progress(1.0)
     return Segmentation(

@@ -11,7 +11,6 @@ from pydantic import BaseModel, Field
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chain_fitting import fit_chains
 from fluoromap.segmenter.chains.families import catheter_families
 from fluoromap.segmenter.chains.linking import evidence, link_candidates
 from fluoromap.segmenter.electrodes.proposals import probability_of_contrast
@@ -25,6 +24,7 @@ from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.gaussian_blur import reduce_by
 from fluoromap.segmenter.picture.log_image import Image, pixel_noise
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
+from fluoromap.segmenter.places.chain_fitting import fit_chains
 
 MOST_BLOBS = 40
 """With more blobs than this the threshold has separated noise from the rest, not electrodes."""

@@ -54,7 +54,7 @@ class ScoreLimits:
 class Acceptance:
     """How sure chains have to be, in the measures of one proposer.
 
-    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.refinement.ElectrodeFit.clearness`, of a chain found in
+    least_clearness, again_clearness : of :attr:`~fluoromap.segmenter.places.refinement.ElectrodeFit.clearness`, of a chain found in
     its image and of one of another frame. sure_clearness : one chain of an image has to reach it. extra_clearness : a catheter
     beside those of the catalogue is reported from here on. scores : limits for a chain. scores_beside : limits for a chain in
     an image that shows another catheter; the same by default. unseen_evidence : an electrode that was not proposed is predicted

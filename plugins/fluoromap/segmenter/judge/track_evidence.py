@@ -50,8 +50,8 @@ _DENIED, _DENIED_LONG = -3.0, -4.0
 _DARK_LINES = DarkLineLimits(thinnest=0.6, sure=0.5, sure_long=2.0)
 """In the means along a track, which have less noise than a frame."""
 _CLEAR_GAPS, _DARK_GAPS = 0.3, 0.5
-"""How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.judge.features.dark_lines.gap_share`. Gaps of a loop are
-not measured: seen on edge, both of its sides are one line."""
+"""How dark gaps are, as a share of the electrodes' depth, see :func:`~fluoromap.segmenter.judge.features.dark_lines.gap_share`.
+Gaps of a loop are not measured: seen on edge, both of its sides are one line."""
 _LINE_GAPS, _MOST_OF_SHAFT = 0.8, 1
 """How dark gaps on one line are, as a share of the electrodes' depth, and how many places on it may be improbable. Else two
 electrodes of a lead and two places of its shaft look like a catheter, and so does a row between fewer electrodes."""

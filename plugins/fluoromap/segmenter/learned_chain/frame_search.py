@@ -17,6 +17,7 @@ from fluoromap.segmenter.electrodes.frame_answers import OWN_CELLS, LatestBlobs,
 from fluoromap.segmenter.electrodes.network.carried_network import Motion
 from fluoromap.segmenter.electrodes.network.network_response import NetworkResponse
 from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.places import ellipse
 from fluoromap.segmenter.shape.chain_comparison import reverse
 
 SHARED_MS = 21.0
@@ -34,7 +35,6 @@ _MOST_FOLLOWED = 3
 _CARRIED_WITHIN = 4.0
 """How far from an electrode the image moves with it, over ``near_px``."""
 _REACH_PX = 6.0
-_LOOSE_PX = 3.0
 _LEAST_SHARE = 0.5
 """Least likeness of the frame itself, as a share of what it has when all frames of the mean show the catheter alike."""
 
@@ -218,9 +218,7 @@ class FrameSearch:
         in_frame = self.detector.image_evidence(x).likeness
         chains: list[Chain] = []
         for chain in entry.chains:
-            # The frame is part of the mean: its place there is no independent measurement.
-            loose = replace(chain, covariance_px2=chain.covariance_px2 + _LOOSE_PX**2 * np.eye(2))
-            again = self.detector.find_again(x, loose, np.zeros(2), _REACH_PX, chains)
+            again = self.detector.find_again(x, ellipse.of_mean(chain), np.zeros(2), _REACH_PX, chains)
             # The mean has less noise, so the same catheter has more contrast over noise there.
             least = _LEAST_SHARE * np.mean(searched.seen.likeness.at(chain.pixels_uv)) / np.sqrt(averaged)
             if again is not None and np.mean(in_frame.at(again.pixels_uv)) >= least:

@@ -6,13 +6,13 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
-from fluoromap.segmenter.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.electrodes.frame_answers import StoredAnswers
 from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.judge.track_evidence import TrackEvidence
 from fluoromap.segmenter.judge.visible_part import visible_part
 from fluoromap.segmenter.learned_chain.detector import electrode_chains
 from fluoromap.segmenter.picture.field_mask import FieldMask
+from fluoromap.segmenter.places.chain_fitting import names_with_long_tips
 from fluoromap.segmenter.run_segmentation import Detector, segment_run
 
 _DIM_BELOW = 0.02

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from fluoromap.contracts import Array, BoolArray, Chain, FrameChains, FrameSource, PixelFacts
+from fluoromap.contracts import Array, BoolArray, FrameSource, PixelFacts
 from fluoromap.segmenter.picture.gaussian_blur import reduce_by
 from fluoromap.segmenter.picture.grey_steps import usual_step
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.shape.chain_comparison import mean_shift
 
 _TRIPLES, _BLOCK_PX = 3, 16
 _STILL_SHARE = 0.6
@@ -30,9 +26,6 @@ noise to be believed."""
 _LEFT, _LEFT_TOO, _SAME, _MOST_LEFT = 0.05, 0.15, 0.12, 0.65
 """Quantiles of the share of darkness that is left, how near they are where things have moved away from enough pixels, and the
 largest share that is lag: contrast medium flows away more slowly than that."""
-_OF_SHIFT, _MOST_MM = 2.0, 0.2
-"""Standard deviation that lag adds, over lag times the shift since the frame before, and at most: a shadow that has come
-apart from its electrode displaces it no more."""
 
 
 def measure_lag(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:
@@ -132,43 +125,6 @@ def _believed(of_noise: float, left: Array, arrived: Array) -> float:
         return of_noise
     least, before = np.quantile(left, _LEFT_TOO), np.quantile(arrived, _LEFT_TOO)
     return min(of_noise, float(least)) if least - before >= _LATER else 0.0
-
-
-def widen_by_lag(entries: Sequence[FrameChains], lag: float, px_per_mm: float) -> tuple[FrameChains, ...]:
-    """Return the chains of all frames, wider along their motion.
-
-    A shadow of the frame before draws the place of a moving electrode towards where it was. Chains that were set by hand keep their
-    covariance.
-
-    Parameters
-    ----------
-    entries : sequence of FrameChains
-        Tracked chains of successive frames.
-    lag : float
-        See :func:`measure_lag`.
-    px_per_mm : float
-    """
-    if lag == 0.0:
-        return tuple(entries)
-    tracks = [{chain.track: chain for chain in entry.chains} for entry in entries]
-    widened = []
-    for index, entry in enumerate(entries):
-        nearest = [tracks[beside] for beside in (index - 1, index + 1) if 0 <= beside < len(entries)]
-        chains = tuple(_widened(chain, nearest, lag, _MOST_MM * px_per_mm) for chain in entry.chains)
-        widened.append(replace(entry, chains=chains))
-    return tuple(widened)
-
-
-def _widened(chain: Chain, nearest: Sequence[Mapping[int, Chain]], lag: float, most_px: float) -> Chain:
-    beside = next((chains[chain.track] for chains in nearest if chain.track in chains), None)
-    if beside is None or chain.manual:
-        return chain
-    shift = mean_shift(beside, chain)
-    length = float(np.linalg.norm(shift))
-    if length == 0.0:
-        return chain
-    along = min(_OF_SHIFT * lag * length, most_px) / length * shift
-    return replace(chain, covariance_px2=chain.covariance_px2 + np.outer(along, along))
 
 
 def _fine_structure(frame: NDArray[np.generic]) -> Array:

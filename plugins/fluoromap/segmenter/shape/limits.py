@@ -11,3 +11,5 @@ MANY_ELECTRODES = 6
 """From here on a catheter is long. Of a shorter one, more than one electrode is rarely missing."""
 TURNING_ELECTRODES = 8
 """From here on a row is known even where it turns through the viewing direction and a part of its electrodes merge."""
+LONG_TIP_MM = 3.0
+"""From here on a tip is longer than rings for certain."""

@@ -5,13 +5,13 @@ import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.chain_fitting import widen_covariance
 from fluoromap.segmenter.chains.families import catheter_families
 from fluoromap.segmenter.chains.linking import PossibleChains, best_chains, possible_chains
 from fluoromap.segmenter.chains.missing_electrodes import complete_chains
 from fluoromap.segmenter.chains.row_tracing import trace_rows
 from fluoromap.segmenter.picture.field_mask import are_in
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
+from fluoromap.segmenter.places.ellipse import beside_other_electrodes
 from fluoromap.segmenter.shape.row_shape import next_place, place_covariance_mm2, row_fit, smooth_places
 
 PX = 3.5
@@ -147,7 +147,7 @@ def test_electrodes_of_a_turning_row_that_lie_at_one_place_are_less_certain(gap_
     row[5] = row[4] + [gap_px, 0.0]
     covariance = np.tile(0.1 * np.eye(2), (10, 1, 1))
     chain = Chain(tuple(range(1, 11)), row, covariance, np.ones(10), (("cs", 1.0),))
-    sd = np.sqrt(widen_covariance(chain, [], PX)[:, 0, 0])
+    sd = np.sqrt(beside_other_electrodes(chain, [], PX)[:, 0, 0])
     assert (sd[4] > 1.5) == (gap_px < 1.0)
     np.testing.assert_allclose(np.delete(sd, [4, 5]), np.sqrt(0.1))
 

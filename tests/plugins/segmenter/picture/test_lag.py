@@ -10,8 +10,9 @@ from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
 from fluoromap.geometry import Gantry
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
-from fluoromap.segmenter.picture.lag import measure_lag, widen_by_lag
+from fluoromap.segmenter.picture.lag import measure_lag
 from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
+from fluoromap.segmenter.places.ellipse import with_lag
 
 PIXELS = PixelFacts(logarithmic=False, bits_stored=16, monochrome1=False)
 EVERYWHERE = np.ones((128, 128), np.bool_)
@@ -178,17 +179,17 @@ def test_ellipses_are_wider_along_the_motion_only():
         FrameChains(1, (chain(11.0),)),
         FrameChains(2, (chain(31.0), chain(50.0, 1))),
     ]
-    first, second, third = widen_by_lag(run, 0.25, 4.0)
+    first, second, third = with_lag(run, 0.25, 4.0)
     # Half a pixel, at the first frame too; never more than 0.2 mm.
     for entry, sd in ((first, 0.5), (second, 0.5), (third, 0.8)):
         assert entry.chains[0].covariance_px2[1] == pytest.approx(np.diag([0.01 + sd**2, 0.01]))
     assert third.chains[1] is run[2].chains[1]
-    assert widen_by_lag(run, 0.0, 4.0) == tuple(run)
+    assert with_lag(run, 0.0, 4.0) == tuple(run)
 
 
 def test_what_a_user_set_keeps_its_ellipses():
     run = [FrameChains(0, (chain(10.0),)), FrameChains(1, (chain(14.0, manual=True),))]
-    assert widen_by_lag(run, 0.5, 4.0)[1] == run[1]
+    assert with_lag(run, 0.5, 4.0)[1] == run[1]
 
 
 def test_electrodes_are_found_where_they_are_beside_their_shadows():

@@ -42,11 +42,12 @@ _SHAFT = 0.03
 class SectionOdds:
     """The evidence for a part of a track, in the mean of some frames.
 
-    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.judge.features.bars.products_beside`, for its two sets of
-    distances. depths : see :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_along`. shafts : see
+    log_odds : (n,) of its electrodes. beside, across : see :func:`~fluoromap.segmenter.judge.features.bars.products_beside`, for
+    its two sets of distances. depths : see :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_along`. shafts : see
     :func:`~fluoromap.segmenter.judge.features.shaft_ends.shafts_at_ends`. beyond : see
-    :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first and the last
-    electrode. near_uv, near_odds : (m, 2) places and (m,) log-odds of all electrodes of the picture, in the frame of its places.
+    :func:`~fluoromap.segmenter.judge.features.dark_lines.depths_beyond`. tips : (2,) the network's logits of a tip at the first
+    and the last electrode. near_uv, near_odds : (m, 2) places and (m,) log-odds of all electrodes of the picture, in the frame of
+    its places.
     """
 
     log_odds: Array

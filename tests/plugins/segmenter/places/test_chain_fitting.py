@@ -5,10 +5,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
-from fluoromap.segmenter.chain_fitting import fit_chains
 from fluoromap.segmenter.chains.families import catheter_families
 from fluoromap.segmenter.chains.linking import CandidateChain
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
+from fluoromap.segmenter.places.chain_fitting import fit_chains
 
 PX_PER_MM = 3.5
 CATHETER = catheter_type("quadripolar-2-5-2", "reference")

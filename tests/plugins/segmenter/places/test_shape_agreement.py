@@ -7,7 +7,7 @@ import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.shape_agreement import widen_by_shape
+from fluoromap.segmenter.places.ellipse import with_shape
 
 CHI2_95_2D = 5.991464547107979
 PX_PER_MM = 4.0
@@ -34,7 +34,7 @@ def chain_of(name: str, places: np.ndarray, sd_px: float = 0.1, missing: tuple[i
 @pytest.mark.parametrize("missing", [(), (2,)])
 def test_electrodes_on_a_smooth_curve_keep_their_ellipses(name, missing):
     chain = chain_of(name, bent(name), missing=missing)
-    (same,) = widen_by_shape([chain], CATALOGUE, PX_PER_MM)
+    (same,) = with_shape([chain], CATALOGUE, PX_PER_MM)
     np.testing.assert_allclose(same.covariance_px2, chain.covariance_px2)
 
 
@@ -44,7 +44,7 @@ def test_the_ellipse_of_a_displaced_electrode_holds_its_place(index, direction):
     places = bent("decapolar-2-5-2")
     displaced = places.copy()
     displaced[index] += 4.0 * np.array(direction)
-    (wider,) = widen_by_shape([chain_of("decapolar-2-5-2", displaced)], CATALOGUE, PX_PER_MM)
+    (wider,) = with_shape([chain_of("decapolar-2-5-2", displaced)], CATALOGUE, PX_PER_MM)
     error = displaced - places
     missed = np.einsum("ni,nij,nj->n", error, np.linalg.inv(wider.covariance_px2), error)
     assert missed[index] <= CHI2_95_2D
@@ -60,7 +60,7 @@ def test_an_ellipse_grows_along_the_catheter_at_least_as_much_as_across():
     for direction in ([3.0, 0.0], [0.0, 3.0]):
         displaced = straight.copy()
         displaced[4] += direction
-        (wider,) = widen_by_shape([chain_of("decapolar-2-5-2", displaced)], CATALOGUE, PX_PER_MM)
+        (wider,) = with_shape([chain_of("decapolar-2-5-2", displaced)], CATALOGUE, PX_PER_MM)
         sd.append(np.sqrt(np.diag(wider.covariance_px2[4])))
     # What displaced it along the catheter leaves it as sure across.
     assert sd[0][0] > 2.0
@@ -75,7 +75,7 @@ def test_what_is_known_to_be_unsure_gets_no_wider():
     unsure = chain.covariance_px2.copy()
     unsure[4] = 100.0 * np.eye(2)
     chain = replace(chain, covariance_px2=unsure)
-    np.testing.assert_allclose(widen_by_shape([chain], CATALOGUE, PX_PER_MM)[0].covariance_px2, unsure)
+    np.testing.assert_allclose(with_shape([chain], CATALOGUE, PX_PER_MM)[0].covariance_px2, unsure)
 
 
 @pytest.mark.parametrize("name", TYPES)
@@ -85,7 +85,7 @@ def test_ellipses_that_are_right_hold_95_percent_afterwards_too(name, sd_px):
     places, held = bent(name), []
     for _ in range(200):
         error = random.normal(0.0, sd_px, places.shape)
-        (same,) = widen_by_shape([chain_of(name, places + error, sd_px)], CATALOGUE, PX_PER_MM)
+        (same,) = with_shape([chain_of(name, places + error, sd_px)], CATALOGUE, PX_PER_MM)
         held.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(same.covariance_px2), error) <= CHI2_95_2D)
     assert 0.94 < np.mean(held) < 0.988
 
@@ -95,4 +95,4 @@ def test_chains_of_users_and_pairs_keep_their_ellipses():
     places[1] += [0.0, 4.0]
     manual = replace(chain_of("quadripolar-2-5-2", places), manual=True)
     pair = chain_of("quadripolar-2-5-2", places, missing=(2, 3))
-    assert widen_by_shape([manual, pair], CATALOGUE, PX_PER_MM) == (manual, pair)
+    assert with_shape([manual, pair], CATALOGUE, PX_PER_MM) == (manual, pair)

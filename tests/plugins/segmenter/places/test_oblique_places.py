@@ -8,10 +8,10 @@ from scipy.ndimage import gaussian_filter
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.cylinder_fit import fit_cylinders
 from fluoromap.segmenter.judge.acceptance import UNSEEN
-from fluoromap.segmenter.oblique_places import place_obliquely
-from fluoromap.segmenter.refinement import refine, usual_radius_mm
+from fluoromap.segmenter.places.cylinder_fit import fit_cylinders
+from fluoromap.segmenter.places.oblique_places import place_obliquely
+from fluoromap.segmenter.places.refinement import refine, usual_radius_mm
 
 PX_PER_MM = 4.0
 CATHETER = catheter_type("decapolar-2-8-2", "cs")

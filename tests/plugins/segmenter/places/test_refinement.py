@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import catheter_type
-from fluoromap.segmenter.refinement import refine
+from fluoromap.segmenter.places.refinement import refine
 
 PX_PER_MM = 3.5
 CHI2_95_2D = 5.991464547107979
@@ -56,7 +56,7 @@ def test_bands_that_fit_perfectly_say_as_much_of_a_hidden_one(monkeypatch):
         unit_sd, misfits, rests = arguments[-3:]
         unit_sd[:], misfits[:], rests[:] = 1.0, 0.0, 0.0
 
-    monkeypatch.setattr("fluoromap.segmenter.refinement._fit_bands", perfect)
+    monkeypatch.setattr("fluoromap.segmenter.places.refinement._fit_bands", perfect)
     catheter = catheter_type("quadripolar-5-5-5", "rv")
     points = np.stack([40.0 + 6.0 * PX_PER_MM * np.arange(4), np.full(4, 60.0)], axis=1)
     hidden = np.array([[False, False, True, False]])

@@ -11,9 +11,9 @@ from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, catheter_type
 from fluoromap.contracts import Chain, PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
-from fluoromap.segmenter.coded_frames import rest_gain, widen_by_rest
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
-from fluoromap.segmenter.refinement import refine, unexplained_sd
+from fluoromap.segmenter.places.ellipse import rest_gain
+from fluoromap.segmenter.places.refinement import refine, unexplained_sd, with_unexplained_profile
 
 PX_PER_MM = 4.0
 CATHETER = DEFAULT_CATALOGUE["reference"]
@@ -87,7 +87,7 @@ def test_ellipses_hold_what_artefacts_displace():
         nothing = np.zeros((1, len(truth)), np.bool_)
         fit = refine(x, truth[None], CATHETER, PX_PER_MM, 1e-4, nothing, nothing)
         found = replace(chain(fit.points_uv[0]), covariance_px2=fit.covariance_px2[0])
-        (widened,) = widen_by_rest(x, (found,), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
+        (widened,) = with_unexplained_profile(x, (found,), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
         for one in (found, widened):
             off = one.pixels_uv - truth
             held.append((np.einsum("ni,nij,nj->n", off, np.linalg.inv(one.covariance_px2), off) < 5.99)[1:])
@@ -103,7 +103,7 @@ def test_other_ellipses_stay(what):
     one = replace(chain(places, 5.0 if what == "large" else 0.01), manual=what == "manual")
     if what == "one electrode":
         one = Chain((1,), places[:1], one.covariance_px2[:1], one.scores[:1], one.kinds)
-    (kept,) = widen_by_rest(x, (one,), DEFAULT_CATALOGUE, PX_PER_MM, gain)
+    (kept,) = with_unexplained_profile(x, (one,), DEFAULT_CATALOGUE, PX_PER_MM, gain)
     np.testing.assert_array_equal(kept.covariance_px2, one.covariance_px2)
 
 
@@ -116,7 +116,7 @@ def test_the_profile_is_that_of_the_likely_catheter_and_its_tip():
     assert wrong[0, 0] > 1.5 * right[0, 0]
     study = Catalogue((CATHETER, longer), "reference", "mapping")
     likely = replace(chain(places), kinds=(("mapping", 0.1), ("reference", 0.9)))
-    (widened,) = widen_by_rest(x, (likely,), study, PX_PER_MM, 1.5)
+    (widened,) = with_unexplained_profile(x, (likely,), study, PX_PER_MM, 1.5)
     assert np.sqrt(widened.covariance_px2[0, 0, 0]) == pytest.approx(1.5 * right[0, 0])
 
 
@@ -124,7 +124,7 @@ def test_the_profile_is_that_of_the_likely_catheter_and_its_tip():
 def test_coding_that_removes_an_electrode_leaves_a_large_ellipse(slope):
     _, places = picture(0.0)
     flat = np.broadcast_to(slope * np.arange(INSIDE.shape[1], dtype=np.float32), INSIDE.shape).copy()
-    (widened,) = widen_by_rest(flat, (chain(places),), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
+    (widened,) = with_unexplained_profile(flat, (chain(places),), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
     np.testing.assert_allclose(np.sqrt(widened.covariance_px2[:, 1, 1]), 0.2 * PX_PER_MM)
 
 
@@ -149,6 +149,6 @@ def test_electrodes_of_smooth_pictures_have_larger_ellipses(monkeypatch, segment
 def test_where_no_band_shows_a_fifth_of_a_millimetre_is_enough():
     _, places = picture(0.0)
     empty = np.random.default_rng(2).standard_normal(INSIDE.shape).astype(np.float32)
-    (widened,) = widen_by_rest(empty, (chain(places),), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
+    (widened,) = with_unexplained_profile(empty, (chain(places),), DEFAULT_CATALOGUE, PX_PER_MM, 1.5)
     largest = np.sqrt(np.linalg.eigvalsh(widened.covariance_px2).max())
     assert largest == pytest.approx(0.2 * PX_PER_MM)

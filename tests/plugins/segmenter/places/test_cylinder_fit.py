@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoromap.catheters import catheter_type
-from fluoromap.segmenter.cylinder_fit import fit_cylinders
+from fluoromap.segmenter.places.cylinder_fit import fit_cylinders
 
 PX_PER_MM = 4.0
 

@@ -20,9 +20,9 @@ from scipy.ndimage import uniform_filter1d
 
 from fluoromap.catheters import Catheter
 from fluoromap.contracts import Array, BoolArray, IntArray
-from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_length_px, reached_rows
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.places.cylinder_pictures import STEP_PX, draw_electrode, half_length_px, reached_rows
 
 _Degrees = tuple[tuple[int, int], ...]
 
@@ -334,7 +334,7 @@ def _search_along(
 
     Returns the share of its darkness that they leave unexplained, and how far they move, (electrodes,) pixels.
 
-    inner : see :func:`~fluoromap.segmenter.cylinder_pictures.draw_electrode`.
+    inner : see :func:`~fluoromap.segmenter.places.cylinder_pictures.draw_electrode`.
     """
     cosine, gap_cosine = _foreshortening(line.arc_px, shape, degrees)
     size = int((half_length_px(shape.half_px, shape.radius_px, cosine).max() + _MARGIN_PX) / STEP_PX)

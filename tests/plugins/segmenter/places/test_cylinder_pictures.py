@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from fluoromap.segmenter.cylinder_pictures import STEP_PX, draw_electrode, half_length_px
+from fluoromap.segmenter.places.cylinder_pictures import STEP_PX, draw_electrode, half_length_px
 
 HALF, RADIUS = 3.0, 6.0
 

@@ -11,27 +11,26 @@ from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, BoolArray, Chain, IntArray
 from fluoromap.segmenter.chains.families import CatheterFamily
 from fluoromap.segmenter.chains.linking import CandidateChain, shaft_evidence
-from fluoromap.segmenter.cylinder_fit import compare_catheters
 from fluoromap.segmenter.judge.features.shaft_ends import shaft_beyond_ends
 from fluoromap.segmenter.judge.names import kind_probabilities
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.shaft_image import ShaftImage
-from fluoromap.segmenter.refinement import LEAST_GAP, ElectrodeFit, refine, usual_radius_mm
+from fluoromap.segmenter.places import ellipse
+from fluoromap.segmenter.places.cylinder_fit import compare_catheters
+from fluoromap.segmenter.places.refinement import LEAST_GAP, ElectrodeFit, refine, usual_radius_mm
 from fluoromap.segmenter.shape.curve import predict_on_curve
-from fluoromap.segmenter.shape.limits import MANY_ELECTRODES, TURNING_ELECTRODES
+from fluoromap.segmenter.shape.limits import LONG_TIP_MM, MANY_ELECTRODES
 from fluoromap.segmenter.shape.spacings import shape_fit
 
 _SHAFT_WEIGHT = 1.0
 _ENDS_WEIGHT = 3.0
 _TIP_WEIGHT, _SHORT_TIP_WEIGHT, _MOST_TIP = 1.0, 0.5, 4.0
-_LONG_TIP_MM, _MOST_OF_SHORT_TIP = 3.0, 4.0
-"""Tips that are longer than rings for certain, and how much the image of shorter ones says: makers' tips differ."""
+_MOST_OF_SHORT_TIP = 4.0
+"""How much the image of short tips says at most: makers' tips differ."""
 _TIP_SHARE = 0.25
 """Log-odds of the tip for one of log-likelihood: its signs are not independent, and the frames of a run go wrong together."""
 HIDING_MM = 1.2
 """An electrode of another catheter hides what is nearer to it."""
-_NEAR_MM, _NEAR_FACTOR = 3.0, 2.5
-_MERGED_MM, _MERGED_SD_MM = 1.5, 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,7 @@ class FittedChain:
     """A chain with the score of linking, and its clearness.
 
     clearness : how clearly its electrodes look like electrodes, see
-    :attr:`~fluoromap.segmenter.refinement.ElectrodeFit.clearness`.
+    :attr:`~fluoromap.segmenter.places.refinement.ElectrodeFit.clearness`.
     """
 
     chain: Chain
@@ -172,7 +171,7 @@ def _judge(
         directed = fit + _ENDS_WEIGHT * shaft_beyond_ends(points, catheter, shaft_image)
         directed += (_TIP_WEIGHT if _tip_shows(catheter) else _SHORT_TIP_WEIGHT) * like_tip[row]
         forth = float(directed[0] - directed[1])
-        if catheter.tip_mm < _LONG_TIP_MM:
+        if catheter.tip_mm < LONG_TIP_MM:
             of_image = float(in_image[0] - in_image[1])
             forth += float(np.clip(of_image, -_MOST_OF_SHORT_TIP, _MOST_OF_SHORT_TIP)) - of_image
         likelihood[index], forth_over_back[index] = fit[0 if forth >= 0 else 1], forth
@@ -215,7 +214,7 @@ def _apart(fit: ElectrodeFit, candidates_uv: Array, catheter: Catheter, px_per_m
     back = np.zeros(moved.shape, np.bool_)
     back[:, 1:] |= meets & second
     back[:, :-1] |= meets & ~second
-    covariance = fit.covariance_px2 + np.where(back, moved**2, 0.0)[..., None, None] * np.eye(2)
+    covariance = ellipse.returned(fit.covariance_px2, moved, back)
     return replace(_with_places(fit, candidates_uv, back), covariance_px2=covariance)
 
 
@@ -228,7 +227,7 @@ def _with_places(fit: ElectrodeFit, places_uv: Array, there: BoolArray) -> Elect
 
 def names_with_long_tips(catalogue: Catalogue) -> frozenset[str]:
     """Return the names of the catheters whose tips are longer than rings for certain."""
-    return frozenset(catheter.name for catheter in catalogue.catheters if catheter.tip_mm >= _LONG_TIP_MM)
+    return frozenset(catheter.name for catheter in catalogue.catheters if catheter.tip_mm >= LONG_TIP_MM)
 
 
 def _tip_shows(catheter: Catheter) -> bool:
@@ -236,7 +235,7 @@ def _tip_shows(catheter: Catheter) -> bool:
 
     The tip of a quadripolar catheter is as long as its rings.
     """
-    return catheter.tip_mm >= _LONG_TIP_MM or catheter.electrodes >= MANY_ELECTRODES
+    return catheter.tip_mm >= LONG_TIP_MM or catheter.electrodes >= MANY_ELECTRODES
 
 
 def are_hidden(points_uv: Array, others: Sequence[Chain], px_per_mm: float) -> BoolArray:
@@ -246,26 +245,6 @@ def are_hidden(points_uv: Array, others: Sequence[Chain], px_per_mm: float) -> B
         away = np.linalg.norm(points_uv[:, None] - other.pixels_uv[None], axis=2).min(axis=1)
         hidden |= away < HIDING_MM * px_per_mm
     return hidden
-
-
-def widen_covariance(chain: Chain, others: Sequence[Chain], px_per_mm: float) -> Array:
-    """Return the chain's covariances, widened near other electrodes.
-
-    Bands that lie close together disturb each other's fit: those of other chains, and those of a long catheter that turns through
-    the viewing direction, where several of its electrodes may be fitted to one dark place.
-    """
-    covariance = chain.covariance_px2
-    if len(chain.electrodes) >= TURNING_ELECTRODES:
-        apart = np.linalg.norm(chain.pixels_uv[:, None] - chain.pixels_uv, axis=2)
-        np.fill_diagonal(apart, np.inf)
-        merged = np.maximum(1.0 - apart.min(axis=1) / (_MERGED_MM * px_per_mm), 0.0)
-        covariance = covariance + ((_MERGED_SD_MM * px_per_mm * merged) ** 2)[:, None, None] * np.eye(2)
-    if not others:
-        return covariance
-    beside = np.concatenate([other.pixels_uv for other in others])
-    difference = chain.pixels_uv[:, None] - beside
-    near = np.sqrt((difference * difference).sum(axis=2).min(axis=1)) < _NEAR_MM * px_per_mm
-    return np.where(near[:, None, None], _NEAR_FACTOR, 1.0) * covariance
 
 
 def _candidates_of_others(

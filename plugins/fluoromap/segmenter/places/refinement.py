@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fluoromap.catheters import Catheter
-from fluoromap.contracts import Array, BoolArray
+from fluoromap.catheters import Catalogue, Catheter
+from fluoromap.contracts import Array, BoolArray, Chain
 from fluoromap.segmenter.kernels import kernel
 from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.places import ellipse
 from fluoromap.segmenter.shape.curve import predict_on_curve
-from fluoromap.segmenter.shape.limits import LONGEST, SHORTEST
+from fluoromap.segmenter.shape.limits import LONG_TIP_MM, LONGEST, SHORTEST
 
 _STEP_PX = 0.5
 _REACH_PX = 3.5
@@ -23,30 +24,18 @@ _LAST_REACH_PX = 2.0
 LEAST_GAP = 0.15
 """Of the spacing at the isocentre. Nearer than that, two electrodes are fitted to one dark place."""
 _SOFT_PX = 2.0
-_APART_PX = 6.0
-_GAIN, _TIP_GAIN = (4.6, 4.8), (6.15, 5.7)
-_FITTED_PX_PER_MM, _OF_SCALE = 5.75, 0.25
-"""The scale at which the gains were fitted, and the power of the scale with which the standard deviation grows: noise that goes
-together in neighbouring pixels averages out less, the more pixels an electrode has."""
 _TIP_REACH = 0.8
 """How far a long tip's middle is searched, over half its length: the first guess may lie near one of its ends."""
-_FLOOR_PX, _TIP_FLOOR_PX, _LONG_TIP_FLOOR_PX = (0.027, 0.034), (0.072, 0.04), (0.124, 0.04)
-_LONG_TIP_MM = 3.0
-_BLUR_GAIN, _USUAL_CLEARNESS = 0.7, 1.8
-_USUAL_REST, _OF_REST, _TINY = np.array([1.0, 0.9]), np.array([0.8, 1.33]), 1e-12
-"""The unexplained rest of a profile, along and across, as a multiple of that of the chain's middle electrode: from here on it
-widens the standard deviation, in this power."""
-_STEEP, _STEEP_MM, _STEEP_SECOND = 0.80, 1.0, 0.7
 _NO_BAND_SD = 1e4
 """Standard deviation of a place for a pixel noise of 1, where a profile is not dark in its middle."""
 _SPACING_SD = 0.10
 _LONG_CATHETER = 6
+_FEWEST_OF_PROFILE = 2
 _WINDOW_MM = 2.0
 _LEAST_MISFIT = 0.01
 _CLEAR_PX, _LEAST_WINDOW_PX = 2.0, 2.0
 _LEAST_HALF_PX = 0.75
 _COVERED_PX = 30.0
-_HIDDEN_MM = 0.25
 _LOCAL, _LEAST_SHORTENING = 0.75, 0.15
 
 
@@ -147,18 +136,18 @@ def _fit(
         scratch = np.empty((3, 2 * longest + 2 * int(shifts.max()) + 1))
         _fit_bands(image, axes, ends, radius, shifts, sides, scratch, points, unit_sd, misfits, rests)
     _measure_chains(points, arc_mm, px_per_mm, half, arc, axes, ends, sides)
-    sd = _position_sd(unit_sd * noise, misfits, catheter.tip_mm)
+    sd = ellipse.noise_sd(unit_sd * noise, _clearness(misfits), catheter.tip_mm >= LONG_TIP_MM)
     if len(arc_mm) >= 3:
         _pull_to_spacing(points, sd, np.where(hidden, _COVERED_PX, sd[..., 0]), arc, axes, arc_mm, px_per_mm)
     # Not before: spacings of a bent catheter are no better than a disturbed fit.
-    sd = np.minimum(sd * _disturbance(rests) * (px_per_mm / _FITTED_PX_PER_MM) ** _OF_SCALE, _APART_PX)
-    fit = ElectrodeFit(points, _covariances(points, sd, axes, arc_mm, px_per_mm), misfits)
+    sd = ellipse.disturbed_sd(sd, rests, px_per_mm)
+    fit = ElectrodeFit(points, ellipse.of_bands(points, sd, axes, arc_mm, px_per_mm), misfits)
     covariance = fit.covariance_px2
     for row in np.flatnonzero(hidden.any(axis=1)):
         is_hidden = hidden[row]
         if np.count_nonzero(~is_hidden) >= 2:
             points[row, is_hidden] = predict_on_curve(points[row], is_hidden, arc_mm)
-            covariance[row, is_hidden] = (_HIDDEN_MM * px_per_mm) ** 2 * np.eye(2)
+            covariance[row, is_hidden] = ellipse.of_hidden(px_per_mm)
             misfits[row, is_hidden] = np.exp(np.log(np.maximum(misfits[row, ~is_hidden], _LEAST_MISFIT)).mean())
     return fit
 
@@ -206,12 +195,41 @@ def unexplained_sd(
     return np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1), sd
 
 
+def with_unexplained_profile(
+    x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: float, gain: float
+) -> tuple[Chain, ...]:
+    """Return a picture's chains with ellipses that cover the unexplained rests.
+
+    Chains that were set by hand, or have one electrode, keep their covariance.
+
+    Parameters
+    ----------
+    x : (rows, columns) float32
+        Log image.
+    chains : sequence of Chain
+    catalogue : Catalogue
+    px_per_mm : float
+        At the isocentre.
+    gain : float
+        See :func:`~fluoromap.segmenter.places.ellipse.rest_gain`.
+    """
+
+    def covered(chain: Chain) -> Chain:
+        if gain == 0.0 or chain.manual or len(chain.electrodes) < _FEWEST_OF_PROFILE:
+            return chain
+        catheter = catalogue[chain.likely_name]
+        axes, rest_px = unexplained_sd(x, chain.pixels_uv, catheter, chain.electrodes, px_per_mm)
+        return ellipse.with_rest_of_profile(chain, axes, rest_px, gain, px_per_mm)
+
+    return tuple(covered(chain) for chain in chains)
+
+
 def usual_radius_mm(catheter: Catheter) -> float:
     """Return the radius of a catheter, millimetres.
 
     It is that of 7F for the longer tips of ablation catheters, else that of 6F. Catalogues give none.
     """
-    return 1.165 if catheter.tip_mm >= _LONG_TIP_MM else 1.0
+    return 1.165 if catheter.tip_mm >= LONG_TIP_MM else 1.0
 
 
 @kernel("f8[:,:,::1], f8[::1], f8, f8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], i8[:,::1]")
@@ -341,39 +359,6 @@ def _fit_bands(x, axes, ends, radius, shifts, sides, scratch, points, unit_sd, m
                 side, shift, wide = int((radius + 4.0) / _STEP_PX), min(shift, 7), 2.0 * end
 
 
-def _position_sd(noise_sd: Array, misfits: Array, tip_mm: float) -> Array:
-    """Return the standard deviations along and across, (n, electrodes, 2) pixels.
-
-    ``noise_sd`` is the contribution of white noise. The detector's blur increases it. Badly fitting bands have
-    long-tailed errors. Without noise the simplifications of the templates remain, most of all at a tip's rounded end.
-    """
-    gain, floor = _gains_and_floors(misfits.shape[1], tip_mm >= _LONG_TIP_MM)
-    blur_gain = 1.0 + _BLUR_GAIN * np.maximum(_USUAL_CLEARNESS - _clearness(misfits), 0.0)
-    sd = noise_sd * gain * blur_gain[:, None, None]
-    stated: Array = np.minimum(np.sqrt(sd * sd + floor * floor), _APART_PX)
-    return stated
-
-
-def _disturbance(rests: Array) -> Array:
-    """Return factors of the standard deviations along and across, (n, electrodes, 2), from 1 on.
-
-    Where the template leaves more unexplained than at the chain's middle electrode, something else lies there, as a cable, and
-    displaces the electrode. ``rests`` : what is unexplained, of the same shape, see :func:`_fit_bands`.
-    """
-    usual = _USUAL_REST * np.maximum(np.median(rests, axis=1, keepdims=True), _TINY)
-    factors: Array = np.maximum(rests / usual, 1.0) ** _OF_REST
-    return factors
-
-
-@functools.lru_cache(maxsize=64)
-def _gains_and_floors(electrodes: int, long_tip: bool) -> tuple[Array, Array]:
-    """Return gain and floor of each electrode along and across, (electrodes, 2)."""
-    gain, floor = np.full((electrodes, 2), _GAIN), np.full((electrodes, 2), _FLOOR_PX)
-    gain[0] = _TIP_GAIN
-    floor[0] = _LONG_TIP_FLOOR_PX if long_tip else _TIP_FLOOR_PX
-    return gain, floor
-
-
 def _clearness(misfits: Array) -> Array:
     mean: Array = -np.log(np.maximum(misfits, _LEAST_MISFIT)).sum(axis=1) / misfits.shape[1]
     return mean
@@ -404,23 +389,3 @@ def _pull_to_spacing(
     share = variance / (variance + model_sd * model_sd)
     points += (share * rest)[..., None] * axes
     sd[..., 0] = weighed_sd * np.sqrt(1.0 - 0.5 * share)
-
-
-def _covariances(points: Array, sd: Array, axes: Array, arc_mm: Array, px_per_mm: float) -> Array:
-    """Return the covariances (n, electrodes, 2, 2), square pixels.
-
-    A steeply foreshortened tip covers the ring behind it, and its axis is uncertain.
-    """
-    variance = sd * sd
-    first = points[:, 1] - points[:, 0]
-    lacking = np.maximum(_STEEP - np.sqrt((first * first).sum(axis=1)) / (px_per_mm * (arc_mm[1] - arc_mm[0])), 0.0)
-    steep = (_STEEP_MM * px_per_mm * lacking * lacking) ** 2
-    variance[:, 0] += steep[:, None]
-    variance[:, 1] += _STEEP_SECOND**2 * steep[:, None]
-    along, across = variance[..., 0], variance[..., 1]
-    u, v = axes[..., 0], axes[..., 1]
-    covariance = np.empty((*along.shape, 2, 2))
-    covariance[..., 0, 0] = along * u * u + across * v * v
-    covariance[..., 1, 1] = along * v * v + across * u * u
-    covariance[..., 0, 1] = covariance[..., 1, 0] = (along - across) * u * v
-    return covariance

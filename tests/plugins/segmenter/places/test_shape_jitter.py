@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluoromap.contracts import Chain, FrameChains
-from fluoromap.segmenter.shape_jitter import widen_by_jitter
+from fluoromap.segmenter.places.ellipse import with_jitter
 
 PX_PER_MM = 4.0
 FRAMES = 40
@@ -60,32 +60,32 @@ def stated(chain: Chain) -> np.ndarray:
 
 @pytest.mark.parametrize(("along", "across"), [(0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.6, 1.0)])
 def test_ellipses_become_as_large_as_the_errors(along, across):
-    entries, _ = widen_by_jitter(run_of(along, across), (), PX_PER_MM)
+    entries, _ = with_jitter(run_of(along, across), (), PX_PER_MM)
     for entry in entries:
         assert stated(entry.chains[0]) == pytest.approx([along, across], rel=0.15)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_short_catheters_too(seed):
-    entries, _ = widen_by_jitter(run_of(0.2, 0.8, seed, electrodes=4), (), PX_PER_MM)
+    entries, _ = with_jitter(run_of(0.2, 0.8, seed, electrodes=4), (), PX_PER_MM)
     assert stated(entries[5].chains[0]) == pytest.approx([0.2, 0.8], rel=0.3)
 
 
 def test_smaller_errors_do_not_shrink_ellipses():
     run = run_of(0.05, 0.05)
-    entries, _ = widen_by_jitter(run, (), PX_PER_MM)
+    entries, _ = with_jitter(run, (), PX_PER_MM)
     for before, after in zip(run, entries, strict=True):
         np.testing.assert_array_equal(before.chains[0].covariance_px2, after.chains[0].covariance_px2)
 
 
 def test_motion_turning_and_foreshortening_are_no_jitter():
-    entries, _ = widen_by_jitter(run_of(0.0, 0.0), (), PX_PER_MM)
+    entries, _ = with_jitter(run_of(0.0, 0.0), (), PX_PER_MM)
     assert stated(entries[7].chains[0]) == pytest.approx([STATED_PX, STATED_PX])
 
 
 def test_the_chain_at_diastole_grows_as_its_track_does():
     diastole = chain_of(bent(4)), chain_of(bent(4) + 80.0, track=1)
-    _, (wider, other) = widen_by_jitter(run_of(0.2, 0.8), diastole, PX_PER_MM)
+    _, (wider, other) = with_jitter(run_of(0.2, 0.8), diastole, PX_PER_MM)
     assert stated(wider) == pytest.approx([0.2, 0.8], rel=0.15)
     np.testing.assert_array_equal(other.covariance_px2, diastole[1].covariance_px2)
 
@@ -98,7 +98,7 @@ def test_marks_keep_their_ellipses_and_say_nothing_about_others():
         else entry
         for entry in run
     ]
-    entries, _ = widen_by_jitter(by_hand, (), PX_PER_MM)
+    entries, _ = with_jitter(by_hand, (), PX_PER_MM)
     for entry in entries:
         assert stated(entry.chains[0]) == pytest.approx([STATED_PX, STATED_PX])
 
@@ -107,7 +107,7 @@ def test_marks_keep_their_ellipses_and_say_nothing_about_others():
 def test_too_few_successive_frames_say_nothing(frames):
     run = run_of(1.0, 1.0)
     few = [entry if entry.frame in frames else replace(entry, chains=()) for entry in run]
-    entries, _ = widen_by_jitter(few, (), PX_PER_MM)
+    entries, _ = with_jitter(few, (), PX_PER_MM)
     for before, after in zip(few, entries, strict=True):
         assert [chain.covariance_px2.tolist() for chain in before.chains] == [
             chain.covariance_px2.tolist() for chain in after.chains
@@ -118,5 +118,5 @@ def test_a_catheter_with_two_electrodes_or_one_place_is_no_error():
     pairs = [FrameChains(frame, (chain_of(bent(frame)[:2]),)) for frame in range(FRAMES)]
     same = [FrameChains(frame, (chain_of(np.full((4, 2), 50.0)),)) for frame in range(FRAMES)]
     for run in (pairs, same):
-        entries, _ = widen_by_jitter(run, (), PX_PER_MM)
+        entries, _ = with_jitter(run, (), PX_PER_MM)
         assert all(np.isfinite(entry.chains[0].covariance_px2).all() for entry in entries)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluoromap.contracts import Chain
-from fluoromap.segmenter.scale_of_ellipses import at_scale
+from fluoromap.segmenter.places.ellipse import at_scale
 
 CHAIN = Chain(
     (1, 2, 3),

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from fluoromap.catheters import Catalogue, Catheter
 from fluoromap.contracts import Array, Chain
-from fluoromap.segmenter.chain_fitting import are_hidden
-from fluoromap.segmenter.cylinder_fit import fit_cylinders
 from fluoromap.segmenter.judge.acceptance import UNSEEN
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.refinement import usual_radius_mm
+from fluoromap.segmenter.places import ellipse
+from fluoromap.segmenter.places.chain_fitting import are_hidden
+from fluoromap.segmenter.places.cylinder_fit import fit_cylinders
+from fluoromap.segmenter.places.refinement import usual_radius_mm
 from fluoromap.segmenter.shape.spacings import shape_fit
 
 _OBLIQUE, _LEAST_ELECTRODES = 0.9, 3
 """Visible over true length of a gap below which openings show, and how many electrodes have a line."""
 _MORE_LIKELY, _MORE_LIKELY_SOLID = 0.75, 1.75
 """How much the log-likelihood of an electrode has to rise. Clearly solid rings have no openings that lead bands astray."""
-_SD_OF_WAY, _SD_BESIDE = 0.4, 0.15
-"""Standard deviation that is added, as a share of the way that an electrode moves: along the way, by which the two fits differ, and
-in all directions, because the line that it moves along bends."""
 
 
 def place_obliquely(x: Image, chains: Sequence[Chain], catalogue: Catalogue, px_per_mm: float) -> tuple[Chain, ...]:
@@ -58,10 +55,7 @@ def _placed(x: Image, chain: Chain, others: Sequence[Chain], catalogue: Catalogu
     least = _MORE_LIKELY_SOLID if fit.is_solid else _MORE_LIKELY
     if fit.log_likelihood + float(shape[1] - shape[0]) <= least * len(places):
         return chain
-    way = fit.points_uv - places
-    beside = _SD_BESIDE**2 * (way * way).sum(axis=1)
-    more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :] + beside[:, None, None] * np.eye(2)
-    return replace(chain, pixels_uv=fit.points_uv, covariance_px2=chain.covariance_px2 + more)
+    return ellipse.moved_obliquely(chain, fit.points_uv)
 
 
 def _is_oblique(chain_uv: Array, catheter: Catheter, px_per_mm: float) -> bool:
