@@ -17,7 +17,7 @@ from sqlalchemy.exc import OperationalError
 from fluoromap.contracts import Matching, RejectedSite, Silent
 from fluoromap.matching import study_matching
 from fluoromap.reasons import Reason
-from fluoromap.segmenter import run_segmentation
+from fluoromap.segmenter.runs import run_segmentation
 from fluoromap.triangulator import study_triangulation
 from fluoromap.triangulator.site_locator import SiteLocator
 from fluoromap_service.jobs import job_life

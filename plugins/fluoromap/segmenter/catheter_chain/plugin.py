@@ -8,13 +8,13 @@ from pydantic import BaseModel
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, NoParams, Run, Segmentation
-from fluoromap.segmenter.chain_detector import ChainDetector
 from fluoromap.segmenter.electrodes.blob_response import BlobResponse
+from fluoromap.segmenter.frames.chain_detector import ChainDetector
 from fluoromap.segmenter.judge.acceptance import Acceptance, ScoreLimits
 from fluoromap.segmenter.judge.visible_part import visible_part
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.picture.log_image import Image
-from fluoromap.segmenter.run_segmentation import segment_run
+from fluoromap.segmenter.runs.run_segmentation import segment_run
 from fluoromap.segmenter.warm_up import prepare
 
 _ACCEPTANCE = Acceptance(

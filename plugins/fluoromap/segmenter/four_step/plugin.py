@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.four_step.frame_chains import FourStepDetector, FourStepParams
-from fluoromap.segmenter.run_segmentation import segment_run
+from fluoromap.segmenter.runs.run_segmentation import segment_run
 
 
 class FourStep:

@@ -1,7 +1,7 @@
 import numpy as np
 
+from fluoromap.segmenter.frames.electrode_detector import ALONE, IN_A_RUN
 from fluoromap.segmenter.judge.acceptance import Acceptance, ScoreLimits
-from fluoromap.segmenter.learned_chain.detector import ALONE, IN_A_RUN
 
 
 def test_a_long_row_is_accepted_with_less_from_each_electrode():

@@ -8,9 +8,9 @@ from frame_sources import Frames
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
-from fluoromap.segmenter.hidden_catheters import add_hidden_catheters
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.segmenter.picture.moved_means import moved_means
+from fluoromap.segmenter.tracks.hidden_catheters import add_hidden_catheters
 
 PX_PER_MM = 3.5
 FRAMES = 16

@@ -1,0 +1,1 @@
+"""Tracks: the chains of one catheter along a run, in one direction, with one name."""
