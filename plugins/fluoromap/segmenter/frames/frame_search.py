@@ -84,7 +84,7 @@ class FrameSearch:
     _erratic: bool = field(default=False, init=False)
 
     def find_chains(self, x: Image, frame: int, beside: Sequence[Image] = ()) -> FrameChains:
-        """Return the chains of one log image; see :class:`~fluoromap.segmenter.runs.run_segmentation.Detector`."""
+        """Return the chains of one log image; see :class:`~fluoromap.segmenter.frames.detector.Detector`."""
         # The mean of a run's frames follows its last frame, with the number of another one.
         is_next = frame == self._next
         expected = self._expected(frame)

@@ -12,8 +12,8 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Preview, Run, Segmentation
 from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
 from fluoromap.segmenter.learned_chain.preview import preview
-from fluoromap.segmenter.runs.run_search import RunSearch
-from fluoromap.segmenter.runs.scale_and_polarity import is_inverted
+from fluoromap.segmenter.runs.hypotheses.run_search import RunSearch
+from fluoromap.segmenter.runs.hypotheses.scale_and_polarity import is_inverted
 from fluoromap.segmenter.warm_up import prepare
 
 _log = logging.getLogger(__name__)

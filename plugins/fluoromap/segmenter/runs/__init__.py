@@ -1,1 +1,1 @@
-"""The steps of a run, and its hypotheses: other scales, absent and unlisted catheters."""
+"""The steps of a run, from its frames to the chains of all frames and of diastole."""

@@ -31,7 +31,7 @@ class ChainSearch(Protocol):
         same_shape: bool = False,
         confirmed: bool = False,
     ) -> Chain | None:
-        """Return the chain in a frame; see :meth:`~fluoromap.segmenter.runs.run_segmentation.Detector.find_again`."""
+        """Return the chain in a frame; see :meth:`~fluoromap.segmenter.frames.detector.Detector.find_again`."""
 
 
 @dataclass(slots=True, eq=False)

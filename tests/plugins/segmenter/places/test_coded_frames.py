@@ -137,7 +137,7 @@ def test_electrodes_of_smooth_pictures_have_larger_ellipses(monkeypatch, segment
     coded = Frames(np.array([np.round(200.0 * frame / highest) for frame in smooth]).astype(np.uint8))
     run = Run(coded, lateral.frame_times_ms, 512 / 178 * 2, PixelFacts(False, 8, False))
     found = segmenter().segment(run, DEFAULT_CATALOGUE, {}, Silent())
-    monkeypatch.setattr("fluoromap.segmenter.runs.run_segmentation.rest_gain", lambda *_: 0.0)
+    monkeypatch.setattr("fluoromap.segmenter.runs.final_ellipses.rest_gain", lambda *_: 0.0)
     without = segmenter().segment(run, DEFAULT_CATALOGUE, {}, Silent())
 
     def sizes(entries):

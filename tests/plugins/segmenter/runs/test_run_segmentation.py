@@ -8,7 +8,7 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Silent
 from fluoromap.segmenter.judge.verdict import Verdict
-from fluoromap.segmenter.runs import run_segmentation
+from fluoromap.segmenter.runs import final_ellipses, recalled_searches
 from fluoromap.segmenter.runs.run_segmentation import segment_run
 from fluoromap.segmenter.shape.chain_comparison import reverse
 
@@ -187,7 +187,8 @@ def test_a_long_row_that_is_not_clear_is_judged_where_its_rings_are_fitted(monke
         judged.append(there)
         return Verdict(log_odds >= 1.0 or there, max(log_odds, 1.5 * there))
 
-    monkeypatch.setattr(run_segmentation, "place_obliquely", place)
+    for module in (recalled_searches, final_ellipses):
+        monkeypatch.setattr(module, "place_obliquely", place)
     detector = Row(6)
     found = segment_run(run, catalogue, {}, Silent(), lambda field: detector, True, False, judge, oblique=True)
     assert [len(entry.chains) for entry in found.frames] == [1] * 6

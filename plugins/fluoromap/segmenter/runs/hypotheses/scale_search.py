@@ -8,12 +8,13 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.electrodes.frame_answers import StoredAnswers
 from fluoromap.segmenter.electrodes.network.weights import Trained
+from fluoromap.segmenter.frames.detector import Detector
 from fluoromap.segmenter.frames.electrode_detector import electrode_chains
 from fluoromap.segmenter.judge.track_evidence import TrackEvidence
 from fluoromap.segmenter.judge.visible_part import visible_part
 from fluoromap.segmenter.picture.field_mask import FieldMask
 from fluoromap.segmenter.places.chain_fitting import names_with_long_tips
-from fluoromap.segmenter.runs.run_segmentation import Detector, segment_run
+from fluoromap.segmenter.runs.run_segmentation import segment_run
 
 _DIM_BELOW = 0.02
 """Probabilities fall fast: an electrode of a fiftieth of its chain's best probability was only predicted."""

@@ -15,7 +15,7 @@ import numpy as np
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import FrameChains, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.runs.added_catheters import add_catheters
+from fluoromap.segmenter.runs.hypotheses.added_catheters import add_catheters
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 OTHER_SCALES = 1.18, 1.39, 0.85
@@ -44,7 +44,7 @@ def useful_scales(
     """Return the scales that together show most of a run's catheters.
 
     It is the stated one alone where that shows all or others add nothing. Else the catheters are most probable in this order, see
-    :func:`~fluoromap.segmenter.runs.added_catheters.add_catheters`. Where the stated scale shows none, two have to be
+    :func:`~fluoromap.segmenter.runs.hypotheses.added_catheters.add_catheters`. Where the stated scale shows none, two have to be
     there: contrast medium may lie like one catheter at some scale. Where it shows one that is not listed, there have to be three,
     or six more electrodes: four of an unlisted catheter may lie like a listed one of another size. Where it shows all and one that
     is not listed, the others have to show all without that one, and to make them more probable.

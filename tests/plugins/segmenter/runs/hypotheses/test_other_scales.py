@@ -8,7 +8,7 @@ import pytest
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.runs.other_scales import useful_scales
+from fluoromap.segmenter.runs.hypotheses.other_scales import useful_scales
 
 TYPES = {"a": "quadripolar-2-5-2", "b": "quadripolar-5-5-5", "c": "hexapolar-2-5-2"}
 CATALOGUE = Catalogue(tuple(catheter_type(type_, name) for name, type_ in TYPES.items()), "a", "b")

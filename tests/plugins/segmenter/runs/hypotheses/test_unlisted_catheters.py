@@ -10,7 +10,7 @@ from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Segmentatio
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain
-from fluoromap.segmenter.runs.unlisted_catheters import (
+from fluoromap.segmenter.runs.hypotheses.unlisted_catheters import (
     asked_frames,
     frame_shows_more,
     listed_alone,

@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from fluoromap.catheters import Catalogue, Catheter, catheter_type
 from fluoromap.contracts import Chain, FrameChains, Segmentation
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.runs.added_catheters import tracks_of
-from fluoromap.segmenter.runs.other_scales import expected_electrodes
+from fluoromap.segmenter.runs.hypotheses.added_catheters import tracks_of
+from fluoromap.segmenter.runs.hypotheses.other_scales import expected_electrodes
 from fluoromap.segmenter.shape.chain_comparison import overlaps
 from fluoromap.segmenter.tracks.track import Track
 

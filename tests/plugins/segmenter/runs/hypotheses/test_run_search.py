@@ -8,10 +8,10 @@ from frame_sources import Frames
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, PixelFacts, Run, Segmentation, Silent
-from fluoromap.segmenter.runs.run_search import RunSearch
+from fluoromap.segmenter.runs.hypotheses.run_search import RunSearch
 
 PX_PER_MM = 5.0
-RUN_SEARCH = "fluoromap.segmenter.runs.run_search"
+RUN_SEARCH = "fluoromap.segmenter.runs.hypotheses.run_search"
 
 
 def listed_catheters(catalogue, marks):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Segmentation
-from fluoromap.segmenter.runs.added_catheters import tracks_of
+from fluoromap.segmenter.runs.hypotheses.added_catheters import tracks_of
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from fluoromap.catheters import Catalogue, catheter_type
 from fluoromap.contracts import Chain, FrameChains, Segmentation
-from fluoromap.segmenter.runs.absent_catheters import absent_catheters, without_absent
+from fluoromap.segmenter.runs.hypotheses.absent_catheters import absent_catheters, without_absent
 
 TYPES = {"cs": "decapolar-2-5-2", "loop": "circular-10", "his": "quadripolar-2-5-2", "ablation": "ablation-4"}
 CATALOGUE = Catalogue(tuple(catheter_type(type_, name) for name, type_ in TYPES.items()), "cs", "ablation")

@@ -11,12 +11,12 @@ from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Context, Marks, Run, Segmentation
 from fluoromap.segmenter.electrodes.network.weights import Trained
 from fluoromap.segmenter.recall import recall_for
-from fluoromap.segmenter.runs.absent_catheters import AbsentCatheters, absent_catheters, without_absent
-from fluoromap.segmenter.runs.added_catheters import add_catheters
-from fluoromap.segmenter.runs.other_scales import UsefulScales, useful_scales
-from fluoromap.segmenter.runs.scale_and_polarity import frame_electrodes, promising_scales
-from fluoromap.segmenter.runs.scale_search import search_at_scale
-from fluoromap.segmenter.runs.unlisted_catheters import (
+from fluoromap.segmenter.runs.hypotheses.absent_catheters import AbsentCatheters, absent_catheters, without_absent
+from fluoromap.segmenter.runs.hypotheses.added_catheters import add_catheters
+from fluoromap.segmenter.runs.hypotheses.other_scales import UsefulScales, useful_scales
+from fluoromap.segmenter.runs.hypotheses.scale_and_polarity import frame_electrodes, promising_scales
+from fluoromap.segmenter.runs.hypotheses.scale_search import search_at_scale
+from fluoromap.segmenter.runs.hypotheses.unlisted_catheters import (
     ShowsUnlisted,
     asked_frames,
     frame_shows_more,

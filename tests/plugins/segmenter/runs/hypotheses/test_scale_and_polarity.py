@@ -11,8 +11,13 @@ from fluoromap.contracts import PixelFacts, Run, Silent
 from fluoromap.phantom import StudySpec, simulate_study
 from fluoromap.segmenter.electrodes.network.weights import SHIPPED, read_weights
 from fluoromap.segmenter.learned_chain.plugin import LearnedChain, LearnedChainParams
-from fluoromap.segmenter.runs import scale_and_polarity as explanation
-from fluoromap.segmenter.runs.scale_and_polarity import Explanation, find_scale, is_inverted, promising_scales
+from fluoromap.segmenter.runs.hypotheses import scale_and_polarity as explanation
+from fluoromap.segmenter.runs.hypotheses.scale_and_polarity import (
+    Explanation,
+    find_scale,
+    is_inverted,
+    promising_scales,
+)
 
 PX_PER_MM = 512 / 178 * 2
 HIGHEST = 4095
