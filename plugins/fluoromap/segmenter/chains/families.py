@@ -6,6 +6,7 @@ import functools
 from dataclasses import dataclass
 
 from fluoromap.catheters import Catalogue, Catheter
+from fluoromap.contracts import Chain
 
 _WORTH = 6.0
 _FLOOR_FALLS = 0.6
@@ -50,3 +51,13 @@ def catheter_families(catalogue: Catalogue) -> tuple[CatheterFamily, ...]:
         else:
             groups.append([catheter])
     return tuple(CatheterFamily(tuple(member.name for member in group), group[0]) for group in groups)
+
+
+def family_of(chain: Chain, catalogue: Catalogue) -> CatheterFamily | None:
+    """Return the most probable family whose catheters have exactly this chain's electrodes."""
+    whole = [
+        family
+        for family in catheter_families(catalogue)
+        if chain.electrodes == tuple(range(1, family.catheter.electrodes + 1))
+    ]
+    return max(whole, key=lambda family: sum(chain.probability(name) for name in family.names), default=None)

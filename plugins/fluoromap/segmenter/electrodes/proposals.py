@@ -11,6 +11,10 @@ import numpy as np
 
 from fluoromap.contracts import Array, BoolArray, frozen
 from fluoromap.segmenter.picture.log_image import Image
+from fluoromap.segmenter.picture.shaft_image import ShaftImage
+
+_LEAST_LINE, _LINE_NOISE = 0.03, 0.6
+"""Depth of a clear shaft, log units: at least, and over the noise of a pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +139,12 @@ class ImageEvidence(Protocol):
 
         It is the proposer's own measure: ``Chain.scores``.
         """
+
+
+def shaft_image_of(seen: ImageEvidence, px_per_mm: float) -> ShaftImage:
+    """Return the image in which the shafts of a log image are looked for."""
+    clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
+    return ShaftImage(seen.smooth, seen.reduction, clear, px_per_mm)
 
 
 Proposer = Callable[[Image], ImageEvidence]

@@ -10,10 +10,10 @@ from functools import partial
 
 import numpy as np
 
-from fluoromap.catheters import Catalogue, Catheter
+from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, BoolArray, Chain, FrameChains
 from fluoromap.reasons import Reason
-from fluoromap.segmenter.chains.families import CatheterFamily, catheter_families
+from fluoromap.segmenter.chains.families import CatheterFamily, catheter_families, family_of
 from fluoromap.segmenter.chains.linking import (
     CandidateChain,
     PossibleChains,
@@ -25,47 +25,42 @@ from fluoromap.segmenter.chains.linking import (
 )
 from fluoromap.segmenter.chains.missing_electrodes import complete_chains
 from fluoromap.segmenter.chains.rigid_search import rigid_search
-from fluoromap.segmenter.electrodes.proposals import ImageEvidence, Proposals, Proposer, answers_for_each, log_odds
+from fluoromap.segmenter.electrodes.proposals import (
+    ImageEvidence,
+    Proposals,
+    Proposer,
+    answers_for_each,
+    log_odds,
+    shaft_image_of,
+)
 from fluoromap.segmenter.judge.acceptance import UNSEEN, Acceptance, shows_enough
-from fluoromap.segmenter.judge.features.bars import follows_bars, products_beside
-from fluoromap.segmenter.judge.features.crossings import are_crossings
-from fluoromap.segmenter.judge.features.dark_lines import depths_along, is_dark_line
+from fluoromap.segmenter.judge.catalogue_judge import NO_ELECTRODE, CatalogueJudge
 from fluoromap.segmenter.judge.features.faded_ends import without_shorter_catheters
-from fluoromap.segmenter.judge.features.shared_metal import lies_on_metal
 from fluoromap.segmenter.judge.features.unexplained_rows import (
     EVEN_ODDS,
     SURE,
-    continues,
     not_on,
     shows_row,
-    unexplained_between,
 )
 from fluoromap.segmenter.picture.field_mask import FieldMask, are_in
 from fluoromap.segmenter.picture.log_image import Image
 from fluoromap.segmenter.picture.moved_means import moved_means
-from fluoromap.segmenter.picture.shaft_image import ShaftImage
 from fluoromap.segmenter.places import ellipse
 from fluoromap.segmenter.places.chain_fitting import HIDING_MM, FittedChain, are_hidden, fit_chains
 from fluoromap.segmenter.places.refinement import refine
 from fluoromap.segmenter.shape.chain_comparison import is_same_shape
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
-_LEAST_LINE, _LINE_NOISE = 0.03, 0.6
 _COMPANION_SLACK = 2.5
 _AGAIN_SLACK = 2.5
 _CONFIRMED_CONTRAST = 3.0
 _LEAST_FREE = 2
 _WORST_FIT = 2.0
 _BESIDE_MM = 2.0
-_WEAKER = 0.25
 _LEAST_MOVING_ODDS, _LEAST_ROW_ODDS, _FAINT_CONTRAST = 0.2, -0.2, 11.0
 """Least log-odds of the middle electrode in a moved mean: of any chain, and of a long row of less contrast over noise."""
-_FOR_ONE_CROSSING = 8
-"""Electrodes of a chain for which one thing may cross it."""
-_CLEARLY_LESS, _MOST_EXCUSED = 0.5, 1.0
 _GOOD_ALONE = 1.5
-_NO_ELECTRODE = -1.0
-_EXCHANGED, _PAIR = 2, 2
+_EXCHANGED = 2
 _LEAST_PLACES, _TWICE = 4, 3.0
 _SAME_PLACE_MM = 1.0
 _SURE_AT_EDGE = 2
@@ -157,6 +152,10 @@ class ChainDetector:
     def forget_image(self) -> None:
         """Ask the proposer again when the latest image comes back."""
         self._latest = None
+
+    @property
+    def _judge(self) -> CatalogueJudge:
+        return CatalogueJudge(self.catalogue, self.acceptance, self.px_per_mm)
 
     def _evidence(self, probability: Array) -> Array:
         return evidence(probability, self.acceptance.trust)
@@ -265,7 +264,7 @@ class ChainDetector:
         self, seen: ImageEvidence, proposed: Proposals, families: tuple[CatheterFamily, ...], halves: int
     ) -> _Linking:
         """Link the proposals, and complete chains where not every catheter has a well-fitting one."""
-        shaft_image = self._shafts(seen)
+        shaft_image = shaft_image_of(seen, self.px_per_mm)
         # A copy that may be written to, as the completed points: kernels are compiled for one kind of array only.
         points = proposed.points_uv.copy()
         weights, variance = self._evidence(proposed.probability), proposed.variance_px2
@@ -350,8 +349,8 @@ class ChainDetector:
     ) -> _FittedSet:
         """Fit linked chains to the image, and drop those that are not accepted."""
         fitted = fit_chains(
-            x, linking.points_uv, linking.chains, self._shafts(seen), families, seen.position_noise, linking.proposed,
-            seen.tip_logits_at, self._is_seen(linking.points_uv),
+            x, linking.points_uv, linking.chains, shaft_image_of(seen, self.px_per_mm), families, seen.position_noise,
+            linking.proposed, seen.tip_logits_at, self._is_seen(linking.points_uv),
         )  # fmt: skip
         clear = [
             _Clear(candidates, one, self._where_surest(one.chain, linking.points_uv[list(candidates.candidates)], seen))
@@ -399,7 +398,7 @@ class ChainDetector:
         for one, scores in zip(clear, all_scores, strict=True):
             chain = one.fitted.chain
             others = [other.fitted.chain for other in clear if other is not one]
-            if self.acceptance.accepts(scores, chain.scores[0], beside) or self._hides_a_pair(
+            if self.acceptance.accepts(scores, chain.scores[0], beside) or self._judge.hides_a_pair(
                 one.judged, scores, proposed
             ):
                 covariance = ellipse.beside_other_electrodes(chain, others, self.px_per_mm)
@@ -408,24 +407,13 @@ class ChainDetector:
                 judged.append(replace(one.judged, scores=shown))
         listed = np.ones(len(accepted), np.bool_)
         if self.acceptance.strict:
-            listed = self._are_of_catalogue(tuple(judged), seen, proposed)
+            listed = self._judge.are_of_catalogue(tuple(judged), seen, proposed)
         return _FittedSet(
             tuple(chain for (_, chain), kept in zip(accepted, listed, strict=True) if kept),
             tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if kept),
             tuple(candidates for (candidates, _), kept in zip(accepted, listed, strict=True) if not kept),
             sure,
         )
-
-    def _hides_a_pair(self, chain: Chain, scores: Array, proposed: Proposals) -> bool:
-        """Return whether something hides a pair of a long catheter.
-
-        A chain that is displaced along its catheter leaves a pair beyond its other end.
-        """
-        if len(scores) < MANY_ELECTRODES or not self.acceptance.hidden_pair.allow(scores):
-            return False
-        family = self.family_of(chain)
-        sure = proposed.points_uv[proposed.probability >= SURE]
-        return family is not None and not continues(chain, sure, family.catheter, self.px_per_mm, least=1)
 
     def _link_without_rejected(
         self, seen: ImageEvidence, linking: _Linking, result: _FittedSet, families: tuple[CatheterFamily, ...]
@@ -451,102 +439,6 @@ class ChainDetector:
         possible = linking.possible.where(allowed)
         chains = best_chains(possible, linking.points_uv, families, self.px_per_mm, linking.proposed, linking.is_merged)
         return replace(linking, possible=possible, chains=chains)
-
-    def _lies_on_a_line(self, chain_uv: Array, seen: ImageEvidence, catheter: Catheter) -> bool:
-        """Return whether a chain (n, 2) lies on parallel bars or on a dark line.
-
-        A loop on edge shows both sides as one line. Scores that are no probabilities, but contrasts, count as sure.
-        """
-        shafts = self._shafts(seen)
-        on_dark_line = not catheter.is_circular and is_dark_line(
-            [depths_along(chain_uv, shafts)], log_odds(seen.scores_at(chain_uv)), self.acceptance.dark_lines
-        )
-        return on_dark_line or follows_bars(products_beside(chain_uv, shafts))
-
-    def _are_of_catalogue(self, chains: tuple[Chain, ...], seen: ImageEvidence, proposed: Proposals) -> BoolArray:
-        """Return which chains can be catheters of the catalogue, (n,).
-
-        Others are part of a catheter with more electrodes than the catalogue has, or no catheter: their electrodes are places on
-        parallel bars. The electrodes of one catheter look alike, so proposals in less than half of the gaps may be parts of a
-        dark shaft if they are less probable: less than a long chain's weaker electrodes, or clearly less than all electrodes of
-        a short one and 0.73 at most. Electrodes of a long chain in another chain's line belong to the long one, if that is
-        listed. Two in the line that are nearly as probable as the chain's middle electrode are a pair of a longer catheter.
-        Besides, one thing may cross each eight electrodes of a chain, unless it has places without an electrode, as displaced
-        chains have.
-        """
-        free = not_on(proposed.points_uv, chains, self.px_per_mm)
-        places = [free, proposed.points_uv, *(chain.pixels_uv for chain in chains)]
-        odds_of_free, odds, *odds_of_chains = answers_for_each(seen.kind_odds_at, places)
-        listed = np.ones(len(chains), np.bool_)
-        # What is no catheter of the catalogue explains nothing in the line of a shorter chain.
-        for index in sorted(range(len(chains)), key=lambda one: -len(chains[one].electrodes)):
-            chain, own = chains[index], odds_of_chains[index]
-            family = self.family_of(chain)
-            is_seen = chain.scores > UNSEEN
-            if (
-                family is None
-                or self._lies_on_another(index, chains, listed)
-                or self._lies_on_a_line(chain.pixels_uv[is_seen], seen, family.catheter)
-            ):
-                listed[index] = False
-                continue
-            onwards = EVEN_ODDS
-            own = own[is_seen]
-            if len(chain.electrodes) >= MANY_ELECTRODES:
-                like = max(EVEN_ODDS, float(np.quantile(own, _WEAKER, method="lower")))
-                onwards = min(like, _MOST_EXCUSED)
-            else:
-                like = min(max(EVEN_ODDS, float(own.min()) - _CLEARLY_LESS), _MOST_EXCUSED)
-            long_ones = [
-                other
-                for other, kept in zip(chains, listed, strict=True)
-                if kept and other is not chain and len(other.electrodes) >= MANY_ELECTRODES
-            ]
-            row = not_on(proposed.points_uv[odds >= onwards], long_ones, self.px_per_mm)
-            sure, alike = free[odds_of_free >= EVEN_ODDS], free[odds_of_free >= like]
-            pair = free[odds_of_free >= max(float(np.median(own)) - _CLEARLY_LESS, _MOST_EXCUSED)]
-            unexplained = sure, alike, row, pair
-            crossings = len(own) // _FOR_ONE_CROSSING if own.min() >= _NO_ELECTRODE else 0
-            listed[index] = self._explains(chain, family.catheter, crossings, *unexplained)
-            if not listed[index]:
-                uncrossed = (self._not_crossed(points, chain, seen) for points in unexplained)
-                listed[index] = self._explains(chain, family.catheter, crossings, *uncrossed)
-        return listed
-
-    def _lies_on_another(self, index: int, chains: Sequence[Chain], listed: BoolArray) -> bool:
-        """Return whether a chain lies on the metal of another one that is listed."""
-        family = self.family_of(chains[index])
-        others = [
-            (other, self.family_of(other))
-            for other, kept in zip(chains, listed, strict=True)
-            if kept and other is not chains[index]
-        ]
-        return family is not None and any(
-            of_other is not None
-            and lies_on_metal(chains[index], family.catheter, other, of_other.catheter, self.px_per_mm)
-            for other, of_other in others
-        )
-
-    def _explains(
-        self, chain: Chain, catheter: Catheter, crossings: int, sure: Array, alike: Array, row: Array, pair: Array
-    ) -> bool:
-        """Return whether a chain leaves no electrodes of its catheter unexplained.
-
-        crossings : how many things may cross the chain. sure, alike : proposals that no chain explains, (n, 2). row : proposals in
-        whose line the chain may be. pair : those that no chain explains and that are like its electrodes, so that two are enough.
-        """
-        # Those alike are among the sure ones.
-        between = unexplained_between(chain, sure, catheter, self.px_per_mm)
-        return (
-            2 * between < len(chain.electrodes)
-            and not (between > crossings and unexplained_between(chain, alike, catheter, self.px_per_mm))
-            and not continues(chain, row, catheter, self.px_per_mm)
-            and not continues(chain, pair, catheter, self.px_per_mm, _PAIR)
-        )
-
-    def _not_crossed(self, points_uv: Array, chain: Chain, seen: ImageEvidence) -> Array:
-        """Return the points at which nothing crosses the chain."""
-        return points_uv[~are_crossings(points_uv, chain.pixels_uv, self._shafts(seen))]
 
     def _is_complete(self, linked: Sequence[CandidateChain], weights: Array) -> bool:
         """Return whether each catheter has a well-fitting chain.
@@ -608,7 +500,7 @@ class ChainDetector:
         weights = self._evidence(seen.probability_at(points))
         for values in (scores, weights, variance) if hidden.any() else ():
             values[hidden] = np.median(values[~hidden])
-        score = chain_score(points, weights, variance, self._shafts(seen), family)
+        score = chain_score(points, weights, variance, shaft_image_of(seen, self.px_per_mm), family)
         # Half an electrode at the edge cannot be located.
         scores[~are_in(self.field.with_edge, points)] = UNSEEN
         in_view = confirmed and np.mean(seen.likeness.at(points[is_seen])) >= _CONFIRMED_CONTRAST
@@ -658,7 +550,7 @@ class ChainDetector:
         free = away > _BESIDE_MM * self.px_per_mm
         points, weights = proposed.points_uv[free], self._evidence(proposed.probability[free])
         families = catheter_families(self.catalogue)
-        shaft_image = self._shafts(seen)
+        shaft_image = shaft_image_of(seen, self.px_per_mm)
         linked = link_candidates(points, weights, proposed.variance_px2[free], shaft_image, families)
         fitted = fit_chains(x, points, linked, shaft_image, families, seen.position_noise)
         return any(one.clearness >= self.acceptance.extra_clearness for one in fitted)
@@ -673,22 +565,13 @@ class ChainDetector:
 
     def family_of(self, chain: Chain) -> CatheterFamily | None:
         """Return the most probable family whose catheters have exactly this chain's electrodes."""
-        whole = [
-            family
-            for family in catheter_families(self.catalogue)
-            if chain.electrodes == tuple(range(1, family.catheter.electrodes + 1))
-        ]
-        return max(whole, key=lambda family: sum(chain.probability(name) for name in family.names), default=None)
-
-    def _shafts(self, seen: ImageEvidence) -> ShaftImage:
-        clear = max(_LEAST_LINE, _LINE_NOISE * seen.pixel_noise)
-        return ShaftImage(seen.smooth, seen.reduction, clear, self.px_per_mm)
+        return family_of(chain, self.catalogue)
 
 
 def _is_doubtful(chain: Chain, seen: ImageEvidence) -> bool:
     """Return whether a long chain has a place that is clearly no electrode."""
     places = chain.pixels_uv[chain.scores > UNSEEN]
-    return len(chain.electrodes) >= MANY_ELECTRODES and bool((seen.kind_odds_at(places) < _NO_ELECTRODE).any())
+    return len(chain.electrodes) >= MANY_ELECTRODES and bool((seen.kind_odds_at(places) < NO_ELECTRODE).any())
 
 
 def _away(points_uv: Array, from_uv: Array) -> Array:
