@@ -35,7 +35,7 @@ class SyntheticFrames:
 
     def __getitem__(self, index: int) -> NDArray[np.uint16]:
         if not 0 <= index < _FRAMES:
-            raise IndexError(index)
+            raise IndexError(f"frame {index} of {len(self)}")
         v, u = np.ogrid[0 : self.shape[0], 0 : self.shape[1]]
         level = np.full(self.shape, _LEVEL)
         shown = self._catalogue.catheters[: -1 if index == _HIDDEN_IN else None]

@@ -261,10 +261,10 @@ def _best_set(
 def _needless(chosen: IntArray, family: IntArray, sure: int, is_merged: BoolArray) -> IntArray:
     """Return how many electrodes of each chain nobody proposed and nobody needs, (n,).
 
-    A chain that lies two electrodes too far along its catheter would leave two of them to a part of another chain. So a
-    long chain needs as many such electrodes as the chain of its family that has the fewest of them and half of its
-    candidates. A short one needs none, and nobody needs an electrode that another one covers. Rows of ``chosen`` are filled up
-    with -1.
+    A short chain needs none of the electrodes that nobody proposed. A long chain needs some of them: else a chain that lies two
+    electrodes too far along the catheter would win, and leave two to a part of another chain. It needs as many as that chain has
+    which, among those of its family with half of its candidates, has the fewest. No chain needs an electrode that another one
+    covers. Rows of ``chosen`` are filled up with -1.
     """
     merged = (is_merged[chosen] & (chosen >= 0)).sum(axis=1)
     needless: IntArray = (chosen >= sure).sum(axis=1) - merged

@@ -133,10 +133,13 @@ def _grow(points, spacing_px, step, least_cosine, ring_px, kept, ratios, longer,
 def count_shared(chosen: IntArray, points: Array, near_px: float, most: int) -> IntArray:
     """Return how many candidates each two chains have in common, (n, n).
 
-    ``most`` is added where that many electrodes of one chain lie within ``near_px`` of the other's: a wide ring may
-    give two candidates. Where some chain is long, so it is where chains take turns along a catheter with more electrodes: two or
-    more electrodes of one chain lie between those of the other, or those between and those at the same places are ``most``
-    together. Rows of ``chosen`` are filled up with -1.
+    ``most`` is added to the number of two chains that exclude each other. They do in two cases:
+
+    - ``most`` electrodes of one chain lie within ``near_px`` of the other's, because a wide ring may give two candidates.
+    - Some chain is long, and both take turns along one catheter: two electrodes of one chain lie between those of the other, or
+      the electrodes between and those at the same places are ``most`` together.
+
+    Rows of ``chosen`` are filled up with -1.
     """
     used = np.flatnonzero(np.bincount(chosen.ravel() + 1, minlength=len(points) + 1)[1:])
     member = np.zeros((len(chosen), len(points) + 1), np.float32)

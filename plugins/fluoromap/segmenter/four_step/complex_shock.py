@@ -61,9 +61,9 @@ def complex_shock(
     (rows, columns) float32
     """
     if not 0 < step <= 0.25 / magnitude:
-        raise ValueError("the step of the shock filter must lie between 0 and 1 / (4 magnitude)")
+        raise ValueError(f"the step of the shock filter is {step}: it must lie between 0 and {0.25 / magnitude}")
     if not 0 < theta <= 0.01:
-        raise ValueError("theta of the shock filter must lie between 0 and 0.01")
+        raise ValueError(f"theta of the shock filter is {theta}: it must lie between 0 and 0.01")
     rows, columns = x.shape
     real = np.empty((rows + 2 * sweeps, columns + 2), np.float32)
     imaginary = np.empty_like(real)

@@ -54,7 +54,7 @@ def perona_malik(x: Image, k: float, sweeps: int = 15, step: float = 0.2) -> Ima
         Within 0.005 of the range of a double precision sweep-by-sweep evaluation.
     """
     if not 0 < step < STABLE_STEP:
-        raise ValueError("the step of the diffusion must lie between 0 and 0.25")
+        raise ValueError(f"the step of the diffusion is {step}: it must lie between 0 and {STABLE_STEP}")
     # In this unit the conduction is exp(-8 d^2), the eighth power of a series in d^2.
     unit = np.float32(math.sqrt(8.0) * k)
     out: Image = np.ascontiguousarray(x * (np.float32(1) / unit), dtype=np.float32)

@@ -61,9 +61,9 @@ class FrameSearch:
     - In fast runs (``shares``) the network's answer for a frame is used in the next one too.
     - Where all catheters were found in the frames before, twelve more frames use the answer, carried along with the catheters.
     - Of these frames, three of four are not searched: clear catheters that move on as before are only fitted.
-    - A frame that with the answer of another one shows fewer chains than that one, or none for sure, or a catheter more than
-      ``near_px`` from where it would be if it moved on, is searched again with an answer of its own. So are the frames after it,
-      until catheters move on again.
+    - A frame that was searched with the answer of another frame is searched again with its own in three cases: it shows fewer
+      chains than that frame, it shows none for sure, or a catheter lies more than ``near_px`` from where it would be if it moved
+      on. The frames after it have answers of their own too, until catheters move on again.
     """
 
     detector: ChainDetector

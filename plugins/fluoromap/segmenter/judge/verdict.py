@@ -12,8 +12,10 @@ from fluoromap.contracts import Chain
 from fluoromap.segmenter.judge.features.unexplained_rows import Onwards
 from fluoromap.segmenter.shape.limits import MANY_ELECTRODES
 
-_LESS_CLEAR, _CLEAR_ROW = 2.0, 0.6
-"""How much less clear than the run's other catheters a catheter may be, and what is clear in a long row in itself, log-odds."""
+_LESS_CLEAR = 2.0
+"""How far a catheter's log-odds may lie below the median of the run's other catheters."""
+_CLEAR_ROW = 0.6
+"""Log-odds from which on a long row is clear, whatever the others are."""
 
 
 @dataclass(frozen=True, slots=True)

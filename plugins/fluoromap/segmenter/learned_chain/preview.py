@@ -34,7 +34,7 @@ class _Stretch:
 
     def __getitem__(self, index: int) -> NDArray[np.generic]:
         if not 0 <= index < self.count:
-            raise IndexError(index)
+            raise IndexError(f"frame {index} of {len(self)}")
         return self.frames[self.first + index]
 
     def __iter__(self) -> Iterator[NDArray[np.generic]]:

@@ -17,15 +17,20 @@ _ALIKE = 0.5
 _LEAST_LAG, _MOST_LAG = 0.05, 0.9
 _TINY = 1e-9
 _FEWEST_FRAMES, _SAMPLED, _REDUCED = 4, 12, 2
-_EMPTY, _DARKEST, _DARK, _DARK_NOISE, _LEAST_PIXELS = 0.9, 0.9995, 0.4, 10.0, 50
-"""Quantile over time that shows what lies behind moving things, quantile over the picture that is the darkest of these, how dark a
-pixel is to count, as a share of that and over the noise, and how many such pixels there are at least."""
+_EMPTY = 0.9
+"""Quantile of a pixel over time that shows the background behind moving things."""
+_DARKEST = 0.9995
+"""Quantile over a picture that is the darkness of its darkest moving thing."""
+_DARK, _DARK_NOISE = 0.4, 10.0
+"""Least darkness of a pixel that counts: as a share of the darkest, and over the noise."""
+_LEAST_PIXELS = 50
+"""Fewest dark pixels that say what the lag is."""
 _NEARLY, _LATER = 0.8, 0.08
-"""How much of the lag of noise has to be left of all darkness, or else how much more has to be left than was there before, for
-noise to be believed."""
+"""Noise is believed where all darkness keeps this share of its lag. Else it is believed where the later frame keeps so much more
+darkness than the earlier frame had there."""
 _LEFT, _LEFT_TOO, _SAME, _MOST_LEFT = 0.05, 0.15, 0.12, 0.65
-"""Quantiles of the share of darkness that is left, how near they are where things have moved away from enough pixels, and the
-largest share that is lag: contrast medium flows away more slowly than that."""
+"""Two quantiles of the share of darkness that pixels keep; how much they differ at most where things have left enough pixels; and
+the largest share that is lag. Contrast medium flows away so slowly that pixels keep more."""
 
 
 def measure_lag(frames: FrameSource, inside: BoolArray, pixels: PixelFacts) -> float:

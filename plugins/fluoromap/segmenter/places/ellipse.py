@@ -80,8 +80,9 @@ _SD_OF_WAY, _SD_BESIDE = 0.4, 0.15
 """Standard deviation that is added, as a share of the way that an oblique electrode moves: along the way, by which the two fits
 differ, and in all directions, because the line that it moves along bends."""
 _OF_REST, _FOR_EACH_LEVEL = 1.7, 0.7
-"""The least standard deviation over the unexplained rest where neighbouring pixels are alike, and how much less that is for each
-grey level by which they usually differ. Fitted to simulated cines that were made without knowledge of this project."""
+"""Least ratio of the standard deviation to the unexplained rest. The first number holds where neighbouring pixels are alike. The
+second is subtracted for each grey level by which they differ. Fitted to simulated cines that were made without knowledge of
+this project."""
 _MOST_REST_MM = 0.2
 """Where the profile of an electrode hardly shows, its rest says nothing more."""
 _FEWEST_OF_JITTER, _LEAST_TRIPLES = 3, 3
@@ -99,11 +100,11 @@ _FEWEST_OF_SHAPE = 3
 _PLACE_SD_MM = 0.05
 """How far an electrode's middle lies off its catheter's smooth curve."""
 _AGREES, _LOOP_AGREES = np.array([0.4, 0.1]), 1.0
-"""The square of an electrode's distance from its prediction, along the catheter and across, over its expectation, up to which the
-chain agrees where the places themselves are sure. Catheters mostly bend less than they can, and where they lie across the rays they
-are as long as they can be. The ends of a loop are predicted less well."""
+"""Largest square of an electrode's distance from its prediction that is no reason to widen its ellipse, over the square that is
+expected: along the catheter and across it, and on a loop. It is below 1, because catheters mostly bend less than they can. On a
+loop it is 1, because the others predict its ends less well."""
 _NOISE_AGREES = 2.0
-"""The same where the expected distance is all due to the ellipses: what they say already is no reason to widen them."""
+"""The same where the ellipses alone make up the expected distance: what they say already does not widen them."""
 
 
 def noise_sd(bound: Array, clearness: Array, long_tip: bool) -> Array:

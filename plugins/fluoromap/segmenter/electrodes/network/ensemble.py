@@ -35,7 +35,10 @@ class NetworkEnsemble:
         """
         count = len(weights.get("heads.bias", ()))
         if not count:
-            raise ValueError("the weights hold no network: make them with python -m fluoromap.training of this version")
+            held = ", ".join(weights) or "nothing"
+            raise ValueError(
+                f"the weights hold no network, but {held}: make them with python -m fluoromap.training of this version"
+            )
         return cls(
             tuple(
                 ElectrodeNetwork.of_weights({name: array[k] for name, array in weights.items() if k < len(array)})

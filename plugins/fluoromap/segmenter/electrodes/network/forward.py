@@ -182,8 +182,10 @@ class ElectrodeNetwork:
             taps, bias = weights.get(f"{name}.taps"), weights.get(f"{name}.bias")
             expected = (shape.width, shape.width, shape.inputs, shape.outputs)
             if taps is None or bias is None or taps.shape != expected or bias.shape != (shape.outputs,):
+                found = "nothing" if taps is None else f"shape {taps.shape}"
                 raise ValueError(
-                    f"the weights have no layer {name!r} of shape {expected}: train them with this version"
+                    f"layer {name!r} of the weights needs taps of shape {expected} with a bias, but has {found}: "
+                    "train the weights with this version"
                 )
             layers[name] = Layer.of_weights(shape, taps, bias)
         return cls(layers)
