@@ -23,7 +23,7 @@ lag                                     share of the shift by which the shadow o
 shape of the row                        distance from where the other electrodes predict it, over its expectation
 ======================================  ==============================================================================
 
-The order in which a run uses them stands in :mod:`~fluoromap.segmenter.runs.final_ellipses`.
+The order in which a run uses them is in :mod:`~fluoromap.segmenter.runs.final_ellipses`.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def beside_other_electrodes(chain: Chain, others: Sequence[Chain], px_per_mm: fl
 
 
 def of_hidden(px_per_mm: float) -> Array:
-    """Return the covariance of an electrode that was put on the curve through the others, (2, 2) square pixels."""
+    """Return the covariance of a place on the others' curve, (2, 2) pixels²."""
     return (_HIDDEN_MM * px_per_mm) ** 2 * np.eye(2)
 
 
@@ -225,9 +225,9 @@ def returned(covariance_px2: Array, moved_px: Array, back: BoolArray) -> Array:
 def weighed_with_shape(
     expected_uv: Array, found_uv: Array, found_px2: Array, shape_px2: Array, reach_px: float
 ) -> tuple[Array, Array]:
-    """Return places and covariances of a chain that was found again in another frame.
+    """Return places and covariances of a chain found in another frame.
 
-    Each place is weighed against the one that the other frame's shape gives. A band that is far from there is something else, and
+    Each place is weighed against that of the other frame's shape. A band that is far from there is something else, and
     hardly counts.
 
     Parameters
@@ -259,12 +259,18 @@ def _bending_px(reach_px: float) -> float:
 
 
 def of_mean(chain: Chain) -> Chain:
-    """Return a mean's chain for the search in a frame of the mean: its place there is no independent measurement."""
+    """Return a mean's chain for the search in one of its frames.
+
+    Its place in the mean is no independent measurement.
+    """
     return replace(chain, covariance_px2=chain.covariance_px2 + _IN_MEAN_PX**2 * np.eye(2))
 
 
 def moved_obliquely(chain: Chain, points_uv: Array) -> Chain:
-    """Return a chain at the places (n, 2) of its electrodes as oblique cylinders; the way adds to its covariances."""
+    """Return a chain at the places of its electrodes as oblique cylinders.
+
+    The way to the places (n, 2) adds to its covariances.
+    """
     way = points_uv - chain.pixels_uv
     beside = _SD_BESIDE**2 * (way * way).sum(axis=1)
     more: Array = _SD_OF_WAY**2 * way[:, :, None] * way[:, None, :] + beside[:, None, None] * np.eye(2)
