@@ -19,7 +19,7 @@ from skimage.exposure import equalize_adapthist
 
 from fluoromap.catheters import Catalogue, Catheter, catheter_type
 from fluoromap.contracts import Array
-from fluoromap.segmenter.gaussian_blur import gaussian
+from fluoromap.segmenter.picture.gaussian_blur import gaussian
 from fluoromap.training.anatomy import anatomy
 from fluoromap.training.drawing import Canvas, Image
 from fluoromap.training.drawn_catheters import design_of, draw_catheters
