@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import FrameSource, Preview, Run, Segmenter, Silent
-from fluoromap.segmenter.learned_chain.plugin import LearnedChain
 from fluoromap.segmenter.runs.hypotheses.scale_and_polarity import SCALES_PX_PER_MM, find_scale
 
 _NEIGHBOURS = 2

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import FrameChains, PixelFacts, Run
-from fluoromap.segmenter.field_mask import FieldMask, evenly_spaced_frames, find_field
 from fluoromap.segmenter.electrodes.network.weights import SHIPPED, Trained, read_weights
 from fluoromap.segmenter.frames.electrode_detector import electrode_chains
 from fluoromap.segmenter.picture.field_mask import FieldMask, evenly_spaced_frames, find_field
