@@ -34,11 +34,11 @@ from fluoromap.contracts import (
     Silent,
     Triangulation,
 )
+from fluoromap.diastole import diastolic_frames
 from fluoromap.geometry import camera_from_gantry
 from fluoromap.matching import SiteRuns, match_study
 from fluoromap.phantom import SimulatedRun, SimulatedSite, SimulatedStudy, StudySpec, simulate_study
 from fluoromap.segmenter.catheter_chain.plugin import CatheterChain
-from fluoromap.segmenter.picture.quiet_frames import diastolic_frames
 from fluoromap.triangulator.maximum_likelihood import MaximumLikelihood
 from fluoromap.triangulator.uncertainty import UncertaintyParams
 

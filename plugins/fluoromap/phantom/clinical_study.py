@@ -11,6 +11,7 @@ from scipy.special import ndtr
 
 from fluoromap.catheters import DEFAULT_CATALOGUE, Catalogue, Catheter
 from fluoromap.contracts import Array, Chain, FrameChains, Segmentation
+from fluoromap.diastole import diastolic_frames
 from fluoromap.geometry import Camera, camera_from_gantry
 from fluoromap.matching import SiteRuns
 from fluoromap.phantom.anatomy import RADIUS_6F_MM, Anatomy, Resident, draw_anatomy
@@ -26,7 +27,6 @@ from fluoromap.phantom.motion import (
 )
 from fluoromap.phantom.shaft import Shaft, arc_lengths_mm
 from fluoromap.phantom.simulated_study import FRONTAL, LATERAL
-from fluoromap.segmenter.picture.quiet_frames import diastolic_frames
 
 NOISE_PX = 0.5
 GANTRIES = (LATERAL, FRONTAL)

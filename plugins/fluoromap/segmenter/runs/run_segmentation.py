@@ -11,6 +11,7 @@ import numpy as np
 
 from fluoromap.catheters import Catalogue
 from fluoromap.contracts import Array, Context, FrameChains, Marks, Run, Segmentation
+from fluoromap.diastole import diastolic_frames
 from fluoromap.reasons import Reason
 from fluoromap.segmenter.frames.detector import Detector
 from fluoromap.segmenter.picture.field_mask import (
@@ -22,7 +23,7 @@ from fluoromap.segmenter.picture.field_mask import (
 )
 from fluoromap.segmenter.picture.lag import measure_lag
 from fluoromap.segmenter.picture.log_image import Image, LogTransform
-from fluoromap.segmenter.picture.quiet_frames import MotionMeter, diastolic_frames
+from fluoromap.segmenter.picture.motion_meter import MotionMeter
 from fluoromap.segmenter.picture.shadowless_frames import ShadowlessFrames
 from fluoromap.segmenter.recall import recall_for
 from fluoromap.segmenter.runs.diastole import (
