@@ -130,7 +130,7 @@ def test_signature_holds_and_a_changed_statement_does_not(released: Path, tmp_pa
 def test_files_that_are_not_committed_are_refused(repository: Path, tmp_path: Path) -> None:
     clone = tmp_path / "clone"
     _git(tmp_path, "clone", "--quiet", str(repository), str(clone))
-    with (clone / "service" / "fluoromap_service" / "auth.py").open("a") as file:
+    with (clone / "service" / "fluoromap_service" / "settings.py").open("a") as file:
         file.write("\n# changed\n")
     answer = _release(clone, "--out", tmp_path / "out")
     assert answer.returncode == 1
