@@ -16,13 +16,12 @@ from finished_study import FinishedStudy, make_study
 from sqlalchemy import delete, select
 
 from fluoromap_service.api.app import create_app
-from fluoromap_service.api.dicomweb import stored
 from fluoromap_service.api.http import file_pool
 from fluoromap_service.dicom import deterministic_uid
 from fluoromap_service.jobs import stage_results
 from fluoromap_service.store import files
 from fluoromap_service.store.engine import reading, writing
-from fluoromap_service.store.models import Instance, Rendering, StageRow, Study
+from fluoromap_service.store.models import DicomObject, Instance, Rendering, StageRow, Study
 
 DICOM_STUDY = deterministic_uid("study")
 DAMAGES: dict[str, Callable[[Path], Any]] = {
@@ -82,8 +81,7 @@ def forget_everything_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forget the renderings and results, so that every route reads again."""
     with writing() as session:
         session.execute(delete(Rendering))
-    for name in ("_headers_of_runs", "_headers_of_jobs"):
-        monkeypatch.setattr(stored, name, stored._Remembered(10))
+        session.execute(delete(DicomObject).where(DicomObject.job_id.is_not(None)))
     monkeypatch.setattr(stage_results, "_remembered", OrderedDict())
 
 
