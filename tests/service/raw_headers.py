@@ -91,7 +91,7 @@ def _raw_element(keyword: str, representation: str, value: bytes) -> bytes:
     tag = Tag(keyword)
     value += (b"\0" if representation == "UI" else b" ") * (len(value) % 2)
     head = struct.pack("<HH2s", tag.group, tag.element, representation.encode())
-    long = representation in ("OB", "SQ", "UC", "UR", "UT", "UN")
+    long = representation in ("OB", "OD", "OF", "OL", "OV", "OW", "SQ", "SV", "UC", "UN", "UR", "UT", "UV")
     return head + struct.pack("<HL" if long else "<H", *((0, len(value)) if long else (len(value),))) + value
 
 

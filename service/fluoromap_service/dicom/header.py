@@ -299,7 +299,9 @@ class Header:
         return values if all(math.isfinite(value) for value in values) else ()
 
     def _texts(self, dataset: Dataset, attribute: str | BaseTag) -> tuple[str, ...]:
-        values = tuple(str(value).strip(" \0") for value in _values(self._value(dataset, attribute)))
+        # A number under the tag of a text or a UID has another representation, and no reader of the text finds it.
+        found = _values(self._value(dataset, attribute))
+        values = tuple(value.strip(" \0") for value in found if isinstance(value, str))
         return values if any(values) else ()
 
     @staticmethod

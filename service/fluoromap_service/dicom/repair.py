@@ -83,9 +83,10 @@ def _repair(dataset: Dataset, inherited: CharacterSets) -> frozenset[str]:
 def _repair_element(dataset: Dataset, tag: BaseTag, sets: CharacterSets) -> bool:
     """Repair one attribute; return whether its value is the same."""
     element = dataset.get_item(tag)
-    representation = _representation(tag, element)
+    known = dictionary_VR(tag) if dictionary_has_tag(tag) else None
+    representation = _representation(known, element)
     if representation in _TEXTUAL:
-        if element.VR == "SQ":
+        if "SQ" in (known, element.VR):
             del dataset[tag]
             return False
         text, certain = _text(element, representation, sets)
@@ -94,7 +95,11 @@ def _repair_element(dataset: Dataset, tag: BaseTag, sets: CharacterSets) -> bool
         dataset[tag] = DataElement(tag, representation, repaired[0] if len(repaired) == 1 else repaired)
         return certain and repaired == [value.strip(_PADDING) for value in values]
     try:
-        items = dataset[tag].value if dataset[tag].VR == "SQ" else ()
+        is_sequence = dataset[tag].VR == "SQ"
+        if known is not None and is_sequence is not (known == "SQ"):
+            del dataset[tag]
+            return False
+        items = dataset[tag].value if is_sequence else ()
         return not frozenset().union(*(_repair(item, sets) for item in items))
     except Exception:
         # The conversion of a damaged value raises nearly anything.
@@ -102,11 +107,9 @@ def _repair_element(dataset: Dataset, tag: BaseTag, sets: CharacterSets) -> bool
         return False
 
 
-def _representation(tag: BaseTag, element: DataElement | RawDataElement) -> str:
+def _representation(known: str | None, element: DataElement | RawDataElement) -> str:
     """Return the dictionary's representation of a text, else the element's own."""
-    own = str(element.VR or "UN")
-    known = dictionary_VR(tag) if dictionary_has_tag(tag) else own
-    return known if known in _TEXTUAL else own
+    return known if known in _TEXTUAL else str(element.VR or "UN")
 
 
 def _text(element: DataElement | RawDataElement, representation: str, sets: CharacterSets) -> tuple[str, bool]:

@@ -141,6 +141,32 @@ def test_other_representations_than_those_of_the_dictionary(tmp_path: Path) -> N
     assert strictly_read((tmp_path / "copy.dcm").read_bytes()).StudyDate == "20240105"
 
 
+@pytest.mark.parametrize("value", [b"ab", b"abcd"])
+@pytest.mark.parametrize("representation", ["LO", "US", "SQ", "OB", "UN", "AT"])
+@pytest.mark.parametrize(
+    "keyword",
+    ["DeidentificationMethodCodeSequence", "DeidentificationMethod", "PatientIdentityRemoved", "TimezoneOffsetFromUTC",
+     "SpecificCharacterSet", "LongitudinalTemporalInformationModified", "StudyInstanceUID", "SOPClassUID"],
+)  # fmt: skip
+def test_results_of_a_header_with_a_wrong_representation(
+    tmp_path: Path, keyword: str, representation: str, value: bytes
+) -> None:
+    path = tmp_path / "run.dcm"
+    path.write_bytes(with_raw_values(_run(), {keyword: value}, {keyword: representation}))
+    try:
+        read_instance(path)
+    except Problem as problem:
+        assert (keyword, problem.code) in {  # noqa: PT017 - most of them are accepted
+            ("StudyInstanceUID", "malformed"), ("SOPClassUID", "malformed"), ("SOPClassUID", "not_xa"),
+            ("SpecificCharacterSet", "malformed"),
+        }  # fmt: skip
+        return
+    for made in results_of(path, tmp_path).values():
+        strictly_read(made)
+    deidentify_file(path, tmp_path / "copy.dcm", Pseudonyms(b"secret", "patient", "", Dates.KEEP))
+    assert strictly_read((tmp_path / "copy.dcm").read_bytes()).PatientIdentityRemoved == "YES"
+
+
 def test_the_warning_does_not_quote_the_value() -> None:
     assert "PatientName" not in TOLD.sentence
     assert TOLD.sentence.endswith(".")
@@ -223,27 +249,33 @@ _VALUES = st.one_of(
         b"1.02", b" 1.2.3 ", b"A^B^C^D^E^F", b"nan", b"1e400", b"\x1b$B", b"0" * 80, b"m", b"YES ", b"+0100", b"+99",
     ]),
 )  # fmt: skip
-_HEADERS = st.dictionaries(
-    st.sampled_from([
-        *PATIENT_AND_STUDY, "PatientAge", "PatientWeight", "OtherPatientIDs", "IssuerOfPatientID", "StudyDescription",
-        "PatientComments", "EthnicGroup", "InstanceNumber", "SeriesNumber", "SeriesDescription", "SeriesDate", "SeriesTime",
-        "ContentDate", "AcquisitionDateTime", "AcquisitionTime", "TimezoneOffsetFromUTC", "Manufacturer", "SoftwareVersions",
-        "ImageType", "LossyImageCompression", "PatientIdentityRemoved", "DeidentificationMethod", "BodyPartExamined", "KVP",
-        "ImageComments", "InstanceCreatorUID", "DeviceSerialNumber", "PositionerMotion", "AcquisitionNumber",
-    ]),
-    _VALUES,
-    max_size=12,
-)  # fmt: skip
+_KEYWORDS = st.sampled_from([
+    *PATIENT_AND_STUDY, "PatientAge", "PatientWeight", "OtherPatientIDs", "IssuerOfPatientID", "StudyDescription",
+    "PatientComments", "EthnicGroup", "InstanceNumber", "SeriesNumber", "SeriesDescription", "SeriesDate", "SeriesTime",
+    "ContentDate", "AcquisitionDateTime", "AcquisitionTime", "TimezoneOffsetFromUTC", "Manufacturer", "SoftwareVersions",
+    "ImageType", "LossyImageCompression", "PatientIdentityRemoved", "DeidentificationMethod", "BodyPartExamined", "KVP",
+    "ImageComments", "InstanceCreatorUID", "DeviceSerialNumber", "PositionerMotion", "AcquisitionNumber",
+    "DeidentificationMethodCodeSequence", "LongitudinalTemporalInformationModified", "OtherPatientIDsSequence",
+])  # fmt: skip
+_HEADERS = st.dictionaries(_KEYWORDS, _VALUES, max_size=12)
+_REPRESENTATIONS = st.dictionaries(
+    st.one_of(_KEYWORDS, st.just("SpecificCharacterSet")),
+    st.sampled_from(["LO", "UT", "PN", "DS", "IS", "UI", "US", "FD", "AT", "SQ", "OB", "OW", "UN"]),
+    max_size=6,
+)
 
 
 @settings(max_examples=25, deadline=None)  # a report takes half a second
-@given(terms=st.one_of(st.none(), _TERMS), values=_HEADERS, dates=st.sampled_from(Dates))
+@given(
+    terms=st.one_of(st.none(), _TERMS), values=_HEADERS, representations=_REPRESENTATIONS, dates=st.sampled_from(Dates)
+)
 def test_results_of_every_header_that_the_door_accepts(
-    terms: bytes | None, values: dict[str, bytes | None], dates: Dates
+    terms: bytes | None, values: dict[str, bytes | None], representations: dict[str, str], dates: Dates
 ) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        path = _file(folder, {**values, "SpecificCharacterSet": terms})
+        path = folder / "run.dcm"
+        path.write_bytes(with_raw_values(_run(), {**values, "SpecificCharacterSet": terms}, representations))
         try:
             facts = read_instance(path)
         except Problem:
