@@ -13,7 +13,7 @@ from pydicom.pixels.decoders.base import get_decoder
 from pydicom.uid import JPEGExtended12Bit
 
 from fluoromap_service.dicom.errors import DicomCode, dicom_problem
-from fluoromap_service.dicom.pixel_layout import JP2_SIGNATURE, JPEG_2000, RLE, PixelLayout, syntax_name
+from fluoromap_service.dicom.pixel_layout import JP2_SIGNATURE, JPEG_2000, JPEG_LS, RLE, PixelLayout, syntax_name
 from fluoromap_service.problem import Problem
 
 Pixels = NDArray[np.unsignedinteger[Any]]
@@ -98,9 +98,11 @@ def decode(layout: PixelLayout, codestream: bytes) -> Pixels:
         "photometric_interpretation": "MONOCHROME2",
         "pixel_keyword": "PixelData",
     }
+    gdcm_fails = layout.transfer_syntax in JPEG_LS and described.precision in (6, 7)
+    options["decoding_plugin"] = "pyjpegls" if gdcm_fails else "gdcm"
     try:
         decoder = get_decoder(layout.transfer_syntax)
-        pixels, _ = decoder.as_array(encapsulate([essential]), index=0, raw=True, decoding_plugin="gdcm", **options)
+        pixels, _ = decoder.as_array(encapsulate([essential]), index=0, raw=True, **options)
     except Exception as error:
         raise _undecodable(layout, "the decoder fails") from error
     if pixels.shape != (layout.rows, layout.columns) or pixels.dtype.kind != "u":

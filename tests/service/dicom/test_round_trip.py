@@ -13,13 +13,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jpeg_ls
 import numpy as np
 import pydicom
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from pydicom.pixels.encoders.base import get_encoder
-from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, JPEGLSLossless, RLELossless
+from pydicom.uid import (
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    JPEGLSLossless,
+    JPEGLSNearLossless,
+    RLELossless,
+)
 
 from fluoromap.contracts import FrameSource
 from fluoromap.geometry import Gantry
@@ -220,6 +227,27 @@ def test_jpeg_ls(make_xa: MakeXa) -> None:
     )
     layout = PixelLayout(4, 4, 1, 8, 8, JPEGLSLossless, ((),))
     np.testing.assert_array_equal(decode(layout, stream), image)
+
+
+@pytest.mark.parametrize("syntax", [JPEGLSLossless, JPEGLSNearLossless])
+@pytest.mark.parametrize("bits_allocated", [8, 16])
+@pytest.mark.parametrize("bits_stored", range(2, 17))
+def test_jpeg_ls_of_every_precision(bits_stored: int, bits_allocated: int, syntax: str) -> None:
+    """Some encoders state the bits of the pixels, others those of the cells."""
+    if bits_stored > bits_allocated:
+        pytest.skip("the pixels do not fit into their cells")
+    cell = np.uint8 if bits_stored <= 8 else np.uint16
+    image = np.random.default_rng(bits_stored).integers(0, 1 << bits_stored, (20, 24)).astype(cell)
+    for precision in (bits_stored, 8 * image.itemsize):
+        stream = jpeg_ls.encode_pixel_data(
+            image.tobytes(), rows=20, columns=24, samples_per_pixel=1, bits_allocated=8 * image.itemsize,
+            bits_stored=precision, photometric_interpretation="MONOCHROME2", planar_configuration=0,
+        )  # fmt: skip
+        layout = PixelLayout(20, 24, 1, bits_allocated, bits_stored, syntax, ((),))
+        decoded = decode(layout, bytes(stream))
+        assert decoded.dtype == f"<u{bits_allocated // 8}"
+        assert decoded.flags.writeable
+        np.testing.assert_array_equal(decoded, image)
 
 
 def test_implicit_and_padded(make_xa: MakeXa) -> None:
