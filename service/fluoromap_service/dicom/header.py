@@ -107,6 +107,17 @@ _PATIENT_AND_STUDY = ("SpecificCharacterSet", *PATIENT_AND_STUDY)
 _PRIVATE_GROUP = 0x0019
 _PRIVATE_ELEMENTS = (0x21, 0x22, 0x23)
 _PRIVATE_BLOCKS = range(0x10, 0x100)
+_UNPACK, _SEND_ORIGINAL = "unpack it and send the DICOM files in it", "send the DICOM file from which it was made"
+_OTHER_FORMATS = {
+    b"PK\x03\x04": ("a ZIP archive", _UNPACK),
+    b"\x1f\x8b": ("a gzip file", _UNPACK),
+    b"7z\xbc\xaf\x27\x1c": ("a 7-Zip archive", _UNPACK),
+    b"Rar!": ("a RAR archive", _UNPACK),
+    b"%PDF-": ("a PDF document", _SEND_ORIGINAL),
+    b"\x89PNG": ("a PNG picture", _SEND_ORIGINAL),
+    b"\xff\xd8\xff": ("a JPEG picture", _SEND_ORIGINAL),
+}
+"""Files that people send in place of DICOM files, by their first bytes: a name, and what to do."""
 _OVERLAY_GROUPS, _OVERLAY_BIT_POSITION = range(0x6000, 0x6020, 2), 0x0102
 """OverlayBitPosition (60xx,0102) of the sixteen overlays of PS3.3 C.9.2."""
 
@@ -585,4 +596,9 @@ def _no_preamble(start: bytes) -> Problem:
             DicomCode.NO_PART10_HEADER,
             "This looks like a bare DICOM data set; export it as a DICOM file with preamble and file meta information.",
         )
+    if not start:
+        return dicom_problem(DicomCode.NOT_DICOM, "The file is empty; send it again.")
+    for first_bytes, (kind, advice) in _OTHER_FORMATS.items():
+        if start.startswith(first_bytes):
+            return dicom_problem(DicomCode.NOT_DICOM, f"This is {kind}, not a DICOM file; {advice}.")
     return dicom_problem(DicomCode.NOT_DICOM, "This is not a DICOM file; send DICOM files only.")

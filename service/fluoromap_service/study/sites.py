@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import select
+from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
 from fluoromap_service.problem import Problem
@@ -34,6 +34,16 @@ def mention(session: Session, study_id: str, name: str) -> Site:
     Problem
         422 when the text cannot be a name.
     """
+    _check_name(name)
+    row = session.scalar(select(Site).where(Site.study_id == study_id, Site.name == name))
+    if row is None:
+        row = Site(study_id=study_id, name=name)
+        session.add(row)
+        session.flush()
+    return row
+
+
+def _check_name(name: str) -> None:
     if not is_site_name(name):
         raise Problem(
             422,
@@ -41,12 +51,6 @@ def mention(session: Session, study_id: str, name: str) -> Site:
             "A site's name has 1 to 64 characters, no slash, no control character and no space at its ends.",
             [("site", "not usable as a name")],
         )
-    row = session.scalar(select(Site).where(Site.study_id == study_id, Site.name == name))
-    if row is None:
-        row = Site(study_id=study_id, name=name)
-        session.add(row)
-        session.flush()
-    return row
 
 
 def is_site_name(name: str) -> bool:
@@ -68,17 +72,29 @@ def put_table(session: Session, study: Study, table: Sequence[ActivationTime]) -
     list of str
         Sites of the table that have no run, or not the run that the table names.
     """
-    for row in rows_of(session, study.id):
+    _add_sites(session, study.id, [entry.site for entry in table])
+    rows = {row.name: row for row in rows_of(session, study.id)}
+    for row in rows.values():
         row.csv_row = row.csv_a = row.csv_b = row.ordered_a = row.ordered_b = None
         if row.lat_by == "csv":
             row.lat_ms = row.lat_sd_ms = row.lat_by = None
     for entry in table:
-        row = mention(session, study.id, entry.site)
+        row = rows[entry.site]
         row.csv_row, row.csv_a, row.csv_b = entry.row, entry.view_a, entry.view_b
         row.lat_ms, row.lat_sd_ms, row.lat_by = entry.lat_ms, None, "csv"
     session.flush()
     bound = {site.site: site for site in binding_of(session, study.id).sites}
     return [entry.site for entry in table if not _has_its_runs(entry, bound[entry.site])]
+
+
+def _add_sites(session: Session, study_id: str, names: Sequence[str]) -> None:
+    """Add the sites that the study lacks, in this order."""
+    for name in names:
+        _check_name(name)
+    known = set(session.scalars(select(Site.name).where(Site.study_id == study_id)))
+    added = [{"study_id": study_id, "name": name} for name in dict.fromkeys(names) if name not in known]
+    if added:
+        session.execute(insert(Site), added)
 
 
 def _has_its_runs(entry: ActivationTime, site: BoundSite) -> bool:

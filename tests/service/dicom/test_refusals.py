@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import pickle
 import struct
 import tracemalloc
@@ -53,12 +54,31 @@ def refusal(path: Path) -> Problem:
     return problem
 
 
-@pytest.mark.parametrize("content", [b"", b"%PDF-1.7 and so on" * 20, b"\0" * 4096])
-def test_what_is_not_dicom(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "empty"),
+        (b"%PDF-1.7 and so on" * 20, "a PDF document"),
+        (gzip.compress(b"DICM" * 100), "a gzip file, not a DICOM file; unpack it"),
+        (b"PK\x03\x04" + bytes(200), "a ZIP archive, not a DICOM file; unpack it"),
+        (b"\xff\xd8\xff\xe0" + bytes(200), "a JPEG picture"),
+        (bytes(4096), "send DICOM files only"),
+        (b"\x1f", "send DICOM files only"),
+    ],
+)
+def test_what_is_not_dicom(tmp_path: Path, content: bytes, told: str) -> None:
     path = tmp_path / "x.bin"
     path.write_bytes(content)
     problem = refusal(path)
     assert (problem.code, problem.status) == (DicomCode.NOT_DICOM, 415)
+    assert told in problem.detail
+
+
+def test_a_run_whose_preamble_looks_like_another_format(tmp_path: Path, cine: Path) -> None:
+    """The preamble of a slide may make it a TIFF file too (PS3.10 section 7.1)."""
+    path = tmp_path / "dual.dcm"
+    path.write_bytes(b"PK\x03\x04" + cine.read_bytes()[4:])
+    assert read_instance(path) == read_instance(cine)
 
 
 def test_bare_data_set(tmp_path: Path, cine: Path) -> None:
